@@ -1,0 +1,17 @@
+"""Chromatic difference of refraction of the average eye."""
+
+from numpy.typing import ArrayLike
+
+INDIANA_OFFSET_DPT = 1.68524
+INDIANA_SLOPE_DPT_NM = 633.46
+INDIANA_POLE_NM = 214.102
+
+
+def chromatic_refraction_dpt(wavelength_nm: ArrayLike):
+    """Refraction of the Indiana chromatic eye, dpt, zero at 589.98 nm.
+
+    A fit to measured eyes (Thibos, Ye, Zhang & Bradley 1992), used for profiles that
+    are a wavefront and no eye: only differences between wavelengths are taken from
+    it.  Shorter wavelengths are more myopic (negative).
+    """
+    return INDIANA_OFFSET_DPT - INDIANA_SLOPE_DPT_NM / (wavelength_nm - INDIANA_POLE_NM)

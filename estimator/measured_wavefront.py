@@ -1,0 +1,183 @@
+"""A profile used as the measured wavefront: the light option, with no eye model.
+
+Pupil, object, focus and wavelength act on the measurement by closed formulas
+(DESIGN 4): coefficients rescale downwards, defocus shifts by vergence,
+accommodation and chromatic difference.  On axis only.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import prescription as rx
+from estimator.chromatic import chromatic_refraction_dpt
+from estimator.profiles import EyeProfile
+from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.zernike import remove_central_tilt, rescale_pupil
+
+DEFAULT_AMPLITUDE_DPT = 10.0
+"""Amplitude of accommodation of an eye whose age is not given."""
+
+
+def accommodation_amplitude_dpt(
+    *, age_years: float | None, add_dpt: float = 0.0
+) -> float:
+    """Largest accommodation in dpt.
+
+    By age: objective amplitude 7.33 - 0.0035 (age - 3)² (Anderson et al. 2008), zero
+    from 49 years on.  A near addition says that half the amplitude and the addition
+    make up the 2.5 dpt of a reading distance.  The smaller of the two holds.
+    """
+    amplitude_dpt = DEFAULT_AMPLITUDE_DPT
+    if age_years is not None:
+        amplitude_dpt = max(0.0, 7.33 - 0.0035 * (age_years - 3.0) ** 2)
+    if add_dpt > 0.0:
+        amplitude_dpt = min(amplitude_dpt, max(0.0, 2.0 * (2.5 - add_dpt)))
+    return amplitude_dpt
+
+
+@dataclass(frozen=True)
+class WavefrontState:
+    """Wavefront of the eye at one pupil, object, focus and wavelength.
+
+    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm``; ``notes`` say what
+    could not be met as asked.
+    """
+
+    zernike_um: NDArray[np.float64]
+    pupil_diameter_mm: float
+    notes: tuple[str, ...]
+
+
+class MeasuredWavefront:
+    """Wavefront-only eye: measured coefficients plus defocus by formula.
+
+    Attributes
+    ----------
+    refraction_dpt : float
+        Least-squares spherical equivalent M at 555 nm, from C(2,0) on the measured
+        pupil, correction included.
+    amplitude_dpt : float
+        Largest accommodation.
+    max_pupil_diameter_mm : float
+        Above it the pupil is capped.
+    """
+
+    def __init__(self, profile: EyeProfile):
+        radius_mm = profile.pupil_diameter_mm / 2.0
+        zernike_um = remove_central_tilt(profile.zernike_um)
+        if profile.correction is not None:
+            zernike_um = zernike_um - rx.zernike_from_power_vector(
+                *rx.power_vector(profile.correction), zernike_radius_mm=radius_mm
+            )
+        self.zernike_um = zernike_um
+        self.zernike_radius_mm = radius_mm
+        self.wavelength_nm = profile.wavelength_nm
+        self.max_pupil_diameter_mm = profile.max_pupil_diameter_mm
+        self.amplitude_dpt = accommodation_amplitude_dpt(
+            age_years=profile.age_years, add_dpt=profile.add_dpt
+        )
+        self.refraction_dpt = self.refraction_at_dpt(REFERENCE_WAVELENGTH_NM)
+
+    @classmethod
+    def from_profile(cls, profile: EyeProfile) -> "MeasuredWavefront":
+        """Build from a parsed profile."""
+        return cls(profile)
+
+    def refraction_at_dpt(self, wavelength_nm: float) -> float:
+        """M(lambda) = M(lambda_0) + Rx(lambda) - Rx(lambda_0), dpt."""
+        m_dpt, _, _ = rx.power_vector_from_zernike(
+            self.zernike_um, zernike_radius_mm=self.zernike_radius_mm
+        )
+        return m_dpt + self.chromatic_shift_dpt(wavelength_nm)
+
+    def chromatic_shift_dpt(self, wavelength_nm: float) -> float:
+        """Refraction at this wavelength less that at the measured one, dpt."""
+        return float(
+            chromatic_refraction_dpt(wavelength_nm)
+            - chromatic_refraction_dpt(self.wavelength_nm)
+        )
+
+    def accommodation_dpt(self, focus_dpt: float) -> float:
+        """Accommodation a = clamp(f + M(555 nm), 0, amplitude) for a focus distance."""
+        return min(max(focus_dpt + self.refraction_dpt, 0.0), self.amplitude_dpt)
+
+    def reachable_focus_dpt(self, focus_dpt: float) -> float:
+        """Distance, dpt, that the eye is really focused at when asked for this one."""
+        return self.accommodation_dpt(focus_dpt) - self.refraction_dpt
+
+    def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
+        """Pupil asked for, capped at the measured one."""
+        return min(pupil_diameter_mm, self.max_pupil_diameter_mm)
+
+    def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
+        """Say in words what of the request this eye cannot meet."""
+        notes = []
+        if pupil_diameter_mm > self.max_pupil_diameter_mm + 1e-9:
+            notes.append(
+                f"pupil {pupil_diameter_mm:g} mm capped at the measured "
+                f"{self.max_pupil_diameter_mm:g} mm"
+            )
+        asked_dpt = focus_dpt + self.refraction_dpt
+        if asked_dpt < -1e-9:
+            notes.append(
+                f"focus {focus_dpt:g} dpt is beyond the far point "
+                f"({-self.refraction_dpt:.3g} dpt): the eye stays relaxed"
+            )
+        elif asked_dpt > self.amplitude_dpt + 1e-9:
+            notes.append(
+                f"focus {focus_dpt:g} dpt is nearer than the near point "
+                f"({self.amplitude_dpt - self.refraction_dpt:.3g} dpt): "
+                f"accommodation stops at {self.amplitude_dpt:.3g} dpt"
+            )
+        return tuple(notes)
+
+    def zernike_with_defocus(
+        self, *, pupil_diameter_mm: float, added_defocus_dpt: float
+    ) -> NDArray[np.float64]:
+        """Coefficients (28,), um, on a pupil with vergence added to the relaxed eye.
+
+        ``added_defocus_dpt`` is object vergence minus accommodation plus chromatic
+        shift; C(2,0) changes by -added r²/(4 sqrt 3), everything else is the
+        measurement rescaled.
+        """
+        radius_mm = pupil_diameter_mm / 2.0
+        zernike_um = rescale_pupil(
+            self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
+        )
+        zernike_um[rx.C20] -= added_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
+        return zernike_um
+
+    def state(
+        self,
+        *,
+        pupil_diameter_mm: float,
+        object_dpt: float,
+        focus_dpt: float,
+        wavelength_nm: float,
+    ) -> WavefrontState:
+        """Wavefront for one pupil, object distance, focus and wavelength.
+
+        Raises
+        ------
+        ValueError
+            A pupil that is not positive, or values that are not finite.
+        """
+        values = (pupil_diameter_mm, object_dpt, focus_dpt, wavelength_nm)
+        if not all(math.isfinite(v) for v in values) or pupil_diameter_mm <= 0:
+            raise ValueError(f"eye state {values}: needs a positive pupil, all finite")
+        usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
+        added_dpt = (
+            object_dpt
+            - self.accommodation_dpt(focus_dpt)
+            + self.chromatic_shift_dpt(wavelength_nm)
+        )
+        return WavefrontState(
+            zernike_um=self.zernike_with_defocus(
+                pupil_diameter_mm=usable_mm, added_defocus_dpt=added_dpt
+            ),
+            pupil_diameter_mm=usable_mm,
+            notes=self.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt),
+        )

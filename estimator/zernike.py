@@ -1,0 +1,185 @@
+"""Zernike circle polynomials up to radial order 6, OSA/ANSI index and normalisation.
+
+Every set is an array of 28 coefficients in um, index = j, piston first, and travels
+with the radius of its circle.  Evaluation goes through monomials x^a y^b: gradients
+and pupil rescaling are then exact and share one table.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_RADIAL_ORDER = 6
+N_TERMS = (MAX_RADIAL_ORDER + 1) * (MAX_RADIAL_ORDER + 2) // 2
+
+EXPONENTS: NDArray[np.int64] = np.array(
+    [
+        (degree - b, b)
+        for degree in range(MAX_RADIAL_ORDER + 1)
+        for b in range(degree + 1)
+    ]
+)
+"""(28, 2): exponents (a, b) of the monomials x^a y^b, by degree."""
+
+
+def nm_from_index(index: int) -> tuple[int, int]:
+    """Radial order n and frequency m of OSA/ANSI index j (j = 0 is piston)."""
+    if index < 0:
+        raise ValueError(f"Zernike index {index}: must be 0 or more")
+    n = math.ceil((-3.0 + math.sqrt(9.0 + 8.0 * index)) / 2.0)
+    return n, 2 * index - n * (n + 2)
+
+
+def index_from_nm(n: int, m: int) -> int:
+    """OSA/ANSI index j = (n(n+2)+m)/2; n >= |m| with n - |m| even."""
+    if n < 0 or abs(m) > n or (n - abs(m)) % 2:
+        raise ValueError(f"Zernike term ({n},{m}): needs n >= |m| >= 0, n - |m| even")
+    return (n * (n + 2) + m) // 2
+
+
+def _solid_harmonic(m: int) -> tuple[dict, dict]:
+    """Real and imaginary part of (x + iy)^m as {(a, b): coefficient}."""
+    real, imaginary = {}, {}
+    for k in range(m + 1):
+        sign = (1, 1, -1, -1)[k % 4]
+        part = real if k % 2 == 0 else imaginary
+        part[(m - k, k)] = sign * math.comb(m, k)
+    return real, imaginary
+
+
+def _radial_coefficients(n: int, m: int) -> list[tuple[int, float]]:
+    """R_n^m / rho^m as [(power of rho², coefficient)]."""
+    half_sum, half_difference = (n + m) // 2, (n - m) // 2
+    return [
+        (
+            half_difference - k,
+            (-1) ** k
+            * math.factorial(n - k)
+            / (
+                math.factorial(k)
+                * math.factorial(half_sum - k)
+                * math.factorial(half_difference - k)
+            ),
+        )
+        for k in range(half_difference + 1)
+    ]
+
+
+@cache
+def monomial_matrix() -> NDArray[np.float64]:
+    """Coefficients of every Zernike polynomial in the monomial basis.
+
+    Returns
+    -------
+    matrix : (28, 28)
+        ``matrix[j, t]`` multiplies ``x**a * y**b`` with ``(a, b) = EXPONENTS[t]``;
+        ``zernike_um @ matrix`` are the monomial coefficients of a wavefront.
+    """
+    column = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
+    matrix = np.zeros((N_TERMS, N_TERMS))
+    for j in range(N_TERMS):
+        n, m = nm_from_index(j)
+        norm = math.sqrt((2 - (m == 0)) * (n + 1))
+        harmonic = _solid_harmonic(abs(m))[0 if m >= 0 else 1]
+        for power, radial in _radial_coefficients(n, abs(m)):
+            for i in range(power + 1):
+                binomial = math.comb(power, i)
+                for (a, b), value in harmonic.items():
+                    key = (a + 2 * (power - i), b + 2 * i)
+                    matrix[j, column[key]] += norm * radial * binomial * value
+    matrix.setflags(write=False)
+    return matrix
+
+
+def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
+    """Monomial coefficients (..., 28) of W = sum C_j Z_j on the unit circle, um."""
+    return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
+
+
+def _powers(x: NDArray, highest: int) -> NDArray:
+    return np.stack([x**k for k in range(highest + 1)])
+
+
+def zernike_values(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+    """Values of the 28 polynomials.
+
+    Parameters
+    ----------
+    x, y : (...), unit pupil
+        Positions on the unit circle, x to the person's right, y up.
+
+    Returns
+    -------
+    values : (..., 28)
+    """
+    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    px, py = _powers(x, MAX_RADIAL_ORDER), _powers(y, MAX_RADIAL_ORDER)
+    monomials = px[EXPONENTS[:, 0]] * py[EXPONENTS[:, 1]]
+    return np.moveaxis(monomials, 0, -1) @ monomial_matrix().T
+
+
+def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+    """Gradients of the 28 polynomials, per unit of the normalised pupil.
+
+    Returns
+    -------
+    gradient : (..., 2, 28)
+        d/dx and d/dy.
+    """
+    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    px, py = _powers(x, MAX_RADIAL_ORDER), _powers(y, MAX_RADIAL_ORDER)
+    a, b = EXPONENTS[:, 0], EXPONENTS[:, 1]
+    shape = (-1,) + (1,) * x.ndim
+    d_x = a.reshape(shape) * px[np.maximum(a - 1, 0)] * py[b]
+    d_y = b.reshape(shape) * px[a] * py[np.maximum(b - 1, 0)]
+    monomials = np.stack([np.moveaxis(d_x, 0, -1), np.moveaxis(d_y, 0, -1)], axis=-2)
+    return monomials @ monomial_matrix().T
+
+
+def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray:
+    """Coefficients of the same wavefront on a concentric circle of another radius.
+
+    Parameters
+    ----------
+    zernike_um : (..., 28), um
+    radius_ratio : (...)
+        New radius over old.  Exact for any ratio as polynomial algebra; above 1 it
+        extrapolates a measurement, which callers must not do silently.
+
+    Returns
+    -------
+    zernike_um : (..., 28), um
+
+    Notes
+    -----
+    Equals the closed form of Dai 2006 to 1e-12 (tests/numerical/test_zernike.py).
+    """
+    ratio = np.asarray(radius_ratio, dtype=np.float64)
+    if not np.all(ratio > 0):
+        raise ValueError(f"pupil radius ratio {radius_ratio}: must be positive")
+    degree = EXPONENTS.sum(axis=1)
+    scaled = wavefront_polynomial(zernike_um) * ratio[..., None] ** degree
+    return np.linalg.solve(monomial_matrix().T, scaled[..., None])[..., 0]
+
+
+@cache
+def _horizontal_parity() -> NDArray[np.float64]:
+    terms = [nm_from_index(j) for j in range(N_TERMS)]
+    odd_in_x = [(m > 0 and m % 2 == 1) or (m < 0 and m % 2 == 0) for _, m in terms]
+    return np.where(odd_in_x, -1.0, 1.0)
+
+
+def flip_horizontal(zernike_um: ArrayLike) -> NDArray[np.float64]:
+    """Mirror x: examiner's frame to eye frame and back, or OD to OS (um in, um out)."""
+    return np.asarray(zernike_um, dtype=np.float64) * _horizontal_parity()
+
+
+def remove_central_tilt(zernike_um: ArrayLike) -> NDArray[np.float64]:
+    """Set C(1,±1) so that the slope at the pupil centre is zero (DESIGN 4, tilt)."""
+    zernike_um = np.array(zernike_um, dtype=np.float64)
+    slope = zernike_gradient(0.0, 0.0)
+    for row, j in ((0, index_from_nm(1, 1)), (1, index_from_nm(1, -1))):
+        zernike_um[..., j] -= zernike_um @ slope[row] / slope[row, j]
+    return zernike_um
