@@ -1,0 +1,110 @@
+"""Numbers that Python and GLSL share; every one becomes a ``#define`` of its name."""
+
+TILE_SIZE_PX = 8
+"""Edge of a screen tile and of a fragment block; 64 threads serve one."""
+
+THREADS = TILE_SIZE_PX * TILE_SIZE_PX
+"""Threads of a tile's work group, and fragment slots of a block."""
+
+SCAN_THREADS = 256
+"""Threads of the single group that sums the tile counts."""
+
+RADIX_BITS = 4
+RADIX = 1 << RADIX_BITS
+"""Buckets of one sorting pass; RADIX x THREADS counters fill 4 KiB shared memory."""
+
+SORT_KEY_BITS = 24
+"""Depth steps within a tile's own depth range; six passes, so the sorted list ends in
+the buffer it started in."""
+
+SORT_KEY_MAX = float((1 << SORT_KEY_BITS) - 1)
+
+DISCONTINUITY_PX = 0.25
+"""Blur change between neighbours above which they count as two surfaces.  Continuous
+tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %
+and are normalised away."""
+
+MERGE_MIN_BLUR_PX = 3.0
+"""Fragments blurred less than this stay single."""
+
+MERGE_CONTRAST = 0.015
+"""Largest colour difference within a merged 2 x 2 quad is this times blur**1.5: the
+error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
+area), so the bound on the image error is the same at every blur."""
+
+MERGE_CONTRAST_POWER = 1.5
+
+MERGE_MAX_BLUR_STEP_PX = 0.25
+"""Largest blur difference within a merged quad."""
+
+PAPER_TIE_BREAK_M = 0.01
+"""The paper's rule sorts by distance plus this times the scan position (0..1)."""
+
+PAPER_FAR_M = 1000.0
+"""Distance that stands for infinity in the paper's sort key."""
+
+MIN_COVERAGE = 1.0e-4
+"""A pixel that less light reaches keeps its own colour."""
+
+MIN_BLUR_RANGE = 1.0e-12
+"""Smallest depth range that is divided by."""
+
+QUAD = 4.0
+"""Pixels of a merged quad."""
+
+SRGB_DECODE_KNEE = 0.04045
+SRGB_ENCODE_KNEE = 0.0031308
+SRGB_SLOPE = 12.92
+SRGB_OFFSET = 0.055
+SRGB_SCALE = 1.055
+SRGB_GAMMA = 2.4
+BYTE_MAX = 255.0
+"""IEC 61966-2-1."""
+
+PLACE_BITS = 16
+PLACE_MASK = 0xFFFF
+INTERVAL_MASK = 0xFFFF
+MERGED_BIT = 0x10000
+EDGE_BIT = 0x20000
+"""Packing of a fragment's position and state words (shaders/README.md)."""
+
+ATLAS_WIDTH_BITS = 12
+ATLAS_WIDTH = 1 << ATLAS_WIDTH_BITS
+"""Texels of one row of the kernel atlas, a 2D texture addressed as one long line.  A
+texel fetch costs half of a storage buffer load on a software renderer, and a texture
+may be larger than a storage block."""
+
+IMAGE_ATLAS = 0
+TEXTURE_ATLAS = 0
+"""Image and texture units of the kernel atlas."""
+
+LAYER_WORDS = 2
+"""uvec4 words of one layer record."""
+
+RECIPE_WORDS = 3
+"""uvec4 words of one blending recipe: four offsets, four radii, four weights."""
+
+BITS_PER_WORD = 32
+BYTES_PER_WORD = 4
+BYTE_BITS = 8
+BYTE_MASK = 0xFF
+RGB = 3
+
+BINDINGS = {
+    "BINDING_COLOR_IN": 0,
+    "BINDING_DEPTH_IN": 1,
+    "BINDING_PIXELS": 2,
+    "BINDING_PIXEL_BLUR": 3,
+    "BINDING_FRAGMENT_COLOR": 4,
+    "BINDING_FRAGMENT_PLACE": 5,
+    "BINDING_BLOCKS": 6,
+    "BINDING_TILE_COUNTS": 7,
+    "BINDING_TILE_OFFSETS": 8,
+    "BINDING_ENTRIES": 9,
+    "BINDING_ENTRIES_SPARE": 10,
+    "BINDING_LAYERS": 11,
+    "BINDING_STORE": 13,
+    "BINDING_RECIPES": 14,
+    "BINDING_COLOR_OUT": 15,
+}
+"""Storage buffer bindings; the reference software renderer allows 16 per stage."""

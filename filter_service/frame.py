@@ -1,0 +1,122 @@
+"""One view of an RGB-D frame: checked, with missing depth filled and counted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from filter_service.errors import BadMessage
+
+MAX_SIDE_PX = 16384
+DEPTH_KINDS = ("planar", "radial")
+
+
+@dataclass(frozen=True)
+class View:
+    """Colour, depth and camera of one view.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        uint8 sRGB, or float32 linear light.
+    depth_m : (height, width), float32
+        +inf is infinity; 0, negative and NaN are missing.
+    tangents : (left, right, up, down)
+    depth_kind : "planar" or "radial"
+        View-space z, or distance from the eye.
+    """
+
+    color: NDArray
+    depth_m: NDArray[np.float32]
+    tangents: tuple[float, float, float, float]
+    depth_kind: str = "planar"
+
+    @property
+    def width_px(self) -> int:
+        """Columns."""
+        return self.color.shape[1]
+
+    @property
+    def height_px(self) -> int:
+        """Rows."""
+        return self.color.shape[0]
+
+
+def check_view(view: View) -> None:
+    """Refuse a view whose arrays cannot be filtered.
+
+    Raises
+    ------
+    BadMessage
+        Names the field, the bad value and what is allowed.
+    """
+    color, depth_m = view.color, view.depth_m
+    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+        raise BadMessage(
+            f"shape {color.shape}", field="color", allowed="(height, width, 3)"
+        )
+    if max(color.shape) > MAX_SIDE_PX:
+        raise BadMessage(
+            f"shape {color.shape}", field="color", allowed=f"sides up to {MAX_SIDE_PX}"
+        )
+    if color.dtype not in (np.uint8, np.float32):
+        raise BadMessage(
+            f"dtype {color.dtype}", field="color", allowed="uint8 sRGB, float32 linear"
+        )
+    if depth_m.shape != color.shape[:2] or depth_m.dtype != np.float32:
+        raise BadMessage(
+            f"{depth_m.dtype} of shape {depth_m.shape}",
+            field="depth",
+            allowed=f"float32 of shape {color.shape[:2]}",
+        )
+    if view.depth_kind not in DEPTH_KINDS:
+        raise BadMessage(
+            f"{view.depth_kind!r}", field="depth.kind", allowed=", ".join(DEPTH_KINDS)
+        )
+
+
+def fill_missing_depth(
+    depth_m: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], int]:
+    """Give missing pixels the depth of the nearest valid pixel, and count them.
+
+    Nearest by Euclidean distance in the image; if no pixel is valid, all are at
+    infinity.
+    """
+    missing = ~(depth_m > 0.0)
+    count = int(np.count_nonzero(missing))
+    if count == 0:
+        return depth_m, 0
+    if count == depth_m.size:
+        return np.full_like(depth_m, np.inf), count
+    rows, columns = distance_transform_edt(
+        missing, return_distances=False, return_indices=True
+    )
+    return depth_m[rows, columns], count
+
+
+def finite_color(color: NDArray) -> tuple[NDArray, int]:
+    """Replace non-finite colour values by zero, and count their pixels."""
+    if color.dtype == np.uint8:
+        return color, 0
+    finite = np.isfinite(color)
+    if finite.all():
+        return color, 0
+    count = int(np.count_nonzero(~finite.all(axis=2)))
+    return np.where(finite, color, np.float32(0.0)), count
+
+
+def radial_stretch(view: View) -> NDArray[np.float64]:
+    """Distance from the eye per unit of planar depth, (height, width)."""
+    left, right, up, down = view.tangents
+    x = left + (right - left) * (np.arange(view.width_px) + 0.5) / view.width_px
+    y = up + (down - up) * (np.arange(view.height_px) + 0.5) / view.height_px
+    return np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+
+
+def object_dpt(view: View, depth_m: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Object distance in dioptres (height, width) of valid depths."""
+    with np.errstate(divide="ignore"):
+        inverse = 1.0 / depth_m.astype(np.float64)
+    return inverse / radial_stretch(view) if view.depth_kind == "planar" else inverse

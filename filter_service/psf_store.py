@@ -1,0 +1,205 @@
+"""The PSF cache of one eye and camera, and its blending recipe for one frame.
+
+Plain arrays without GL: the worker fills it, the renderer uploads it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.units import REFERENCE_WAVELENGTH_NM
+from filter_service.constants import RECIPE_WORDS, RGB
+from filter_service.psf_grid import GridSpec, layer_distances_dpt
+
+
+@dataclass(frozen=True)
+class PsfStore:
+    """Kernels over pupil, total defocus and channel.
+
+    Attributes
+    ----------
+    pupil_nodes_mm : (n_pupils,)
+    defocus_nodes_dpt : list of (n_defocus,) arrays, one a pupil, ascending
+    first_psf : (n_pupils,)
+        PSF index of a pupil's first node; node k and channel c follow at 3 k + c.
+    kernels : (n_texels,), float32
+        All kernels, rows downwards, one after the other.
+    offsets, radius_px : (n_psfs,)
+        Where a kernel starts and its radius.
+    blur_px : (n_psfs,)
+        Geometric blur radius.
+    """
+
+    spec: GridSpec
+    eye: MeasuredWavefront
+    pupil_nodes_mm: NDArray[np.float64]
+    defocus_nodes_dpt: list[NDArray[np.float64]]
+    first_psf: NDArray[np.int64]
+    kernels: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    blur_px: NDArray[np.float64]
+    methods: dict[str, int] = field(default_factory=dict)
+    max_lost_energy_ratio: float = 0.0
+    build_ms: float = 0.0
+
+    @property
+    def psf_count(self) -> int:
+        """Number of kernels."""
+        return len(self.offsets)
+
+    @property
+    def memory_mb(self) -> float:
+        """Size of the kernels."""
+        return self.kernels.nbytes / 1e6
+
+
+@dataclass(frozen=True)
+class FrameLayers:
+    """Layers of one frame: distances, sizes and what to blend from the cache.
+
+    Attributes
+    ----------
+    object_dpt : (n,)
+    radius_px : (n,)
+        Kernel radius of each layer, wide enough for both its intervals.
+    reach_px : (n,)
+        Radius of the interval from this layer to the next.
+    blur_px : (n,)
+        Largest geometric blur radius over the channels.
+    recipes : (n, 3, 12), uint32
+        Per channel four kernel offsets, four radii, four weights (float bits).
+    """
+
+    object_dpt: NDArray[np.float64]
+    radius_px: NDArray[np.int64]
+    reach_px: NDArray[np.int64]
+    blur_px: NDArray[np.float64]
+    recipes: NDArray[np.uint32]
+    pupil_diameter_mm: float
+    focus_dpt: float
+    blur_px_per_dpt: float
+    notes: tuple[str, ...]
+
+
+def channel_defocus_dpt(eye: MeasuredWavefront, spec: GridSpec) -> NDArray[np.float64]:
+    """Total defocus (3,) of the relaxed eye per channel for an object at infinity."""
+    wavelengths_nm = spec.wavelengths_nm
+    if not spec.chromatic:
+        wavelengths_nm = (REFERENCE_WAVELENGTH_NM,) * RGB
+    return np.array([eye.refraction_at_dpt(w) for w in wavelengths_nm])
+
+
+def frame_layers(
+    store: PsfStore,
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    object_range_dpt: tuple[float, float] | None = None,
+) -> FrameLayers:
+    """Plan a frame's layers for a pupil and focus.
+
+    The pupil is clamped to the cache's range and to what was measured, with a note.
+    Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i is
+    read at total defocus t A / A_i, so no blended pair differs in size.
+
+    Parameters
+    ----------
+    object_range_dpt : (low, high), optional
+        Distances in the frame; default and limit is the cache's range.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, section 6.4 (four cached neighbours) and 6.2.
+    """
+    pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
+    notes += store.eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
+    relaxed_dpt = channel_defocus_dpt(store.eye, store.spec)
+    at_infinity_dpt = relaxed_dpt - store.eye.accommodation_dpt(focus_dpt)
+    blend = _Blend(store, pupil_mm)
+    object_dpt = layer_distances_dpt(
+        object_range_dpt or store.spec.object_range_dpt,
+        focused_dpt=-at_infinity_dpt,
+        blur_radius_px=lambda d: blend.blur_px(d[:, None] + at_infinity_dpt),
+        max_blur_step_px=store.spec.max_blur_step_px,
+    )
+    psfs, weights = blend.neighbours(object_dpt[:, None] + at_infinity_dpt)
+    own_px = np.where(weights > 0.0, store.radius_px[psfs], 0).max(axis=(1, 2))
+    reach_px = np.maximum(own_px, np.append(own_px[1:], own_px[-1]))
+    return FrameLayers(
+        object_dpt=object_dpt,
+        radius_px=np.maximum(reach_px, np.append(reach_px[0], reach_px[:-1])),
+        reach_px=reach_px,
+        blur_px=blend.blur_px(object_dpt[:, None] + at_infinity_dpt).max(axis=1),
+        recipes=_recipes(store, psfs, weights),
+        pupil_diameter_mm=pupil_mm,
+        focus_dpt=store.eye.reachable_focus_dpt(focus_dpt),
+        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
+        notes=notes,
+    )
+
+
+def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
+    usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
+    low_mm, high_mm = store.pupil_nodes_mm[0], store.pupil_nodes_mm[-1]
+    clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
+    if abs(clamped_mm - usable_mm) <= 1e-9:
+        return clamped_mm, ()
+    note = (
+        f"pupil {pupil_diameter_mm:g} mm is outside the prepared "
+        f"{low_mm:.3g} to {high_mm:.3g} mm: {clamped_mm:.3g} mm used"
+    )
+    return clamped_mm, (note,)
+
+
+class _Blend:
+    """Cached neighbours of one pupil at any total defocus."""
+
+    def __init__(self, store: PsfStore, pupil_mm: float):
+        nodes = store.pupil_nodes_mm
+        upper = int(
+            np.clip(
+                np.searchsorted(nodes, pupil_mm), min(1, len(nodes) - 1), len(nodes) - 1
+            )
+        )
+        lower = max(upper - 1, 0)
+        span = nodes[upper] - nodes[lower]
+        fraction = (pupil_mm - nodes[lower]) / span if span > 0 else 0.0
+        self.store = store
+        self.pupil_mm = pupil_mm
+        self.sides = [(lower, 1.0 - fraction), (upper, fraction)]
+
+    def neighbours(self, total_dpt: NDArray) -> tuple[NDArray, NDArray]:
+        """PSF indices and weights (n, 3, 4) for total defocus (n, 3), dpt."""
+        channels = np.arange(RGB)
+        psfs, weights = [], []
+        for pupil_index, pupil_weight in self.sides:
+            nodes = self.store.defocus_nodes_dpt[pupil_index]
+            scaled = total_dpt * self.pupil_mm / self.store.pupil_nodes_mm[pupil_index]
+            scaled = np.clip(scaled, nodes[0], nodes[-1])
+            upper = np.clip(
+                np.searchsorted(nodes, scaled), min(1, len(nodes) - 1), len(nodes) - 1
+            )
+            lower = np.maximum(upper - 1, 0)
+            span = nodes[upper] - nodes[lower]
+            safe = np.where(span > 0, span, 1.0)
+            fraction = np.where(span > 0, (scaled - nodes[lower]) / safe, 0.0)
+            first = self.store.first_psf[pupil_index]
+            psfs += [first + RGB * lower + channels, first + RGB * upper + channels]
+            weights += [pupil_weight * (1.0 - fraction), pupil_weight * fraction]
+        return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
+
+    def blur_px(self, total_dpt: NDArray) -> NDArray:
+        """Geometric blur radius (n, 3), px."""
+        psfs, weights = self.neighbours(total_dpt)
+        return (self.store.blur_px[psfs] * weights).sum(axis=-1)
+
+
+def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uint32]:
+    recipes = np.empty((*psfs.shape[:2], RECIPE_WORDS * 4), dtype=np.uint32)
+    recipes[..., 0:4] = store.offsets[psfs]
+    recipes[..., 4:8] = store.radius_px[psfs]
+    recipes[..., 8:12] = weights.astype(np.float32).view(np.uint32)
+    return recipes

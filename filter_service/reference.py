@@ -1,0 +1,135 @@
+"""Slow, plain twins of the passes in float64; tests and benchmarks only.
+
+`gather` asks every output pixel for all the light that reaches it and sorts that
+itself: no tiles, no lists, no merging, no shared code with the passes beyond the PSF
+store and the planned layers.
+"""
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from filter_service.constants import MIN_COVERAGE, PAPER_FAR_M, PAPER_TIE_BREAK_M
+from filter_service.frame import View, fill_missing_depth, object_dpt
+from filter_service.psf_store import FrameLayers, PsfStore
+
+
+def linear_from_srgb(srgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """IEC 61966-2-1 decoding of 8-bit values."""
+    value = srgb.astype(np.float64) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
+    """IEC 61966-2-1 encoding to 8 bits, rounded."""
+    value = np.clip(linear_rgb, 0.0, 1.0)
+    curve = 1.055 * np.power(value, 1.0 / 2.4) - 0.055
+    encoded = np.where(value <= 0.0031308, 12.92 * value, curve)
+    return np.floor(255.0 * encoded + 0.5).astype(np.uint8)
+
+
+def layer_kernels(store: PsfStore, layers: FrameLayers) -> NDArray[np.float64]:
+    """Kernels (n_layers, size, size, 3) on one common odd size, blended in float64."""
+    radius = int(layers.radius_px.max())
+    size = 2 * radius + 1
+    kernels = np.zeros((len(layers.object_dpt), size, size, 3))
+    for k, by_channel in enumerate(layers.recipes):
+        for channel, words in enumerate(by_channel):
+            weights = words[8:12].view(np.float32)
+            for offset, own, weight in zip(words[:4], words[4:8], weights, strict=True):
+                if weight > 0.0:
+                    width = 2 * int(own) + 1
+                    first = int(offset)
+                    cached = store.kernels[first : first + width * width]
+                    part = slice(radius - int(own), radius + int(own) + 1)
+                    kernels[k, part, part, channel] += float(weight) * cached.reshape(
+                        width, width
+                    ).astype(np.float64)
+    return kernels
+
+
+def gather(
+    view: View,
+    store: PsfStore,
+    layers: FrameLayers,
+    *,
+    accumulation: str = "coverage",
+) -> NDArray[np.float64]:
+    """Filter a view by sorted per-pixel gathering.
+
+    Returns
+    -------
+    linear_rgb : (height, width, 3)
+    """
+    depth_m, _ = fill_missing_depth(view.depth_m)
+    distance_dpt = np.clip(
+        object_dpt(view, depth_m), layers.object_dpt[0], layers.object_dpt[-1]
+    )
+    linear = view.color.astype(np.float64)
+    if view.color.dtype == np.uint8:
+        linear = linear_from_srgb(view.color)
+    position = np.interp(
+        distance_dpt, layers.object_dpt, np.arange(len(layers.object_dpt))
+    )
+    out = np.empty_like(linear)
+    _gather(
+        linear,
+        position,
+        _sort_key(distance_dpt, accumulation),
+        layer_kernels(store, layers),
+        accumulation == "paper",
+        out,
+    )
+    return out
+
+
+def _sort_key(distance_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
+    """Smaller is nearer; the paper adds the scan position to the distance."""
+    if accumulation == "coverage":
+        return -distance_dpt
+    with np.errstate(divide="ignore"):
+        distance_m = np.minimum(1.0 / distance_dpt, PAPER_FAR_M)
+    scan = np.arange(distance_m.size).reshape(distance_m.shape) / distance_m.size
+    return distance_m + PAPER_TIE_BREAK_M * scan
+
+
+@njit(parallel=True, cache=True)
+def _gather(linear, position, key, kernels, paper_rule, out):
+    height, width = position.shape
+    n_layers, size = kernels.shape[0], kernels.shape[1]
+    radius = size // 2
+    for y in prange(height):
+        found_key = np.empty(size * size)
+        found_weight = np.empty((size * size, 3))
+        found_color = np.empty((size * size, 3))
+        for x in range(width):
+            count = 0
+            for sy in range(max(0, y - radius), min(height, y + radius + 1)):
+                for sx in range(max(0, x - radius), min(width, x + radius + 1)):
+                    near = min(int(position[sy, sx]), max(n_layers - 2, 0))
+                    fraction = position[sy, sx] - near
+                    any_light = False
+                    for c in range(3):
+                        weight = kernels[near, y - sy + radius, x - sx + radius, c]
+                        if fraction > 0.0:
+                            far = kernels[near + 1, y - sy + radius, x - sx + radius, c]
+                            weight += fraction * (far - weight)
+                        found_weight[count, c] = weight
+                        any_light = any_light or weight > 0.0
+                    if any_light:
+                        found_key[count] = key[sy, sx]
+                        found_color[count] = linear[sy, sx]
+                        count += 1
+            order = np.argsort(found_key[:count], kind="mergesort")
+            for c in range(3):
+                light, coverage = 0.0, 0.0
+                for i in order:
+                    room = 1.0 - coverage
+                    weight = found_weight[i, c]
+                    weight = weight * room if paper_rule else min(weight, room)
+                    light += weight * found_color[i, c]
+                    coverage += weight
+                if coverage >= MIN_COVERAGE:
+                    out[y, x, c] = light / coverage
+                else:
+                    out[y, x, c] = linear[y, x, c]

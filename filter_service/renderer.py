@@ -1,0 +1,449 @@
+"""Filters one view: pass order, buffer sizes and bands.  Pass order in shaders/README."""
+
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    BYTES_PER_WORD,
+    LAYER_WORDS,
+    RGB,
+    THREADS,
+    TILE_SIZE_PX,
+)
+from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.frame import (
+    View,
+    check_view,
+    fill_missing_depth,
+    finite_color,
+    object_dpt,
+)
+from filter_service.gpu import Gpu, StageTimer
+from filter_service.psf_grid import pixel_pitch_mrad
+from filter_service.psf_store import FrameLayers, PsfStore, frame_layers
+
+PITCH_TOLERANCE = 1e-3
+ENTRY_BYTES = 4
+MAX_BAND_ENTRIES = 16 * 2**20
+"""Tile list entries in flight; more go through in bands.  Keeps each list buffer at
+64 MB, half of the smallest storage block that the service runs on."""
+
+SOFTWARE_PIXELS_PER_THREAD = 8
+"""2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
+
+ACCUMULATIONS = ("coverage", "paper")
+OUTPUTS = ("linear", "srgb8")
+
+
+@dataclass(frozen=True)
+class LoadedStore:
+    """A PSF store whose kernels are on the GPU."""
+
+    store: PsfStore
+    kernels: moderngl.Buffer
+
+    def release(self) -> None:
+        """Free the GPU copy."""
+        self.kernels.release()
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A filtered view and how it was made.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        float32 linear light, or uint8 sRGB.
+    stage_times_ms : dict
+        By stage; their sum is the time spent in the renderer.
+    missing_depth_count, clamped_depth_count, bad_color_count : int
+        Pixels whose depth was filled in, lay outside the prepared distances, or whose
+        colour was not finite (taken as black).
+    pupil_diameter_mm, focus_dpt : float
+        As used.
+    """
+
+    color: NDArray
+    stage_times_ms: dict[str, float]
+    missing_depth_count: int
+    clamped_depth_count: int
+    bad_color_count: int
+    pupil_diameter_mm: float
+    focus_dpt: float
+    fragment_count: int
+    merged_count: int
+    entry_count: int
+    layer_count: int
+    notes: list[str]
+
+
+class FilterRenderer:
+    """Runs the passes for one view at a time; not thread-safe."""
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self._layers_key: tuple | None = None
+        self._layers: FrameLayers | None = None
+
+    def load(self, store: PsfStore) -> LoadedStore:
+        """Copy a store's kernels to the GPU."""
+        return LoadedStore(store=store, kernels=self._gpu.make_buffer(store.kernels))
+
+    def render(
+        self,
+        view: View,
+        handle: LoadedStore,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        accumulation: str = "coverage",
+        merge: bool = True,
+        output: str = "linear",
+    ) -> Rendered:
+        """Filter one view through the eye of a loaded store.
+
+        Raises
+        ------
+        BadMessage
+            Arrays or options that cannot be used.
+        CameraMismatch
+            The pixel pitch differs by more than 0.1 % from the store's.
+        OutOfGpuMemory, RenderFailed
+        """
+        check_view(view)
+        _check_choice("accumulation", accumulation, ACCUMULATIONS)
+        _check_choice("output", output, OUTPUTS)
+        _check_pitch(view, handle.store)
+        frame = _Frame(self._gpu, view, accumulation == "paper", merge)
+        with frame.timer.wall("prepare_ms"):
+            depth = self._prepared_depth(view, handle.store)
+            color, bad_color_count = finite_color(view.color)
+        layers = self._blended_layers(frame, handle, pupil_diameter_mm, focus_dpt)
+        frame.upload(color, depth.depth_m)
+        frame.build_fragments(layers)
+        frame.count_tiles()
+        frame.splat_bands()
+        picture = frame.read_back(output)
+        self._gpu.check("render")
+        notes = list(layers.notes)
+        if bad_color_count:
+            notes.append(f"{bad_color_count} pixels with non-finite colour taken as black")
+        return Rendered(
+            color=picture,
+            stage_times_ms=frame.timer.result_ms(),
+            missing_depth_count=depth.missing_count,
+            clamped_depth_count=depth.clamped_count,
+            bad_color_count=bad_color_count,
+            pupil_diameter_mm=layers.pupil_diameter_mm,
+            focus_dpt=layers.focus_dpt,
+            fragment_count=frame.fragment_count,
+            merged_count=frame.merged_count,
+            entry_count=frame.entry_count,
+            layer_count=len(layers.object_dpt),
+            notes=notes,
+        )
+
+    def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
+        depth_m, missing_count = fill_missing_depth(view.depth_m)
+        distances = object_dpt(view, depth_m)
+        low_dpt, high_dpt = store.spec.object_range_dpt
+        margin = 1e-6 * max(high_dpt, 1.0)
+        clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
+        return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
+
+    def _blended_layers(self, frame, handle, pupil_diameter_mm, focus_dpt) -> FrameLayers:
+        """Layers of this pupil and focus; those of the last frame when unchanged."""
+        key = (handle, pupil_diameter_mm, focus_dpt)
+        same = self._layers_key is not None and all(
+            a is b or a == b for a, b in zip(key, self._layers_key, strict=True)
+        )
+        with frame.timer.stage("psf_blend_ms"):
+            if not same:
+                self._layers = frame_layers(
+                    handle.store,
+                    pupil_diameter_mm=pupil_diameter_mm,
+                    focus_dpt=focus_dpt,
+                )
+                frame.blend_layers(self._layers, handle.kernels)
+                self._layers_key = key
+        return self._layers
+
+
+@dataclass(frozen=True)
+class _Depth:
+    depth_m: NDArray[np.float32]
+    missing_count: int
+    clamped_count: int
+
+
+def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:
+    if value not in options:
+        raise BadMessage(f"{value!r}", field=field, allowed=", ".join(options))
+
+
+def _check_pitch(view: View, store: PsfStore) -> None:
+    pitch_mrad = pixel_pitch_mrad(
+        width_px=view.width_px, height_px=view.height_px, tangents=view.tangents
+    )
+    for mine, built in zip(pitch_mrad, store.spec.pixel_pitch_mrad, strict=True):
+        if abs(mine / built - 1.0) > PITCH_TOLERANCE:
+            raise CameraMismatch(
+                f"pixel pitch {pitch_mrad} mrad, PSFs are for "
+                f"{store.spec.pixel_pitch_mrad} mrad",
+                field="tangents",
+            )
+
+
+def _groups(count: int, size: int) -> int:
+    return (count + size - 1) // size
+
+
+class _Frame:
+    """The passes of one frame, in order; buffers are the context's named ones."""
+
+    def __init__(self, gpu: Gpu, view: View, paper_rule: bool, merge: bool):
+        self.gpu = gpu
+        self.view = view
+        self.paper_rule = paper_rule
+        self.merge = merge
+        self.timer = StageTimer(gpu)
+        self.size = (view.width_px, view.height_px)
+        self.pixel_count = view.width_px * view.height_px
+        self.grid = tuple(_groups(side, TILE_SIZE_PX) for side in self.size)
+        self.tile_count = self.grid[0] * self.grid[1]
+        self.buffers: dict[str, moderngl.Buffer] = {}
+        self.entry_count = 0
+
+    def _reserve(self, **n_bytes: int) -> None:
+        for name, size in n_bytes.items():
+            self.buffers[name] = self.gpu.storage(name, size)
+
+    def _run(self, name: str, groups: tuple[int, int], *bindings: str, **uniforms) -> None:
+        defines = uniforms.pop("defines", None)
+        atlas = self.gpu.atlas(1) if uniforms.pop("with_atlas", False) else None
+        self.gpu.dispatch(
+            name,
+            groups,
+            buffers={binding: self.buffers[binding] for binding in bindings},
+            uniforms=uniforms,
+            defines=defines,
+            atlas=atlas,
+        )
+
+    def blend_layers(self, layers: FrameLayers, store_kernels: moderngl.Buffer) -> None:
+        """Upload the layer table and compute the layer kernels, single and merged."""
+        table, texel_count = _layer_table(layers)
+        largest = 2 * int(layers.radius_px.max()) + 2
+        self.buffers["STORE"] = store_kernels
+        self.buffers["LAYERS"] = self.gpu.upload("LAYERS", table)
+        self.buffers["RECIPES"] = self.gpu.upload("RECIPES", layers.recipes)
+        self.gpu.atlas(texel_count)
+        groups = (_groups(largest * largest, THREADS), len(table))
+        self._run("blend_psfs", groups, "STORE", "RECIPES", "LAYERS", with_atlas=True)
+        self._run("merge_psfs", groups, "LAYERS", with_atlas=True)
+
+    def upload(self, color: NDArray, depth_m: NDArray) -> None:
+        """Send the frame; bytes are padded to whole words."""
+        with self.timer.stage("upload_ms"):
+            n_bytes = _groups(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
+            packed = _groups(self.pixel_count, BYTES_PER_WORD) * RGB * BYTES_PER_WORD
+            self._reserve(COLOR_IN=max(n_bytes, packed))
+            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
+            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
+
+    def build_fragments(self, layers: FrameLayers) -> None:
+        """Linear light, dioptres, blur; then merging into blocks."""
+        slots = self.tile_count * THREADS
+        self._reserve(
+            LAYERS=1,
+            PIXELS=16 * self.pixel_count,
+            PIXEL_BLUR=4 * self.pixel_count,
+            FRAGMENT_COLOR=16 * slots,
+            FRAGMENT_PLACE=16 * slots,
+            BLOCKS=16 * self.tile_count,
+        )
+        common = {
+            "frame_size_px": self.size,
+            "layer_count": len(layers.object_dpt),
+        }
+        with self.timer.stage("fragments_ms"):
+            self._run(
+                "build_fragments",
+                self.grid,
+                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_BLUR"),
+                **common,
+                tangents=self.view.tangents,
+                depth_is_planar=int(self.view.depth_kind == "planar"),
+                defines=(
+                    {"COLOR_IS_LINEAR": 1}
+                    if self.view.color.dtype == np.float32
+                    else None
+                ),
+            )
+        with self.timer.stage("merge_ms"):
+            self._run(
+                "merge_fragments",
+                self.grid,
+                *("PIXELS", "PIXEL_BLUR", "LAYERS"),
+                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
+                **common,
+                blur_px_per_dpt=layers.blur_px_per_dpt,
+                merge_enabled=int(self.merge),
+                paper_order=int(self.paper_rule),
+            )
+        reach_px = int(layers.reach_px.max()) + 1.5
+        self.search_blocks = min(_groups(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid))
+
+    def count_tiles(self) -> None:
+        """Lengths and offsets of the tile lists, and the bands they are made in."""
+        self._reserve(TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2))
+        with self.timer.stage("bin_ms"):
+            self._run(
+                "count_tiles",
+                self.grid,
+                *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
+                tile_grid=self.grid,
+                search_blocks=self.search_blocks,
+                order_always=int(self.paper_rule),
+            )
+            self._run(
+                "scan_tiles", (1, 1), "TILE_COUNTS", "TILE_OFFSETS", tile_count=self.tile_count
+            )
+        with self.timer.wall("plan_ms"):
+            self.bands = self._plan_bands()
+
+    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
+        """Bands as (first tile, tile count, first entry, entry count)."""
+        total, total_float = self._totals()
+        self.entry_count = int(round(total_float)) if total_float > 2**31 else total
+        if self.entry_count <= MAX_BAND_ENTRIES:
+            return [(0, self.tile_count, 0, total)]
+        counts = self.gpu.read(
+            self.buffers["TILE_COUNTS"], (self.tile_count, 2), np.uint32
+        )[:, 0].astype(np.int64)
+        offsets, bands = _split(counts, MAX_BAND_ENTRIES)
+        self.buffers["TILE_OFFSETS"] = self.gpu.upload(
+            "TILE_OFFSETS", offsets.astype(np.uint32)
+        )
+        return bands
+
+    def _totals(self) -> tuple[int, float]:
+        data = self.buffers["TILE_OFFSETS"].read(8, offset=4 * self.tile_count)
+        return (
+            int(np.frombuffer(data, np.uint32, 1)[0]),
+            float(np.frombuffer(data, np.float32, 1, offset=4)[0]),
+        )
+
+    def splat_bands(self) -> None:
+        """Scatter, sort and splat, band by band."""
+        longest = max(band[3] for band in self.bands)
+        self._reserve(
+            ENTRIES=ENTRY_BYTES * longest,
+            ENTRIES_SPARE=ENTRY_BYTES * longest,
+            COLOR_OUT=16 * self.pixel_count,
+        )
+        for first_tile, tile_count, first_entry, _ in self.bands:
+            band = {"first_tile": first_tile, "first_entry": first_entry}
+            groups = (tile_count, 1)
+            with self.timer.stage("bin_ms"):
+                self._run(
+                    "scatter_fragments",
+                    groups,
+                    *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
+                    tile_grid=self.grid,
+                    search_blocks=self.search_blocks,
+                    **band,
+                )
+            with self.timer.stage("sort_ms"):
+                self._run(
+                    "sort_tiles",
+                    groups,
+                    *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
+                    *("ENTRIES", "ENTRIES_SPARE"),
+                    **band,
+                )
+            with self.timer.stage("splat_ms"):
+                self._run(
+                    "splat_tiles",
+                    groups,
+                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "TILE_COUNTS", "TILE_OFFSETS"),
+                    *("ENTRIES", "LAYERS", "PIXELS", "COLOR_OUT"),
+                    with_atlas=True,
+                    frame_size_px=self.size,
+                    tile_grid=self.grid,
+                    **band,
+                    defines=self._splat_variant(),
+                )
+
+    def _splat_variant(self) -> dict[str, int]:
+        pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
+        rows = TILE_SIZE_PX // pixels
+        rule = {"PAPER_RULE": 1} if self.paper_rule else {}
+        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **rule}
+
+    def read_back(self, output: str) -> NDArray:
+        """Fetch the filtered picture, encoded as asked."""
+        width, height = self.size
+        if output == "linear":
+            with self.timer.wall("readback_ms"):
+                pixels = self.gpu.read(
+                    self.buffers["COLOR_OUT"], (height, width, 4), np.float32
+                )
+                return np.ascontiguousarray(pixels[..., :RGB])
+        with self.timer.stage("encode_ms"):
+            quads = _groups(self.pixel_count, BYTES_PER_WORD)
+            self._run(
+                "encode_srgb",
+                (_groups(quads, THREADS), 1),
+                *("COLOR_OUT", "COLOR_IN"),
+                pixel_count=self.pixel_count,
+            )
+        with self.timer.wall("readback_ms"):
+            return self.gpu.read(self.buffers["COLOR_IN"], (height, width, RGB), np.uint8)
+
+    @property
+    def _block_counts(self) -> NDArray[np.uint32]:
+        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[:, 0]
+
+    @property
+    def fragment_count(self) -> int:
+        """Fragments after merging."""
+        return int(self._block_counts.sum())
+
+    @property
+    def merged_count(self) -> int:
+        """Pixels that went into merged fragments."""
+        singles_saved = self.pixel_count - self.fragment_count
+        return singles_saved * 4 // 3
+
+
+def _layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
+    """Layer records (n, 2, 4) for common/layers.glsl, and texels of all kernels."""
+    widths = 2 * layers.radius_px + 1
+    single, merged = widths**2, (widths + 1) ** 2
+    starts = np.concatenate([[0], np.cumsum(single + merged)])
+    table = np.zeros((len(widths), LAYER_WORDS, 4), dtype=np.uint32)
+    table[:, 0, 0] = layers.object_dpt.astype(np.float32).view(np.uint32)
+    table[:, 0, 1] = starts[:-1]
+    table[:, 0, 2] = starts[:-1] + single
+    table[:, 0, 3] = layers.radius_px
+    table[:, 1, 0] = layers.reach_px
+    table[:, 1, 1] = layers.blur_px.astype(np.float32).view(np.uint32)
+    return table, int(starts[-1])
+
+
+def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
+    """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
+    bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
+    first = 0
+    while first < len(counts):
+        sums = np.cumsum(counts[first:])
+        tiles = max(int(np.searchsorted(sums, limit, side="right")), 1)
+        offsets[first : first + tiles] = sums[:tiles] - counts[first : first + tiles]
+        bands.append((first, tiles, 0, int(sums[tiles - 1])))
+        first += tiles
+    return offsets, bands

@@ -1,0 +1,35 @@
+// Walk over the fragments whose light reaches a tile.  Thread t takes the blocks
+// t, t + THREADS, ... around the tile and their fragments in order: a fixed order, so
+// the same frame gives the same list.
+// Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks` in scope.
+
+struct Walk {
+    ivec2 tile;
+    int next;                     // next block of this thread within the window
+    int width;                    // blocks along one side of the window
+};
+
+Walk start_walk(ivec2 tile) {
+    int width = 2 * search_blocks + 1;
+    return Walk(tile, int(gl_LocalInvocationIndex), width);
+}
+
+// Next block in reach, or -1.
+int next_block(inout Walk walk) {
+    while (walk.next < walk.width * walk.width) {
+        ivec2 at = walk.tile - search_blocks
+                 + ivec2(walk.next % walk.width, walk.next / walk.width);
+        walk.next += THREADS;
+        if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, tile_grid))) continue;
+        int block = at.y * tile_grid.x + at.x;
+        float reach = uintBitsToFloat(blocks[block].y);
+        if (distance_squared_between_tiles(at, walk.tile) <= reach * reach) return block;
+    }
+    return -1;
+}
+
+bool reaches_tile(uvec4 place, ivec2 tile) {
+    float reach = place_reach_px(place);
+    vec2 center = place_center_px(place);
+    return distance_squared_to_tile(center, tile * TILE_SIZE_PX) <= reach * reach;
+}

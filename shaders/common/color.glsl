@@ -1,0 +1,14 @@
+// sRGB transfer curves (IEC 61966-2-1) on linear light in 0..1.
+
+vec3 linear_from_srgb(vec3 srgb) {
+    vec3 low = srgb / SRGB_SLOPE;
+    vec3 high = pow((srgb + SRGB_OFFSET) / SRGB_SCALE, vec3(SRGB_GAMMA));
+    return mix(high, low, vec3(lessThanEqual(srgb, vec3(SRGB_DECODE_KNEE))));
+}
+
+vec3 srgb_from_linear(vec3 linear_rgb) {
+    vec3 clamped = clamp(linear_rgb, 0.0, 1.0);
+    vec3 low = clamped * SRGB_SLOPE;
+    vec3 high = SRGB_SCALE * pow(clamped, vec3(1.0 / SRGB_GAMMA)) - SRGB_OFFSET;
+    return mix(high, low, vec3(lessThanEqual(clamped, vec3(SRGB_ENCODE_KNEE))));
+}

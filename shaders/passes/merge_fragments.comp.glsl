@@ -1,0 +1,130 @@
+// Merges similar pixels 2 x 2 where the blur hides the difference, and packs the
+// fragments of each 8 x 8 block, in scan order, to the front of the block's slots.
+// In:  PIXELS, PIXEL_BLUR, LAYERS.
+// Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
+//      reach bits, has an edge, 0).
+// Dispatch: one group a block, one thread a pixel.
+// Twin: reference.merge_fragments.  Source: section 6.3 (merging of tiled splatting).
+
+layout(local_size_x = TILE_SIZE_PX, local_size_y = TILE_SIZE_PX) in;
+
+layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
+layout(std430, binding = BINDING_PIXEL_BLUR) readonly buffer Blur { float blur_px[]; };
+layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
+layout(std430, binding = BINDING_FRAGMENT_COLOR) writeonly buffer Color { vec4 colors[]; };
+layout(std430, binding = BINDING_FRAGMENT_PLACE) writeonly buffer Place { uvec4 places[]; };
+layout(std430, binding = BINDING_BLOCKS) writeonly buffer Blocks { uvec4 blocks[]; };
+
+#include "common/layers.glsl"
+#include "common/fragments.glsl"
+
+uniform ivec2 frame_size_px;
+uniform int layer_count;
+uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
+uniform int merge_enabled;
+uniform int paper_order;          // sort as the paper does: metres plus scan position
+
+shared uint alive[2];             // bit per thread: it keeps a fragment
+shared uint largest_reach_bits;   // reach is positive, so its bits order like it
+shared uint block_has_edge;
+
+uint pixel_index(ivec2 at) { return uint(at.y * frame_size_px.x + at.x); }
+
+bool inside(ivec2 at) {
+    return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, frame_size_px));
+}
+
+// Whether a neighbour lies on another surface, seen through this pupil.
+bool is_edge_pixel(ivec2 at, float dpt) {
+    const ivec2 steps[] = ivec2[](ivec2(1, 0), ivec2(-1, 0), ivec2(0, 1), ivec2(0, -1));
+    for (int i = 0; i < steps.length(); ++i) {
+        ivec2 other = at + steps[i];
+        if (!inside(other)) continue;
+        float change = abs(pixels[pixel_index(other)].a - dpt) * blur_px_per_dpt;
+        if (change > DISCONTINUITY_PX) return true;
+    }
+    return false;
+}
+
+bool quad_is_similar(ivec2 corner) {
+    if (merge_enabled == 0 || !inside(corner + 1)) return false;
+    vec4 low = pixels[pixel_index(corner)];
+    vec4 high = low;
+    float blur = blur_px[pixel_index(corner)];
+    for (int i = 1; i < int(QUAD); ++i) {
+        uint pixel = pixel_index(corner + ivec2(i & 1, i >> 1));
+        low = min(low, pixels[pixel]);
+        high = max(high, pixels[pixel]);
+        blur = min(blur, blur_px[pixel]);
+    }
+    vec3 contrast = high.rgb - low.rgb;
+    float largest = max(contrast.r, max(contrast.g, contrast.b));
+    return blur >= MERGE_MIN_BLUR_PX
+        && largest <= MERGE_CONTRAST * pow(blur, MERGE_CONTRAST_POWER)
+        && (high.a - low.a) * blur_px_per_dpt <= MERGE_MAX_BLUR_STEP_PX;
+}
+
+vec4 quad_mean(ivec2 corner) {
+    return (pixels[pixel_index(corner)] + pixels[pixel_index(corner + ivec2(1, 0))]
+          + pixels[pixel_index(corner + ivec2(0, 1))] + pixels[pixel_index(corner + 1)]) / QUAD;
+}
+
+// Smaller is nearer.
+float sort_depth(ivec2 at, float dpt) {
+    if (paper_order == 0) return -dpt;
+    float distance_m = dpt > 0.0 ? min(1.0 / dpt, PAPER_FAR_M) : PAPER_FAR_M;
+    float scan = float(at.y * frame_size_px.x + at.x) / float(frame_size_px.x * frame_size_px.y);
+    return distance_m + PAPER_TIE_BREAK_M * scan;
+}
+
+Fragment make_fragment(ivec2 at, vec4 pixel, bool merged, bool edge) {
+    int k = find_interval(pixel.a, layer_count);
+    float fraction = interval_fraction(k, pixel.a, layer_count);
+    int reach = int(layers[k * LAYER_WORDS + 1].x);
+    return Fragment(pixel.rgb, sort_depth(at, pixel.a), at, uint(k), fraction, reach,
+                    merged, edge);
+}
+
+void main() {
+    uint thread = gl_LocalInvocationIndex;
+    uint block = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
+    if (thread == 0u) {
+        alive[0] = 0u;
+        alive[1] = 0u;
+        largest_reach_bits = 0u;
+        block_has_edge = 0u;
+    }
+    barrier();  // the counters are clear before anyone adds to them
+
+    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 corner = at & ~1;
+    bool exists = inside(at);
+    bool merged = exists && quad_is_similar(corner);
+    bool keeps = exists && (!merged || at == corner);
+    uint word = thread / uint(BITS_PER_WORD);
+    uint bit = thread % uint(BITS_PER_WORD);
+    Fragment fragment;
+    uvec4 place = uvec4(0u);
+    if (keeps) {
+        vec4 pixel = merged ? quad_mean(corner) : pixels[pixel_index(at)];
+        bool edge = is_edge_pixel(at, pixels[pixel_index(at)].a);
+        fragment = make_fragment(at, pixel, merged, edge);
+        place = pack_place(fragment);
+        atomicOr(alive[word], 1u << bit);
+        atomicMax(largest_reach_bits, floatBitsToUint(place_reach_px(place)));
+        if (edge) atomicOr(block_has_edge, 1u);
+    }
+    barrier();  // every survivor is counted before slots are given out
+
+    if (keeps) {
+        uint before = bitCount(alive[word] & ((1u << bit) - 1u));
+        if (word == 1u) before += bitCount(alive[0]);
+        uint slot = block * uint(THREADS) + before;
+        colors[slot] = vec4(fragment.linear_rgb, fragment.sort_depth);
+        places[slot] = place;
+    }
+    if (thread == 0u) {
+        uint count = bitCount(alive[0]) + bitCount(alive[1]);
+        blocks[block] = uvec4(count, largest_reach_bits, block_has_edge, 0u);
+    }
+}

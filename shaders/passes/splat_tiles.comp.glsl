@@ -1,0 +1,127 @@
+// Adds up the light that a tile's fragments send to each of its pixels.
+// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, TILE_COUNTS, TILE_OFFSETS, ENTRIES, LAYERS,
+//      the kernel atlas, PIXELS (own colour where no light arrives).
+// Out: COLOR_OUT (vec4: linear RGB, mean coverage).
+// Dispatch: one group a tile of the band; a thread serves PIXELS_PER_THREAD pixels of a
+//      column (8 on a software renderer, where a staged fragment is then read once by
+//      one vector of threads; 1 on hardware).
+// Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage:
+//      front to back, w <- min(w, 1 - A), and plain sums where one surface fills the tile.
+// Twin: reference.splat.  Source: section 6.1; accumulation DESIGN 4.
+
+#include "common/fragments.glsl"
+#include "common/atlas.glsl"
+
+layout(local_size_x = TILE_SIZE_PX, local_size_y = GROUP_ROWS) in;
+
+layout(std430, binding = BINDING_FRAGMENT_COLOR) readonly buffer Color { vec4 colors[]; };
+layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
+layout(std430, binding = BINDING_TILE_COUNTS) readonly buffer Counts { uvec2 counts[]; };
+layout(std430, binding = BINDING_TILE_OFFSETS) readonly buffer Offsets { uint offsets[]; };
+layout(std430, binding = BINDING_ENTRIES) readonly buffer Entries { uint entries[]; };
+layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
+layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
+layout(std430, binding = BINDING_COLOR_OUT) writeonly buffer ColorOut { vec4 color_out[]; };
+
+uniform ivec2 frame_size_px;
+uniform ivec2 tile_grid;
+uniform int first_tile;           // of the band
+uniform uint first_entry;
+layout(binding = TEXTURE_ATLAS) uniform sampler2D atlas;
+
+const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
+
+// Staged fragments: what the pixel loop needs, ready to use.
+shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
+shared ivec4 staged_place[THREADS];   // origin x, y, reach, 1 if merged
+shared ivec4 staged_kernels[THREADS]; // centre texel and row length, near and far layer
+
+vec3 atlas_weight(int texel) { return texelFetch(atlas, atlas_position(texel), 0).rgb; }
+
+// Centre texel of a layer's kernel and the texels from row to row.
+ivec2 kernel_centre(int layer, bool merged) {
+    uvec4 record = layers[layer * LAYER_WORDS];
+    int radius = int(record.w);
+    int row = 2 * radius + 1 + int(merged);
+    return ivec2(int(merged ? record.z : record.y) + radius * row + radius, row);
+}
+
+void stage(uint slot, uint at) {
+    vec4 color = colors[slot];
+    uvec4 place = places[slot];
+    bool merged = (place.y & MERGED_BIT) != 0u;
+    int near_layer = int(place.y & INTERVAL_MASK);
+    float fraction = uintBitsToFloat(place.z);
+    staged_color[at] = vec4(color.rgb, fraction);
+    staged_place[at] = ivec4(place_origin_px(place), int(place.w), int(merged));
+    ivec2 near_centre = kernel_centre(near_layer, merged);
+    ivec2 far_centre = fraction > 0.0 ? kernel_centre(near_layer + 1, merged) : near_centre;
+    staged_kernels[at] = ivec4(near_centre, far_centre);
+}
+
+// Weight that remains under the accumulation rule.
+vec3 ruled_weight(vec3 weight, vec3 coverage, bool merged, bool ordered) {
+#ifdef PAPER_RULE
+    if (merged) {
+        vec3 through = 1.0 - min(weight / QUAD, 1.0);
+        weight = 1.0 - through * through * through * through;
+    }
+    return weight * (1.0 - coverage);
+#else
+    return ordered ? min(weight, 1.0 - coverage) : weight;
+#endif
+}
+
+void main() {
+    int index = first_tile + int(gl_WorkGroupID.x);
+    ivec2 tile = ivec2(index % tile_grid.x, index / tile_grid.x);
+    ivec2 at = tile * TILE_SIZE_PX
+             + ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
+    uint thread = gl_LocalInvocationIndex;
+    bool ordered = counts[index].y != 0u;
+    uint first = offsets[index] - first_entry;
+    uint end = first + counts[index].x;
+    vec3 light[PIXELS_PER_THREAD];
+    vec3 coverage[PIXELS_PER_THREAD];
+    for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
+        light[p] = vec3(0.0);
+        coverage[p] = vec3(0.0);
+    }
+    for (uint batch = first; batch < end; batch += uint(THREADS)) {
+        barrier();  // the last batch is used up
+        for (uint i = thread; i < uint(THREADS); i += uint(GROUP_THREADS))
+            if (batch + i < end) stage(entries[batch + i], i);
+        barrier();  // the new batch is staged
+        int staged = int(min(end - batch, uint(THREADS)));
+        for (int i = 0; i < staged; ++i) {
+            ivec4 place = staged_place[i];
+            ivec4 centre = staged_kernels[i];
+            vec4 color = staged_color[i];
+            ivec2 offset = at - place.xy;
+            int reach = place.z;
+            bool in_columns = offset.x >= -reach && offset.x <= reach + place.w;
+            ivec2 texel = centre.xz + offset.y * centre.yw + offset.x;
+            for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
+                bool in_reach = in_columns && offset.y + p >= -reach
+                             && offset.y + p <= reach + place.w;
+                ivec2 use = in_reach ? texel : ivec2(0);
+                vec3 weight = mix(atlas_weight(use.x), atlas_weight(use.y), color.a);
+                weight = in_reach ? weight : vec3(0.0);
+                weight = ruled_weight(weight, coverage[p], place.w != 0, ordered);
+                light[p] += weight * color.rgb;
+                coverage[p] += weight;
+                texel += centre.yw;
+            }
+        }
+    }
+    for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
+        ivec2 here = at + ivec2(0, p);
+        if (any(greaterThanEqual(here, frame_size_px))) continue;
+        int pixel = here.y * frame_size_px.x + here.x;
+        vec3 own = pixels[pixel].rgb;
+        vec3 normalised = light[p] / max(coverage[p], vec3(MIN_COVERAGE));
+        vec3 lit = vec3(greaterThanEqual(coverage[p], vec3(MIN_COVERAGE)));
+        color_out[pixel] = vec4(mix(own, normalised, lit),
+                                dot(coverage[p], vec3(1.0 / float(RGB))));
+    }
+}
