@@ -148,6 +148,7 @@ class MeasuredWavefront:
             self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
         )
         zernike_um[rx.C20] -= added_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
+        zernike_um[0] = 0.0  # rescaling makes piston, which no image shows
         return zernike_um
 
     def state(

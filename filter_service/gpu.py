@@ -88,7 +88,9 @@ class Gpu:
                 reserve=min(wanted, self.max_block_bytes), dynamic=True
             )
         except moderngl.Error as error:
-            raise OutOfGpuMemory(f"buffer '{name}' of {wanted} bytes: {error}") from error
+            raise OutOfGpuMemory(
+                f"buffer '{name}' of {wanted} bytes: {error}"
+            ) from error
         self._buffers[name] = created
         return created
 
@@ -108,7 +110,9 @@ class Gpu:
                 f"{self.max_block_bytes / 1e6:.0f} MB here; narrow the pupil, focus or "
                 "object range, or use a smaller image"
             )
-        return self.context.buffer(np.ascontiguousarray(data).reshape(-1).view(np.uint8))
+        return self.context.buffer(
+            np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+        )
 
     def atlas(self, n_texels: int) -> moderngl.Texture:
         """Half-float RGBA texture for this many texels in lines of ATLAS_WIDTH."""
@@ -124,7 +128,9 @@ class Gpu:
         if self._atlas is not None:
             self._atlas.release()
         wanted = min(int(rows * GROWTH) + 1, limit)
-        self._atlas = self.context.texture((constants.ATLAS_WIDTH, wanted), 4, dtype="f2")
+        self._atlas = self.context.texture(
+            (constants.ATLAS_WIDTH, wanted), 4, dtype="f2"
+        )
         self._atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return self._atlas
 

@@ -131,7 +131,9 @@ class FilterRenderer:
         self._gpu.check("render")
         notes = list(layers.notes)
         if bad_color_count:
-            notes.append(f"{bad_color_count} pixels with non-finite colour taken as black")
+            notes.append(
+                f"{bad_color_count} pixels with non-finite colour taken as black"
+            )
         return Rendered(
             color=picture,
             stage_times_ms=frame.timer.result_ms(),
@@ -155,7 +157,9 @@ class FilterRenderer:
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
         return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
 
-    def _blended_layers(self, frame, handle, pupil_diameter_mm, focus_dpt) -> FrameLayers:
+    def _blended_layers(
+        self, frame, handle, pupil_diameter_mm, focus_dpt
+    ) -> FrameLayers:
         """Layers of this pupil and focus; those of the last frame when unchanged."""
         key = (handle, pupil_diameter_mm, focus_dpt)
         same = self._layers_key is not None and all(
@@ -222,7 +226,9 @@ class _Frame:
         for name, size in n_bytes.items():
             self.buffers[name] = self.gpu.storage(name, size)
 
-    def _run(self, name: str, groups: tuple[int, int], *bindings: str, **uniforms) -> None:
+    def _run(
+        self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
+    ) -> None:
         defines = uniforms.pop("defines", None)
         atlas = self.gpu.atlas(1) if uniforms.pop("with_atlas", False) else None
         self.gpu.dispatch(
@@ -296,11 +302,15 @@ class _Frame:
                 paper_order=int(self.paper_rule),
             )
         reach_px = int(layers.reach_px.max()) + 1.5
-        self.search_blocks = min(_groups(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid))
+        self.search_blocks = min(
+            _groups(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
+        )
 
     def count_tiles(self) -> None:
         """Lengths and offsets of the tile lists, and the bands they are made in."""
-        self._reserve(TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2))
+        self._reserve(
+            TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2)
+        )
         with self.timer.stage("bin_ms"):
             self._run(
                 "count_tiles",
@@ -311,7 +321,11 @@ class _Frame:
                 order_always=int(self.paper_rule),
             )
             self._run(
-                "scan_tiles", (1, 1), "TILE_COUNTS", "TILE_OFFSETS", tile_count=self.tile_count
+                "scan_tiles",
+                (1, 1),
+                "TILE_COUNTS",
+                "TILE_OFFSETS",
+                tile_count=self.tile_count,
             )
         with self.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
@@ -370,7 +384,12 @@ class _Frame:
                 self._run(
                     "splat_tiles",
                     groups,
-                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "TILE_COUNTS", "TILE_OFFSETS"),
+                    *(
+                        "FRAGMENT_COLOR",
+                        "FRAGMENT_PLACE",
+                        "TILE_COUNTS",
+                        "TILE_OFFSETS",
+                    ),
                     *("ENTRIES", "LAYERS", "PIXELS", "COLOR_OUT"),
                     with_atlas=True,
                     frame_size_px=self.size,
@@ -403,11 +422,15 @@ class _Frame:
                 pixel_count=self.pixel_count,
             )
         with self.timer.wall("readback_ms"):
-            return self.gpu.read(self.buffers["COLOR_IN"], (height, width, RGB), np.uint8)
+            return self.gpu.read(
+                self.buffers["COLOR_IN"], (height, width, RGB), np.uint8
+            )
 
     @property
     def _block_counts(self) -> NDArray[np.uint32]:
-        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[:, 0]
+        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[
+            :, 0
+        ]
 
     @property
     def fragment_count(self) -> int:

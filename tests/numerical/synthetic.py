@@ -1,0 +1,61 @@
+"""Synthetic views, stores and figures of merit for the tests of the renderer."""
+
+import math
+
+import numpy as np
+from scipy.ndimage import zoom
+
+from estimator.profiles import parse_profile
+from filter_service.frame import View
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_store import frame_layers
+from filter_service.renderer import FilterRenderer
+
+
+def tangents(width_px, height_px, vertical_fov_deg):
+    up = math.tan(math.radians(vertical_fov_deg) / 2)
+    right = up * width_px / height_px
+    return -right, right, up, -up
+
+
+def texture(rng, height_px, width_px, cell_px=4):
+    """Smoothly varying coloured noise in 0..1, float32 linear."""
+    coarse = rng.random((height_px // cell_px + 2, width_px // cell_px + 2, 3))
+    fine = zoom(coarse, (cell_px, cell_px, 1), order=1)[:height_px, :width_px]
+    return np.clip(fine, 0.0, 1.0).astype(np.float32)
+
+
+def psnr_db(image, reference):
+    """Linear light, peak 1, mean over channels."""
+    error = np.mean((np.asarray(image, float) - reference) ** 2)
+    return -10.0 * math.log10(max(float(error), 1e-30))
+
+
+class Bench:
+    """One camera and eye, ready to render."""
+
+    def __init__(self, gpu, profile, *, width_px, height_px, vertical_fov_deg, **spec):
+        self.width_px, self.height_px = width_px, height_px
+        self.tangents = tangents(width_px, height_px, vertical_fov_deg)
+        self.spec = GridSpec.for_camera(
+            width_px=width_px, height_px=height_px, tangents=self.tangents, **spec
+        )
+        self.store = build_psf_store(parse_profile(profile), self.spec)
+        self.gpu = gpu
+        self.renderer = FilterRenderer(gpu)
+        self.handle = self.renderer.load(self.store)
+
+    def view(self, color, depth_m, depth_kind="planar"):
+        depth_m = np.broadcast_to(
+            np.float32(depth_m), (self.height_px, self.width_px)
+        ).astype(np.float32)
+        return View(color, depth_m, self.tangents, depth_kind)
+
+    def render(self, view, **options):
+        options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0, **options}
+        return self.renderer.render(view, self.handle, **options)
+
+    def layers(self, **options):
+        options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0, **options}
+        return frame_layers(self.store, **options)

@@ -1,0 +1,157 @@
+"""Prescriptions and the wavefront-only eye against published values and closed forms."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimator.chromatic import chromatic_refraction_dpt
+from estimator.measured_wavefront import (
+    MeasuredWavefront,
+    accommodation_amplitude_dpt,
+)
+from estimator.prescription import (
+    C2M2,
+    C20,
+    C22,
+    Prescription,
+    power_at_cornea_dpt,
+    power_vector,
+    power_vector_from_zernike,
+    prescription_from_power_vector,
+)
+from estimator.profiles import parse_profile, preset_names
+from estimator.zernike import rescale_pupil, zernike_gradient
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+def wavefront(**fields):
+    return MeasuredWavefront.from_profile(parse_profile(fields))
+
+
+def state(eye, *, pupil=5.0, d=0.0, f=0.0, wavelength=555.0):
+    return eye.state(
+        pupil_diameter_mm=pupil, object_dpt=d, focus_dpt=f, wavelength_nm=wavelength
+    )
+
+
+def test_published_prescription_example():
+    """-6/-3x102 at 5 mm (optics of the paper's astigmatism), in the examiner's frame."""
+    eye = wavefront(
+        kind="prescription", sphere_dpt=-6.0, cylinder_dpt=-3.0, axis_deg=102.0
+    )
+    zernike_um = state(eye).zernike_um
+    assert zernike_um[C20] == pytest.approx(6.76582, abs=5e-6)
+    assert zernike_um[C22] == pytest.approx(1.74822, abs=5e-6)
+    # the examiner's +0.77836 mirrors to the eye frame
+    assert zernike_um[C2M2] == pytest.approx(-0.77836, abs=5e-6)
+
+
+def test_prescription_round_trips():
+    given = Prescription(sphere_dpt=-2.25, cylinder_dpt=-1.5, axis_deg=35.0)
+    back = prescription_from_power_vector(*power_vector(given))
+    assert back.sphere_dpt == pytest.approx(-2.25, abs=1e-12)
+    assert back.cylinder_dpt == pytest.approx(-1.5, abs=1e-12)
+    assert back.axis_deg == pytest.approx(35.0, abs=1e-9)
+
+
+def test_vertex_distance_closed_form():
+    assert power_at_cornea_dpt(-6.0, vertex_mm=12.0) == pytest.approx(-6 / 1.072)
+
+
+def test_chromatic_refraction_matches_the_published_table():
+    rows = json.loads((DATA / "optics_vectors.json").read_text())["lca"]["rows"]
+    for wavelength_nm, _, indiana_dpt in rows:
+        ours = chromatic_refraction_dpt(wavelength_nm) - chromatic_refraction_dpt(589.3)
+        assert ours == pytest.approx(indiana_dpt, abs=1e-9)
+
+
+def test_presets_carry_the_published_mean_coefficients():
+    """Table 5 of the paper, target row: mean |Z2..Z28| as published."""
+    published = json.loads((DATA / "conditions.json").read_text())["profiles"]
+    assert set(published) == set(preset_names())
+    for name, row in published.items():
+        profile = parse_profile({"kind": "preset", "name": name})
+        mean_um = np.abs(profile.zernike_um[1:]).sum() / 27.0
+        assert mean_um == pytest.approx(row["mean_abs_over_27"], abs=1e-12)
+
+
+@pytest.mark.parametrize("pupil_mm", [2.0, 3.5, 5.0])
+def test_myope_sees_clearly_at_the_far_point_only(pupil_mm):
+    eye = wavefront(kind="prescription", sphere_dpt=-4.0)
+    assert state(eye, pupil=pupil_mm, d=4.0).zernike_um == pytest.approx(0.0, abs=1e-12)
+    far = state(eye, pupil=pupil_mm, d=0.0).zernike_um[C20]
+    assert far == pytest.approx(4.0 * (pupil_mm / 2) ** 2 / (4 * math.sqrt(3)))
+
+
+def test_hyperope_accommodates_and_myope_does_not():
+    hyperope = wavefront(kind="prescription", sphere_dpt=2.0)
+    assert hyperope.accommodation_dpt(0.0) == pytest.approx(2.0)
+    assert state(hyperope, d=3.0, f=3.0).zernike_um[C20] == pytest.approx(0.0, abs=1e-12)
+    myope = wavefront(kind="prescription", sphere_dpt=-2.0)
+    answer = state(myope, d=1.0, f=1.0)
+    assert myope.accommodation_dpt(1.0) == 0.0
+    assert answer.zernike_um[C20] == pytest.approx(6.25 / (4 * math.sqrt(3)))
+    assert "beyond the far point" in answer.notes[0]
+
+
+def test_old_eye_stops_at_its_near_point_and_says_so():
+    eye = wavefront(kind="prescription", sphere_dpt=0.0, age_years=45)
+    amplitude_dpt = 7.33 - 0.0035 * 42**2
+    answer = state(eye, d=4.0, f=4.0)
+    left_dpt = 4.0 - amplitude_dpt
+    expected_um = -left_dpt * 6.25 / (4 * math.sqrt(3))
+    assert answer.zernike_um[C20] == pytest.approx(expected_um)
+    assert "near point" in answer.notes[0]
+    assert accommodation_amplitude_dpt(age_years=70) == 0.0
+
+
+def test_full_correction_leaves_no_refraction():
+    eye = wavefront(
+        kind="prescription",
+        sphere_dpt=-6.0,
+        cylinder_dpt=-3.0,
+        axis_deg=102.0,
+        correction={"sphere_dpt": -6.0, "cylinder_dpt": -3.0, "axis_deg": 102.0},
+    )
+    assert np.abs(state(eye).zernike_um).max() < 1e-12
+    assert state(eye, d=2.0, f=2.0).zernike_um == pytest.approx(0.0, abs=1e-12)
+
+
+def test_measured_wavefront_is_capped_at_its_pupil_and_says_so():
+    eye = wavefront(kind="preset", name="cataract")
+    answer = state(eye, pupil=7.0)
+    assert answer.pupil_diameter_mm == 4.0
+    assert "capped" in answer.notes[0]
+    prescription = wavefront(kind="prescription", sphere_dpt=-1.0)
+    assert state(prescription, pupil=7.0).pupil_diameter_mm == 7.0
+
+
+def test_chromatic_defocus_is_the_difference_of_refraction():
+    eye = wavefront(kind="preset", name="keratoconus")
+    blue = state(eye, wavelength=464.0).zernike_um
+    red = state(eye, wavelength=612.0).zernike_um
+    m_blue, m_red = (
+        power_vector_from_zernike(z, zernike_radius_mm=2.5)[0] for z in (blue, red)
+    )
+    published = -633.46 / (464.0 - 214.102) + 633.46 / (612.0 - 214.102)
+    assert m_blue - m_red == pytest.approx(published, abs=1e-12)
+
+
+def test_imported_tilt_is_dropped_and_coma_keeps_its_balance():
+    eye = wavefront(kind="preset", name="keratoconus")
+    for pupil_mm in (5.0, 3.0):
+        zernike_um = state(eye, pupil=pupil_mm).zernike_um
+        assert np.abs(zernike_gradient(0.0, 0.0) @ zernike_um).max() < 1e-12
+
+
+def test_downwards_rescaling_is_the_measurement_itself():
+    eye = wavefront(kind="preset", name="post_lasik")
+    small = state(eye, pupil=2.0, wavelength=460.0, d=1.0).zernike_um
+    expected = rescale_pupil(eye.zernike_um, radius_ratio=2.0 / 3.0)
+    expected[C20] -= 1.0 / (4 * math.sqrt(3)) * 1.0
+    expected[0] = 0.0
+    assert np.abs(small - expected).max() < 1e-12

@@ -1,0 +1,107 @@
+"""Profile parsing: what is accepted, and what an error names."""
+
+import json
+
+import numpy as np
+import pytest
+
+from estimator.profile_files import load_profile
+from estimator.profiles import ProfileError, parse_profile
+from estimator.zernike import flip_horizontal, index_from_nm
+
+GOOD = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 5,
+    "wavelength_nm": 587.56,
+    "zernike_um": {"2,0": 5.41, "3,-1": -0.2, "3,1": 0.1},
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"kind": "guess"}, "kind"),
+        ({"pupil_diameter_mm": 12}, "pupil_diameter_mm"),
+        ({"pupil_diameter_mm": "5"}, "pupil_diameter_mm"),
+        ({"pupil_diameter_mm": float("nan")}, "pupil_diameter_mm"),
+        ({"wavelength_nm": None}, "wavelength_nm"),
+        ({"zernike_um": {"7,1": 0.1}}, "zernike_um.7,1"),
+        ({"zernike_um": {"3,2": 0.1}}, "zernike_um.3,2"),
+        ({"zernike_um": {"2": 0.1}}, "zernike_um.2"),
+        ({"zernike_um": {"2,0": True}}, "zernike_um.2,0"),
+        ({"zernike_um": []}, "zernike_um"),
+        ({"frame": "camera"}, "frame"),
+        ({"eye_side": "left"}, "eye_side"),
+        ({"age_years": -1}, "age_years"),
+        ({"sphere_dpt": -1}, "sphere_dpt"),
+        ({"correction": {"sphere_dpt": -1, "axis_deg": 200}}, "correction.axis_deg"),
+    ],
+)
+def test_bad_field_is_named_with_its_range(change, field):
+    with pytest.raises(ProfileError) as caught:
+        parse_profile({**GOOD, **change})
+    assert caught.value.field == field
+    assert caught.value.allowed in str(caught.value)
+
+
+@pytest.mark.parametrize("body", [None, [], "myopia", {1: 2}, {}])
+def test_a_profile_that_is_no_object_is_refused(body):
+    with pytest.raises(ProfileError):
+        parse_profile(body)
+
+
+def test_examiner_frame_is_mirrored_on_the_way_in():
+    eye = parse_profile({**GOOD, "frame": "eye"}).zernike_um
+    examiner = parse_profile({**GOOD, "frame": "examiner"}).zernike_um
+    assert np.array_equal(examiner, flip_horizontal(eye))
+
+
+def test_abp_file_reads_integers_comments_and_terms(tmp_path):
+    path = tmp_path / "eye.abp"
+    path.write_text(
+        "# an eye\nAp = 5\nWa = 587.56\nZ[2, 0] = 5.4127 # myopia\nZ[3,-1]=1\n"
+    )
+    profile = load_profile(path)
+    assert profile.pupil_diameter_mm == 5.0
+    assert profile.zernike_um[index_from_nm(2, 0)] == 5.4127
+    assert profile.zernike_um[index_from_nm(3, -1)] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("Ap = 5\nWa = 500\nZ[2 0] = 1\n", "line 3"),
+        ("Ap = five\nWa = 500\n", "line 1"),
+        ("Wa = 500\nZ[2,0] = 1\n", "pupil_diameter_mm"),
+    ],
+)
+def test_broken_abp_names_the_line_or_field(tmp_path, text, where):
+    path = tmp_path / "eye.abp"
+    path.write_text(text)
+    with pytest.raises(ProfileError, match=where):
+        load_profile(path)
+
+
+def test_csv_takes_its_pupil_from_beside_it_or_from_comments(tmp_path):
+    path = tmp_path / "eye.csv"
+    path.write_text("n,m,um\n2,0,1.5\n3,-1,-0.25\n")
+    with pytest.raises(ProfileError, match="pupil_diameter_mm"):
+        load_profile(path)
+    beside = load_profile(path, pupil_diameter_mm=6.0, wavelength_nm=550.0)
+    path.write_text(
+        "# pupil_diameter_mm: 6\n# wavelength_nm = 550\n2,0,1.5\n3,-1,-0.25"
+    )
+    inside = load_profile(path)
+    assert np.array_equal(beside.zernike_um, inside.zernike_um)
+    assert inside.pupil_diameter_mm == 6.0
+
+
+def test_json_file_is_the_wire_object(tmp_path):
+    path = tmp_path / "eye.json"
+    path.write_text(json.dumps(GOOD))
+    assert np.array_equal(load_profile(path).zernike_um, parse_profile(GOOD).zernike_um)
+
+
+def test_unknown_name_lists_what_exists():
+    with pytest.raises(ProfileError, match="keratoconus"):
+        load_profile("kerataconus")
