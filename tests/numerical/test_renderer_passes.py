@@ -1,0 +1,236 @@
+"""Each pass against a plain numpy twin, and what must hold for every input."""
+
+import numpy as np
+import pytest
+
+from filter_service import constants, reference, renderer
+from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.frame import View
+from tests.numerical.synthetic import Bench, psnr_db, tangents, texture
+
+MYOPIA = {"kind": "preset", "name": "myopia"}
+SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
+
+
+@pytest.fixture(scope="module")
+def bench(gpu):
+    return Bench(gpu, MYOPIA, **SIZE)
+
+
+def depth_scene():
+    """Near disc, slanted floor and far wall: edges, slopes and flats."""
+    y, x = np.mgrid[0:101, 0:150]
+    floor = 1.0 / (0.1 + 1.5 * np.clip(y - 60, 0, None) / 40)
+    depth_m = np.where(y > 60, floor, 8.0)
+    disc = (x - 60) ** 2 + (y - 40) ** 2 < 20**2
+    return np.where(disc, 0.4, depth_m).astype(np.float32)
+
+
+@pytest.fixture
+def view(bench, rng):
+    return bench.view(texture(rng, 101, 150), depth_scene())
+
+
+def read(bench, name, shape, dtype):
+    gpu = bench.gpu
+    return gpu.read(gpu.storage(name, 1), shape, dtype)
+
+
+def tile_grid():
+    return -(-150 // constants.TILE_SIZE_PX), -(-101 // constants.TILE_SIZE_PX)
+
+
+def fragments(bench):
+    """Alive slots, their centres and reaches, as the merge pass packed them."""
+    columns, rows = tile_grid()
+    n_tiles, slots = columns * rows, columns * rows * constants.THREADS
+    counts = read(bench, "BLOCKS", (n_tiles, 4), np.uint32)[:, 0]
+    place = read(bench, "FRAGMENT_PLACE", (slots, 4), np.uint32)
+    alive = np.arange(slots) % constants.THREADS < np.repeat(counts, constants.THREADS)
+    merged = (place[:, 1] & constants.MERGED_BIT) != 0
+    x = (place[:, 0] & constants.PLACE_MASK) + 0.5 * merged
+    y = (place[:, 0] >> constants.PLACE_BITS) + 0.5 * merged
+    reach = place[:, 3] + 0.5 + np.sqrt(0.5) * merged
+    return np.flatnonzero(alive), x, y, reach, merged
+
+
+def test_blended_layers_equal_their_twin(bench, view):
+    bench.render(view, pupil_diameter_mm=3.3, focus_dpt=7.0)
+    layers = bench.layers(pupil_diameter_mm=3.3, focus_dpt=7.0)
+    expected = reference.layer_kernels(bench.store, layers)
+    table, texels = renderer._layer_table(layers)
+    atlas = bench.gpu.atlas(1)
+    line = np.frombuffer(atlas.read(), np.float16).reshape(-1, 4)[:texels, :3]
+    largest = expected.shape[1] // 2
+    for k, radius in enumerate(layers.radius_px):
+        width, first = 2 * radius + 1, int(table[k, 0, 1])
+        kernel = line[first : first + width**2].reshape(width, width, 3)
+        part = slice(largest - radius, largest + radius + 1)
+        # half floats, rounded or cut: 2^-10 relative, 2^-24 where subnormal
+        assert np.allclose(
+            kernel, expected[k, part, part], rtol=2.0**-10, atol=2.0**-24
+        )
+        merged_first = int(table[k, 0, 2])
+        merged = line[merged_first : merged_first + (width + 1) ** 2]
+        # two steps of half floats that may cut: 4 x 2 x 2^-11 on average
+        assert merged.astype(float).sum(axis=0) == pytest.approx([4.0] * 3, abs=8e-3)
+
+
+def test_layers_are_no_farther_apart_than_the_blur_step(bench):
+    layers = bench.layers()
+    change_px = np.abs(np.diff(layers.blur_px))
+    assert np.all(np.diff(layers.object_dpt) > 0)
+    assert change_px.max() <= bench.spec.max_blur_step_px + 1e-9
+
+
+def test_merging_keeps_every_pixel_once(bench, view):
+    result = bench.render(view, pupil_diameter_mm=5.0)
+    alive, x, y, _, merged = fragments(bench)
+    assert result.fragment_count == len(alive)
+    assert merged[alive].sum() * 4 == result.merged_count > 0
+    covered = np.zeros((101, 150), int)
+    for slot in alive:
+        left, top = int(x[slot] - 0.5 * merged[slot]), int(y[slot] - 0.5 * merged[slot])
+        edge = 2 if merged[slot] else 1
+        covered[top : top + edge, left : left + edge] += 1
+    assert np.all(covered == 1)
+
+
+def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
+    bench.render(view)
+    alive, x, y, reach, _ = fragments(bench)
+    columns, rows = tile_grid()
+    n_tiles, size = columns * rows, constants.TILE_SIZE_PX
+    offsets = read(bench, "TILE_OFFSETS", (n_tiles + 1,), np.uint32)
+    counts = read(bench, "TILE_COUNTS", (n_tiles, 2), np.uint32)
+    assert np.array_equal(offsets, np.concatenate([[0], np.cumsum(counts[:, 0])]))
+    entries = read(bench, "ENTRIES", (int(offsets[-1]),), np.uint32)
+    depth = read(bench, "FRAGMENT_COLOR", (n_tiles * constants.THREADS, 4), np.float32)
+    sorted_tiles = 0
+    for tile in range(n_tiles):
+        left, top = (tile % columns) * size, (tile // columns) * size
+        dx = np.clip(x[alive], left, left + size - 1) - x[alive]
+        dy = np.clip(y[alive], top, top + size - 1) - y[alive]
+        expected = alive[dx**2 + dy**2 <= reach[alive] ** 2]
+        listed = entries[offsets[tile] : offsets[tile + 1]]
+        assert np.array_equal(np.sort(listed), expected)
+        if counts[tile, 1]:
+            keys = depth[listed, 3]
+            span = max(float(keys.max() - keys.min()), 1e-12)
+            assert np.all(np.diff(keys) >= -2.0 * span / constants.SORT_KEY_MAX)
+            sorted_tiles += 1
+    assert 0 < sorted_tiles < n_tiles
+
+
+def test_eight_bit_output_is_the_encoded_linear_output(bench, rng):
+    color = rng.integers(0, 256, (101, 150, 3), dtype=np.uint8)
+    view = bench.view(color, depth_scene())
+    linear = bench.render(view, output="linear").color
+    encoded = bench.render(view, output="srgb8").color
+    twin = reference.srgb_from_linear(linear)
+    # pow() of the shader may round a value that lies on a step the other way
+    assert np.abs(encoded.astype(int) - twin).max() <= 1
+    assert np.mean(encoded != twin) < 1e-3
+
+
+@pytest.mark.parametrize("accumulation", ["coverage", "paper"])
+def test_same_input_gives_the_same_bytes(bench, view, accumulation):
+    first = bench.render(view, accumulation=accumulation).color
+    again = bench.render(view, accumulation=accumulation).color
+    assert first.tobytes() == again.tobytes()
+
+
+def test_bands_change_nothing(bench, view, monkeypatch):
+    whole = bench.render(view)
+    monkeypatch.setattr(renderer, "MAX_BAND_ENTRIES", whole.entry_count // 7)
+    banded = bench.render(view)
+    assert banded.entry_count == whole.entry_count
+    assert whole.color.tobytes() == banded.color.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("width_px", "height_px"),
+    [
+        *[(1, 1), (3, 2), (8, 8), (9, 17), (257, 33)],
+        pytest.param(1283, 517, marks=pytest.mark.slow),
+    ],
+)
+def test_every_frame_size_agrees_with_the_gather(gpu, rng, width_px, height_px):
+    # 1.2 mrad a pixel whatever the size
+    fov_deg = 2 * np.degrees(np.arctan(0.6e-3 * height_px))
+    bench = Bench(
+        gpu, MYOPIA, width_px=width_px, height_px=height_px, vertical_fov_deg=fov_deg
+    )
+    depth_m = np.where(np.arange(width_px) % 40 < 20, 0.5, 3.0)[None, :]
+    view = bench.view(texture(rng, height_px, width_px), depth_m)
+    result = bench.render(view, merge=False)
+    truth = reference.gather(view, bench.store, bench.layers())
+    assert result.color.shape == (height_px, width_px, 3)
+    assert psnr_db(result.color, truth) >= 50.0
+
+
+@pytest.mark.parametrize("fill", [0.0, -1.0, np.nan])
+def test_missing_depth_takes_the_nearest_and_is_counted(bench, rng, fill):
+    image = texture(rng, 101, 150)
+    whole = bench.view(image, np.where(np.arange(150) < 75, 0.5, 4.0)[None, :])
+    holes = whole.depth_m.copy()
+    holes[20:30, 10:14] = fill
+    result = bench.render(View(image, holes, whole.tangents))
+    assert result.missing_depth_count == 40
+    assert result.color.tobytes() == bench.render(whole).color.tobytes()
+
+
+def test_all_depth_missing_is_infinity(bench, rng):
+    image = texture(rng, 101, 150)
+    nothing = bench.render(bench.view(image, np.nan))
+    assert nothing.missing_depth_count == 101 * 150
+    assert np.array_equal(nothing.color, bench.render(bench.view(image, np.inf)).color)
+
+
+def test_colour_that_is_not_finite_is_black_and_counted(bench, rng):
+    image = texture(rng, 101, 150)
+    image[5, 7] = np.nan
+    image[6, 9, 1] = np.inf
+    result = bench.render(bench.view(image, 2.0))
+    assert result.bad_color_count == 2
+    assert np.isfinite(result.color).all()
+    assert any("non-finite" in note for note in result.notes)
+
+
+def test_depth_nearer_than_prepared_is_counted(gpu, rng):
+    bench = Bench(gpu, MYOPIA, **SIZE, object_range_dpt=(0.0, 2.0))
+    depth_m = np.where(np.arange(150) < 30, 0.2, 1.0)[None, :]
+    result = bench.render(bench.view(texture(rng, 101, 150), depth_m, "radial"))
+    assert result.clamped_depth_count == 30 * 101
+
+
+def test_wrong_arrays_and_cameras_are_refused(bench, rng):
+    image, depth_m = texture(rng, 101, 150), depth_scene()
+    bad = [
+        View(image[..., :2], depth_m, bench.tangents),
+        View(image.astype(np.float64), depth_m, bench.tangents),
+        View(image, depth_m[:50], bench.tangents),
+        View(image, depth_m, bench.tangents, "sideways"),
+    ]
+    for view in bad:
+        with pytest.raises(BadMessage):
+            bench.render(view)
+    with pytest.raises(CameraMismatch):
+        bench.render(View(image, depth_m, tangents(150, 101, 20.0)))
+    with pytest.raises(BadMessage, match="accumulation"):
+        bench.render(bench.view(image, depth_m), accumulation="average")
+
+
+def test_pupil_outside_the_prepared_range_is_clamped_with_a_note(bench, view):
+    result = bench.render(view, pupil_diameter_mm=1.0)
+    assert result.pupil_diameter_mm == pytest.approx(2.0)
+    assert any("prepared" in note for note in result.notes)
+
+
+def test_stage_times_name_every_pass(bench, view):
+    times_ms = bench.render(view, output="srgb8").stage_times_ms
+    assert {"upload_ms", "psf_blend_ms", "fragments_ms", "merge_ms", "bin_ms"} <= set(
+        times_ms
+    )
+    assert {"sort_ms", "splat_ms", "encode_ms", "readback_ms"} <= set(times_ms)
+    assert all(value >= 0.0 for value in times_ms.values())
