@@ -51,7 +51,7 @@ class GridSpec:
 
     pixel_pitch_mrad: tuple[float, float]
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)
-    object_range_dpt: tuple[float, float] = (0.0, 8.0)
+    object_range_dpt: tuple[float, float] = (0.0, 10.0)
     focus_range_dpt: tuple[float, float] = (0.0, 6.0)
     wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
     diffraction: bool = True

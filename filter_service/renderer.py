@@ -91,7 +91,10 @@ class FilterRenderer:
 
     def load(self, store: PsfStore) -> LoadedStore:
         """Copy a store's kernels to the GPU."""
-        return LoadedStore(store=store, kernels=self._gpu.make_buffer(store.kernels))
+        with self._gpu.context:
+            return LoadedStore(
+                store=store, kernels=self._gpu.make_buffer(store.kernels)
+            )
 
     def render(
         self,
@@ -118,6 +121,15 @@ class FilterRenderer:
         _check_choice("accumulation", accumulation, ACCUMULATIONS)
         _check_choice("output", output, OUTPUTS)
         _check_pitch(view, handle.store)
+        # Another library's context (a renderer of the input) may be current.
+        with self._gpu.context:
+            return self._render(
+                view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+            )
+
+    def _render(
+        self, view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+    ) -> Rendered:
         frame = _Frame(self._gpu, view, accumulation == "paper", merge)
         with frame.timer.wall("prepare_ms"):
             depth = self._prepared_depth(view, handle.store)

@@ -33,7 +33,8 @@ def view(bench, rng):
 
 def read(bench, name, shape, dtype):
     gpu = bench.gpu
-    return gpu.read(gpu.storage(name, 1), shape, dtype)
+    with gpu.context:
+        return gpu.read(gpu.storage(name, 1), shape, dtype)
 
 
 def tile_grid():
@@ -59,8 +60,9 @@ def test_blended_layers_equal_their_twin(bench, view):
     layers = bench.layers(pupil_diameter_mm=3.3, focus_dpt=7.0)
     expected = reference.layer_kernels(bench.store, layers)
     table, texels = renderer._layer_table(layers)
-    atlas = bench.gpu.atlas(1)
-    line = np.frombuffer(atlas.read(), np.float16).reshape(-1, 4)[:texels, :3]
+    with bench.gpu.context:
+        line = np.frombuffer(bench.gpu.atlas(1).read(), np.float16)
+    line = line.reshape(-1, 4)[:texels, :3]
     largest = expected.shape[1] // 2
     for k, radius in enumerate(layers.radius_px):
         width, first = 2 * radius + 1, int(table[k, 0, 1])

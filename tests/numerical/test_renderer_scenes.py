@@ -1,0 +1,57 @@
+"""Both scenes through all six eyes, against the float64 sorted gather."""
+
+from functools import cache
+
+import pytest
+
+from estimator.profiles import parse_profile, preset_names
+from filter_service import reference
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_store import frame_layers
+from filter_service.renderer import FilterRenderer
+from tests.numerical.scene_frames import SCENES, scene_view
+from tests.numerical.synthetic import psnr_db
+
+SIZE = {"width_px": 320, "height_px": 180}
+STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
+MERGING = [
+    ("myopia", "primitives"),
+    ("astigmatism", "courtyard"),
+    ("astigmatism", "primitives"),
+    ("keratoconus", "primitives"),
+    ("cataract", "primitives"),
+]
+"""Cases in which at least half of the pixels merge."""
+
+
+@cache
+def eye_store(eye, scene):
+    view = scene_view(scene, **SIZE)
+    spec = GridSpec.for_camera(
+        **SIZE,
+        tangents=view.tangents,
+        pupil_range_mm=(5.0, 5.0),
+    )
+    return build_psf_store(parse_profile({"kind": "preset", "name": eye}), spec)
+
+
+@pytest.mark.parametrize("accumulation", ["coverage", "paper"])
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("eye", preset_names())
+def test_passes_agree_with_the_sorted_gather(gpu, eye, scene, accumulation):
+    view, store = scene_view(scene, **SIZE), eye_store(eye, scene)
+    renderer = FilterRenderer(gpu)
+    handle = renderer.load(store)
+    truth = reference.gather(
+        view, store, frame_layers(store, **STATE), accumulation=accumulation
+    )
+    single = renderer.render(
+        view, handle, **STATE, accumulation=accumulation, merge=False
+    )
+    merged = renderer.render(view, handle, **STATE, accumulation=accumulation)
+    assert psnr_db(single.color, truth) >= 50.0
+    assert psnr_db(merged.color, truth) >= 45.0
+    if (eye, scene) in MERGING:
+        assert merged.merged_count >= 0.5 * merged.color[..., 0].size
+    handle.release()
