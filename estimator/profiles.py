@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator import profile_fields as fields
 from estimator import prescription as rx
+from estimator import profile_fields as fields
 from estimator.profile_fields import ProfileError
 from estimator.units import REFERENCE_WAVELENGTH_NM
 from estimator.zernike import (

@@ -1,4 +1,4 @@
-"""Prescriptions and the wavefront-only eye against published values and closed forms."""
+"""Prescriptions and the wavefront-only eye against published values."""
 
 import json
 import math
@@ -39,7 +39,7 @@ def state(eye, *, pupil=5.0, d=0.0, f=0.0, wavelength=555.0):
 
 
 def test_published_prescription_example():
-    """-6/-3x102 at 5 mm (optics of the paper's astigmatism), in the examiner's frame."""
+    """-6/-3x102 at 5 mm, the paper's astigmatism, in the examiner's frame."""
     eye = wavefront(
         kind="prescription", sphere_dpt=-6.0, cylinder_dpt=-3.0, axis_deg=102.0
     )

@@ -1,14 +1,12 @@
 """PSFs of both engines against closed forms, invariants and the float64 reference."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
 
 from estimator.psf import (
     GEOMETRIC_FROM_WAVE_NUMBER,
-    PsfTooLarge,
     choose_method,
     compute_psfs,
 )
@@ -351,66 +349,3 @@ def test_auto_switches_at_the_documented_wave_number():
     limit = GEOMETRIC_FROM_WAVE_NUMBER
     assert choose_method([limit - 0.1, limit]).tolist() == ["fourier", "geometric"]
     assert choose_method([1.0], diffraction=False).tolist() == ["geometric"]
-
-
-def test_batches_equal_single_calls_in_order():
-    cases = ("emmetropia", 2.0), ("periph40", 6.0), ("keratoconus", 4.0)
-    zernike_um = np.stack([case_zernike_um(*case) for case in cases])
-    pupil_mm, wavelength_nm = np.array([2.0, 6.0, 4.0]), np.array([464.0, 549.0, 612.0])
-    batch = compute_psfs(
-        zernike_um,
-        pupil_diameter_mm=pupil_mm,
-        wavelength_nm=wavelength_nm,
-        pixel_pitch_mrad=PITCH_MRAD,
-        workers=2,
-    )
-    assert {psf.method for psf in batch} == {"fourier", "geometric"}
-    for i, psf in enumerate(batch):
-        single = one_psf(
-            zernike_um[i], pupil_mm=pupil_mm[i], wavelength_nm=wavelength_nm[i]
-        )
-        assert psf.method == single.method
-        np.testing.assert_array_equal(psf.kernel, single.kernel)
-
-
-def test_a_psf_beyond_the_allowed_radius_is_refused_with_the_numbers():
-    zernike_um = np.stack([np.zeros(28), case_zernike_um("periph40", 7.0)])
-    with pytest.raises(
-        PsfTooLarge, match=r"PSF 1 needs a radius of \d+ px.*24 px"
-    ) as e:
-        compute_psfs(
-            zernike_um,
-            pupil_diameter_mm=7.0,
-            wavelength_nm=550.0,
-            pixel_pitch_mrad=PITCH_MRAD,
-            max_radius_px=24,
-        )
-    assert e.value.index == 1
-    assert e.value.radius_px > 24
-    assert pickle.loads(pickle.dumps(e.value)).radius_px == e.value.radius_px
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"zernike_um": np.zeros((2, 27))}, "zernike_um has shape"),
-        ({"zernike_um": np.full((1, 28), np.nan)}, "NaN"),
-        ({"pupil_diameter_mm": 0.0}, "pupil_diameter_mm 0.0"),
-        ({"wavelength_nm": [550.0, 450.0, 650.0]}, "wavelength_nm has shape"),
-        ({"pixel_pitch_mrad": -1.0}, "pixel_pitch_mrad -1.0"),
-        ({"method": "enz"}, "method 'enz'"),
-        ({"accuracy": "best"}, "accuracy 'best'"),
-        ({"radius_px": -1}, "radius_px -1"),
-        ({"method": "fourier", "diffraction": False}, "includes diffraction"),
-        ({"min_energy_ratio": 1.0}, "min_energy_ratio 1.0"),
-    ],
-)
-def test_wrong_arguments_are_named(change, message):
-    arguments = {
-        "zernike_um": np.zeros((1, 28)),
-        "pupil_diameter_mm": 4.0,
-        "wavelength_nm": 550.0,
-        "pixel_pitch_mrad": PITCH_MRAD,
-    } | change
-    with pytest.raises(ValueError, match=message):
-        compute_psfs(arguments.pop("zernike_um"), **arguments)

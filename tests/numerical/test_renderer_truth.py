@@ -62,7 +62,7 @@ def test_perfect_eye_gives_the_input_back_over_a_90_degree_field(
 
 
 def airy_kernel(*, pupil_mm, wavelength_nm, pitch_mrad, radius_px):
-    """Airy pattern (2 J1(x)/x)² integrated over pixels by Gauss-Legendre, closed form."""
+    """Airy pattern (2 J1(x)/x)² integrated over pixels by Gauss-Legendre."""
     order = 40  # several rings cross a pixel
     nodes, weights = np.polynomial.legendre.leggauss(order)
     centres = np.arange(-radius_px, radius_px + 1)

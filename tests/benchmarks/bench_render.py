@@ -1,0 +1,153 @@
+"""Frame time against PSNR, by pass, beside the sorted gather in the same run.
+
+Usage: python -m tests.benchmarks.bench_render [--quick] [--json]
+
+Error: PSNR in linear light against the float64 sorted gather with the same layers.
+"""
+
+import argparse
+import json
+
+import numpy as np
+
+from estimator.profiles import parse_profile
+from filter_service import reference
+from filter_service.gpu import Gpu
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_store import frame_layers
+from filter_service.renderer import FilterRenderer
+from tests.benchmarks.harness import (
+    Row,
+    machine_info,
+    memory_mb,
+    print_rows,
+    report,
+    time_calls,
+    write_report,
+)
+from tests.numerical.scene_frames import scene_view
+from tests.numerical.synthetic import psnr_db
+
+REFERENCE = "float64 sorted gather, same layers"
+PUPIL_MM = 5.0
+FOCUS_DPT = 0.5
+STATE = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}
+EYES = {
+    "emmetropia": {"kind": "preset", "name": "emmetropia"},
+    "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0},
+    "keratoconus": {"kind": "preset", "name": "keratoconus"},
+}
+VARIANTS = {
+    "tiles": {},
+    "tiles unmerged": {"merge": False},
+    "tiles paper rule": {"accumulation": "paper"},
+}
+
+
+def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
+    """Rows of one scene, size and eye."""
+    view = scene_view(scene, width_px=size[0], height_px=size[1])
+    spec = GridSpec.for_camera(
+        width_px=size[0],
+        height_px=size[1],
+        tangents=view.tangents,
+        pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+    )
+    store = build_psf_store(parse_profile(body), spec)
+    layers = frame_layers(store, **STATE)
+    handle = renderer.load(store)
+    setting = f"{scene} {size[0]}x{size[1]}"
+
+    def row(method, n, median_ms, p95_ms, error_db) -> Row:
+        return Row(
+            bench="render",
+            method=method,
+            case=eye,
+            setting=setting,
+            n=n,
+            median_ms=median_ms,
+            p95_ms=p95_ms,
+            memory_mb=gpu.memory_mb if method.startswith("tiles") else memory_mb(),
+            error_name="psnr_db",
+            error=error_db,
+            reference=REFERENCE,
+        )
+
+    truth = {
+        rule: reference.gather(view, store, layers, accumulation=rule)
+        for rule in ("coverage", "paper")
+    }
+    gather_ms = time_calls(
+        lambda: reference.gather(view, store, layers), repeats=max(repeats // 2, 2)
+    )
+    rows = [row("gather", max(repeats // 2, 2), *gather_ms, float("inf"))]
+    for method, options in VARIANTS.items():
+        results = []
+
+        def filtered(options=options, results=results):
+            results.append(renderer.render(view, handle, **STATE, **options))
+
+        median_ms, p95_ms = time_calls(filtered, repeats=repeats)
+        error_db = psnr_db(
+            results[-1].color, truth[options.get("accumulation", "coverage")]
+        )
+        rows.append(row(method, repeats, median_ms, p95_ms, error_db))
+        if method == "tiles":
+            rows += pass_rows(row, results[-repeats:], error_db)
+    handle.release()
+    return rows
+
+
+def pass_rows(row, results, error_db) -> list[Row]:
+    """One row a pass; the error is the frame's."""
+    rows = []
+    for name in results[-1].stage_times_ms:
+        times_ms = [result.stage_times_ms[name] for result in results]
+        label = "tiles: " + name.removesuffix("_ms")
+        median_ms, p95_ms = np.median(times_ms), np.percentile(times_ms, 95)
+        rows.append(
+            row(label, len(times_ms), float(median_ms), float(p95_ms), error_db)
+        )
+    return rows
+
+
+def main() -> None:
+    """Run, print, and write tests/benchmarks/results/render*.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="320x180, courtyard only")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    arguments = parser.parse_args()
+    gpu = Gpu()
+    renderer = FilterRenderer(gpu)
+    sizes = [(320, 180)] if arguments.quick else [(320, 180), (1280, 720)]
+    scenes = ["courtyard"] if arguments.quick else ["courtyard", "primitives"]
+    repeats = 3 if arguments.quick else 7
+    rows = [
+        row
+        for size in sizes
+        for scene in scenes
+        for eye, body in EYES.items()
+        for row in bench_case(renderer, gpu, scene, size, eye, body, repeats)
+    ]
+    content = report(
+        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
+    )
+    if arguments.json:
+        # JSON has no infinity: the gather is its own reference.
+        print(json.dumps(_finite(content)))
+        return
+    print_rows(rows)
+    if not arguments.quick:
+        write_report("render", _finite(content))
+
+
+def _finite(content: dict) -> dict:
+    for row in content["rows"]:
+        if not np.isfinite(row["error"]):
+            row["error"] = None
+    return content
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Shared by the benchmarks: the machine, the commit, timing, and rows of results.
+
+A row never holds a time without the error it was bought with.
+"""
+
+import json
+import os
+import platform
+import resource
+import subprocess
+import time
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+RESULTS = Path(__file__).parent / "results"
+
+WARM_UPS = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement; ``error_name`` says in which measure ``error`` is."""
+
+    bench: str
+    method: str
+    case: str
+    setting: str
+    n: int
+    median_ms: float
+    p95_ms: float
+    memory_mb: float
+    error_name: str
+    error: float
+    reference: str
+
+
+def machine_info() -> dict:
+    """Processor, cores in use and versions of the numerical libraries."""
+    name = platform.processor()
+    cpu_info = Path("/proc/cpuinfo")
+    if cpu_info.exists():
+        lines = cpu_info.read_text(encoding="utf-8").splitlines()
+        names = [
+            line.split(":", 1)[1].strip() for line in lines if "model name" in line
+        ]
+        name = names[0] if names else name
+    return {
+        "cpu": name,
+        "n_cores": len(os.sched_getaffinity(0)),
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        **{lib: version(lib) for lib in ("numpy", "scipy", "numba")},
+    }
+
+
+def commit_id() -> str:
+    """Short hash of the checkout, with "+" where files differ from it."""
+
+    def git(*arguments: str) -> str:
+        answer = subprocess.run(
+            ("git", *arguments), cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        return answer.stdout.strip() if answer.returncode == 0 else ""
+
+    changed = git("status", "--porcelain", "--untracked-files=no")
+    return (git("rev-parse", "--short", "HEAD") or "none") + ("+" if changed else "")
+
+
+def time_calls(
+    function, *, repeats: int, per_call: int = 1, clock=time.perf_counter
+) -> tuple[float, float]:
+    """Median and 95th percentile of a call in ms, after warm-ups.
+
+    ``per_call``: how many units of work one call does; times are per unit.
+    """
+    for _ in range(WARM_UPS):
+        function()
+    times_ms = []
+    for _ in range(repeats):
+        start = clock()
+        function()
+        times_ms.append((clock() - start) * 1000.0 / per_call)
+    return float(np.median(times_ms)), float(np.percentile(times_ms, 95))
+
+
+def memory_mb() -> float:
+    """Largest memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def report(rows: list[Row], *, machine: dict | None = None) -> dict:
+    """What ``ocufilter bench`` prints: machine, commit and rows."""
+    return {
+        "machine": machine or machine_info(),
+        "commit": commit_id(),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "rows": [asdict(row) for row in rows],
+    }
+
+
+def write_report(name: str, content: dict) -> Path:
+    """Write a report to tests/benchmarks/results/NAME.json."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def print_rows(rows: list[Row]) -> None:
+    """Readable table of rows."""
+    header = ("method", "case", "setting", "n", "ms", "p95", "error", "value")
+    print("{:<18}{:<14}{:<26}{:>5}{:>9}{:>9}  {:<14}{:>10}".format(*header))
+    for row in rows:
+        print(
+            f"{row.method:<18}{row.case:<14}{row.setting:<26}{row.n:>5}"
+            f"{row.median_ms:>9.3f}{row.p95_ms:>9.3f}  {row.error_name:<14}"
+            f"{row.error:>10.4g}"
+        )
