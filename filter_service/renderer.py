@@ -1,15 +1,17 @@
-"""Filters one view: pass order, buffer sizes and bands.  Pass order in shaders/README."""
+"""Filters one view: pass order, buffer sizes and bands (order: shaders/README.md)."""
 
 from dataclasses import dataclass
 
-import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import (
     BYTES_PER_WORD,
     LAYER_WORDS,
+    PAPER_SORT_KEY_BITS,
+    QUAD,
     RGB,
+    SORT_KEY_BITS,
     THREADS,
     TILE_SIZE_PX,
 )
@@ -21,7 +23,7 @@ from filter_service.frame import (
     finite_color,
     object_dpt,
 )
-from filter_service.gpu import Gpu, StageTimer
+from filter_service.gpu import Buffer, Gpu, StageTimer
 from filter_service.psf_grid import pixel_pitch_mrad
 from filter_service.psf_store import FrameLayers, PsfStore, frame_layers
 
@@ -43,7 +45,7 @@ class LoadedStore:
     """A PSF store whose kernels are on the GPU."""
 
     store: PsfStore
-    kernels: moderngl.Buffer
+    kernels: Buffer
 
     def release(self) -> None:
         """Free the GPU copy."""
@@ -231,7 +233,7 @@ class _Frame:
         self.pixel_count = view.width_px * view.height_px
         self.grid = tuple(_groups(side, TILE_SIZE_PX) for side in self.size)
         self.tile_count = self.grid[0] * self.grid[1]
-        self.buffers: dict[str, moderngl.Buffer] = {}
+        self.buffers: dict[str, Buffer] = {}
         self.entry_count = 0
 
     def _reserve(self, **n_bytes: int) -> None:
@@ -252,7 +254,7 @@ class _Frame:
             atlas=atlas,
         )
 
-    def blend_layers(self, layers: FrameLayers, store_kernels: moderngl.Buffer) -> None:
+    def blend_layers(self, layers: FrameLayers, store_kernels: Buffer) -> None:
         """Upload the layer table and compute the layer kernels, single and merged."""
         table, texel_count = _layer_table(layers)
         largest = 2 * int(layers.radius_px.max()) + 2
@@ -260,8 +262,15 @@ class _Frame:
         self.buffers["LAYERS"] = self.gpu.upload("LAYERS", table)
         self.buffers["RECIPES"] = self.gpu.upload("RECIPES", layers.recipes)
         self.gpu.atlas(texel_count)
-        groups = (_groups(largest * largest, THREADS), len(table))
-        self._run("blend_psfs", groups, "STORE", "RECIPES", "LAYERS", with_atlas=True)
+        intervals = max(len(table) - 1, 1)
+        groups = (_groups(largest * largest, THREADS), intervals)
+        self._run(
+            "blend_psfs",
+            groups,
+            *("STORE", "RECIPES", "LAYERS"),
+            layer_count=len(table),
+            with_atlas=True,
+        )
         self._run("merge_psfs", groups, "LAYERS", with_atlas=True)
 
     def upload(self, color: NDArray, depth_m: NDArray) -> None:
@@ -313,7 +322,7 @@ class _Frame:
                 merge_enabled=int(self.merge),
                 paper_order=int(self.paper_rule),
             )
-        reach_px = int(layers.reach_px.max()) + 1.5
+        reach_px = int(layers.radius_px.max()) + 1.5
         self.search_blocks = min(
             _groups(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
         )
@@ -345,7 +354,7 @@ class _Frame:
     def _plan_bands(self) -> list[tuple[int, int, int, int]]:
         """Bands as (first tile, tile count, first entry, entry count)."""
         total, total_float = self._totals()
-        self.entry_count = int(round(total_float)) if total_float > 2**31 else total
+        self.entry_count = round(total_float) if total_float > 2**31 else total
         if self.entry_count <= MAX_BAND_ENTRIES:
             return [(0, self.tile_count, 0, total)]
         counts = self.gpu.read(
@@ -391,6 +400,11 @@ class _Frame:
                     *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
                     *("ENTRIES", "ENTRIES_SPARE"),
                     **band,
+                    defines={
+                        "KEY_BITS": (
+                            PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
+                        )
+                    },
                 )
             with self.timer.stage("splat_ms"):
                 self._run(
@@ -466,8 +480,11 @@ def _layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
     table[:, 0, 1] = starts[:-1]
     table[:, 0, 2] = starts[:-1] + single
     table[:, 0, 3] = layers.radius_px
-    table[:, 1, 0] = layers.reach_px
-    table[:, 1, 1] = layers.blur_px.astype(np.float32).view(np.uint32)
+    table[:, 1, 0] = layers.blur_px.astype(np.float32).view(np.uint32)
+    scale = layers.peak.astype(np.float32)
+    table[:, 1, 1] = scale.view(np.uint32)
+    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
+    table[:, 1, 2] = merged_scale.view(np.uint32)
     return table, int(starts[-1])
 
 

@@ -1,5 +1,17 @@
-// The kernel atlas: a 2D texture addressed as one long line of texels.
+// The kernel atlas: a 2D texture addressed as one long line of texels.  A texel holds,
+// for red, green and blue, the weights at both ends of an interval of layers.
 
 ivec2 atlas_position(int texel) {
     return ivec2(texel & (ATLAS_WIDTH - 1), texel >> ATLAS_WIDTH_BITS);
 }
+
+// Weights as parts of the scale; rounded to the nearest step.
+uvec4 pack_weights(vec3 near, vec3 far, float scale) {
+    uvec3 low = uvec3(min(near / scale, 1.0) * WEIGHT_MAX + 0.5);
+    uvec3 high = uvec3(min(far / scale, 1.0) * WEIGHT_MAX + 0.5);
+    return uvec4(low | (high << WEIGHT_BITS), 0u);
+}
+
+vec3 near_weights(uvec4 texel) { return vec3(texel.rgb & WEIGHT_MASK); }
+
+vec3 far_weights(uvec4 texel) { return vec3(texel.rgb >> WEIGHT_BITS); }

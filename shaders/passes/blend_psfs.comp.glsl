@@ -1,18 +1,20 @@
-// Blends the cached PSFs into this frame's layers, one object distance each.
-// In:  STORE (f32 kernels), RECIPES (8 words per layer and channel: four kernels as
-//      offset and radius, four weights), LAYERS (distance, offset, merged offset, radius).
-// Out: the kernel atlas (RGB weight).
-// Dispatch: x over texels of the largest kernel / THREADS, y = layer.
-// Twin: reference.blend_psfs.  Source: Csoba & Kunkli 2023, section 6.4.
+// Blends the cached PSFs into this frame's layers and packs neighbours in pairs.
+// In:  STORE (f32 kernels), RECIPES (3 words per layer and channel: offsets and radii of
+//      four kernels, four weights), LAYERS (common/layers.glsl).
+// Out: the kernel atlas, single kernels.
+// Dispatch: x over texels of the largest kernel / THREADS, y = interval.
+// Twin: reference.layer_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
 
 layout(local_size_x = THREADS) in;
 
 layout(std430, binding = BINDING_STORE) readonly buffer Store { float store[]; };
 layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uvec4 recipes[]; };
 layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
-layout(rgba16f, binding = IMAGE_ATLAS) writeonly uniform image2D atlas;
+layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 
 #include "common/atlas.glsl"
+
+uniform int layer_count;
 
 float cached(uint offset, int radius, ivec2 at) {
     if (abs(at.x) > radius || abs(at.y) > radius) return 0.0;
@@ -30,16 +32,22 @@ float blended(uint recipe, ivec2 at) {
          + weights.w * cached(offsets.w, int(radii.w), at);
 }
 
+vec3 layer_weight(uint layer, ivec2 at) {
+    uint recipe = layer * uint(RGB * RECIPE_WORDS);
+    return vec3(blended(recipe, at), blended(recipe + uint(RECIPE_WORDS), at),
+                blended(recipe + 2u * uint(RECIPE_WORDS), at));
+}
+
 void main() {
-    uint layer_index = gl_WorkGroupID.y;
-    uvec4 layer = layers[layer_index * uint(LAYER_WORDS)];
-    int radius = int(layer.w);
+    uint interval = gl_WorkGroupID.y;
+    uvec4 place = layers[interval * uint(LAYER_WORDS)];
+    float scale = uintBitsToFloat(layers[interval * uint(LAYER_WORDS) + 1u].y);
+    int radius = int(place.w);
     int width = 2 * radius + 1;
     int texel = int(gl_GlobalInvocationID.x);
     if (texel >= width * width) return;
     ivec2 at = ivec2(texel % width, texel / width) - radius;
-    uint recipe = layer_index * uint(RGB) * uint(RECIPE_WORDS);
-    vec3 weight = vec3(blended(recipe, at), blended(recipe + uint(RECIPE_WORDS), at),
-                       blended(recipe + 2u * uint(RECIPE_WORDS), at));
-    imageStore(atlas, atlas_position(int(layer.y) + texel), vec4(weight, 0.0));
+    uint far = min(interval + 1u, uint(layer_count - 1));
+    uvec4 packed_pair = pack_weights(layer_weight(interval, at), layer_weight(far, at), scale);
+    imageStore(atlas, atlas_position(int(place.y) + texel), packed_pair);
 }

@@ -80,7 +80,7 @@ float sort_depth(ivec2 at, float dpt) {
 Fragment make_fragment(ivec2 at, vec4 pixel, bool merged, bool edge) {
     int k = find_interval(pixel.a, layer_count);
     float fraction = interval_fraction(k, pixel.a, layer_count);
-    int reach = int(layers[k * LAYER_WORDS + 1].x);
+    int reach = int(layers[k * LAYER_WORDS].w);
     return Fragment(pixel.rgb, sort_depth(at, pixel.a), at, uint(k), fraction, reach,
                     merged, edge);
 }

@@ -3,7 +3,7 @@
 // goes through one path and equal depths keep their order.
 // In:  FRAGMENT_COLOR (sort depth in a), TILE_COUNTS, TILE_OFFSETS.
 // In/Out: ENTRIES; ENTRIES_SPARE is scratch of the same size.
-// Dispatch: one group a tile of the band.
+// Dispatch: one group a tile of the band.  KEY_BITS: SORT_KEY_BITS or PAPER_SORT_KEY_BITS.
 // Twin: reference.sort_tiles (numpy stable argsort).
 
 layout(local_size_x = THREADS) in;
@@ -24,7 +24,7 @@ shared float highest[THREADS];
 
 uint depth_key(uint slot, vec2 depth_range) {
     float position = (colors[slot].a - depth_range.x) / depth_range.y;
-    return uint(clamp(position, 0.0, 1.0) * SORT_KEY_MAX);
+    return uint(clamp(position, 0.0, 1.0) * float((1 << KEY_BITS) - 1));
 }
 
 // Nearest depth and depth range of the list.
@@ -59,7 +59,7 @@ void main() {
     uint my_end = min(my_first + share, end);
     vec2 depth_range = find_depth_range(first, end);
 
-    for (int shift = 0; shift < SORT_KEY_BITS; shift += RADIX_BITS) {
+    for (int shift = 0; shift < KEY_BITS; shift += RADIX_BITS) {
         bool forwards = (shift / RADIX_BITS) % 2 == 0;
         for (int digit = 0; digit < RADIX; ++digit) buckets[digit * THREADS + int(thread)] = 0u;
         for (uint i = my_first; i < my_end; ++i) {

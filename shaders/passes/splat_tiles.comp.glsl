@@ -27,36 +27,28 @@ uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
 uniform int first_tile;           // of the band
 uniform uint first_entry;
-layout(binding = TEXTURE_ATLAS) uniform sampler2D atlas;
+layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 
 // Staged fragments: what the pixel loop needs, ready to use.
 shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
 shared ivec4 staged_place[THREADS];   // origin x, y, reach, 1 if merged
-shared ivec4 staged_kernels[THREADS]; // centre texel and row length, near and far layer
-
-vec3 atlas_weight(int texel) { return texelFetch(atlas, atlas_position(texel), 0).rgb; }
-
-// Centre texel of a layer's kernel and the texels from row to row.
-ivec2 kernel_centre(int layer, bool merged) {
-    uvec4 record = layers[layer * LAYER_WORDS];
-    int radius = int(record.w);
-    int row = 2 * radius + 1 + int(merged);
-    return ivec2(int(merged ? record.z : record.y) + radius * row + radius, row);
-}
+shared ivec2 staged_kernel[THREADS];  // centre texel, scale bits
 
 void stage(uint slot, uint at) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
-    bool merged = (place.y & MERGED_BIT) != 0u;
-    int near_layer = int(place.y & INTERVAL_MASK);
-    float fraction = uintBitsToFloat(place.z);
-    staged_color[at] = vec4(color.rgb, fraction);
-    staged_place[at] = ivec4(place_origin_px(place), int(place.w), int(merged));
-    ivec2 near_centre = kernel_centre(near_layer, merged);
-    ivec2 far_centre = fraction > 0.0 ? kernel_centre(near_layer + 1, merged) : near_centre;
-    staged_kernels[at] = ivec4(near_centre, far_centre);
+    int merged = (place.y & MERGED_BIT) != 0u ? 1 : 0;
+    int record = int(place.y & INTERVAL_MASK) * LAYER_WORDS;
+    int radius = int(place.w);
+    int centre = radius * (2 * radius + 1 + merged) + radius;
+    uvec4 look = layers[record + 1];
+    float scale = uintBitsToFloat(merged != 0 ? look.z : look.y) / WEIGHT_MAX;
+    int offset = int(merged != 0 ? layers[record].z : layers[record].y);
+    staged_color[at] = vec4(color.rgb, uintBitsToFloat(place.z));
+    staged_place[at] = ivec4(place_origin_px(place), radius, merged);
+    staged_kernel[at] = ivec2(offset + centre, floatBitsToInt(scale));
 }
 
 // Weight that remains under the accumulation rule.
@@ -95,22 +87,23 @@ void main() {
         int staged = int(min(end - batch, uint(THREADS)));
         for (int i = 0; i < staged; ++i) {
             ivec4 place = staged_place[i];
-            ivec4 centre = staged_kernels[i];
+            ivec2 kernel = staged_kernel[i];
             vec4 color = staged_color[i];
             ivec2 offset = at - place.xy;
             int reach = place.z;
+            int row = 2 * reach + 1 + place.w;
             bool in_columns = offset.x >= -reach && offset.x <= reach + place.w;
-            ivec2 texel = centre.xz + offset.y * centre.yw + offset.x;
+            int texel = kernel.x + offset.y * row + offset.x;
             for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                 bool in_reach = in_columns && offset.y + p >= -reach
                              && offset.y + p <= reach + place.w;
-                ivec2 use = in_reach ? texel : ivec2(0);
-                vec3 weight = mix(atlas_weight(use.x), atlas_weight(use.y), color.a);
-                weight = in_reach ? weight : vec3(0.0);
+                uvec4 pair = texelFetch(atlas, atlas_position(in_reach ? texel : 0), 0);
+                vec3 weight = mix(near_weights(pair), far_weights(pair), color.a);
+                weight *= in_reach ? intBitsToFloat(kernel.y) : 0.0;
                 weight = ruled_weight(weight, coverage[p], place.w != 0, ordered);
                 light[p] += weight * color.rgb;
                 coverage[p] += weight;
-                texel += centre.yw;
+                texel += row;
             }
         }
     }
