@@ -16,8 +16,8 @@ RADIX = 1 << RADIX_BITS
 SORT_KEY_BITS = 16
 PAPER_SORT_KEY_BITS = 24
 """Depth steps within a tile's own depth range.  The paper's rule weighs every pair by
-its order, so it gets finer steps; equal keys keep the order of the list.  Even counts of
-passes, so that the sorted list ends in the buffer it started in."""
+its order, so it gets finer steps; equal keys keep the order of the list.  An even count
+of passes lets the sorted list end in the buffer it started in."""
 
 DISCONTINUITY_PX = 0.25
 """Blur change between neighbours above which they count as two surfaces.  Continuous

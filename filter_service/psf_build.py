@@ -173,7 +173,7 @@ def _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s) -> P
         offsets=offsets[share],
         radius_px=np.array([psf.radius_px for psf in psfs])[share],
         blur_px=np.array([psf.blur_radius_px for psf in psfs])[share],
-        peak=np.array([float(psf.kernel.max()) for psf in psfs])[share],
+        peak_ratio=np.array([float(psf.kernel.max()) for psf in psfs])[share],
         methods=dict(Counter(psf.method for psf in psfs)),
         max_lost_energy_ratio=max(psf.lost_energy_ratio for psf in psfs),
         build_ms=1e3 * (time.perf_counter() - started_s),

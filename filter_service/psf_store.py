@@ -30,7 +30,7 @@ class PsfStore:
         Where a kernel starts and its radius.
     blur_px : (n_psfs,)
         Geometric blur radius.
-    peak : (n_psfs,)
+    peak_ratio : (n_psfs,)
         Largest weight.
     """
 
@@ -43,7 +43,7 @@ class PsfStore:
     offsets: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     blur_px: NDArray[np.float64]
-    peak: NDArray[np.float64]
+    peak_ratio: NDArray[np.float64]
     methods: dict[str, int] = field(default_factory=dict)
     max_lost_energy_ratio: float = 0.0
     build_ms: float = 0.0
@@ -68,7 +68,7 @@ class FrameLayers:
     object_dpt : (n,)
     radius_px : (n,)
         Kernel radius of the interval from this layer to the next.
-    peak : (n,)
+    peak_ratio : (n,)
         Bound on the weights of that interval.
     blur_px : (n,)
         Largest geometric blur radius over the channels.
@@ -78,7 +78,7 @@ class FrameLayers:
 
     object_dpt: NDArray[np.float64]
     radius_px: NDArray[np.int64]
-    peak: NDArray[np.float64]
+    peak_ratio: NDArray[np.float64]
     blur_px: NDArray[np.float64]
     recipes: NDArray[np.uint32]
     pupil_diameter_mm: float
@@ -130,11 +130,11 @@ def frame_layers(
     )
     psfs, weights = blend.neighbours(object_dpt[:, None] + at_infinity_dpt)
     own_px = np.where(weights > 0.0, store.radius_px[psfs], 0).max(axis=(1, 2))
-    own_peak = (weights * store.peak[psfs]).sum(axis=2).max(axis=1)
+    own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
     return FrameLayers(
         object_dpt=object_dpt,
         radius_px=np.maximum(own_px, np.append(own_px[1:], own_px[-1])),
-        peak=np.maximum(own_peak, np.append(own_peak[1:], own_peak[-1])),
+        peak_ratio=np.maximum(own_peak, np.append(own_peak[1:], own_peak[-1])),
         blur_px=blend.blur_px(object_dpt[:, None] + at_infinity_dpt).max(axis=1),
         recipes=_recipes(store, psfs, weights),
         pupil_diameter_mm=pupil_mm,

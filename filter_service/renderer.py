@@ -481,7 +481,7 @@ def _layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
     table[:, 0, 2] = starts[:-1] + single
     table[:, 0, 3] = layers.radius_px
     table[:, 1, 0] = layers.blur_px.astype(np.float32).view(np.uint32)
-    scale = layers.peak.astype(np.float32)
+    scale = layers.peak_ratio.astype(np.float32)
     table[:, 1, 1] = scale.view(np.uint32)
     merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
     table[:, 1, 2] = merged_scale.view(np.uint32)
