@@ -1,0 +1,1 @@
+"""What users copy: the client library and programs that use it."""

@@ -1,0 +1,100 @@
+"""The eyes of the demo, and what a person should look for in each."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A preset, its title, and two lines of caption for each scene."""
+
+    preset: str
+    title: str
+    look_for: dict[str, tuple[str, str]]
+
+
+EYES = (
+    Eye(
+        "emmetropia",
+        "Emmetropia: no error",
+        {
+            "courtyard": (
+                "Sign, lamps and arches are sharp;",
+                "leaves and cup, close by, are a little soft.",
+            ),
+            "primitives": (
+                "It looks at the letter: that is sharp.",
+                "The ball, 12 to 19 cm away, is soft.",
+            ),
+        },
+    ),
+    Eye(
+        "myopia",
+        "Myopia, -6 D",
+        {
+            "courtyard": (
+                "Nothing beyond 16 cm can be sharp: sign and",
+                "menus are gone, lamps are faint discs.",
+            ),
+            "primitives": (
+                "The ball is sharp, the cube nearly,",
+                "the letter is lost in blur.",
+            ),
+        },
+    ),
+    Eye(
+        "astigmatism",
+        "Astigmatism, with myopia",
+        {
+            "courtyard": (
+                "More blur than myopia, and wider across than",
+                "up and down: upright window bars vanish.",
+            ),
+            "primitives": (
+                "Upright edges and the bars' ends blur more",
+                "than the bars' upper and lower edges.",
+            ),
+        },
+    ),
+    Eye(
+        "keratoconus",
+        "Keratoconus",
+        {
+            "courtyard": (
+                "Words stay readable but throw a ghost",
+                "downwards; lamps have tails.",
+            ),
+            "primitives": (
+                "The bars fade above and below, their ends",
+                "hardly: the blur is lopsided.",
+            ),
+        },
+    ),
+    Eye(
+        "cataract",
+        "Cataract (wavefront only)",
+        {
+            "courtyard": (
+                "Letters smear downwards. The haze of a",
+                "cataract is not part of a wavefront.",
+            ),
+            "primitives": (
+                "Upper and lower edges of the bars fade,",
+                "upright edges stay crisp.",
+            ),
+        },
+    ),
+    Eye(
+        "post_lasik",
+        "After presbyopic LASIK",
+        {
+            "courtyard": (
+                "Near menu and far sign are both readable,",
+                "each a little softer than without error.",
+            ),
+            "primitives": (
+                "Letter and ball are both fairly sharp:",
+                "a long range at a small cost.",
+            ),
+        },
+    ),
+)

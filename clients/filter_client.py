@@ -1,0 +1,386 @@
+"""The client library: connect, send a profile, stream RGB-D frames, get them filtered.
+
+    with FilterClient("tcp://127.0.0.1:5577") as client:
+        client.set_profile({"kind": "preset", "name": "keratoconus"})
+        view = RgbdView(color, depth_m, tangents_from_fov(60.0, 640, 360))
+        reply = client.filter(view, pupil_diameter_mm=4.0, focus_dpt=0.0)
+
+`filter` sends one frame and waits for it.  `submit` and `poll` are for live streams:
+at most ``max_in_flight`` frames are on their way, and of those that wait at the client
+only the newest is kept.  Every frame submitted comes back from `poll` once, as a
+`FilteredFrame`, a `Dropped` or an `ErrorReply`.
+
+After a restart of the service the client says hello and sends its profile again by
+itself.  Every wait ends in time with an error that says what was awaited.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from clients.connection import SendBufferPool
+from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
+from clients.rgbd_view import RgbdView, tangents_from_fov
+from filter_service.errors import FilterError
+from filter_service.messages import (
+    DEFAULT_ENDPOINT,
+    LINEAR,
+    SRGB8,
+    Accepted,
+    Camera,
+    Dropped,
+    ErrorReply,
+    Frame,
+    Ping,
+    Pong,
+    ProfileRequest,
+    ProfileSettings,
+    Progress,
+    Ready,
+    ViewImages,
+    Welcome,
+    encode,
+)
+
+__all__ = [
+    "Event",
+    "FilterClient",
+    "FilteredFrame",
+    "RgbdView",
+    "tangents_from_fov",
+]
+
+OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR}
+
+
+class FilterClient:
+    """A session with the filter service.  One thread at a time may use it.
+
+    Parameters
+    ----------
+    endpoint : str
+        Where the service listens.
+    timeout_s : float
+        The longest wait for an answer, unless a call says otherwise.
+    max_in_flight : int
+        Frames on their way at once.  1 keeps a live stream freshest (the age of a
+        frame is 1.2 filter periods instead of 2.2); the service's credit, 2 by
+        default, gives the highest rate.
+    client_name : str
+        Appears in the service's log.
+    """
+
+    def __init__(
+        self,
+        endpoint: str = DEFAULT_ENDPOINT,
+        *,
+        timeout_s: float = 10.0,
+        max_in_flight: int = 1,
+        client_name: str = "filter_client",
+    ) -> None:
+        if not timeout_s > 0:
+            raise ValueError(f"timeout_s is {timeout_s}; allowed: above 0")
+        if max_in_flight < 1:
+            raise ValueError(f"max_in_flight is {max_in_flight}; allowed: 1 or more")
+        self.timeout_s = timeout_s
+        self._link = ServiceLink(endpoint, max_in_flight, client_name)
+        self._pool = SendBufferPool(timeout_s)
+        self._next_frame_id = 0
+        self._next_profile_id = 0
+
+    def __enter__(self) -> FilterClient:
+        """Connect; return when the service has answered hello."""
+        try:
+            self.hello()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """End the session."""
+        self.close()
+
+    def hello(self, timeout_s: float | None = None) -> Welcome:
+        """Wait until the service has answered hello; return its welcome.
+
+        Raises
+        ------
+        ServiceTimeout, TooManySessions, VersionMismatch
+        """
+        limit_s = self.timeout_s if timeout_s is None else timeout_s
+        self._link.wait_until(
+            lambda: self._link.welcome is not None, limit_s, "an answer to hello"
+        )
+        return self._link.welcome
+
+    @property
+    def welcome(self) -> Welcome | None:
+        """Return what the service said of itself, None while it is not there."""
+        return self._link.welcome
+
+    def close(self) -> None:
+        """End the session; closing twice is allowed."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    # Profiles
+
+    def set_profile(
+        self,
+        body: Mapping[str, Any],
+        *,
+        settings: Mapping[str, Any] | None = None,
+        views: Sequence[Camera | RgbdView] = (),
+        wait: bool = True,
+        on_progress: Callable[[Progress], None] | None = None,
+        timeout_s: float = 120.0,
+    ) -> Ready | Accepted:
+        """Change the eye; frames go on through the old one until it is ready.
+
+        Parameters
+        ----------
+        body : mapping
+            The profile, as in ``{"kind": "preset", "name": "myopia"}``.
+        settings : mapping, optional
+            Fields of `ProfileSettings` that differ from the defaults.
+        views : sequence, optional
+            The cameras to prepare for.  Without them the service prepares for those
+            of the last frame; before any frame there is nothing to prepare, and
+            Accepted is returned with ``is_building`` false.
+        wait : bool
+            Return only when the profile is ready; otherwise as soon as it is accepted
+            (`poll` then hands out Progress and Ready).
+        on_progress : callable, optional
+            Called with each Progress while waiting.
+
+        Raises
+        ------
+        UnknownProfile, GridTooLarge, BuildFailed, WorkerCrashed, ServiceTimeout
+            After any of them the eye that was in use before stays in use.
+        """
+        cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
+        request = ProfileRequest(
+            self._next_profile_id,
+            dict(body),
+            ProfileSettings(**(settings or {})),
+            cameras,
+        )
+        parts = encode(request)  # before any state changes: it may refuse the body
+        self.hello()
+        self._next_profile_id += 1
+        previous, self._link.profile = self._link.profile, request
+        self._link.say(parts)
+        try:
+            return self._await_profile(request, wait, on_progress, timeout_s)
+        except FilterError:
+            # After a restart of the service the last good profile is sent again.
+            self._link.profile = previous
+            raise
+
+    def _await_profile(
+        self,
+        request: ProfileRequest,
+        wait: bool,
+        on_progress: Callable[[Progress], None] | None,
+        timeout_s: float,
+    ) -> Ready | Accepted:
+        profile_id = request.profile_id
+        deadline_s = time.monotonic() + timeout_s
+        n_ready = 0
+        while True:
+            for event in self._link.take_events(
+                lambda e: getattr(e, "profile_id", None) == profile_id
+            ):
+                if isinstance(event, ErrorReply):
+                    raise event.exception()
+                if isinstance(event, Progress) and on_progress is not None:
+                    on_progress(event)
+                if isinstance(event, Ready):
+                    n_ready += 1
+                    if n_ready >= len(_distinct_pitches(request.cameras)):
+                        return event
+                if isinstance(event, Accepted) and not (wait and event.is_building):
+                    return event
+            self._link.pump_before(deadline_s, f"profile {profile_id} to become ready")
+
+    # Frames
+
+    def filter(
+        self,
+        views: RgbdView | Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        output: str = "srgb8",
+        accumulation: str = "coverage",
+        merge: bool = True,
+        timeout_s: float | None = None,
+    ) -> FilteredFrame:
+        """Send one frame and return it filtered.
+
+        Where the service is still preparing the eye for this camera, or has just been
+        restarted, the frame is sent again until the time is over.
+
+        Raises
+        ------
+        ProtocolError, SessionError, RenderError, ServiceTimeout
+        """
+        limit_s = self.timeout_s if timeout_s is None else timeout_s
+        deadline_s = time.monotonic() + limit_s
+        while True:
+            frame_id = self.submit(
+                views,
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                output=output,
+                accumulation=accumulation,
+                merge=merge,
+            )
+            answer = self._await_frame(frame_id, deadline_s)
+            if isinstance(answer, FilteredFrame):
+                return answer
+            if isinstance(answer, ErrorReply):
+                raise answer.exception()
+            if answer.reason == "preparing":
+                self._await_ready(deadline_s)
+
+    def _await_frame(
+        self, frame_id: int, deadline_s: float
+    ) -> FilteredFrame | Dropped | ErrorReply:
+        while True:
+            answers = self._link.take_events(
+                lambda e: getattr(e, "frame_id", None) == frame_id
+            )
+            if answers:
+                return answers[0]
+            self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
+
+    def _await_ready(self, deadline_s: float) -> None:
+        """Wait for the eye that is being prepared; a failed build raises."""
+        profile = self._link.profile
+        profile_id = None if profile is None else profile.profile_id
+        while True:
+            for event in self._link.take_events(
+                lambda e: (
+                    isinstance(e, Ready | ErrorReply) and e.profile_id == profile_id
+                )
+            ):
+                if isinstance(event, ErrorReply):
+                    raise event.exception()
+                return
+            self._link.pump_before(deadline_s, "the eye to be prepared for this camera")
+
+    def submit(
+        self,
+        views: RgbdView | Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        output: str = "srgb8",
+        accumulation: str = "coverage",
+        merge: bool = True,
+    ) -> int:
+        """Hand over a frame without waiting; return its frame_id.
+
+        The images are copied, so the caller may reuse its arrays at once.  If the
+        service is busy the frame waits here, and a frame that already waits is
+        dropped for it with the reason ``superseded``.
+        """
+        if output not in OUTPUTS:
+            raise ValueError(f"output is {output!r}; allowed: {', '.join(OUTPUTS)}")
+        items = (views,) if isinstance(views, RgbdView) else tuple(views)
+        self._check_limits(items)
+        buffers, images = [], []
+        for item in items:
+            color_buffer, color = self._pool.copy_in(item.color)
+            depth_buffer, depth_m = self._pool.copy_in(item.depth_m)
+            buffers += [color_buffer, depth_buffer]
+            images.append(ViewImages(color, depth_m))
+        frame = Frame(
+            frame_id=self._next_frame_id,
+            views=tuple(item.header for item in items),
+            pupil_diameter_mm=float(pupil_diameter_mm),
+            focus_dpt=float(focus_dpt),
+            output=OUTPUTS[output],
+            accumulation=accumulation,
+            merge=merge,
+            images=tuple(images),
+        )
+        self._next_frame_id += 1
+        self._link.submit(
+            Outgoing(frame.frame_id, encode(frame), buffers, time.monotonic())
+        )
+        return frame.frame_id
+
+    def _check_limits(self, views: Sequence[RgbdView]) -> None:
+        """Refuse what the service would cut the connection for."""
+        if self.welcome is None:
+            return
+        limits = self.welcome.limits
+        if not 1 <= len(views) <= limits.max_views:
+            raise ValueError(f"{len(views)} views; allowed: 1 to {limits.max_views}")
+        for view in views:
+            camera = view.camera
+            if (
+                camera.width_px > limits.max_width_px
+                or camera.height_px > limits.max_height_px
+                or view.color.nbytes > limits.max_part_bytes
+            ):
+                raise ValueError(
+                    f"a view has {camera.width_px} x {camera.height_px} px and "
+                    f"{view.color.nbytes} bytes; allowed: {limits.max_width_px} x "
+                    f"{limits.max_height_px} px and {limits.max_part_bytes} bytes"
+                )
+
+    def poll(self, timeout_s: float = 0.0) -> list[Event]:
+        """Return what has happened; wait up to ``timeout_s`` if nothing has.
+
+        Messages about profiles are in the list too.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        self._link.pump(0.0)
+        while not self._link.has_events:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0:
+                break
+            self._link.pump(remaining_s)
+        return self._link.take_events(lambda event: True)
+
+    @property
+    def n_unanswered(self) -> int:
+        """Return how many submitted frames are still waiting or on their way."""
+        return len(self._link.in_flight) + (self._link.pending is not None)
+
+    @property
+    def n_superseded(self) -> int:
+        """Return how many frames were dropped at the client for a newer one."""
+        return self._link.n_superseded
+
+    def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
+        """Return (round trip in ms, the state of the service's render loop)."""
+        limit_s = self.timeout_s if timeout_s is None else timeout_s
+        self.hello(limit_s)
+        self._link.pongs.clear()
+        start_s = time.monotonic()
+        self._link.say(encode(Ping(start_s)))
+        self._link.wait_until(
+            lambda: bool(self._link.pongs), limit_s, "an answer to ping"
+        )
+        return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]
+
+
+def _distinct_pitches(cameras: Sequence[Camera]) -> set[tuple[float, float]]:
+    """Return the pixel pitches that the service builds for, one Ready each."""
+    pitches: list[tuple[float, float]] = []
+    for camera in cameras:
+        pitch = camera.pixel_pitch_mrad
+        if not any(
+            all(abs(a / b - 1) <= 1e-3 for a, b in zip(pitch, known, strict=True))
+            for known in pitches
+        ):
+            pitches.append(pitch)
+    return set(pitches)

@@ -1,0 +1,330 @@
+"""Latency benchmark: pre-rendered frames on a fixed schedule through the service.
+
+    python -m clients.latency --spawn --size 1280x720 --rate-hz 30 --seconds 10
+    python -m clients.latency --endpoint tcp://127.0.0.1:5577 --json out.json
+
+The schedule is open-loop: a frame is due when it is due, whether or not earlier ones
+have come back, and ages count from there.  `ocufilter bench roundtrip` is this program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.latency_report import (
+    SERVICE_STAGES,
+    LatencyRun,
+    as_json,
+    as_table,
+    save_plot,
+    summary,
+)
+from clients.rgbd_view import tangents_from_fov
+from clients.service_process import ServiceProcess
+from filter_service.errors import FilterError
+from filter_service.messages import Dropped, ErrorReply
+
+N_FRAMES = 8  # in the loop that is sent
+VERTICAL_FOV_DEG = 45.0
+DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}'
+STRAGGLER_S = 10.0
+STDOUT = "-"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is streamed and how."""
+
+    width_px: int
+    height_px: int
+    n_views: int
+    rate_hz: float
+    duration_s: float
+    profile: dict[str, Any]
+    profile_settings: dict[str, Any]
+    pupil_diameter_mm: float
+    focus_dpt: float
+    output: str
+    max_in_flight: int
+
+    @property
+    def case(self) -> str:
+        """Return what is streamed, in words."""
+        views = "" if self.n_views == 1 else f"{self.n_views} x "
+        eye = self.profile.get("name", self.profile.get("kind", "profile"))
+        return (
+            f"{views}{self.width_px}x{self.height_px} {self.output}, {eye}, "
+            f"{self.pupil_diameter_mm:g} mm, {self.focus_dpt:g} dpt"
+        )
+
+    @property
+    def setting(self) -> str:
+        """Return how it is streamed, in words."""
+        schedule = f"{self.rate_hz:g} Hz for {self.duration_s:g} s"
+        return f"{schedule}, {self.max_in_flight} in flight"
+
+
+def make_frames(settings: Settings) -> list[list[RgbdView]]:
+    """Return a loop of frames: a slanted checkered floor and a near disc that moves."""
+    width_px, height_px = settings.width_px, settings.height_px
+    tangents = tangents_from_fov(VERTICAL_FOV_DEG, width_px, height_px)
+    x, y = np.meshgrid(np.arange(width_px), np.arange(height_px))
+    cell_px = max(height_px // 24, 2)
+    checks = ((x // cell_px + y // cell_px) % 2).astype(np.float32)
+    depth_m = (6.0 - 5.0 * y / height_px).astype(np.float32)
+    frames = []
+    for k in range(N_FRAMES):
+        center_x = width_px * (0.2 + 0.6 * k / (N_FRAMES - 1))
+        near = (x - center_x) ** 2 + (y - height_px / 2) ** 2 < (height_px / 6) ** 2
+        color = np.stack([0.2 + 0.6 * checks, y / height_px, x / width_px], axis=-1)
+        color[near] = (0.9, 0.7, 0.2)
+        image = np.rint(255 * color).astype(np.uint8)
+        depth = np.where(near, np.float32(0.5), depth_m)
+        if settings.output == "linear":
+            image = (color.astype(np.float32)) ** np.float32(2.2)
+        frames.append([RgbdView(image, depth, tangents)] * settings.n_views)
+    return frames
+
+
+def measure(client: FilterClient, settings: Settings, read_memory_mb) -> LatencyRun:
+    """Prepare the eye, warm up, and send the frames on their schedule."""
+    frames = make_frames(settings)
+    look = {
+        "pupil_diameter_mm": settings.pupil_diameter_mm,
+        "focus_dpt": settings.focus_dpt,
+        "output": settings.output,
+    }
+    client.set_profile(
+        settings.profile, settings=settings.profile_settings, views=frames[0]
+    )
+    first_replies = [client.filter(frame, **look, timeout_s=60) for frame in frames]
+    welcome = client.hello()
+    run = LatencyRun(settings.case, settings.setting, welcome.server["gl_renderer"])
+    run.memory_start_mb = read_memory_mb()
+    loop = _Loop(client, run, [reply.colors for reply in first_replies])
+    start_s = time.monotonic()
+    run.n_scheduled = max(1, round(settings.rate_hz * settings.duration_s))
+    for k in range(run.n_scheduled):
+        loop.take_until(start_s + k / settings.rate_hz)
+        frame_id = client.submit(frames[k % N_FRAMES], **look)
+        loop.due[frame_id] = (start_s + k / settings.rate_hz, k % N_FRAMES)
+    end_s = time.monotonic() + STRAGGLER_S
+    while client.n_unanswered and time.monotonic() < end_s:
+        loop.take_until(time.monotonic() + 0.01)
+    loop.take_until(time.monotonic())
+    run.drops["unanswered"] += client.n_unanswered
+    run.drops += type(run.drops)()  # drops what was counted zero times
+    run.duration_s = time.monotonic() - start_s
+    run.due_s = [due_s - start_s for due_s in run.due_s]
+    run.memory_end_mb = read_memory_mb()
+    return run
+
+
+class _Loop:
+    """Takes in replies between two frames that are due."""
+
+    def __init__(self, client: FilterClient, run: LatencyRun, first_colors) -> None:
+        self._client = client
+        self._run = run
+        self._first_colors = first_colors
+        self.due: dict[int, tuple[float, int]] = {}
+
+    def take_until(self, end_s: float) -> None:
+        while True:
+            remaining_s = end_s - time.monotonic()
+            for event in self._client.poll(max(0.0, remaining_s)):
+                self._take(event)
+            if time.monotonic() >= end_s:
+                return
+
+    def _take(self, event: object) -> None:
+        if isinstance(event, FilteredFrame):
+            now_s = time.monotonic()
+            due_s, index = self.due.pop(event.frame_id)
+            age_ms = 1000 * (now_s - due_s)
+            header = event.header
+            stages_ms = header.stage_times_ms
+            wire_ms = event.round_trip_ms - header.total_ms
+            own_ms = sum(stages_ms.get(name, 0.0) for name in SERVICE_STAGES)
+            times_ms = {
+                "client_wait_ms": age_ms - event.round_trip_ms,
+                "wire_and_queue_ms": wire_ms,
+                **stages_ms,
+                "added_ms": wire_ms + own_ms,
+                "service_total_ms": header.total_ms,
+                "round_trip_ms": event.round_trip_ms,
+                "age_ms": age_ms,
+            }
+            self._run.add(due_s, times_ms)
+            self._compare(event, index)
+        elif isinstance(event, Dropped):
+            self._run.drops[event.reason] += 1
+        elif isinstance(event, ErrorReply):
+            raise event.exception()
+
+    def _compare(self, event: FilteredFrame, index: int) -> None:
+        """Compare with the first reply to this frame, on every 16th pixel: cheap."""
+        for first, now in zip(self._first_colors[index], event.colors, strict=True):
+            part = slice(None, None, 4)
+            difference = first[part, part].astype(np.float32) - now[part, part]
+            self._run.max_repeat_difference = max(
+                self._run.max_repeat_difference, float(np.abs(difference).max())
+            )
+
+
+@contextlib.contextmanager
+def connect(endpoint: str | None, max_in_flight: int) -> Iterator[tuple]:
+    """Yield (client, how to read the service's memory); spawn a service if need be."""
+    with contextlib.ExitStack() as stack:
+        service = None
+        if endpoint is None:
+            service = stack.enter_context(ServiceProcess())
+            endpoint = service.endpoint
+        client = stack.enter_context(
+            FilterClient(
+                endpoint, max_in_flight=max_in_flight, client_name="latency benchmark"
+            )
+        )
+        if service is not None:
+            yield client, lambda: service.memory_mb
+        else:
+            yield client, lambda: client.ping(timeout_s=30)[1].memory_mb
+
+
+def read_profile(text: str) -> dict[str, Any]:
+    """Return a profile from JSON text, a JSON file, or the name of a preset."""
+    if not text.lstrip().startswith("{"):
+        path = Path(text)
+        if path.suffix != ".json":
+            return {"kind": "preset", "name": text}
+        text = path.read_text(encoding="utf-8")
+    return read_object("--profile", text)
+
+
+def read_object(option: str, text: str) -> dict[str, Any]:
+    """Return a JSON object from the command line."""
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{option} is no JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{option} is {value!r}; allowed: a JSON object")
+    return value
+
+
+def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m clients.latency", description=__doc__.splitlines()[0]
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--endpoint", help="a running service")
+    where.add_argument("--spawn", action="store_true", help="start a service (default)")
+    parser.add_argument("--size", default="1280x720", help="WxH in px")
+    parser.add_argument("--views", type=int, default=1, help="1, or 2 for stereo")
+    parser.add_argument("--rate-hz", type=float, default=30.0)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument(
+        "--profile", default=DEFAULT_PROFILE, help="preset, JSON text or .json file"
+    )
+    parser.add_argument(
+        "--settings",
+        default="{}",
+        help='JSON with a profile\'s settings, as {"pupil_range_mm": [3, 5]}',
+    )
+    parser.add_argument("--pupil-mm", type=float, default=4.0)
+    parser.add_argument("--focus-dpt", type=float, default=0.0)
+    parser.add_argument("--output", choices=("srgb8", "linear"), default="srgb8")
+    parser.add_argument("--in-flight", type=int, default=1)
+    parser.add_argument(
+        "--json",
+        nargs="?",
+        const=STDOUT,
+        metavar="OUT",
+        help="write JSON to a file, or to stdout and nothing else there",
+    )
+    parser.add_argument("--plot", type=Path, metavar="OUT.png")
+    parser.add_argument("--quick", action="store_true", help="320x180 for 3 s")
+    return parser.parse_args(arguments)
+
+
+def read_settings(arguments: argparse.Namespace) -> Settings:
+    """Return the settings of a command line.
+
+    Raises
+    ------
+    ValueError
+        Names the option.
+    """
+    size = "320x180" if arguments.quick else arguments.size
+    sides = size.lower().split("x")
+    if len(sides) != 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
+        raise ValueError(f"--size is {size!r}; allowed: WIDTHxHEIGHT in px")
+    if not 0 < arguments.rate_hz <= 1000:
+        raise ValueError(f"--rate-hz is {arguments.rate_hz:g}; allowed: up to 1000")
+    if not arguments.seconds > 0:
+        raise ValueError(f"--seconds is {arguments.seconds:g}; allowed: above 0")
+    return Settings(
+        width_px=int(sides[0]),
+        height_px=int(sides[1]),
+        n_views=arguments.views,
+        rate_hz=arguments.rate_hz,
+        duration_s=3.0 if arguments.quick else arguments.seconds,
+        profile=read_profile(arguments.profile),
+        profile_settings=read_object("--settings", arguments.settings),
+        pupil_diameter_mm=arguments.pupil_mm,
+        focus_dpt=arguments.focus_dpt,
+        output=arguments.output,
+        max_in_flight=arguments.in_flight,
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark; return the exit code."""
+    parsed = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+    try:
+        settings = read_settings(parsed)
+        with connect(parsed.endpoint, settings.max_in_flight) as (client, memory):
+            run = measure(client, settings, memory)
+    except ValueError as error:
+        print(f"latency: {error}", file=sys.stderr)
+        return 2
+    except (FilterError, OSError, RuntimeError) as error:
+        print(f"latency: {error}", file=sys.stderr)
+        return 1
+    if run.n_filtered == 0:
+        print(f"latency: no frame was filtered: {dict(run.drops)}", file=sys.stderr)
+        return 1
+    report(run, parsed)
+    return 0
+
+
+def report(run: LatencyRun, parsed: argparse.Namespace) -> None:
+    """Write table, JSON and plot to where they were asked for."""
+    console = Console(stderr=parsed.json == STDOUT)
+    console.print(as_table(run))
+    console.print(summary(run), highlight=False)
+    if parsed.plot is not None:
+        save_plot(run, parsed.plot)
+    if parsed.json == STDOUT:
+        print(json.dumps(as_json(run)))
+    elif parsed.json is not None:
+        path = Path(parsed.json)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(as_json(run), indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

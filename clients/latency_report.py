@@ -1,0 +1,189 @@
+"""What a latency run measured, as numbers, table, JSON and picture."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+PERCENTILES = (50, 95, 99)
+CLIENT_STAGES = ("client_wait_ms", "wire_and_queue_ms")
+SERVICE_STAGES = ("decode_ms", "queue_ms", "other_ms")  # not the renderer's
+SUMS = ("added_ms", "service_total_ms", "round_trip_ms", "age_ms")
+
+
+@dataclass
+class LatencyRun:
+    """Samples of one run; one entry per filtered frame.
+
+    Attributes
+    ----------
+    case, setting : str
+        What was streamed and how.
+    stages_ms : dict of lists
+        ``client_wait_ms`` from the schedule to the send; ``wire_and_queue_ms`` what
+        the round trip has beyond the service's own total; the service's stages;
+        ``added_ms`` what the round trip has beyond the renderer's stages;
+        ``service_total_ms``, ``round_trip_ms``, and ``age_ms`` from the schedule to the
+        reply (a late client does not hide: the schedule never waits).
+    due_s : list
+        When each filtered frame was scheduled, from the start of the run.
+    max_repeat_difference : float
+        Largest difference between two replies to the same frame, in units of the
+        output (levels of 255, or linear light): mixed up or torn images would show.
+    """
+
+    case: str
+    setting: str
+    gl_renderer: str
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+    due_s: list[float] = field(default_factory=list)
+    drops: Counter = field(default_factory=Counter)
+    n_scheduled: int = 0
+    duration_s: float = 0.0
+    memory_start_mb: float = 0.0
+    memory_end_mb: float = 0.0
+    max_repeat_difference: float = 0.0
+
+    def add(self, due_s: float, times_ms: dict[str, float]) -> None:
+        """Add one filtered frame."""
+        self.due_s.append(due_s)
+        for name, value_ms in times_ms.items():
+            self.stages_ms.setdefault(name, []).append(value_ms)
+
+    @property
+    def n_filtered(self) -> int:
+        """Return how many frames came back filtered."""
+        return len(self.due_s)
+
+    def stage_names(self) -> list[str]:
+        """Return the stages in the order in which a frame passes them, then sums."""
+        inner = [n for n in self.stages_ms if n not in (*CLIENT_STAGES, *SUMS)]
+        ordered = [*CLIENT_STAGES, *inner, *SUMS]
+        return [name for name in ordered if name in self.stages_ms]
+
+    def percentiles_ms(self, name: str) -> dict[int, float]:
+        """Return p50, p95 and p99 of one stage."""
+        values = np.percentile(self.stages_ms[name], PERCENTILES)
+        return dict(zip(PERCENTILES, values.tolist(), strict=True))
+
+
+def as_json(run: LatencyRun) -> dict[str, Any]:
+    """Return the run in the form of every `ocufilter bench`: no time without error."""
+    rows = []
+    for name in run.stage_names():
+        p = run.percentiles_ms(name)
+        rows.append(
+            {
+                "bench": "roundtrip",
+                "method": name,
+                "case": run.case,
+                "setting": run.setting,
+                "n": run.n_filtered,
+                "median_ms": p[50],
+                "p95_ms": p[95],
+                "p99_ms": p[99],
+                "memory_mb": run.memory_end_mb,
+                "error_name": "max_abs_repeat_difference",
+                "error": run.max_repeat_difference,
+                "reference": "first reply to the same frame",
+            }
+        )
+    return {
+        "machine": machine() | {"gl_renderer": run.gl_renderer},
+        "commit": commit(),
+        "rows": rows,
+        "frames": {
+            "scheduled": run.n_scheduled,
+            "filtered": run.n_filtered,
+            "dropped": dict(run.drops),
+            "filtered_hz": run.n_filtered / run.duration_s,
+        },
+        "service_memory_mb": {"start": run.memory_start_mb, "end": run.memory_end_mb},
+    }
+
+
+def as_table(run: LatencyRun) -> Table:
+    """Return the run as a table for a terminal."""
+    table = Table(title=f"{run.case}, {run.setting}", title_justify="left")
+    table.add_column("stage")
+    for percentile in PERCENTILES:
+        table.add_column(f"p{percentile} [ms]", justify="right")
+    for name in run.stage_names():
+        if name == SUMS[0]:
+            table.add_section()
+        values = run.percentiles_ms(name).values()
+        table.add_row(name.removesuffix("_ms"), *(f"{value:.2f}" for value in values))
+    return table
+
+
+def summary(run: LatencyRun) -> str:
+    """Return the run in one line."""
+    dropped = ", ".join(f"{n} {reason}" for reason, n in run.drops.items()) or "none"
+    return (
+        f"{run.n_filtered} of {run.n_scheduled} frames filtered "
+        f"({run.n_filtered / run.duration_s:.1f} Hz), dropped: {dropped}; service "
+        f"memory {run.memory_start_mb:.0f} to {run.memory_end_mb:.0f} MB; largest "
+        f"difference between replies to one frame {run.max_repeat_difference:g}"
+    )
+
+
+def save_plot(run: LatencyRun, path: Path) -> None:
+    """Write a picture: age over the run, and the stages."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (over_time, by_stage) = pyplot.subplots(1, 2, figsize=(12, 4.5))
+    over_time.plot(run.due_s, run.stages_ms["age_ms"], ".", label="age of the reply")
+    over_time.plot(
+        run.due_s, run.stages_ms["service_total_ms"], ".", label="time in the service"
+    )
+    over_time.set(xlabel="scheduled at [s]", ylabel="[ms]", title=run.case)
+    over_time.set_ylim(bottom=0)
+    over_time.legend()
+    names = [name for name in run.stage_names() if name not in SUMS][::-1]
+    places = np.arange(len(names))
+    for offset, percentile in zip((0.25, 0.0, -0.25), PERCENTILES, strict=True):
+        values = [run.percentiles_ms(name)[percentile] for name in names]
+        by_stage.barh(places + offset, values, height=0.25, label=f"p{percentile}")
+    by_stage.set_yticks(places, [name.removesuffix("_ms") for name in names])
+    by_stage.set(xlabel="[ms]", title=run.setting)
+    by_stage.legend()
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def machine() -> dict[str, Any]:
+    """Return what the times depend on."""
+    import os
+
+    return {
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def commit() -> str:
+    """Return the commit of this checkout, or ``unknown``."""
+    try:
+        finished = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return finished.stdout.strip()

@@ -1,0 +1,262 @@
+"""The client's side of the protocol: hello, what is in flight, what has happened.
+
+`filter_client` is the interface to use; this file keeps its state.  There is no
+thread: everything happens inside `ServiceLink.pump`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clients.connection import Connection, SendBuffer
+from filter_service.errors import FilterError, NoSession, ServiceTimeout
+from filter_service.messages import (
+    Accepted,
+    Alive,
+    Bye,
+    Dropped,
+    ErrorReply,
+    Hello,
+    Pong,
+    ProfileRequest,
+    Progress,
+    Ready,
+    Result,
+    Welcome,
+    decode_reply,
+    encode,
+)
+
+MAX_KEPT_PROGRESS = 1000
+RETRY_SEND_S = 0.002  # a new connection takes messages a moment after it is reported
+
+
+@dataclass(frozen=True)
+class FilteredFrame:
+    """A filtered frame.
+
+    ``colors`` holds one image per view; ``header`` what the service says about it.
+    ``age_ms`` counts from `submit`, ``round_trip_ms`` from the send.
+    """
+
+    frame_id: int
+    colors: tuple[NDArray[Any], ...]
+    header: Result
+    age_ms: float
+    round_trip_ms: float
+
+    @property
+    def color(self) -> NDArray[Any]:
+        """Return the first view's image, (height, width, 3)."""
+        return self.colors[0]
+
+
+Event = FilteredFrame | Dropped | ErrorReply | Ready | Progress | Accepted
+
+
+@dataclass
+class Outgoing:
+    """A frame that is packed and waits to be sent, or was sent and is not answered."""
+
+    frame_id: int
+    parts: list[Any]
+    buffers: list[SendBuffer]
+    submitted_s: float
+    sent_s: float = 0.0
+
+    def release(self) -> None:
+        """Let the pool have the memory back, once it is sent; only once."""
+        for buffer in self.buffers:
+            buffer.is_held = False
+        self.parts, self.buffers = [], []
+
+
+class ServiceLink:
+    """What one client knows of its session.
+
+    Parameters
+    ----------
+    endpoint : str
+        Where the service listens.
+    max_in_flight : int
+        Frames on their way at once; the service's credit bounds it too.
+    client_name : str
+        Sent with hello.
+    """
+
+    def __init__(self, endpoint: str, max_in_flight: int, client_name: str) -> None:
+        self.welcome: Welcome | None = None
+        self.profile: ProfileRequest | None = None
+        self.pending: Outgoing | None = None
+        self.in_flight: dict[int, Outgoing] = {}
+        self.pongs: list[Pong] = []
+        self.n_superseded = 0
+        self._max_in_flight = max_in_flight
+        self._client_name = client_name
+        self._connection = Connection(endpoint)
+        self._outbox: list[list[Any]] = []
+        self._events: list[Event] = []
+        self._refusal: FilterError | None = None
+
+    def close(self) -> None:
+        """Say bye if anybody listens, and close the socket."""
+        if self._connection.is_up:
+            self._connection.send(encode(Bye()))
+        self._connection.close()
+
+    def say(self, parts: list[Any]) -> None:
+        """Send a control message as soon as the connection takes it, in order."""
+        self._outbox.append(parts)
+
+    def submit(self, outgoing: Outgoing) -> None:
+        """Make this the frame to be sent next; one that still waits is superseded."""
+        if self.pending is not None:
+            self.n_superseded += 1
+            self._drop(self.pending, "superseded")
+        self.pending = outgoing
+        self.pump(0.0)
+
+    def take_events(self, is_wanted: Callable[[Event], bool]) -> list[Event]:
+        """Return and forget the events that are wanted, oldest first."""
+        wanted = [event for event in self._events if is_wanted(event)]
+        self._events = [event for event in self._events if not is_wanted(event)]
+        return wanted
+
+    @property
+    def has_events(self) -> bool:
+        """Return whether anything has happened that was not taken."""
+        return bool(self._events)
+
+    def wait_until(
+        self, is_done: Callable[[], bool], timeout_s: float, what: str
+    ) -> None:
+        """Pump until something is so; ServiceTimeout says what was awaited."""
+        deadline_s = time.monotonic() + timeout_s
+        self.pump(0.0)
+        while not is_done():
+            self.pump_before(deadline_s, what)
+
+    def pump_before(self, deadline_s: float, what: str) -> None:
+        """Pump once, or raise where the time is over or the service refused hello."""
+        remaining_s = deadline_s - time.monotonic()
+        if remaining_s <= 0:
+            raise ServiceTimeout(
+                f"waited in vain for {what}: {self._connection.endpoint} is "
+                f"{self._connection.describe()}. Is the service running there? "
+                f"`ocufilter serve --bind {self._connection.endpoint}` starts it"
+            )
+        self.pump(min(remaining_s, 0.5))
+        if self._refusal is not None:
+            refusal, self._refusal = self._refusal, None
+            raise refusal
+
+    def pump(self, timeout_s: float) -> None:
+        """Wait for something to happen, once; handle it, send what may be sent."""
+        is_due = bool(self._outbox) and self._connection.is_up
+        self._connection.wait(min(timeout_s, RETRY_SEND_S) if is_due else timeout_s)
+        for is_up in self._connection.changes():
+            if is_up:
+                self.greet()
+            else:
+                self._lose_connection()
+        while (parts := self._connection.receive()) is not None:
+            self._handle(decode_reply([part.buffer for part in parts]))
+        self._send_waiting()
+
+    def greet(self) -> None:
+        """Say hello; the first connection and every later one take the same way."""
+        self.welcome = None
+        self._refusal = None
+        self._outbox = [encode(Hello(self._client_name))]
+        if self.profile is not None:
+            self._outbox.append(encode(self.profile))
+
+    def _lose_connection(self) -> None:
+        self.welcome = None
+        self._outbox = []
+        for outgoing in self.in_flight.values():
+            self._drop(outgoing, "connection_lost")
+        self.in_flight.clear()
+
+    def _drop(self, outgoing: Outgoing, reason: str) -> None:
+        outgoing.release()
+        self._events.append(Dropped(outgoing.frame_id, reason))
+
+    def _send_waiting(self) -> None:
+        if not self._connection.is_up:
+            return
+        while self._outbox:
+            if not self._connection.send(self._outbox[0]):
+                return
+            self._outbox.pop(0)
+        if self.pending is None or self.welcome is None:
+            return
+        if len(self.in_flight) >= min(self._max_in_flight, self.welcome.credit):
+            return
+        outgoing = self.pending
+        outgoing.sent_s = time.monotonic()
+        if self._connection.send(outgoing.parts, outgoing.buffers):
+            self.pending = None
+            self.in_flight[outgoing.frame_id] = outgoing
+            outgoing.release()
+
+    def _handle(self, reply: Any) -> None:
+        if isinstance(reply, Result | Dropped):
+            self._finish_frame(reply)
+        elif isinstance(reply, ErrorReply):
+            self._handle_error(reply)
+        elif isinstance(reply, Welcome):
+            self.welcome = reply
+        elif isinstance(reply, Pong):
+            self.pongs.append(reply)
+        elif not isinstance(reply, Alive):
+            self._events.append(reply)
+            self._bound_progress()
+
+    def _bound_progress(self) -> None:
+        """Forget the oldest progress of a program that never polls for it."""
+        if len(self._events) > MAX_KEPT_PROGRESS:
+            progress = (e for e in self._events if isinstance(e, Progress))
+            oldest = next(progress, None)
+            if oldest is not None:
+                self._events.remove(oldest)
+
+    def _finish_frame(self, reply: Result | Dropped) -> None:
+        outgoing = self.in_flight.pop(reply.frame_id, None)
+        if outgoing is None:
+            return  # reported already, as lost with an earlier connection
+        if isinstance(reply, Dropped):
+            self._events.append(reply)
+            return
+        now_s = time.monotonic()
+        self._events.append(
+            FilteredFrame(
+                frame_id=reply.frame_id,
+                colors=reply.colors,
+                header=reply,
+                age_ms=1000 * (now_s - outgoing.submitted_s),
+                round_trip_ms=1000 * (now_s - outgoing.sent_s),
+            )
+        )
+
+    def _handle_error(self, reply: ErrorReply) -> None:
+        if reply.code == NoSession.code:
+            self._restart_session(reply)
+            return
+        if reply.frame_id is not None:
+            self.in_flight.pop(reply.frame_id, None)
+        elif self.welcome is None and reply.profile_id is None:
+            self._refusal = reply.exception()
+        self._events.append(reply)
+
+    def _restart_session(self, reply: ErrorReply) -> None:
+        """Say hello again: the service ended this session on a live connection."""
+        if reply.frame_id is not None and self.in_flight.pop(reply.frame_id, None):
+            self._events.append(Dropped(reply.frame_id, "connection_lost"))
+        if self.welcome is not None:
+            self.greet()

@@ -1,0 +1,237 @@
+"""Stream a scene through a running filter service, as a game or a viewer would.
+
+    ocufilter serve &
+    python -m clients.pyrender_stream --scene courtyard --profile keratoconus --window
+
+Frames are rendered and sent without waiting for answers; of those that wait, the
+newest wins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clients.filter_client import FilterClient, FilteredFrame
+from clients.scene_renderer import SceneFrame, SceneRenderer, scene_frames
+from clients.scenes.paths import PATHS, path_moments
+from clients.scenes.scene import Scene, build_scene, scene_builders
+from clients.streaming import FrameLog, view_of
+from clients.window import LiveWindow, NoDisplay
+from filter_service.errors import FilterError, ServiceTimeout
+from filter_service.messages import DEFAULT_ENDPOINT, Dropped, ErrorReply
+
+
+def profile_body(name_or_file: str) -> dict[str, Any]:
+    """Return the profile of a preset's name or of a JSON file.
+
+    Raises
+    ------
+    ValueError
+        The file holds no JSON object.
+    """
+    path = Path(name_or_file)
+    if not path.is_file():
+        return {"kind": "preset", "name": name_or_file}
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not JSON: {error}") from None
+    if not isinstance(body, dict):
+        raise ValueError(f"{path} holds {type(body).__name__}; allowed: an object")
+    return body
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Read WxH in pixels.
+
+    Raises
+    ------
+    ValueError
+        Not two whole numbers of at least 16.
+    """
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
+        raise ValueError(f"size {text!r}; allowed: WIDTHxHEIGHT, 16 px or more each")
+    return int(parts[0]), int(parts[1])
+
+
+def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
+    """Return the settings that cover the pupils and foci of the scenes' own paths."""
+    moments = [m for name in scene_names for m in path_moments(PATHS[name], 200)]
+    pupils_mm = [moment.pupil_diameter_mm for moment in moments]
+    foci_dpt = [moment.focus_dpt for moment in moments]
+    # The nearest thing in a scene is at 0.12 m; the margins are for rounding.
+    return {
+        "pupil_range_mm": (min(pupils_mm) - 0.01, max(pupils_mm) + 0.01),
+        "focus_range_dpt": (max(min(foci_dpt) - 0.01, 0.0), max(foci_dpt) + 0.01),
+        "object_range_dpt": (0.0, 8.5),
+    }
+
+
+def _looped_frames(
+    scene: Scene, size_px: tuple[int, int], n_frames: int
+) -> Iterator[SceneFrame]:
+    """Follow the scene's path to its end and back, without end."""
+    moments = path_moments(PATHS[scene.name], n_frames)
+    moments = moments + moments[-2:0:-1]
+    with SceneRenderer(scene, size_px) as renderer:
+        while True:
+            for moment in moments:
+                color, depth_m = renderer.render(moment.pose)
+                yield SceneFrame(
+                    color,
+                    depth_m,
+                    renderer.tangents,
+                    moment.pose,
+                    moment.pupil_diameter_mm,
+                    moment.focus_dpt,
+                )
+
+
+def stream(
+    client: FilterClient, frames: Iterator[SceneFrame], log: FrameLog, show=None
+) -> int:
+    """Submit frames as they are rendered until they end or the window closes.
+
+    Parameters
+    ----------
+    show : called with (input, filtered, title) for each answer; false ends the stream.
+
+    Returns
+    -------
+    Number of frames submitted.
+
+    Raises
+    ------
+    FilterError
+        The service refuses a frame or stops answering.
+    """
+    sent: dict[int, SceneFrame] = {}
+    n_sent = 0
+    for frame in frames:
+        frame_id = client.submit(
+            view_of(frame),
+            pupil_diameter_mm=frame.pupil_diameter_mm,
+            focus_dpt=frame.focus_dpt,
+        )
+        sent[frame_id], n_sent = frame, n_sent + 1
+        if not _take_answers(client, sent, log, show, timeout_s=0.0):
+            return n_sent
+    go_on = True
+    while go_on and client.n_unanswered:
+        go_on = _take_answers(client, sent, log, show, timeout_s=client.timeout_s)
+    return n_sent
+
+
+def _take_answers(client, sent, log, show, *, timeout_s: float) -> bool:
+    """Handle what has come back; return whether to go on."""
+    events = client.poll(timeout_s)
+    if not events and timeout_s:
+        raise ServiceTimeout(f"no answer to a frame within {timeout_s:g} s")
+    go_on = True
+    for event in events:
+        if isinstance(event, ErrorReply):
+            raise event.exception()
+        if isinstance(event, Dropped):
+            log.add_drop(event.reason)
+            sent.pop(event.frame_id, None)
+        elif isinstance(event, FilteredFrame):
+            log.add(event)
+            frame = sent.pop(event.frame_id)
+            if show is not None:
+                go_on = show(frame.color, event.color, _title(event)) and go_on
+    return go_on
+
+
+def _title(answer: FilteredFrame) -> str:
+    header = answer.header
+    return (
+        f"ocufilter   pupil {header.pupil_diameter_mm:.1f} mm   "
+        f"focus {header.focus_dpt:.2f} dpt   {answer.age_ms:.0f} ms   (Esc ends)"
+    )
+
+
+def _arguments(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m clients.pyrender_stream", description=__doc__.split("\n")[0]
+    )
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
+    parser.add_argument(
+        "--scene", default="courtyard", choices=sorted(scene_builders())
+    )
+    parser.add_argument(
+        "--profile", default="myopia", help="a preset's name or a JSON file"
+    )
+    parser.add_argument("--size", default="480x270", type=parse_size, metavar="WxH")
+    parser.add_argument("--frames", default=96, type=int, help="frames of the path")
+    parser.add_argument(
+        "--window", action="store_true", help="show it live; the path repeats until Esc"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser.parse_args(argv)
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Connect, stream, and return what the log says."""
+    scene = build_scene(options.scene)
+    log = FrameLog()
+    with ExitStack() as stack:
+        show = None
+        if options.window:
+            window = stack.enter_context(LiveWindow(options.size, "ocufilter"))
+            show = window.show
+            frames = _looped_frames(scene, options.size, options.frames)
+        else:
+            frames = scene_frames(scene, None, options.frames, options.size)
+        client = stack.enter_context(
+            FilterClient(options.endpoint, client_name="pyrender_stream")
+        )
+        frames = stack.enter_context(closing(frames))
+        first = next(frames)
+        if show is not None:
+            show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
+        client.set_profile(
+            profile_body(options.profile),
+            settings=path_settings(options.scene),
+            views=[view_of(first)],
+        )
+        n_sent = stream(client, chain([first], frames), log, show)
+    return {"sent": n_sent, **log.summary()}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the program; return its exit code."""
+    options = _arguments(argv)
+    try:
+        report = run(options)
+    except ValueError as error:
+        sys.stderr.write(f"pyrender_stream: {error}\n")
+        return 2
+    except (FilterError, NoDisplay) as error:
+        sys.stderr.write(f"pyrender_stream: {error}\n")
+        return 1
+    text = json.dumps(report) + "\n" if options.json else _report_line(report)
+    sys.stdout.write(text)
+    return 0
+
+
+def _report_line(report: dict[str, Any]) -> str:
+    age = report["frame_age_ms"]
+    dropped = sum(report["drops"].values())
+    return (
+        f"{report['frames']} of {report['sent']} frames filtered, {dropped} dropped; "
+        f"frame age p50 {age['p50']} ms, p99 {age['p99']} ms\n"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

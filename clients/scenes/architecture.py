@@ -1,0 +1,258 @@
+"""Walls, arches, columns, roofs, a fountain and the view behind."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from clients.scenes.geometry import (
+    Mesh,
+    box,
+    lathe,
+    merged,
+    new_mesh,
+    patch,
+    placed,
+    rotation,
+    sphere,
+    transformed,
+    tube,
+)
+
+
+def column(height_m: float, *, radius_m=0.16, color="#d9c7a5") -> Mesh:
+    """Return a round column with base and capital, its foot at the origin."""
+    r, h = radius_m, height_m
+    shaft = np.linspace(0.24, h - 0.32, 9)
+    swelling = r * (1 - 0.10 * (shaft / h) ** 2)
+    profile = [
+        (1.5 * r, 0.0), (1.5 * r, 0.10), (1.25 * r, 0.14), (1.35 * r, 0.18), (r, 0.24),
+        *zip(swelling, shaft, strict=True),
+        (1.15 * r, h - 0.28), (0.95 * r, h - 0.25), (1.3 * r, h - 0.14),
+        (1.6 * r, h - 0.10), (1.6 * r, h),
+    ]  # fmt: skip
+    return lathe(profile, sides=16, color=color)
+
+
+def arch_wall(
+    *, bay_m, bays, springing_m, height_m, opening_ratio=0.78, depth_m=0.45, **look
+) -> Mesh:
+    """Return a wall of round arches along x from 0, its front towards +z at z = 0.
+
+    Parameters
+    ----------
+    bay_m, height_m, depth_m : width of one bay, height and thickness, metres
+    springing_m : height at which the arches start, metres
+    opening_ratio : width of an opening over `bay_m`
+    look : texture and color for `new_mesh`; uv repeats once every two metres.
+    """
+    radius = opening_ratio * bay_m / 2
+    parts = []
+    for bay in range(bays):
+        center = (bay + 0.5) * bay_m
+        edge = _arch_edge(center, radius, springing_m)
+        parts += _face_over_arch(edge, bay * bay_m, bay_m, height_m, look)
+        # Underside of the arch and the inner faces of the piers.
+        back = edge - [0, 0, depth_m]
+        strip = np.stack([edge, back], axis=1)
+        parts.append(_sheet(strip, inward=np.array([center, springing_m, 0]), **look))
+    return merged(parts)
+
+
+def _arch_edge(center, radius, springing_m):
+    """Return the outline (n, 3) of one opening, foot to foot."""
+    angle = np.linspace(np.pi, 0, 17)
+    curve = np.stack(
+        [center + radius * np.cos(angle), springing_m + radius * np.sin(angle)], axis=1
+    )
+    rise = np.linspace(0, springing_m, 9)[:-1]
+    left = np.stack([np.full(8, center - radius), rise], axis=1)
+    right = np.stack([np.full(8, center + radius), rise[::-1]], axis=1)
+    flat = np.concatenate([left, curve, right])
+    return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+
+
+def _face_over_arch(edge, start_m, bay_m, height_m, look) -> list[Mesh]:
+    """Return the front of one bay: two piers and the sheet above the curve."""
+    left_pier = edge[:9]
+    right_pier = edge[-9:]
+    curve = edge[8:-8]
+    start, end = np.full(9, start_m), np.full(9, start_m + bay_m)
+    rows = [
+        np.stack([np.column_stack([start, left_pier[:, 1:]]), left_pier]),
+        np.stack(
+            [right_pier, np.column_stack([end, right_pier[:, 1:]])]
+        ),
+    ]  # fmt: skip
+    top = np.linspace(0, 1, 13)[:, None, None]
+    above = np.linspace(start_m, start_m + bay_m, len(curve))
+    crown = np.column_stack([above, np.full(len(curve), height_m), 0 * above])
+    sheet = (1 - top) * curve[None] + top * crown[None]
+    # The sheet's sides run from the springing to the corners: fill what they leave.
+    corner_l = _corner_fill(sheet[:, 0], start_m)
+    corner_r = _corner_fill(sheet[:, -1], start_m + bay_m)
+    front = np.array([0, 0, 1e3])
+    return [
+        _sheet(block.swapaxes(0, 1), inward=front, **look)
+        for block in (*rows, sheet.swapaxes(0, 1), corner_l, corner_r)
+    ]
+
+
+def _corner_fill(side, x):
+    """Return the block between a sheet's slanted side and the vertical at x."""
+    straight = side.copy()
+    straight[:, 0] = x
+    return np.stack([side, straight], axis=0)
+
+
+def _sheet(points, *, inward, **look) -> Mesh:
+    """Return a grid of points (a, b, 3) as a sheet that faces towards `inward`."""
+    a, b = points.shape[:2]
+    i, j = np.meshgrid(np.arange(a - 1), np.arange(b - 1), indexing="ij")
+    first = (i * b + j).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([first, first + b, first + b + 1], axis=1),
+            np.stack([first, first + b + 1, first + 1], axis=1),
+        ]
+    )
+    flat = points.reshape(-1, 3)
+    uv = np.stack([(flat[:, 0] - flat[:, 2]) / 2, flat[:, 1] / 2], axis=1)
+    mesh = new_mesh(flat, faces, uv=uv, **look)
+    toward = inward - flat
+    turned = np.einsum("ij,ij->i", mesh.normals, toward) < 0
+    sign = -1.0 if turned.mean() > 0.5 else 1.0
+    return new_mesh(flat, faces, normals=sign * mesh.normals, uv=uv, **look)
+
+
+def wall(origin_m, along_m, height_m, *, cell_m=0.25, texture="", color="#ffffff"):
+    """Return a plain upright wall, its front where along × up points."""
+    length_m = float(np.linalg.norm(along_m))
+    cells = (max(1, round(length_m / cell_m)), max(1, round(height_m / cell_m)))
+    return patch(
+        origin_m,
+        along_m,
+        (0, height_m, 0),
+        cells=cells,
+        uv_scale=(length_m / 2, height_m / 2),
+        texture=texture,
+        color=color,
+    )
+
+
+def tiled_roof(width_m, slope_m, *, pitch_deg=24.0, rows=5) -> Mesh:
+    """Return rows of clay tiles that fall towards +z; the ridge lies on the x axis."""
+    rng = np.random.default_rng(12)
+    tiles = []
+    step = slope_m / rows
+    count = round(width_m / 0.26)
+    angle = np.linspace(0, np.pi, 5)
+    arc = np.stack([-np.cos(angle) * 0.135, np.sin(angle) * 0.07], axis=1)
+    palette = ("#b4552f", "#c4683c", "#a34a2a", "#cf7d4e", "#b86142")
+    for row in range(rows):
+        for i in range(count):
+            x = (i + 0.5) * width_m / count
+            near = np.column_stack([x + arc[:, 0], arc[:, 1] + 0.03, 0 * arc[:, 0]])
+            far = near - [0, 0.03, 0]
+            near[:, 2], far[:, 2] = (row + 1.1) * step, row * step
+            tiles.append(
+                _sheet(
+                    np.stack([far, near]),
+                    inward=np.array([x, 1e3, row * step]),
+                    color=str(rng.choice(palette)),
+                )
+            )
+    return transformed(merged(tiles), rotation("x", pitch_deg))
+
+
+def window(*, width_m=0.9, height_m=1.4, shutter="#2f6f73") -> list[Mesh]:
+    """Return a shuttered window for a wall that faces +z, its foot at the origin."""
+    w, h = width_m, height_m
+    glass = patch((-w / 2, 0, 0.02), (w, 0, 0), (0, h, 0), color="#28343d")
+    parts = [glass]
+    for x in (-w / 2, 0.0, w / 2):
+        parts.append(placed(box((0.05, h, 0.06), color="#efe6d2"), (x, h / 2, 0.04)))
+    for y in (0.0, 0.5 * h, h):
+        parts.append(placed(box((w, 0.05, 0.06), color="#efe6d2"), (0, y, 0.04)))
+    parts.append(placed(box((w + 0.3, 0.07, 0.16), color="#d8c6a0"), (0, -0.07, 0.08)))
+    for side in (-1, 1):
+        x = side * 0.78 * w
+        parts.append(placed(box((0.5 * w, h, 0.03), color=shutter), (x, h / 2, 0.04)))
+        for k in range(7):
+            foot = (x - 0.21 * w, (k + 0.5) * h / 7.2, 0.058)
+            slat = patch(foot, (0.42 * w, 0, 0), (0, 0.03, 0), color="#5aa3a7")
+            parts.append(slat)
+    return parts
+
+
+def awning(width_m, reach_m, drop_m, *, texture: str) -> list[Mesh]:
+    """Return a striped awning that hangs from (0..width, 0, 0) towards +z."""
+    cloth = patch(
+        (0, -drop_m, reach_m),
+        (width_m, 0, 0),
+        (0, drop_m, -reach_m),
+        cells=(24, 8),
+        uv_scale=(width_m / 2, 1),
+        texture=texture,
+    )
+    fringe = patch(
+        (0, -drop_m - 0.22, reach_m),
+        (width_m, 0, 0),
+        (0, 0.22, 0),
+        cells=(24, 1),
+        uv_scale=(width_m / 2, 1),
+        texture=texture,
+    )
+    return [cloth, fringe]
+
+
+def fountain() -> list[Mesh]:
+    """Return a round fountain with two bowls, its foot at the origin."""
+    stone = "#c9bda6"
+    basin = lathe(
+        [(1.15, 0.0), (1.15, 0.38), (1.22, 0.40), (1.22, 0.48), (1.02, 0.48),
+         (1.0, 0.2)],
+        sides=36,
+        color=stone,
+    )  # fmt: skip
+    water = lathe([(1.02, 0.36), (0.6, 0.36), (0.3, 0.36), (0.0, 0.36)], sides=36)
+    up = np.tile([0.0, 1.0, 0.0], (len(water.vertices_m), 1))
+    water = new_mesh(water.vertices_m, water.faces, normals=up, color="#5b9aa8")
+    stem = lathe(
+        [(0.22, 0.3), (0.14, 0.5), (0.11, 0.8), (0.16, 1.0), (0.5, 1.12), (0.56, 1.2),
+         (0.5, 1.2), (0.1, 1.12), (0.07, 1.4), (0.24, 1.52), (0.28, 1.58), (0.0, 1.56)],
+        sides=28,
+        color=stone,
+    )  # fmt: skip
+    jets = []
+    for angle in np.linspace(0, 2 * np.pi, 10, endpoint=False):
+        t = np.linspace(0, 1, 8)
+        reach = 0.5 + 0.4 * t
+        height = 1.22 + 0.25 * t - 1.1 * t**2
+        path = np.stack(
+            [reach * np.cos(angle), height, reach * np.sin(angle)],
+            axis=1,
+        )  # fmt: skip
+        jets.append(tube(path, 0.008, sides=4, color="#e4f3f6"))
+    top = placed(sphere(0.09, sides=14, color=stone), (0, 1.66, 0))
+    return [basin, water, stem, top, *jets]
+
+
+def lattice(width_m, height_m, *, spacing_m=0.2, color="#e8dfc8") -> list[Mesh]:
+    """Return a diagonal wooden lattice in the plane z = 0, from the origin."""
+    parts = []
+    for sign in (-1, 1):
+        for c in np.arange(-height_m, width_m + height_m, spacing_m):
+            x = np.array([c, c + height_m]) if sign > 0 else np.array([c + height_m, c])
+            t = np.clip((np.array([0, width_m]) - x[0]) / (x[1] - x[0]), 0, 1)
+            low, high = sorted(t)
+            if high - low < 0.02:
+                continue
+            ends = np.array([low, high])
+            path = np.column_stack(
+                [x[0] + ends * (x[1] - x[0]), ends * height_m, [0.01 * sign] * 2]
+            )
+            parts.append(tube(path, 0.013, sides=4, color=color))
+    rails = [(0, 0), (width_m, 0), (width_m, height_m), (0, height_m), (0, 0)]
+    for (xa, ya), (xb, yb) in pairwise(rails):
+        parts.append(tube([(xa, ya, 0), (xb, yb, 0)], 0.03, sides=4, color=color))
+    return parts

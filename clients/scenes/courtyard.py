@@ -1,0 +1,350 @@
+"""Courtyard: a café garden in the evening sun, 0.3 to 30 m deep.
+
+It stands where the literature uses San Miguel: thin occluders, foliage close by,
+furniture, text of several sizes, repeated arches, small lamps.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from clients.scenes import architecture as build_
+from clients.scenes import foliage, furniture
+from clients.scenes.geometry import (
+    Mesh,
+    by_texture,
+    new_mesh,
+    patch,
+    placed,
+    rotation,
+    transformed,
+)
+from clients.scenes.lighting import Baker, Lights, baker
+from clients.scenes.scene import Batch, Scene, finished
+from clients.scenes.textures import (
+    board,
+    evening_sky,
+    framed,
+    hills,
+    plaster,
+    stone_tiles,
+    stripes,
+    uint8_srgb,
+    wood,
+)
+
+_FLOOR_M = (-6.5, -15.0, 13.0, 17.0)  # left, far, width, length
+_SUN = np.array([0.55, 0.62, 0.42])
+
+
+def build() -> Scene:
+    """Build the scene and bake its light (a few seconds on two cores)."""
+    lamps, lamps_m = _lamps()
+    rng = np.random.default_rng(2023)
+    solid = [*_architecture(), *_furniture(rng), *_plants(rng), *lamps]
+    backdrop = _backdrop()
+    lights = Lights(
+        sun_direction=_SUN,
+        sun=np.array([1.0, 0.80, 0.55]) * 1.25,
+        sky_zenith=np.array([0.30, 0.42, 0.62]) * 0.85,
+        sky_horizon=np.array([0.75, 0.62, 0.50]) * 0.75,
+        bounce=np.array([0.34, 0.26, 0.19]) * 0.55,
+        lamps_m=lamps_m,
+        lamp=np.array([1.0, 0.62, 0.28]) * 0.05,
+    )
+    textures = _textures()
+    solids = by_texture(solid)
+    occluders = [*solids, _floor()]
+    with baker(lights, occluders, center_m=(0, 2.0, -6.5), radius_m=11.5) as bake:
+        batches = [
+            finished(m, bake.light(m.vertices_m, m.normals, m.translucency), textures)
+            for m in solids
+        ]
+        batches.append(_floor_batch(bake))
+    for mesh in by_texture(backdrop):
+        light = np.ones((len(mesh.vertices_m), 3))
+        batches.append(finished(mesh, light, textures))
+    return Scene(
+        name="courtyard",
+        batches=tuple(batches),
+        background_srgb=(0.55, 0.72, 0.88),
+        near_m=0.08,
+        far_m=140.0,
+        infinite_from_m=60.0,
+    )
+
+
+def _architecture() -> list[Mesh]:
+    """Return the walls, arcades and the fountain."""
+    wall_look = {"texture": "plaster_warm"}
+    back = build_.arch_wall(
+        bay_m=2.6, bays=5, springing_m=1.7, height_m=3.75, **wall_look
+    )
+    parts = [placed(back, (-6.5, 0, -14.0))]
+    parts.append(
+        build_.wall((-6.5, 3.75, -14.0), (13, 0, 0), 1.95, texture="plaster_warm")
+    )
+    for x in np.arange(5) * 2.6 - 5.2:
+        parts += [placed(p, (x, 4.15, -14.0)) for p in build_.window(height_m=1.15)]
+    roof = build_.tiled_roof(13.4, 1.5)
+    parts.append(placed(roof, (-6.7, 6.1, -14.9)))
+    parts += _side(-6.5, 5.2, "plaster_rose", turn_deg=90)
+    # A low garden wall on this side lets the evening sun in.
+    parts += _side(6.5, 2.3, "plaster_warm", turn_deg=-90)
+    parts += [placed(p, (0.4, 0, -7.6)) for p in build_.fountain()]
+    awning = build_.awning(4.6, 1.3, 0.7, texture="stripes")
+    parts += [placed(p, (-5.9, 3.45, -12.2), turn_deg=38) for p in awning]
+    sign = patch(
+        (-2.2, 3.1, -13.97), (4.4, 0, 0), (0, 0.62, 0), cells=(16, 4), texture="sign"
+    )
+    return [*parts, sign]
+
+
+def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list[Mesh]:
+    """Return one side of the court: columns in front of a wall, beams above."""
+    inward = -np.sign(x_m)
+    parts = []
+    for z in np.arange(-13.2, -1.0, 2.4):
+        parts.append(placed(build_.column(3.0), (x_m + 1.3 * inward, 0, z)))
+    arcade = build_.arch_wall(
+        bay_m=2.4, bays=5, springing_m=3.0 - 0.02, height_m=4.3, opening_ratio=0.86,
+        depth_m=0.3, texture=texture,
+    )  # fmt: skip
+    # Only the part above the columns is wanted: lift the feet of the piers.
+    lifted = arcade.vertices_m.copy()
+    lifted[:, 1] = np.maximum(lifted[:, 1], 2.98)
+    arcade = replace(arcade, vertices_m=lifted)
+    start_z = -1.2 if inward > 0 else -13.2
+    move = rotation("y", turn_deg)
+    move[:3, 3] = (x_m + 1.15 * inward, 0, start_z)
+    parts.append(transformed(arcade, move))
+    along = (0, 0, -16.0) if inward > 0 else (0, 0, 16.0)
+    foot = (x_m, 0.0, 1.5 if inward > 0 else -14.5)
+    parts.append(build_.wall(foot, along, height_m, texture=texture))
+    return parts
+
+
+def _furniture(rng) -> list[Mesh]:
+    """Return tables, chairs, boards, railing and what stands on the near table."""
+    parts = []
+    spots = ((-1.75, -3.4, 20), (1.9, -4.9, -35), (-2.9, -6.6, 60), (2.7, -8.6, 10))
+    frames = ("#1f6f78", "#2b2f33", "#a23b2a", "#1f6f78")
+    for (x, z, turn), frame in zip(spots, frames, strict=True):
+        parts += _table_group(x, z, turn, frame, rng)
+    parts += _near_table(rng)
+    menu = furniture.standing_board((0.62, 0.98), texture="chalk")
+    parts += [placed(p, (1.42, 0, -2.6), turn_deg=-26) for p in menu]
+    parts += furniture.railing((2.0, 0, -3.3), (5.0, 0, -3.3))
+    return parts
+
+
+def _table_group(x, z, turn, frame, rng) -> list[Mesh]:
+    """Return a table with two or three chairs, a lantern and cups."""
+    group = list(furniture.bistro_table(top="table"))
+    for angle in (15, 140, 255)[: 2 + int(rng.random() < 0.6)]:
+        radians = np.deg2rad(angle)
+        where = (0.62 * np.sin(radians), 0, 0.62 * np.cos(radians))
+        seat = furniture.chair(frame=frame)
+        group += [placed(p, where, turn_deg=angle) for p in seat]
+    group += [placed(p, (0.05, 0.74, -0.06)) for p in furniture.lantern()]
+    for dx, dz in ((-0.18, 0.08), (0.14, 0.15)):
+        group += [
+            placed(p, (dx, 0.74, dz), turn_deg=40) for p in furniture.cup(sides=12)
+        ]
+    return [placed(p, (x, 0, z), turn_deg=turn) for p in group]
+
+
+def _near_table(rng) -> list[Mesh]:
+    """Return the viewer's own table; what stands on it is 0.6 to 1.1 m away."""
+    things = list(furniture.bistro_table(radius_m=0.46, top="table"))
+    top = 0.74
+    cup = furniture.cup()
+    things += [placed(p, (0.02, top, 0.0), turn_deg=-30) for p in cup]
+    card = furniture.table_card((0.15, 0.21), texture="card")
+    things += [placed(p, (-0.23, top, -0.03), turn_deg=16) for p in card]
+    things += [placed(p, (0.24, top, -0.06)) for p in furniture.vase(rng=rng)]
+    things += [placed(p, (-0.03, top, -0.27)) for p in furniture.lantern()]
+    return [placed(p, (0.02, 0, -0.80)) for p in things]
+
+
+def _plants(rng) -> list[Mesh]:
+    """Return the near branch, the climbing plant, potted trees and shrubs."""
+    parts = [
+        foliage.branch(path, rng=rng, n_leaves=n, leaf_m=0.062)
+        for path, n in (
+            (((-0.62, 1.50, -0.62), (-0.42, 1.44, -0.50), (-0.28, 1.37, -0.45)), 26),
+            (((-0.62, 1.46, -0.62), (-0.44, 1.36, -0.55), (-0.36, 1.27, -0.52)), 22),
+            (((-0.50, 1.47, -0.50), (-0.30, 1.42, -0.43), (-0.13, 1.40, -0.40)), 22),
+        )
+    ]
+    frame = [
+        placed(p, (-5.1, 0.2, -3.0), turn_deg=90) for p in build_.lattice(3.4, 2.6)
+    ]
+    parts += frame
+    for start in (0.2, 1.5, 2.9):
+        s = np.linspace(0, 1, 10)
+        path = np.stack(
+            [-5.02 + 0 * s, 0.2 + 2.6 * s, -3.0 - start - 0.4 * np.sin(4 * s)], axis=1
+        )
+        parts.append(
+            foliage.climber(
+                path, spread_m=(0.07, 0.25, 0.3), n_leaves=520, n_blossoms=290, rng=rng
+            )
+        )
+    hedge = [(-6.2 + 0.25 * k, 3.95 + 0.15 * np.sin(k), -13.8) for k in range(14)]
+    parts.append(
+        foliage.climber(
+            hedge, spread_m=(0.2, 0.28, 0.12), n_leaves=760, n_blossoms=430, rng=rng,
+            leaf_m=0.12,
+        )
+    )  # fmt: skip
+    pots = ((-3.2, -9.6, ""), (3.9, -6.3, "#f2a03d"), (-4.0, -1.9, ""),
+            (4.4, -10.6, "#f2c53d"), (-1.9, -12.6, "#f2c53d"))  # fmt: skip
+    for x, z, fruit in pots:
+        tree = foliage.potted_tree(rng=rng, fruit=fruit)
+        parts += [placed(p, (x, 0, z)) for p in tree]
+    return parts
+
+
+def _lamps() -> tuple[list[Mesh], np.ndarray]:
+    """Return the string lights and where their bulbs are (n, 3)."""
+    parts, positions = [], []
+    lines = (
+        ((-5.2, 3.3, -1.4), (4.0, 3.5, -5.2), 0.45, 13),
+        ((-5.2, 3.4, -4.6), (5.2, 3.4, -3.2), 0.55, 14),
+        ((-5.2, 3.5, -6.6), (5.2, 3.5, -9.4), 0.6, 14),
+        ((5.2, 3.5, -6.2), (-5.2, 3.6, -11.6), 0.6, 14),
+    )
+    for start, end, sag_m, count in lines:
+        line, where = furniture.string_lights(start, end, sag_m=sag_m, count=count)
+        parts += line
+        positions.append(where)
+    return parts, np.concatenate(positions)
+
+
+def _floor() -> Mesh:
+    left, far, width, length = _FLOOR_M
+    return patch((left, 0, far + length), (width, 0, 0), (0, 0, -length))
+
+
+def _floor_batch(bake: Baker) -> Batch:
+    """Return the floor with its light in the texture: shadows finer than vertices."""
+    left, far, width, length = _FLOOR_M
+    texel_m = 0.0125
+    columns, rows = round(width / texel_m), round(length / texel_m)
+    image = bake.light_map(
+        (left, 0, far), (width, 0, 0), (0, 0, length), size=(columns, rows)
+    )
+    tile_px = round(4.0 / texel_m)  # one repeat of the pattern is four metres
+    tiles = _resized(stone_tiles(), tile_px, tile_px)
+    repeat = np.tile(tiles, (rows // tile_px + 1, columns // tile_px + 1, 1))
+    texture = uint8_srgb(image * repeat[:rows, :columns])
+    floor = replace(_floor(), texture="floor")
+    ones = np.ones((len(floor.vertices_m), 3))
+    return finished(floor, ones, {"floor": texture})
+
+
+def _resized(image, width: int, height: int):
+    """Average a linear image (h, w, 3) down to a smaller size."""
+    from PIL import Image
+
+    channels = [
+        Image.fromarray(image[..., k].astype(np.float32)).resize(
+            (width, height), Image.Resampling.BOX
+        )
+        for k in range(3)
+    ]
+    return np.stack([np.asarray(channel) for channel in channels], axis=-1)
+
+
+def _backdrop() -> list[Mesh]:
+    """Return what lies behind the arches, and the sky; no shadow falls there."""
+    rng = np.random.default_rng(31)
+    lawn = patch((-30, -0.01, -14.4), (60, 0, 0), (0, 0, -15.6), color="#77853d")
+    view = patch(
+        (-26, -0.6, -30), (52, 0, 0), (0, 12, 0), uv_scale=(1, 0.995), texture="hills"
+    )
+    path = patch((-0.9, 0.0, -14.4), (2.2, 0, 0), (0, 0, -15), color="#d9bf93")
+    trees = []
+    for x, z, height in (
+        (-5.6, -19, 6.0), (-2.6, -23, 7.0), (2.2, -20.5, 6.2), (4.6, -25, 7.5),
+        (6.2, -18.5, 5.2), (-7.6, -24, 7.0),
+    ):  # fmt: skip
+        trees.append(placed(foliage.cypress(rng=rng, height_m=height), (x, 0, z)))
+    # Leaves turned to the sun are brighter: the light of a plain cosine.
+    shaded = []
+    for tree in trees:
+        facing = np.maximum(tree.normals @ _SUN / np.linalg.norm(_SUN), 0)
+        light = 0.55 + 0.75 * facing
+        shaded.append(replace(tree, albedo=tree.albedo * light[:, None]))
+    return [lawn, view, path, *shaded, _sky()]
+
+
+def _sky() -> Mesh:
+    """Return a dome 100 m away; the renderer calls it infinitely far."""
+    t = np.linspace(-0.05, np.pi / 2, 12)
+    a = np.linspace(0, 2 * np.pi, 25)
+    tt, aa = np.meshgrid(t, a, indexing="ij")
+    points = 100 * np.stack(
+        [np.cos(tt) * np.sin(aa), np.sin(tt), np.cos(tt) * np.cos(aa)], axis=-1
+    )
+    i, j = np.meshgrid(np.arange(11), np.arange(24), indexing="ij")
+    first = (i * 25 + j).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([first, first + 1, first + 26], axis=1),
+            np.stack([first, first + 26, first + 25], axis=1),
+        ]
+    )
+    mesh = new_mesh(points, faces)
+    return replace(mesh, albedo=evening_sky(np.sin(tt).ravel()))
+
+
+def _textures() -> dict:
+    """Draw every texture of the scene; the rest is vertex colour."""
+    linear = {
+        "plaster_warm": plaster("#c99a5e", "#ecd09a"),
+        "plaster_rose": plaster("#b87862", "#dca58c", seed=6),
+        "table": wood("#6d4526", "#b27d48"),
+        "stripes": stripes("#b3372b", "#f3e9d2", count=4),
+        "hills": hills(-1.8, 12.0, 30.0),
+        "sign": _sign(),
+        "chalk": _chalk_board(),
+        "card": _menu_card(),
+    }
+    return {name: uint8_srgb(image) for name, image in linear.items()}
+
+
+def _sign():
+    lines = [("CAFE DEL SOL", 0.5, 100, "")]
+    image = board((1024, 144), lines, paper="#1f4d4a", ink="#f5dfa3", grain=0.06)
+    return framed(image, color="#d9b45a", border_px=5, inset_px=8)
+
+
+def _chalk_board():
+    lines = [
+        ("TODAY", 0.10, 120, "#f7e27a"),
+        ("SOUP", 0.26, 100, ""),
+        ("pumpkin & sage  4.50", 0.345, 48, "#d8e4e0"),
+        ("PASTA", 0.47, 100, ""),
+        ("lemon & basil  7.80", 0.555, 48, "#d8e4e0"),
+        ("TART", 0.68, 100, "#f2a7b8"),
+        ("plum, warm  3.90", 0.765, 48, "#d8e4e0"),
+        ("open till 10 pm", 0.91, 62, "#9fd3c7"),
+    ]
+    image = board((640, 1012), lines, paper="#26302e", ink="#f4f4ee", grain=0.3)
+    return framed(image, color="#c9d2cc", border_px=3, inset_px=18)
+
+
+def _menu_card():
+    lines = [
+        ("MENU", 0.12, 92, "#8c2f24"),
+        ("Coffee  2.40", 0.30, 56, ""),
+        ("Cocoa  2.80", 0.41, 56, ""),
+        ("Lemonade  3.10", 0.52, 56, ""),
+        ("Almond cake  3.60", 0.66, 42, ""),
+        ("Apricot tart  3.90", 0.74, 42, ""),
+        ("Ask us about allergens", 0.88, 28, "#6b5a48"),
+    ]
+    image = board((480, 672), lines, paper="#f6ecd6", ink="#2b211a", grain=0.04)
+    return framed(image, color="#8c2f24", border_px=6, inset_px=14)

@@ -1,0 +1,224 @@
+"""Triangle meshes as plain arrays, and the few shapes that the scenes are built from.
+
+Frame of every scene: metres, x right, y up, z towards the viewer (OpenGL).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles that share one texture.
+
+    Attributes
+    ----------
+    vertices_m : (n, 3), metres
+    normals : (n, 3), unit vectors
+    faces : (m, 3), int
+    albedo : (n, 3), linear reflectance 0..1; multiplies the texture
+    emission : (n, 3), linear light added whatever the lighting
+    translucency : (n,), part of the light that comes through from behind (leaves)
+    uv : (n, 2), texture position, v up
+    texture : name of the texture; empty for none
+    """
+
+    vertices_m: Array
+    normals: Array
+    faces: NDArray[np.int64]
+    albedo: Array
+    emission: Array
+    translucency: Array
+    uv: Array
+    texture: str = ""
+
+
+def linear_from_hex(code: str) -> Array:
+    """Return the linear RGB (3,) of an sRGB colour written as "#rrggbb"."""
+    srgb = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: Array) -> Array:
+    """Encode linear light, any shape, clipped to 0..1, as sRGB 0..1 (IEC 61966-2-1)."""
+    value = np.clip(linear, 0.0, 1.0)
+    return np.where(
+        value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055
+    )
+
+
+def new_mesh(
+    vertices_m, faces, *, normals=None, uv=None, color="#ffffff", texture=""
+) -> Mesh:
+    """Fill in a mesh: normals from the faces when none are given, one colour."""
+    vertices_m = np.asarray(vertices_m, float).reshape(-1, 3)
+    faces = np.asarray(faces, int).reshape(-1, 3)
+    n = len(vertices_m)
+    if normals is None:
+        normals = vertex_normals(vertices_m, faces)
+    return Mesh(
+        vertices_m=vertices_m,
+        normals=np.asarray(normals, float).reshape(-1, 3),
+        faces=faces,
+        albedo=np.tile(linear_from_hex(color), (n, 1)),
+        emission=np.zeros((n, 3)),
+        translucency=np.zeros(n),
+        uv=np.zeros((n, 2)) if uv is None else np.asarray(uv, float).reshape(-1, 2),
+        texture=texture,
+    )
+
+
+def vertex_normals(vertices_m: Array, faces: NDArray[np.int64]) -> Array:
+    """Return the area-weighted unit normals (n, 3) of a mesh."""
+    a, b, c = (vertices_m[faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices_m)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], face_normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.maximum(length, 1e-12)
+
+
+def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
+    """Return the mesh in one colour; `emission` times that colour glows."""
+    rgb = np.tile(linear_from_hex(color), (len(mesh.vertices_m), 1))
+    return replace(mesh, albedo=rgb, emission=rgb * emission)
+
+
+def transformed(mesh: Mesh, matrix: Array) -> Mesh:
+    """Apply a (4, 4) matrix to a mesh; non-uniform scales keep normals right."""
+    linear = matrix[:3, :3]
+    normals = mesh.normals @ np.linalg.inv(linear)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return replace(
+        mesh, vertices_m=mesh.vertices_m @ linear.T + matrix[:3, 3], normals=normals
+    )
+
+
+def placed(mesh: Mesh, position_m=(0, 0, 0), *, turn_deg=0.0, scale=1.0) -> Mesh:
+    """Scale, turn about the vertical axis and move a mesh."""
+    matrix = rotation("y", turn_deg)
+    matrix[:3, :3] *= scale
+    matrix[:3, 3] = position_m
+    return transformed(mesh, matrix)
+
+
+def rotation(axis: str, angle_deg: float) -> Array:
+    """Return a (4, 4) right-handed rotation about "x", "y" or "z"."""
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+    matrix = np.eye(4)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+def merged(meshes: Sequence[Mesh]) -> Mesh:
+    """Join meshes that share a texture into one."""
+    names = {mesh.texture for mesh in meshes}
+    if len(names) != 1:
+        raise ValueError(f"meshes to merge carry {sorted(names)}; need one texture")
+    offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
+    joined = {
+        name: np.concatenate([getattr(mesh, name) for mesh in meshes])
+        for name in ("vertices_m", "normals", "albedo", "emission", "uv")
+    }
+    return Mesh(
+        faces=np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes, offsets, strict=True)]
+        ),
+        translucency=np.concatenate([mesh.translucency for mesh in meshes]),
+        texture=meshes[0].texture,
+        **joined,
+    )
+
+
+def by_texture(meshes: Sequence[Mesh]) -> list[Mesh]:
+    """Merge meshes into one per texture, so that a frame takes few draw calls."""
+    names = sorted({mesh.texture for mesh in meshes})
+    return [merged([m for m in meshes if m.texture == name]) for name in names]
+
+
+def patch(origin_m, side_u_m, side_v_m, *, cells=(1, 1), uv_scale=(1, 1), **look):
+    """Return a flat parallelogram, its front where side_u × side_v points."""
+    nu, nv = cells
+    u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
+    u, v = u.ravel(), v.ravel()
+    side_u_m, side_v_m = np.asarray(side_u_m, float), np.asarray(side_v_m, float)
+    vertices = np.asarray(origin_m, float) + np.outer(u, side_u_m)
+    vertices = vertices + np.outer(v, side_v_m)
+    normal = np.cross(side_u_m, side_v_m)
+    normals = np.tile(normal / np.linalg.norm(normal), (len(u), 1))
+    uv = np.stack([u * uv_scale[0], v * uv_scale[1]], axis=1)
+    return new_mesh(vertices, _grid_faces(nv, nu), normals=normals, uv=uv, **look)
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Return the triangles of a (rows+1) × (columns+1) grid of vertices."""
+    r, c = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    first = (r * (columns + 1) + c).ravel()
+    up = first + columns + 1
+    lower = np.stack([first, first + 1, up + 1], axis=1)
+    return np.concatenate([lower, np.stack([first, up + 1, up], axis=1)])
+
+
+def box(size_m, *, cells=1, **look) -> Mesh:
+    """Return a box centred on the origin, its faces split into cells × cells."""
+    sides = []
+    half = np.asarray(size_m, float) / 2
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            u, v, origin = np.zeros(3), np.zeros(3), -half.copy()
+            u[(axis + 1) % 3] = 2 * half[(axis + 1) % 3]
+            v[(axis + 2) % 3] = 2 * half[(axis + 2) % 3]
+            origin[axis] = sign * half[axis]
+            if sign < 0:
+                u, v = v, u
+            sides.append(patch(origin, u, v, cells=(cells, cells), **look))
+    return merged(sides)
+
+
+def lathe(profile_m, *, sides=20, **look) -> Mesh:
+    """Turn a profile of (radius, height) points, bottom first, about the y axis."""
+    profile_m = np.asarray(profile_m, float)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
+    up = np.array([0.0, 1.0, 0.0])
+    vertices = profile_m[:, None, :1] * ring + profile_m[:, None, 1:] * up
+    slope = np.gradient(profile_m, axis=0)
+    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    normals = slope[:, None, 1:] * ring - slope[:, None, :1] * up
+    v = np.linspace(0, 1, len(profile_m))
+    uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), v[:, None]), axis=-1)
+    faces = _grid_faces(len(profile_m) - 1, sides)
+    return new_mesh(vertices, faces, normals=normals, uv=uv, **look)
+
+
+def sphere(radius_m, *, sides=12, **look) -> Mesh:
+    """Return a sphere about the origin."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
+    profile = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return lathe(profile, sides=sides, **look)
+
+
+def tube(path_m, radius_m, *, sides=6, **look) -> Mesh:
+    """Return a round bar along a path (n, 3); radius_m is one number or (n,)."""
+    path_m = np.asarray(path_m, float)
+    radius_m = np.broadcast_to(np.asarray(radius_m, float), len(path_m))
+    along = np.gradient(path_m, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    # One helper direction for the whole bar keeps its rings from twisting.
+    helper = np.eye(3)[np.argmin(np.abs(along).mean(axis=0))]
+    across = np.cross(along, helper)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    third = np.cross(along, across)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
+    normals = np.cos(angle) * across[:, None] + np.sin(angle) * third[:, None]
+    vertices = path_m[:, None] + radius_m[:, None, None] * normals
+    faces = _grid_faces(len(path_m) - 1, sides)
+    return new_mesh(vertices, faces, normals=normals, **look)

@@ -1,0 +1,224 @@
+"""Bake sun, sky and lamps into a still scene, so that a frame needs no lights at all.
+
+Shadows come from depth maps that pyrender renders along parallel rays: one fine map
+for the sun, many coarse ones for the sky (ambient occlusion).
+"""
+
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from PIL import Image
+
+from clients.pyrender_setup import delete_renderer, pyrender
+from clients.scenes.geometry import Array, Mesh, merged
+
+_NEAR_M = 1.0
+_DEPTH_FLAGS = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SKIP_CULL_FACES
+
+
+@dataclass(frozen=True)
+class Lights:
+    """The lights of a scene; colours are linear, 1 makes a white sheet white.
+
+    Attributes
+    ----------
+    sun_direction : (3,), towards the sun
+    sun, sky_zenith, sky_horizon, bounce : (3,), linear RGB
+    lamps_m : (n, 3), positions of small lamps
+    lamp : (3,), light of one lamp on a sheet one metre away
+    """
+
+    sun_direction: Array
+    sun: Array
+    sky_zenith: Array
+    sky_horizon: Array
+    bounce: Array
+    lamps_m: Array
+    lamp: Array
+
+
+class DepthMaps:
+    """Depth maps of fixed occluders along parallel rays."""
+
+    def __init__(self, occluders: list[Mesh], *, center_m, radius_m: float):
+        whole = merged([replace(mesh, texture="") for mesh in occluders])
+        triangles = pyrender.Primitive(
+            positions=whole.vertices_m.astype(np.float32),
+            indices=whole.faces.astype(np.uint32),
+            material=pyrender.MetallicRoughnessMaterial(doubleSided=True),
+        )
+        self._center_m = np.asarray(center_m, float)
+        self._radius_m = radius_m
+        self._scene = pyrender.Scene()
+        self._scene.add(pyrender.Mesh([triangles]))
+        camera = pyrender.OrthographicCamera(
+            xmag=radius_m, ymag=radius_m, znear=_NEAR_M, zfar=_NEAR_M + 2 * radius_m
+        )
+        self._camera = self._scene.add(camera)
+        self._renderer = pyrender.OffscreenRenderer(64, 64)
+
+    def close(self) -> None:
+        """Free the GL context."""
+        delete_renderer(self._renderer)
+
+    def toward(self, direction: Array, size_px: int) -> "ParallelMap":
+        """Render what a far source in `direction` sees."""
+        axes = _axes_along(direction)
+        pose = np.eye(4)
+        pose[:3, :3] = axes.T
+        pose[:3, 3] = self._center_m + axes[2] * (self._radius_m + _NEAR_M)
+        self._scene.set_pose(self._camera, pose)
+        self._renderer.viewport_width = self._renderer.viewport_height = size_px
+        read = self._renderer.render(self._scene, _DEPTH_FLAGS)
+        near_m, far_m = _NEAR_M, _NEAR_M + 2 * self._radius_m
+        with np.errstate(divide="ignore"):
+            # pyrender undoes a perspective even for this camera; put it back.
+            depth_m = np.where(read > 0, near_m + far_m - near_m * far_m / read, np.inf)
+        return ParallelMap(depth_m, pose[:3, 3], axes, self._radius_m)
+
+
+@dataclass(frozen=True)
+class ParallelMap:
+    """One depth map along parallel rays, and how to look points up in it."""
+
+    depth_m: Array
+    origin_m: Array
+    axes: Array
+    radius_m: float
+
+    def seen(self, points_m: Array, *, bias_m: float, soft: bool = False) -> Array:
+        """Return which points (n, 3) the source sees, 0..1 per point."""
+        local = (points_m - self.origin_m) @ self.axes.T
+        size = len(self.depth_m)
+        column = (local[:, 0] / self.radius_m + 1) * size / 2
+        row = (1 - local[:, 1] / self.radius_m) * size / 2
+        shifts = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        total = np.zeros(len(points_m))
+        for dx, dy in shifts if soft else [(0, 0)]:
+            i = np.clip(np.floor(row + dy), 0, size - 1).astype(int)
+            j = np.clip(np.floor(column + dx), 0, size - 1).astype(int)
+            total += self.depth_m[i, j] > -local[:, 2] - bias_m
+        return total / (len(shifts) if soft else 1)
+
+
+def _axes_along(direction: Array) -> Array:
+    """Return rows right, up, back of a camera that looks against `direction`."""
+    back = np.asarray(direction, float) / np.linalg.norm(direction)
+    helper = np.eye(3)[2 if abs(back[1]) > 0.9 else 1]
+    right = np.cross(helper, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
+
+def hemisphere(count: int) -> Array:
+    """Return `count` directions (n, 3) spread evenly over the upper half sphere."""
+    index = np.arange(count) + 0.5
+    height = index / count
+    angle = index * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], axis=1)
+
+
+class Baker:
+    """Works out the light that arrives at points of a scene."""
+
+    def __init__(self, lights: Lights, maps: DepthMaps, *, sky_directions: int = 40):
+        self._lights = lights
+        self._sun_map = maps.toward(lights.sun_direction, 2048)
+        self._sky = [(d, maps.toward(d, 384)) for d in hemisphere(sky_directions)]
+
+    def light(self, points_m: Array, normals: Array, translucency=0.0) -> Array:
+        """Return the light (n, 3) on surfaces at points (n, 3) with normals (n, 3)."""
+        off_surface = points_m + 0.02 * normals
+        through = np.broadcast_to(np.asarray(translucency, float), len(points_m))
+        return (
+            self._sun_light(off_surface, normals, through)
+            + self._sky_light(off_surface, normals, through)
+            + self._lamp_light(points_m, normals, through)
+        )
+
+    def light_map(self, origin_m, side_u_m, side_v_m, *, size) -> Array:
+        """Return the light (h, w, 3) over a parallelogram that faces up.
+
+        Sun at every texel; sky and lamps, which change slowly, at every eighth.
+        """
+        width, height = size
+        coarse = (max(2, width // 8), max(2, height // 8))
+        points = _grid_points(origin_m, side_u_m, side_v_m, coarse)
+        up = np.tile([0.0, 1.0, 0.0], (len(points), 1))
+        none = np.zeros(len(points))
+        slow = self._sky_light(points + 0.02 * up, up, none)
+        slow = (slow + self._lamp_light(points, up, none)).reshape(*coarse[::-1], 3)
+        points = _grid_points(origin_m, side_u_m, side_v_m, size)
+        up = np.tile([0.0, 1.0, 0.0], (len(points), 1))
+        sun = self._sun_light(points, up, np.zeros(len(points)))
+        return _enlarged(slow, size) + sun.reshape(height, width, 3)
+
+    def _sun_light(self, points_m, normals, through) -> Array:
+        sun = self._lights.sun_direction / np.linalg.norm(self._lights.sun_direction)
+        seen = self._sun_map.seen(points_m, bias_m=0.035, soft=True)
+        return (seen * _facing(normals @ sun, through))[:, None] * self._lights.sun
+
+    def _sky_light(self, points_m, normals, through) -> Array:
+        total = np.zeros((len(points_m), 3))
+        openness = np.zeros(len(points_m))
+        for direction, depth_map in self._sky:
+            seen = depth_map.seen(points_m, bias_m=0.04)
+            blend = direction[1] ** 0.6
+            radiance = blend * self._lights.sky_zenith
+            radiance = radiance + (1 - blend) * self._lights.sky_horizon
+            facing = _facing(normals @ direction, through)
+            total += (seen * facing)[:, None] * radiance
+            openness += seen
+        # Uniform directions: the mean of 2 cos over a hemisphere is 1.
+        total *= 2 / len(self._sky)
+        openness = 0.35 + 0.65 * openness / len(self._sky)
+        from_below = 0.55 - 0.45 * normals[:, 1]
+        return total + (openness * from_below)[:, None] * self._lights.bounce
+
+    def _lamp_light(self, points_m, normals, through) -> Array:
+        total = np.zeros(len(points_m))
+        for lamp_m in self._lights.lamps_m:
+            away = lamp_m - points_m
+            square = np.einsum("ij,ij->i", away, away)
+            cosine = np.einsum("ij,ij->i", away, normals) / np.sqrt(square + 1e-9)
+            # The constant stands for the lamp's own size and keeps it finite.
+            total += _facing(cosine, through) / (square + 0.03)
+        return total[:, None] * self._lights.lamp
+
+
+def _grid_points(origin_m, side_u_m, side_v_m, size) -> Array:
+    """Return the texel centres (h·w, 3) of a parallelogram, row by row."""
+    width, height = size
+    u, v = np.meshgrid(
+        (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    )
+    sides = np.outer(u.ravel(), side_u_m) + np.outer(v.ravel(), side_v_m)
+    return np.asarray(origin_m, float) + sides
+
+
+def _enlarged(image: Array, size) -> Array:
+    """Enlarge a linear image (h, w, 3) smoothly to (width, height)."""
+    channels = [
+        Image.fromarray(image[..., k].astype(np.float32)).resize(
+            size, Image.Resampling.BILINEAR
+        )
+        for k in range(3)
+    ]
+    return np.stack([np.asarray(channel) for channel in channels], axis=-1)
+
+
+def _facing(cosine: Array, through: Array) -> Array:
+    """Return the cosine law, with light from behind where a surface lets it pass."""
+    return np.maximum(cosine, 0.0) + through * np.maximum(-cosine, 0.0)
+
+
+@contextmanager
+def baker(lights: Lights, occluders: list[Mesh], *, center_m, radius_m: float):
+    """Open a Baker for a scene; its GL context lives only inside the block."""
+    maps = DepthMaps(occluders, center_m=center_m, radius_m=radius_m)
+    try:
+        yield Baker(lights, maps)
+    finally:
+        maps.close()

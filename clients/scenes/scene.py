@@ -1,0 +1,90 @@
+"""A finished scene: triangles with their light baked in, ready for a flat render."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.scenes.geometry import Array, Mesh, srgb_from_linear
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Triangles of one draw call.
+
+    Attributes
+    ----------
+    vertices_m : (n, 3) float32, metres
+    faces : (m, 3) uint32
+    uv : (n, 2) float32
+    srgb : (n, 3) float32, sRGB-encoded light that leaves the vertex; with a texture,
+        the factor on its sRGB values
+    texture : (h, w, 3) uint8 sRGB, or None
+    """
+
+    vertices_m: NDArray[np.float32]
+    faces: NDArray[np.uint32]
+    uv: NDArray[np.float32]
+    srgb: NDArray[np.float32]
+    texture: NDArray[np.uint8] | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Named batches, the colour behind them and the camera's depth limits.
+
+    Attributes
+    ----------
+    infinite_from_m : planar depth from which a surface counts as background (+inf)
+    """
+
+    name: str
+    batches: tuple[Batch, ...]
+    background_srgb: tuple[float, float, float]
+    near_m: float
+    far_m: float
+    infinite_from_m: float
+    fov_deg: float = 50.0
+
+    @property
+    def n_triangles(self) -> int:
+        """Number of triangles in all batches."""
+        return sum(len(batch.faces) for batch in self.batches)
+
+
+def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -> Batch:
+    """Turn a mesh and the light (n, 3) on its vertices into a draw call."""
+    if mesh.texture:
+        # A power law splits a product exactly; sRGB itself does not.
+        srgb = np.maximum(mesh.albedo * light + mesh.emission, 0.0) ** (1 / 2.2)
+    else:
+        srgb = srgb_from_linear(mesh.albedo * light + mesh.emission)
+    return Batch(
+        vertices_m=mesh.vertices_m.astype(np.float32),
+        faces=mesh.faces.astype(np.uint32),
+        uv=mesh.uv.astype(np.float32),
+        srgb=srgb.astype(np.float32),
+        texture=textures[mesh.texture] if mesh.texture else None,
+    )
+
+
+def scene_builders() -> dict[str, Callable[[], Scene]]:
+    """Return the scenes by name; a scene is built when its function is called."""
+    from clients.scenes import courtyard, primitives
+
+    return {"primitives": primitives.build, "courtyard": courtyard.build}
+
+
+def build_scene(name: str) -> Scene:
+    """Build a scene.
+
+    Raises
+    ------
+    ValueError
+        No scene has that name.
+    """
+    builders = scene_builders()
+    if name not in builders:
+        raise ValueError(f"scene {name!r} is unknown; choose from {sorted(builders)}")
+    return builders[name]()

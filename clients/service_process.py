@@ -1,0 +1,138 @@
+"""A filter service started as a process of its own, for demos, benchmarks and tests."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+SERVE_COMMAND = (sys.executable, "-m", "filter_service", "serve")
+CHECKOUT = Path(__file__).resolve().parents[1]
+POLL_S = 0.02
+LOG_TAIL_CHARACTERS = 2000
+
+
+class ServiceProcess:
+    """`ocufilter serve` on a free port of this machine, from start to clean end.
+
+    Parameters
+    ----------
+    settings : mapping, optional
+        Fields of the service's configuration file.
+    command : sequence of str
+        What is started; ``--config FILE`` is appended.
+    start_timeout_s : float
+        The longest wait for the service to be ready.
+
+    Examples
+    --------
+    >>> with ServiceProcess() as service:  # doctest: +SKIP
+    ...     client = FilterClient(service.endpoint)
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        command: Sequence[str] = SERVE_COMMAND,
+        start_timeout_s: float = 60.0,
+    ) -> None:
+        self.endpoint = ""
+        self._folder = tempfile.TemporaryDirectory(prefix="ocufilter-")
+        folder = Path(self._folder.name)
+        self._ready_file = folder / "ready"
+        self._log_file = folder / "log"
+        config_file = folder / "service.toml"
+        merged = {"bind": "tcp://127.0.0.1:*"} | dict(settings or {})
+        merged["ready_file"] = str(self._ready_file)
+        config_file.write_text(_as_toml(merged), encoding="utf-8")
+        with self._log_file.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*command, "--config", str(config_file)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=CHECKOUT,
+            )
+        try:
+            self._await_ready(start_timeout_s)
+        except BaseException:
+            self.kill()
+            raise
+
+    def __enter__(self) -> ServiceProcess:
+        """Return the service, which is ready."""
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """End the service."""
+        self.stop()
+
+    @property
+    def log(self) -> str:
+        """Return what the service has printed."""
+        return self._log_file.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def memory_mb(self) -> float:
+        """Return the memory that the service holds now (Linux)."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        kilobytes = next(
+            line.split()[1] for line in status.splitlines() if line.startswith("VmRSS")
+        )
+        return int(kilobytes) / 1e3
+
+    def stop(self, timeout_s: float = 10.0) -> int:
+        """Ask the service to end; return its exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            code = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise RuntimeError(
+                f"the service did not end within {timeout_s:g} s of SIGTERM"
+            ) from None
+        self._folder.cleanup()
+        return code
+
+    def kill(self) -> None:
+        """End the service as a crash would."""
+        self.process.kill()
+        self.process.wait()
+        self._folder.cleanup()
+
+    def _await_ready(self, timeout_s: float) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        while not self._ready_file.exists():
+            code = self.process.poll()
+            if code is not None:
+                raise RuntimeError(
+                    f"the service ended with code {code} before it was ready: "
+                    f"{self.log[-LOG_TAIL_CHARACTERS:].strip()}"
+                )
+            if time.monotonic() > deadline_s:
+                raise RuntimeError(
+                    f"the service was not ready within {timeout_s:g} s: "
+                    f"{self.log[-LOG_TAIL_CHARACTERS:].strip()}"
+                )
+            time.sleep(POLL_S)
+        self.endpoint = self._ready_file.read_text(encoding="utf-8").strip()
+
+
+def _as_toml(settings: Mapping[str, Any]) -> str:
+    lines = []
+    for name, value in settings.items():
+        if isinstance(value, bool):
+            text = str(value).lower()
+        elif isinstance(value, str):
+            text = '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        else:
+            text = repr(value)
+        lines.append(f"{name} = {text}\n")
+    return "".join(lines)

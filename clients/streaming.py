@@ -1,0 +1,241 @@
+"""Send rendered frames through a service: in order, while an eye changes, with a log.
+
+Between the scenes' frames and the client library; `pyrender_stream` and `demo` use it.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.scene_renderer import SceneFrame
+from filter_service.errors import ConnectionLost, ServiceTimeout
+from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Ready
+
+# Frames a second while an eye is being prepared: enough to see that the stream goes
+# on, few enough to leave the processor to the preparation.
+_PREVIEW_HZ = 4.0
+_BUILD_LIMIT_S = 180.0
+_LOST = "the connection to the service broke off"
+_NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
+
+
+@dataclass
+class FrameLog:
+    """What became of the frames sent through one eye."""
+
+    ages_ms: list[float] = field(default_factory=list)
+    round_trips_ms: list[float] = field(default_factory=list)
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+    drops: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, tuple[int, str]] = field(default_factory=dict)
+
+    def add(self, answer: FilteredFrame) -> None:
+        """Note a frame that came back filtered."""
+        self.ages_ms.append(answer.age_ms)
+        self.round_trips_ms.append(answer.round_trip_ms)
+        for stage, time_ms in answer.header.stage_times_ms.items():
+            self.stages_ms.setdefault(stage, []).append(time_ms)
+        for note in answer.header.notes:
+            # A note's numbers change with every frame; its kind is worth counting.
+            kind = _NUMBER.sub("#", note)
+            count, example = self.notes.get(kind, (0, note))
+            self.notes[kind] = (count + 1, example)
+
+    def add_drop(self, reason: str) -> None:
+        """Note a frame that was dropped."""
+        self.drops[reason] = self.drops.get(reason, 0) + 1
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts and p50, p95, p99 of every stage, age and round trip."""
+        return {
+            "frames": len(self.ages_ms),
+            "drops": dict(self.drops),
+            "frame_age_ms": percentiles(self.ages_ms),
+            "round_trip_ms": percentiles(self.round_trips_ms),
+            "stages_ms": {
+                stage: percentiles(times) for stage, times in self.stages_ms.items()
+            },
+            "notes": [
+                {"frames": count, "example": example}
+                for count, example in self.notes.values()
+            ],
+        }
+
+
+def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
+    """Return p50, p95 and p99, rounded to a microsecond; None without values."""
+    names = {"p50": 50, "p95": 95, "p99": 99}
+    if not values_ms:
+        return dict.fromkeys(names)
+    return {
+        name: round(float(np.percentile(values_ms, percent)), 3)
+        for name, percent in names.items()
+    }
+
+
+def view_of(frame: SceneFrame) -> RgbdView:
+    """Return a rendered frame as the client library takes it."""
+    return RgbdView(frame.color, frame.depth_m, frame.tangents)
+
+
+def filter_in_order(
+    client: FilterClient, frames: Iterable[SceneFrame], log: FrameLog
+) -> Iterator[tuple[SceneFrame, FilteredFrame]]:
+    """Send one frame after the other and yield each with its filtered image.
+
+    A frame that the service drops is counted and sent again.
+
+    Raises
+    ------
+    FilterError
+        The service refuses a frame, does not answer in time or is gone.
+    """
+    for frame in frames:
+        while True:
+            _submit(client, frame)
+            answer = _next_answer(client)
+            if isinstance(answer, FilteredFrame):
+                break
+            log.add_drop(answer.reason)
+            _check_connection(answer)
+        log.add(answer)
+        yield frame, answer
+
+
+def _check_connection(event) -> None:
+    """Raise where a frame was dropped because the service went away."""
+    if isinstance(event, Dropped) and event.reason == "connection_lost":
+        raise ConnectionLost(_LOST)
+
+
+def _submit(client: FilterClient, frame: SceneFrame) -> int:
+    return client.submit(
+        view_of(frame),
+        pupil_diameter_mm=frame.pupil_diameter_mm,
+        focus_dpt=frame.focus_dpt,
+    )
+
+
+def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
+    """Wait for the one frame that is on its way."""
+    deadline_s = time.monotonic() + client.timeout_s
+    while time.monotonic() < deadline_s:
+        for event in client.poll(0.2):
+            if isinstance(event, ErrorReply):
+                raise event.exception()
+            if isinstance(event, FilteredFrame | Dropped):
+                return event
+    raise ServiceTimeout(f"no answer to a frame within {client.timeout_s:g} s")
+
+
+@dataclass(frozen=True)
+class EyeChange:
+    """How one eye took over from another while frames went on.
+
+    Attributes
+    ----------
+    generation, previous_generation : as the service counts eyes; None before any eye
+    frames_through_previous : frames answered with the old eye during preparation
+    ready : what the service says of the new eye
+    """
+
+    generation: int
+    previous_generation: int | None
+    frames_through_previous: int
+    ready: Ready
+
+    def summary(self) -> dict[str, Any]:
+        """Return the change as plain numbers."""
+        return {
+            "generation": self.generation,
+            "previous_generation": self.previous_generation,
+            "frames_through_previous_eye": self.frames_through_previous,
+            "build_ms": round(self.ready.build_ms, 1),
+            "psf_count": self.ready.psf_count,
+            "memory_mb": round(self.ready.memory_mb, 2),
+            "notes": list(self.ready.notes),
+        }
+
+
+def change_eye(
+    client: FilterClient,
+    body: Mapping[str, Any],
+    *,
+    settings: Mapping[str, Any],
+    frames: Sequence[SceneFrame],
+    has_eye: bool,
+    on_progress: Callable[[float, str], None] = lambda fraction, stage: None,
+) -> EyeChange:
+    """Ask for another eye and keep the stream going until it is ready.
+
+    Parameters
+    ----------
+    body : profile, as ``{"kind": "preset", "name": "myopia"}``
+    settings : fields of `ProfileSettings`
+    frames : sent round and round meanwhile; the first one's camera is prepared for
+    has_eye : whether an earlier eye serves them
+    on_progress : called with (fraction 0..1, stage)
+
+    Raises
+    ------
+    FilterError
+        The profile is refused, its preparation fails or takes too long.
+    """
+    accepted = client.set_profile(
+        body,
+        settings=settings,
+        views=[view_of(frames[0])],
+        wait=False,
+        timeout_s=client.timeout_s,
+    )
+    assert isinstance(accepted, Accepted)
+    watch = _ChangeWatch(accepted, on_progress)
+    deadline_s = time.monotonic() + _BUILD_LIMIT_S
+    next_send_s, index = time.monotonic(), 0
+    while watch.ready is None or client.n_unanswered:
+        now_s = time.monotonic()
+        if now_s > deadline_s:
+            raise ServiceTimeout(f"the eye was not ready within {_BUILD_LIMIT_S:g} s")
+        is_due = has_eye and watch.ready is None and now_s >= next_send_s
+        if is_due and not client.n_unanswered:
+            _submit(client, frames[index % len(frames)])
+            index, next_send_s = index + 1, now_s + 1 / _PREVIEW_HZ
+        for event in client.poll(0.05):
+            watch.take(event)
+        if client.welcome is None:
+            raise ConnectionLost(_LOST)
+    return EyeChange(
+        accepted.generation, watch.old_generation, watch.n_through_old, watch.ready
+    )
+
+
+class _ChangeWatch:
+    """Sorts what happens while an eye is prepared."""
+
+    def __init__(self, accepted: Accepted, on_progress) -> None:
+        self._accepted, self._on_progress = accepted, on_progress
+        self.ready: Ready | None = None
+        self.old_generation: int | None = None
+        self.n_through_old = 0
+
+    def take(self, event) -> None:
+        """Count a frame, pass progress on, keep Ready; raise what went wrong."""
+        if isinstance(event, ErrorReply):
+            raise event.exception()
+        _check_connection(event)
+        if isinstance(event, FilteredFrame):
+            if event.header.generation != self._accepted.generation:
+                self.n_through_old += 1
+                self.old_generation = event.header.generation
+        elif getattr(event, "profile_id", None) == self._accepted.profile_id:
+            if isinstance(event, Progress):
+                self._on_progress(event.fraction, event.stage)
+            elif isinstance(event, Ready):
+                self.ready = event
