@@ -267,7 +267,7 @@ def _compute_chunk(survey, batch, members, radius_px, pixel_pitch_mrad, accuracy
         integrate_pixels(
             field[i], center[i], np.array(window), kx, ky, *filters, scale, kernel
         )
-        add_tail(kernel, survey, p, inside_px=window, pixel_pitch_mrad=pixel_pitch_mrad)
+        add_tail(kernel, survey, p, pixel_pitch_mrad=pixel_pitch_mrad)
         kernels.append(kernel)
     return kernels
 

@@ -222,14 +222,7 @@ def _with_diffraction(survey, p, spot, airy, pixel_pitch_mrad):
     out = np.zeros_like(spot)
     _convolve(spot, airy, window, out)
     # Pixels beyond the reach of the small kernel get the mean edge light instead.
-    reach = AIRY_RADIUS_PX - 1
-    add_tail(
-        out,
-        survey,
-        p,
-        inside_px=(x0 - reach, x1 + reach, y0 - reach, y1 + reach),
-        pixel_pitch_mrad=pixel_pitch_mrad,
-    )
+    add_tail(out, survey, p, pixel_pitch_mrad=pixel_pitch_mrad)
     return out
 
 

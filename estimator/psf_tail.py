@@ -12,28 +12,29 @@ from numba import njit
 
 from estimator.psf_survey import PupilSurvey
 
+EDGE_STRIDE = 4
+"""Every fourth edge sample serves: distances to the edge need no more."""
+
 
 @njit(cache=True, nogil=True)
-def _fill_tail(kernel, inside, pitch_x, pitch_y, center_x, center_y, spread, strength):
-    """Add the tail to every pixel of a kernel outside a rectangle of pixels.
-
-    ``inside`` = (x0, x1, y0, y1): pixel offsets, y upward, ends included.
-    """
+def _fill_tail(kernel, pitch_x, pitch_y, edge, center, strength):
+    """Set every dark pixel of a kernel's disc to the tail."""
     radius = kernel.shape[0] // 2
     limit = (radius + 0.5) * (radius + 0.5)
-    floor = spread + 0.5 * max(pitch_x, pitch_y)
+    half_pixel = 0.5 * max(pitch_x, pitch_y)
     for dy in range(-radius, radius + 1):
-        theta_y = -dy * pitch_y - center_y
-        is_inside_y = inside[2] <= -dy <= inside[3]
         for dx in range(-radius, radius + 1):
-            if is_inside_y and inside[0] <= dx <= inside[1]:
+            if kernel[dy + radius, dx + radius] != 0.0 or dx * dx + dy * dy > limit:
                 continue
-            if dx * dx + dy * dy > limit:
-                continue
-            theta_x = dx * pitch_x - center_x
-            rho = max(math.sqrt(theta_x * theta_x + theta_y * theta_y), floor)
-            near, far = rho - spread, rho + spread
-            kernel[dy + radius, dx + radius] += (
+            theta_x, theta_y = dx * pitch_x, -dy * pitch_y
+            near, far = math.inf, 0.0
+            for i in range(edge.shape[0]):
+                distance = math.hypot(theta_x - edge[i, 0], theta_y - edge[i, 1])
+                near = min(near, distance)
+                far = max(far, distance)
+            near = max(near, half_pixel)
+            rho = max(math.hypot(theta_x - center[0], theta_y - center[1]), near)
+            kernel[dy + radius, dx + radius] = (
                 strength / rho * (1.0 / (near * near) + 1.0 / (far * far))
             )
 
@@ -43,42 +44,38 @@ def add_tail(
     survey: PupilSurvey,
     index: int,
     *,
-    inside_px: tuple[int, int, int, int],
     pixel_pitch_mrad: tuple[float, float],
 ) -> None:
-    """Add, in place, the mean edge-diffracted light outside a rectangle of pixels.
+    """Add, in place, the mean edge-diffracted light where a kernel is dark.
 
     Parameters
     ----------
     kernel : (2R+1, 2R+1) float32
-        Image orientation, in shares of the whole light; only the disc is touched.
+        Image orientation, in shares of the whole light.  Its zeros are the pixels that
+        no window or small diffraction kernel reached; those of the disc are set.
     survey : PupilSurvey
     index : int
         Which PSF of the survey.
-    inside_px : (x0, x1, y0, y1)
-        Pixel offsets (y upward, ends included) that already hold their light.
     pixel_pitch_mrad : (x, y)
 
     Notes
     -----
     The edge light of `psf_survey.needed_radius_px` for a wavefront whose edge slopes
     lie on a circle of radius g about c: density lambda / (2 pi³ D rho)
-    [1/(rho-g)² + 1/(rho+g)²], rho = |theta - c|.  Fringes are left out: pixels
-    average them.  g is the root mean square distance of the edge slopes.
+    [1/(rho-g)² + 1/(rho+g)²], rho = |theta - c|.  For any other edge the distances to
+    its nearest and farthest point take the places of rho -+ g, so that an elongated
+    spot gets no light beside its long sides that only its ends could send.  Fringes
+    are left out: pixels average them.
     """
     slope = survey.edge_slope_mrad[index]
-    center = slope.mean(axis=0)
-    spread = math.sqrt(((slope - center) ** 2).sum(axis=1).mean())
     pitch_x, pitch_y = pixel_pitch_mrad
     wavelength_um = survey.wavelength_nm[index] / 1000.0
     strength = wavelength_um / (2.0 * math.pi**3 * survey.pupil_diameter_mm[index])
     _fill_tail(
         kernel,
-        np.asarray(inside_px, np.int64),
         pitch_x,
         pitch_y,
-        float(center[0]),
-        float(center[1]),
-        spread,
+        np.ascontiguousarray(slope[::EDGE_STRIDE]),
+        slope.mean(axis=0),
         strength * pitch_x * pitch_y,
     )

@@ -1,0 +1,41 @@
+# The verbs of the project.  Each does its own set-up; `make help` lists them.
+# Arguments go through ARGS:  make demo ARGS="--frames 96 --size 640x360"
+
+PYTHON := .venv/bin/python
+ARGS ?=
+RESULTS := tests/benchmarks/results
+BENCHES := psf render roundtrip
+
+.DEFAULT_GOAL := help
+.PHONY: demo test validate check clean help setup setup-test
+
+demo: setup  ## stream two scenes through six eyes; writes out/demo/
+	$(PYTHON) -m filter_service demo $(ARGS)
+
+test: setup-test  ## all tests but the slow ones and those for a hardware GPU
+	$(PYTHON) -m pytest -m "not slow and not gpu" $(ARGS)
+
+validate: setup-test  ## the slow tests, and every benchmark table as JSON
+	$(PYTHON) -m pytest -m "slow and not gpu" $(ARGS)
+	mkdir -p $(RESULTS) out
+	for bench in $(BENCHES); do \
+	    $(PYTHON) -m filter_service bench $$bench --json > out/$$bench.json && \
+	    mv out/$$bench.json $(RESULTS)/$$bench.json || exit 1; \
+	done
+
+check: setup  ## lint and formatting
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+
+clean:  ## remove what the other targets made, .venv included
+	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:  ## this list
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+
+setup:
+	@sh setup.sh
+
+setup-test:
+	@sh setup.sh test

@@ -1,0 +1,1 @@
+"""The running filter service; this file imports nothing, so clients never load GL."""

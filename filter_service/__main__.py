@@ -1,0 +1,82 @@
+"""The `ocufilter` program: command line to function calls, errors to one line."""
+
+import sys
+
+import typer
+from typer.exceptions import Abort, TyperException
+
+from filter_service.commands.console import CommandFailed
+from filter_service.commands.doctor import doctor
+from filter_service.commands.filter_image import filter_image
+from filter_service.commands.programs import bench, demo
+from filter_service.commands.psf import psf
+from filter_service.commands.serve import serve
+
+EXIT_FAILURE = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    name="ocufilter",
+    help="See through another person's eyes.  Start with `ocufilter demo`; "
+    "`ocufilter doctor` says what this machine lacks.",
+    epilog="Units end names: mm, nm, dpt (dioptres; infinity is 0), deg.  "
+    "Exit codes: 0 done, 1 failure, 2 bad input.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command()(demo)
+app.command()(serve)
+app.command(name="filter")(filter_image)
+app.command()(psf)
+app.command()(bench)
+app.command()(doctor)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    traceback: bool = typer.Option(False, help="Show where an error came from."),
+) -> None:
+    if context.invoked_subcommand is None:
+        sys.stdout.write(context.get_help() + "\n")
+
+
+def main() -> None:
+    """Run the program; one line on stderr and an exit code for every error."""
+    sys.exit(_exit_code(sys.argv[1:]))
+
+
+def _exit_code(arguments: list[str]) -> int:
+    try:
+        return app(arguments, prog_name="ocufilter", standalone_mode=False) or 0
+    except (Abort, KeyboardInterrupt):
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        if "--traceback" in arguments[:1]:
+            raise
+        code, text = _code_and_text(error)
+        sys.stderr.write(f"ocufilter: {' '.join(text.split())}\n")
+        return code
+
+
+def _code_and_text(error: Exception) -> tuple[int, str]:
+    from filter_service.errors import FilterError
+
+    if isinstance(error, TyperException):
+        return error.exit_code, error.format_message()
+    if isinstance(error, FilterError):
+        return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
+    if isinstance(error, CommandFailed):
+        return EXIT_FAILURE, str(error)
+    if isinstance(error, ValueError):  # a caller's mistake, by the house rule
+        return EXIT_BAD_INPUT, str(error)
+    if isinstance(error, OSError):
+        return EXIT_FAILURE, str(error)
+    kind = type(error).__name__
+    return EXIT_FAILURE, f"{kind}: {error} (ocufilter --traceback ... shows where)"
+
+
+if __name__ == "__main__":
+    main()

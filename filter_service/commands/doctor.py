@@ -1,0 +1,38 @@
+"""`ocufilter doctor`: what works on this machine, and what to install."""
+
+from filter_service.commands.console import CommandFailed, Json, print_json, say
+
+
+def doctor(json_output: Json = False) -> None:
+    """Try what the program needs and say what is missing.
+
+    Exit code 0 when the service can run here, 1 when it cannot.
+
+    ocufilter doctor --json
+    """
+    from filter_service.doctor import examine
+
+    report = examine()
+    if json_output:
+        print_json(report)
+    else:
+        _print_report(report)
+    if not report["ok"]:
+        fails = ", ".join(name for name, ok in report["works"].items() if not ok)
+        raise CommandFailed(f"the service cannot run here; what fails: {fails}")
+
+
+def _print_report(report: dict) -> None:
+    machine = report["machine"]
+    say(f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores")
+    for check in report["checks"]:
+        say(f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}")
+    for name, value in report["gl"]["limits"].items():
+        say(f"      {name}: {value}")
+    works = [name for name, ok in report["works"].items() if ok]
+    fails = [name for name, ok in report["works"].items() if not ok]
+    say("works here: " + (", ".join(works) or "nothing"))
+    if fails:
+        say("does not work here: " + ", ".join(fails))
+    for command in report["install"]:
+        say(f"install: {command}")

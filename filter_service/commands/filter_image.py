@@ -1,0 +1,206 @@
+"""`ocufilter filter`: one RGB-D image through one eye, without a server."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from filter_service.commands.console import (
+    Json,
+    check_range,
+    print_json,
+    progress_bar,
+    say,
+)
+
+if TYPE_CHECKING:
+    from estimator.profiles import EyeProfile
+    from filter_service.frame import View
+    from filter_service.one_image import FilteredImage
+
+PUPIL_LIMITS_MM = (1.0, 9.0)
+FOCUS_LIMITS_DPT = (0.0, 12.0)
+FOV_LIMITS_DEG = (1.0, 150.0)
+
+
+class Mode(StrEnum):
+    """Which directions have a PSF of their own."""
+
+    ON_AXIS = "on-axis"
+
+
+class Accumulation(StrEnum):
+    """How fragments of one pixel add up."""
+
+    COVERAGE = "coverage"
+    PAPER = "paper"
+
+
+class DepthKind(StrEnum):
+    """What the depth file measures."""
+
+    PLANAR = "planar"
+    RADIAL = "radial"
+
+
+def filter_image(
+    color: Annotated[
+        Path,
+        typer.Option(
+            metavar="IMG",
+            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr.",
+        ),
+    ],
+    depth: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE",
+            help="Metres: .npy, 32-bit float TIFF, .exr; or a 16-bit PNG with "
+            "--depth-scale.  inf is infinity; 0, negative and NaN are missing.",
+        ),
+    ],
+    fov_deg: Annotated[float, typer.Option(help="Vertical field of view, deg.")],
+    profile: Annotated[
+        str,
+        typer.Option(
+            metavar="P", help="A preset name, or a .json, .abp or .csv profile."
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear float32)."
+        ),
+    ],
+    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
+    focus_dpt: Annotated[
+        float, typer.Option(help="Focus distance, dpt; 0 is infinity.")
+    ] = 0.0,
+    mode: Annotated[
+        Mode, typer.Option(help="on-axis: one direction for the whole image.")
+    ] = Mode.ON_AXIS,
+    accumulation: Annotated[
+        Accumulation,
+        typer.Option(help="coverage conserves light; paper is the published rule."),
+    ] = Accumulation.COVERAGE,
+    depth_kind: Annotated[
+        DepthKind, typer.Option(help="planar: view-space z; radial: distance.")
+    ] = DepthKind.PLANAR,
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(help="Metres per unit of the depth file [integers: 0.001]."),
+    ] = None,
+    no_diffraction: Annotated[
+        bool, typer.Option("--no-diffraction", help="Geometrical optics only.")
+    ] = False,
+    no_chromatic: Annotated[
+        bool, typer.Option("--no-chromatic", help="Focus all colours alike.")
+    ] = False,
+    no_merge: Annotated[
+        bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Filter one image with depth through one eye; no server is needed.
+
+    ocufilter filter --color room.png --depth room.npy --fov-deg 50
+    --profile myopia --pupil-mm 5 -o blurred.png
+    """
+    check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
+    check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
+    check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
+
+    from estimator.profile_files import load_profile
+    from filter_service import image_files, one_image
+
+    image_files.check_output(out)
+    eye = load_profile(profile)
+    view = _read_view(
+        color,
+        depth,
+        fov_deg=fov_deg,
+        depth_kind=depth_kind.value,
+        depth_scale=depth_scale,
+    )
+    linear = out.suffix.lower() in image_files.LINEAR_SUFFIXES
+    settings = one_image.ImageSettings(
+        pupil_diameter_mm=pupil_mm,
+        focus_dpt=focus_dpt,
+        accumulation=accumulation.value,
+        diffraction=not no_diffraction,
+        chromatic=not no_chromatic,
+        merge=not no_merge,
+        output="linear" if linear else "srgb8",
+    )
+    with progress_bar("PSFs", quiet=json_output) as progress:
+        filtered = one_image.filter_one_image(view, eye, settings, progress=progress)
+    image_files.write_image(out, filtered.rendered.color)
+    summary = _summary(filtered, out=out, eye=eye)
+    if json_output:
+        print_json(summary)
+    else:
+        _report(summary)
+
+
+def _read_view(
+    color_path: Path,
+    depth_path: Path,
+    *,
+    fov_deg: float,
+    depth_kind: str,
+    depth_scale: float | None,
+) -> "View":
+    from filter_service.frame import View
+    from filter_service.image_files import read_color, read_depth
+    from filter_service.one_image import symmetric_tangents
+
+    color = read_color(color_path)
+    depth_m = read_depth(depth_path, depth_scale=depth_scale)
+    height_px, width_px = color.shape[:2]
+    if depth_m.shape != (height_px, width_px):
+        raise ValueError(
+            f"--depth '{depth_path}': {depth_m.shape[1]}x{depth_m.shape[0]} px; "
+            f"allowed: the size of the colour image, {width_px}x{height_px}"
+        )
+    tangents = symmetric_tangents(
+        width_px=width_px, height_px=height_px, vertical_fov_deg=fov_deg
+    )
+    return View(color=color, depth_m=depth_m, tangents=tangents, depth_kind=depth_kind)
+
+
+def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict:
+    rendered = filtered.rendered
+    height_px, width_px = rendered.color.shape[:2]
+    return {
+        "out": str(out),
+        "width_px": width_px,
+        "height_px": height_px,
+        "profile": eye.name,
+        "pupil_diameter_mm": rendered.pupil_diameter_mm,
+        "focus_dpt": rendered.focus_dpt,
+        "object_range_dpt": list(filtered.grid.object_range_dpt),
+        "missing_depth_count": int(rendered.missing_depth_count),
+        "clamped_depth_count": int(rendered.clamped_depth_count),
+        "build_ms": filtered.build_ms,
+        "start_ms": filtered.start_ms,
+        "render_ms": filtered.render_ms,
+        "stage_times_ms": dict(rendered.stage_times_ms),
+        "gl_renderer": filtered.gl_renderer,
+        "notes": list(rendered.notes),
+    }
+
+
+def _report(summary: dict) -> None:
+    for note in summary["notes"]:
+        say(f"note: {note}")
+    for kind in ("missing", "clamped"):
+        if count := summary[f"{kind}_depth_count"]:
+            say(f"note: {count} pixels with {kind} depth")
+    say(
+        f"{summary['out']}: {summary['width_px']}x{summary['height_px']} through "
+        f"{summary['profile']}, pupil {summary['pupil_diameter_mm']:g} mm, "
+        f"focus {summary['focus_dpt']:.3g} dpt; "
+        f"PSFs {summary['build_ms']:.0f} ms, start {summary['start_ms']:.0f} ms, "
+        f"frame {summary['render_ms']:.0f} ms on {summary['gl_renderer']}"
+    )

@@ -1,0 +1,105 @@
+"""`ocufilter demo` and `ocufilter bench`: programs of the checkout, as subprocesses.
+
+The service never imports its clients or tests; it can only start them.
+"""
+
+import json
+import subprocess
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filter_service.commands.console import CommandFailed, Json, checkout_root, say
+
+
+class Bench(StrEnum):
+    """Benchmarks by what they time."""
+
+    PSF = "psf"
+    RENDER = "render"
+    ROUNDTRIP = "roundtrip"
+
+
+BENCH_MODULES = {
+    Bench.PSF: "tests.benchmarks.bench_psf",
+    Bench.RENDER: "tests.benchmarks.bench_render",
+    Bench.ROUNDTRIP: "clients.latency",
+}
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for what it writes.")
+    ] = Path("out/demo"),
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Frames of each eye.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Frame size in px, as 480x270.")
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Stream two scenes through six eyes and write a video and a contact sheet.
+
+    Starts a service of its own and a pyrender client against it.  Writes a video,
+    contact_sheet.png and latency.json.
+
+    ocufilter demo --out out/demo --frames 24 --size 480x270
+    """
+    arguments = ["--out", str(out.absolute())]
+    if frames is not None:
+        arguments += ["--frames", str(frames)]
+    if size is not None:
+        arguments += ["--size", _checked_size(size)]
+    _run_program("clients.demo", arguments, json_output=json_output)
+
+
+def bench(
+    name: Annotated[Bench, typer.Argument(help="What to time.")],
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer cases and repeats.")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Time one part of the program, always beside its error.
+
+    ocufilter bench psf --quick
+
+    ocufilter bench roundtrip --json
+    """
+    arguments = ["--quick"] if quick else []
+    _run_program(BENCH_MODULES[name], arguments, json_output=json_output)
+
+
+def _checked_size(size: str) -> str:
+    parts = size.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
+        raise ValueError(f"--size '{size}': allowed is WIDTHxHEIGHT, 16 px or more")
+    return "x".join(parts)
+
+
+def _run_program(module: str, arguments: list[str], *, json_output: bool) -> None:
+    root = checkout_root(module.split(".")[0])
+    command = [sys.executable, "-m", module, *arguments]
+    if not json_output:
+        finished = subprocess.run(command, cwd=root, check=False)
+    else:
+        finished = subprocess.run(
+            [*command, "--json"], cwd=root, stdout=subprocess.PIPE, check=False
+        )
+    if finished.returncode in (1, 2):  # it has said why, on the stderr we share
+        raise typer.Exit(finished.returncode)
+    if finished.returncode != 0:
+        raise CommandFailed(f"{module} ended with code {finished.returncode}")
+    if json_output:
+        say(json.dumps(_one_json_object(finished.stdout, module)))
+
+
+def _one_json_object(output: bytes, module: str) -> dict:
+    try:
+        return json.loads(output)
+    except ValueError as error:
+        raise CommandFailed(f"{module} printed no JSON object: {error}") from None

@@ -1,0 +1,38 @@
+"""`ocufilter serve`: the long-running service."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def serve(
+    bind: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Where to listen: tcp://127.0.0.1:5577 or ipc:///tmp/ocufilter.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings file.")
+    ] = None,
+    ready_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Written with the endpoint once frames may come."
+        ),
+    ] = None,
+) -> None:
+    """Filter frames for clients until interrupted.
+
+    Messages are described in filter_service/PROTOCOL.md; --bind wins over the file.
+
+    ocufilter serve --bind tcp://127.0.0.1:5577
+    """
+    from filter_service import server
+    from filter_service.config import load_config
+
+    if config is not None and not config.is_file():
+        raise ValueError(f"--config '{config}': no such file")
+    server.run(load_config(config, bind=bind, ready_file=ready_file))

@@ -1,0 +1,116 @@
+#!/bin/sh
+# Makes a bare Debian or Ubuntu machine ready; the Makefile calls it first.
+#
+#   sh setup.sh         the Python environment in .venv and the system libraries
+#   sh setup.sh test    the same, and a virtual screen for the window test
+#
+# Running it again costs a fraction of a second: the environment is installed anew
+# only when this file, pyproject.toml, constraints.txt or the folder has changed.
+set -eu
+cd "$(dirname "$0")"
+
+SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
+TEST_PACKAGES="xvfb"
+VENV=.venv
+STAMP=$VENV/.ocufilter-installed
+
+say() { printf 'setup: %s\n' "$*" >&2; }
+
+# --- system libraries --------------------------------------------------------
+
+missing_packages() {
+    for package in "$@"; do
+        status=$(dpkg-query -W -f '${Status}' "$package" 2>/dev/null || true)
+        case $status in *"ok installed") ;; *) echo "$package" ;; esac
+    done | xargs # on one line
+}
+
+apt_prefix() { # what to put before apt-get, or failure when we may not run it
+    if [ "$(id -u)" = 0 ]; then
+        echo env
+    elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
+        echo sudo -n env
+    else
+        return 1
+    fi
+}
+
+apt_install() {
+    prefix=$(apt_prefix) || return 1
+    say "installing $* with apt-get"
+    log=$(mktemp)
+    if { $prefix apt-get update &&
+        $prefix DEBIAN_FRONTEND=noninteractive \
+            apt-get install -y --no-install-recommends "$@"; } >"$log" 2>&1; then
+        rm -f "$log"
+    else
+        tail -n 5 "$log" >&2
+        rm -f "$log"
+        return 1
+    fi
+}
+
+install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
+
+install_system_libraries() {
+    if ! command -v dpkg-query >/dev/null; then
+        say "not a Debian system: EGL, OpenGL (Mesa) and libgomp must be there already"
+        return
+    fi
+    missing=$(missing_packages $SYSTEM_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "these system packages are missing: $missing"
+        say "install them, then start again:  $(install_command "$missing")"
+        exit 1
+    fi
+}
+
+install_test_packages() { # worth having, but the tests run without
+    command -v dpkg-query >/dev/null || return 0
+    missing=$(missing_packages $TEST_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "without $missing the window test is skipped;" \
+            "to run it:  $(install_command "$missing")"
+    fi
+}
+
+# --- Python environment ------------------------------------------------------
+
+find_python() { # the first Python 3.11 or newer; asked, as a name alone may lie
+    for name in python3 python3.13 python3.12 python3.11; do
+        if "$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+            2>/dev/null; then
+            echo "$name"
+            return
+        fi
+    done
+    say "Python 3.11 or newer is needed:  $(install_command python3 python3-venv)"
+    exit 1
+}
+
+make_venv() {
+    python=$(find_python)
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        say "$python has no venv module:  $(install_command python3-venv)"
+        exit 1
+    fi
+    "$python" -m venv --clear $VENV
+}
+
+install_packages() {
+    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt | cksum)
+    if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
+    if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
+    rm -f $STAMP
+    say "installing the pinned Python packages into $VENV (a minute or two)"
+    pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
+    $pip install -c constraints.txt setuptools
+    $pip install -c constraints.txt --no-build-isolation -e '.[clients,dev]'
+    # apart and without its dependencies: it pins a PyOpenGL that is too old
+    $pip install --no-deps pyrender==0.1.45
+    echo "$wanted" >$STAMP
+}
+
+install_system_libraries
+install_packages
+if [ "${1:-}" = test ]; then install_test_packages; fi

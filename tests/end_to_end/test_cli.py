@@ -1,0 +1,281 @@
+"""The `ocufilter` program as a person runs it: exit codes, JSON, files, errors."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from tests.source_tree import ROOT
+
+TIMEOUT_S = 120
+WIDTH_PX, HEIGHT_PX = 48, 32
+
+
+def run(*arguments, cwd=ROOT):
+    """Run the program; cwd is the checkout unless a test says otherwise."""
+    return subprocess.run(
+        [sys.executable, "-m", "filter_service", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+
+
+def run_json(*arguments):
+    finished = run(*arguments, "--json")
+    assert finished.returncode == 0, finished.stderr
+    return json.loads(finished.stdout)
+
+
+def refusal(*arguments):
+    """Return the one line on stderr of a run that must end with code 2."""
+    finished = run(*arguments)
+    assert finished.returncode == 2, finished.stderr
+    assert finished.stdout == ""
+    assert finished.stderr.count("\n") == 1, finished.stderr
+    return finished.stderr
+
+
+def psnr_db(image, reference):
+    error = np.mean((image.astype(np.float64) - reference) ** 2)
+    return 10.0 * np.log10(1.0 / max(error, 1e-20))
+
+
+@pytest.fixture
+def scene(tmp_path, rng):
+    """Linear colour, planar depth with a step and a hole, as files."""
+    linear = rng.random((HEIGHT_PX, WIDTH_PX, 3), dtype=np.float32)
+    depth_m = np.full((HEIGHT_PX, WIDTH_PX), np.inf, np.float32)
+    np.save(tmp_path / "color.npy", linear)
+    np.save(tmp_path / "depth.npy", depth_m)
+    return tmp_path, linear
+
+
+def filter_arguments(folder, *extra, profile="emmetropia", fov_deg=50, out="out.npy"):
+    return (
+        *("filter", "--color", folder / "color.npy", "--depth", folder / "depth.npy"),
+        *("--fov-deg", fov_deg, "--profile", profile, "-o", folder / out),
+        *extra,
+    )
+
+
+IDENTITY = ("--no-diffraction", "--no-chromatic", "--pupil-mm", "3")
+
+
+def test_doctor_reports_a_machine_that_can_serve():
+    report = run_json("doctor")
+    assert report["ok"] and report["works"]["serve"]
+    assert report["threading_layer"] in ("omp", "tbb")
+    assert report["gl"]["renderer"]
+    assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
+    checks = {check["name"]: check["ok"] for check in report["checks"]}
+    assert checks["compute"]
+
+
+def test_doctor_without_opengl_says_what_to_install_and_fails():
+    finished = subprocess.run(
+        [sys.executable, "-m", "filter_service", "doctor", "--json"],
+        cwd=ROOT,
+        env={**os.environ, "GLCONTEXT_LINUX_LIBEGL": "libnothing.so"},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    assert finished.returncode == 1
+    assert finished.stderr.count("\n") == 1
+    report = json.loads(finished.stdout)
+    assert not report["works"]["serve"] and report["works"]["psf"]
+    assert any("apt-get install" in command for command in report["install"])
+
+
+def test_an_unaberrated_eye_gives_the_image_back(scene):
+    folder, linear = scene
+    summary = run_json(*filter_arguments(folder, *IDENTITY))
+    filtered = np.load(folder / "out.npy")
+    assert filtered.dtype == np.float32
+    assert psnr_db(filtered, linear) >= 60.0
+    assert summary["missing_depth_count"] == 0
+    assert summary["width_px"] == WIDTH_PX and summary["height_px"] == HEIGHT_PX
+
+
+def test_exr_and_npy_outputs_hold_the_same_linear_light(scene):
+    folder, _ = scene
+    defocus = ("--pupil-mm", "3")
+    run_json(*filter_arguments(folder, *defocus, profile="myopia"))
+    run_json(*filter_arguments(folder, *defocus, profile="myopia", out="out.exr"))
+    with OpenEXR.File(str(folder / "out.exr")) as file:
+        stored = file.channels()["RGB"].pixels
+    np.testing.assert_allclose(stored, np.load(folder / "out.npy"), atol=1e-5)
+
+
+def test_png_input_and_output_are_srgb(scene, rng):
+    folder, _ = scene
+    srgb = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    Image.fromarray(srgb).save(folder / "color.png")
+    millimetres = np.full((HEIGHT_PX, WIDTH_PX), 50_000, np.uint16)
+    Image.fromarray(millimetres).save(folder / "depth.png")
+    arguments = (
+        *("filter", "--color", folder / "color.png", "--depth", folder / "depth.png"),
+        *("--fov-deg", 30, "--profile", "emmetropia", "--focus-dpt", 0.02),
+        *("--depth-scale", 0.001, "--depth-kind", "radial", "-o", folder / "out.png"),
+    )
+    summary = run_json(*arguments, *IDENTITY)
+    assert summary["object_range_dpt"] == pytest.approx([0.02, 0.02])
+    filtered = np.asarray(Image.open(folder / "out.png"))
+    # one step of rounding on the way through linear light
+    assert np.abs(filtered.astype(int) - srgb).max() <= 1
+
+
+def test_missing_depth_is_filled_and_counted(scene):
+    folder, _ = scene
+    depth_m = np.load(folder / "depth.npy")
+    depth_m[3, 5:9] = [0.0, -1.0, np.nan, 2.0]
+    np.save(folder / "depth.npy", depth_m)
+    assert run_json(*filter_arguments(folder))["missing_depth_count"] == 3
+
+
+def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
+    folder, _ = scene
+    finished = run(*filter_arguments(folder, "--pupil-mm", 7, profile="cataract"))
+    assert finished.returncode == 0, finished.stderr
+    assert "capped" in finished.stdout
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"profile": "hyperopia"}, "profile"),
+        ({"fov_deg": 0}, "--fov-deg"),
+        ({"fov_deg": "wide"}, "--fov-deg"),
+        ({"out": "out.gif"}, "--out"),
+        ({"out": "nowhere/out.png"}, "--out"),
+    ],
+)
+def test_bad_filter_arguments_end_with_one_line_that_names_the_field(
+    scene, change, named
+):
+    assert named in refusal(*filter_arguments(scene[0], **change))
+
+
+@pytest.mark.parametrize(
+    ("extra", "named"),
+    [
+        (("--pupil-mm", "30"), "--pupil-mm"),
+        (("--pupil-mm", "nan"), "--pupil-mm"),
+        (("--focus-dpt", "-1"), "--focus-dpt"),
+        (("--depth-scale", "0"), "--depth-scale"),
+        (("--mode", "peripheral"), "--mode"),
+        (("--accumulation", "sum"), "--accumulation"),
+        (("--nonsense",), "--nonsense"),
+    ],
+)
+def test_bad_options_end_with_one_line_that_names_them(scene, extra, named):
+    assert named in refusal(*filter_arguments(scene[0], *extra))
+
+
+def test_depth_of_another_size_is_refused_with_both_sizes(scene):
+    np.save(scene[0] / "depth.npy", np.ones((4, 6), np.float32))
+    line = refusal(*filter_arguments(scene[0]))
+    assert "--depth" in line and "6x4" in line and f"{WIDTH_PX}x{HEIGHT_PX}" in line
+
+
+@pytest.mark.parametrize("name", ["color.npy", "depth.npy"])
+def test_unreadable_and_missing_files_are_refused(scene, name):
+    option = "--" + name.split(".")[0]
+    (scene[0] / name).write_bytes(b"not an array")
+    assert option in refusal(*filter_arguments(scene[0]))
+    (scene[0] / name).unlink()
+    assert option in refusal(*filter_arguments(scene[0]))
+
+
+def test_a_profile_file_with_a_wrong_field_names_it(scene):
+    path = scene[0] / "eye.json"
+    path.write_text('{"kind": "prescription", "sphere_dpt": -400}')
+    assert "sphere_dpt" in refusal(*filter_arguments(scene[0], profile=path))
+
+
+PSF_OPTIONS = ("--pupil-mm", 3, "--wavelength-nm", 549, "--pixel-arcmin", 1)
+
+
+def test_psf_writes_a_kernel_of_unit_sum(tmp_path):
+    facts = run_json("psf", "keratoconus", *PSF_OPTIONS, "-o", tmp_path / "psf.npy")
+    kernel = np.load(tmp_path / "psf.npy")
+    assert kernel.shape == (2 * facts["radius_px"] + 1,) * 2
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+    assert facts["lost_energy_ratio"] < 0.01
+    assert facts["method"] in ("fourier", "geometric")
+
+
+def test_psf_writes_a_picture_with_a_scale_bar(tmp_path):
+    run_json("psf", "myopia", *PSF_OPTIONS, "-o", tmp_path / "psf.png")
+    picture = np.asarray(Image.open(tmp_path / "psf.png"))
+    assert min(picture.shape[:2]) >= 300
+    inside_bar = picture[-12 - 3, 14:40]  # margin, half the height
+    assert (inside_bar == 255).all()
+
+
+def test_psf_of_a_profile_of_its_own_file(tmp_path):
+    eye = tmp_path / "eye.abp"
+    eye.write_text("Ap = 5\nWa = 587.56\nZ[2, 0] = 1  # um\n")
+    facts = run_json("psf", eye, *PSF_OPTIONS, "-o", tmp_path / "psf.npy")
+    assert facts["profile"] == "eye.abp"
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--wavelength-nm", 200), ("--pixel-arcmin", 0), ("--method", "guess")],
+)
+def test_psf_refuses_values_out_of_range(tmp_path, option, value):
+    given = dict(zip(PSF_OPTIONS[::2], PSF_OPTIONS[1::2], strict=True))
+    given[option] = value
+    options = [word for pair in given.items() for word in pair]
+    assert option in refusal("psf", "myopia", *options, "-o", tmp_path / "psf.npy")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("demo", "--size", "wide"), "--size"),
+        (("demo", "--frames", "0"), "--frames"),
+        (("bench", "everything"), "everything"),
+        (("serve", "--config", "no-such-file.toml"), "--config"),
+        (("serve", "--bind", "nowhere"), "bind"),
+        (("psf", "myopia"), "--pupil-mm"),
+        (("dance",), "dance"),
+    ],
+)
+def test_other_commands_refuse_bad_input_with_one_line(arguments, named):
+    assert named in refusal(*arguments)
+
+
+@pytest.mark.parametrize("arguments", [("demo",), ("bench", "psf")])
+def test_checkout_commands_say_so_elsewhere(tmp_path, arguments):
+    (tmp_path / "estimator").symlink_to(ROOT / "estimator")
+    (tmp_path / "filter_service").mkdir()
+    for path in (ROOT / "filter_service").rglob("*.py"):
+        copy = tmp_path / path.relative_to(ROOT)
+        copy.parent.mkdir(exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    finished = subprocess.run(
+        [sys.executable, "-m", "filter_service", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    assert finished.returncode == 1
+    assert finished.stderr.count("\n") == 1 and "checkout" in finished.stderr
+
+
+def test_help_without_arguments_teaches_the_commands():
+    finished = run()
+    assert finished.returncode == 0
+    for command in ("demo", "serve", "filter", "psf", "bench", "doctor"):
+        assert f"\n  {command} " in finished.stdout

@@ -1,0 +1,130 @@
+"""Colour and depth files: what is read is what was written, or a refusal by name."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from filter_service.image_files import (
+    check_output,
+    read_color,
+    read_depth,
+    write_image,
+)
+
+
+@pytest.fixture
+def linear(rng):
+    return rng.random((5, 7, 3), dtype=np.float32) * 40.0  # above 1: no clipping
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr"])
+def test_linear_light_survives_a_file_exactly(tmp_path, linear, suffix):
+    path = tmp_path / f"image{suffix}"
+    write_image(path, linear)
+    np.testing.assert_array_equal(read_color(path), linear)
+
+
+def test_png_keeps_srgb_bytes_and_drops_alpha(tmp_path, rng):
+    srgb = rng.integers(0, 256, (5, 7, 4), dtype=np.uint8)
+    Image.fromarray(srgb).save(tmp_path / "rgba.png")
+    np.testing.assert_array_equal(read_color(tmp_path / "rgba.png"), srgb[:, :, :3])
+
+
+def test_grey_becomes_three_equal_channels(tmp_path):
+    grey = np.arange(35, dtype=np.uint8).reshape(5, 7)
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    color = read_color(tmp_path / "grey.png")
+    assert color.shape == (5, 7, 3)
+    np.testing.assert_array_equal(color[:, :, 1], grey)
+
+
+def test_exr_channels_come_back_in_rgb_order(tmp_path):
+    path = tmp_path / "half.exr"
+    half = np.zeros((4, 6, 4), np.float16)
+    half[:] = [0.25, 0.5, 0.75, 1.0]
+    header = {"type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGBA": half}) as file:
+        file.write(str(path))
+    np.testing.assert_array_equal(read_color(path)[0, 0], [0.25, 0.5, 0.75])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "depth_scale", "expected_m"),
+    [
+        (np.float32, None, [1500.0, np.inf, 0.0]),
+        (np.float64, 0.5, [750.0, np.inf, 0.0]),
+    ],
+)
+def test_float_depth_keeps_infinity_and_holes(tmp_path, dtype, depth_scale, expected_m):
+    np.save(tmp_path / "depth.npy", np.array([[1500.0, np.inf, 0.0]], dtype))
+    depth_m = read_depth(tmp_path / "depth.npy", depth_scale=depth_scale)
+    assert depth_m.dtype == np.float32
+    np.testing.assert_array_equal(depth_m, [expected_m])
+
+
+@pytest.mark.parametrize(("depth_scale", "metres"), [(None, 1.5), (0.0002, 0.3)])
+def test_16_bit_png_is_millimetres_unless_a_scale_is_given(
+    tmp_path, depth_scale, metres
+):
+    Image.fromarray(np.array([[1500, 0]], np.uint16)).save(tmp_path / "depth.png")
+    depth_m = read_depth(tmp_path / "depth.png", depth_scale=depth_scale)
+    np.testing.assert_allclose(depth_m, [[metres, 0.0]], rtol=1e-6)
+
+
+def test_float_tiff_and_exr_depth_are_metres(tmp_path, rng):
+    metres = rng.random((5, 7), dtype=np.float32)
+    Image.fromarray(metres).save(tmp_path / "depth.tif")
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), metres)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": metres}) as file:
+        file.write(str(tmp_path / "depth.exr"))
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.exr"), metres)
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.zeros((4, 6), np.float32), "shape"),
+        (np.zeros((0, 6, 3), np.float32), "shape"),
+        (np.zeros((4, 6, 3), np.int32), "int32"),
+        (np.full((4, 6, 3), -0.1, np.float32), "negative"),
+        (np.full((4, 6, 3), np.nan, np.float32), "not finite"),
+    ],
+)
+def test_unfit_colour_is_refused_with_what_was_found(tmp_path, array, said):
+    np.save(tmp_path / "color.npy", array)
+    with pytest.raises(ValueError, match=said) as caught:
+        read_color(tmp_path / "color.npy")
+    assert "--color" in str(caught.value) and "allowed" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["depth.exr", "depth.png", "depth.npy", "depth.jpg"])
+def test_a_depth_file_that_is_none_is_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="--depth"):
+        read_depth(tmp_path / name)
+
+
+def test_colour_with_three_channels_is_no_depth(tmp_path):
+    Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(tmp_path / "depth.png")
+    with pytest.raises(ValueError, match="one channel"):
+        read_depth(tmp_path / "depth.png")
+
+
+def test_a_pickled_array_is_not_loaded(tmp_path):
+    np.save(tmp_path / "color.npy", np.array([{"a": 1}]), allow_pickle=True)
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_color(tmp_path / "color.npy")
+
+
+def test_outputs_are_checked_before_any_work(tmp_path):
+    check_output(tmp_path / "out.PNG")
+    with pytest.raises(ValueError, match=r"\.png, \.npy, \.exr"):
+        check_output(tmp_path / "out.jpg")
+    with pytest.raises(ValueError, match="folder"):
+        check_output(tmp_path / "missing" / "out.png")
+
+
+def test_a_type_that_does_not_fit_the_file_is_refused(tmp_path, linear):
+    with pytest.raises(ValueError, match="uint8"):
+        write_image(tmp_path / "out.png", linear)

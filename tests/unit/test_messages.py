@@ -1,0 +1,432 @@
+"""The wire types: round trips, and every way a message can be wrong."""
+
+import json
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from filter_service import errors, messages
+from filter_service.messages import (
+    LINEAR,
+    SRGB8,
+    Camera,
+    Frame,
+    Limits,
+    ProfileRequest,
+    ProfileSettings,
+    ViewHeader,
+    ViewImages,
+    decode_reply,
+    decode_request,
+    encode,
+)
+
+CAMERA = Camera(4, 3, (-1.0, 1.25, 0.75, -0.5))
+
+
+def as_bytes(parts):
+    return [bytes(memoryview(part)) for part in parts]
+
+
+def view_images(color_dtype=np.uint8):
+    color = np.arange(36).reshape(3, 4, 3).astype(color_dtype)
+    return ViewImages(color, np.linspace(0.5, 6, 12, dtype=np.float32).reshape(3, 4))
+
+
+def frame(**changes):
+    fields = {
+        "frame_id": 7,
+        "views": (ViewHeader(CAMERA),),
+        "pupil_diameter_mm": 4.0,
+        "focus_dpt": 0.5,
+        "images": (view_images(),),
+    }
+    return Frame(**fields | changes)
+
+
+def changed_header(parts, **changes):
+    """Return the parts with header fields replaced; None removes a field."""
+    header = msgpack.unpackb(parts[0]) | changes
+    header = {key: value for key, value in header.items() if value is not None}
+    return [msgpack.packb(header), *as_bytes(parts[1:])]
+
+
+def frame_parts(**changes):
+    return changed_header(encode(frame()), **changes)
+
+
+def view_map(**changes):
+    return ViewHeader(CAMERA).fields() | changes
+
+
+REQUESTS = [
+    messages.Hello("a client"),
+    messages.Ping(12.5),
+    messages.Bye(),
+    frame(),
+    ProfileRequest(
+        3, {"kind": "preset"}, ProfileSettings(age_years=40.0), (CAMERA, CAMERA)
+    ),
+]
+REPLIES = [
+    messages.Welcome(1, {"name": "ocufilter"}, Limits(), 2, ("tcp",)),
+    messages.Accepted(1, 2, True),
+    messages.Progress(1, 2, "psfs", 0.5),
+    messages.Ready(1, 2, 10.5, 99, 1.5, (1.0, 1.1), ("a note",)),
+    messages.Dropped(4, "superseded"),
+    messages.ErrorReply("bad_message", "text", "views[0]", "1 to 2", frame_id=3),
+    messages.Pong(1.0, 2.0, 50.0, 1, 2, 3, False),
+    messages.Alive(),
+]
+
+
+@pytest.mark.parametrize("message", REQUESTS, ids=lambda m: m.type_name)
+def test_what_a_client_says_arrives_unchanged(message):
+    assert decode_request(as_bytes(encode(message))) == message
+
+
+@pytest.mark.parametrize("message", REPLIES, ids=lambda m: m.type_name)
+def test_what_the_service_says_arrives_unchanged(message):
+    assert decode_reply(as_bytes(encode(message))) == message
+
+
+@pytest.mark.parametrize(("color", "dtype"), [(SRGB8, np.uint8), (LINEAR, np.float32)])
+def test_images_of_two_views_arrive_bit_for_bit(color, dtype):
+    images = (view_images(dtype), ViewImages(*reversed_images(dtype)))
+    views = (ViewHeader(CAMERA, color), ViewHeader(CAMERA, color, "radial"))
+    sent = frame(views=views, images=images)
+    received = decode_request(as_bytes(encode(sent)))
+    assert received == sent
+    for mine, theirs in zip(images, received.images, strict=True):
+        np.testing.assert_array_equal(mine.color, theirs.color)
+        np.testing.assert_array_equal(mine.depth_m, theirs.depth_m)
+        assert not theirs.color.flags.writeable
+
+
+def reversed_images(dtype):
+    images = view_images(dtype)
+    return images.color[::-1], np.ascontiguousarray(images.depth_m[::-1])
+
+
+def test_a_result_carries_its_images_and_stage_times():
+    color = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    sent = messages.Result(
+        frame_id=1,
+        profile_id=2,
+        generation=3,
+        views=(messages.ResultView(4, 3),),
+        pupil_diameter_mm=4.0,
+        focus_dpt=0.25,
+        missing_depth_count=5,
+        clamped_depth_count=6,
+        total_ms=3.0,
+        stage_times_ms={"decode_ms": 1.0, "other_ms": 2.0},
+        notes=("capped",),
+        colors=(color,),
+    )
+    received = decode_reply(as_bytes(encode(sent)))
+    assert received == sent
+    np.testing.assert_array_equal(received.colors[0], color)
+
+
+def test_missing_and_infinite_depth_values_pass():
+    depth_m = np.array([np.nan, np.inf, -1, 0] * 3, np.float32).reshape(3, 4)
+    sent = frame(images=(ViewImages(view_images().color, depth_m),))
+    received = decode_request(as_bytes(encode(sent)))
+    np.testing.assert_array_equal(received.images[0].depth_m, depth_m)
+
+
+def test_unknown_header_fields_are_ignored():
+    assert decode_request(frame_parts(gaze={"x": [1, 2]}, later="yes")) == frame()
+
+
+def test_optional_fields_have_defaults():
+    assert decode_request(frame_parts(output=None, options=None)) == frame()
+
+
+def refusal(parts, error=errors.BadMessage):
+    with pytest.raises(error) as caught:
+        decode_request(parts)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"frame_id": None}, "frame_id"),
+        ({"frame_id": -1}, "frame_id"),
+        ({"frame_id": True}, "frame_id"),
+        ({"frame_id": 1.0}, "frame_id"),
+        ({"frame_id": 2**60}, "frame_id"),
+        ({"pupil_diameter_mm": float("nan")}, "pupil_diameter_mm"),
+        ({"pupil_diameter_mm": float("inf")}, "pupil_diameter_mm"),
+        ({"pupil_diameter_mm": 0.0}, "pupil_diameter_mm"),
+        ({"pupil_diameter_mm": "4"}, "pupil_diameter_mm"),
+        ({"focus_dpt": float("-inf")}, "focus_dpt"),
+        ({"focus_dpt": -0.1}, "focus_dpt"),
+        ({"views": []}, "views"),
+        ({"views": {}}, "views"),
+        ({"views": [view_map()] * 3}, "views"),
+        ({"views": [7]}, "views[0]"),
+        ({"views": [view_map(width_px=0)]}, "views[0].width_px"),
+        ({"views": [view_map(width_px=2**40)]}, "views[0].width_px"),
+        ({"views": [view_map(height_px=5000)]}, "views[0].height_px"),
+        ({"views": [view_map(tangents=[-1, 1, 1])]}, "views[0].tangents"),
+        ({"views": [view_map(tangents=[1, -1, 1, -1])]}, "views[0].tangents"),
+        (
+            {"views": [view_map(tangents=[-1, float("nan"), 1, -1])]},
+            "views[0].tangents[1]",
+        ),
+        (
+            {"views": [view_map(color={"dtype": "float64", "space": "linear"})]},
+            "views[0].color.dtype",
+        ),
+        (
+            {"views": [view_map(color={"dtype": "uint8", "space": "linear"})]},
+            "views[0].color.space",
+        ),
+        ({"views": [view_map(color=None)]}, "views[0].color"),
+        ({"views": [view_map(depth={"kind": "log"})]}, "views[0].depth.kind"),
+        ({"output": {"dtype": "uint16", "space": "srgb"}}, "output.dtype"),
+        ({"options": {"accumulation": "sum"}}, "options.accumulation"),
+        ({"options": {"merge": 1}}, "options.merge"),
+    ],
+)
+def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):
+    error = refusal(frame_parts(**changes))
+    assert error.field == field
+    assert error.allowed
+
+
+@pytest.mark.parametrize(
+    ("settings_map", "field"),
+    [
+        ({"pupil_range_mm": [2, float("nan")]}, "settings.pupil_range_mm[1]"),
+        ({"pupil_range_mm": [7, 2]}, "settings.pupil_range_mm"),
+        ({"pupil_range_mm": [2]}, "settings.pupil_range_mm"),
+        ({"focus_range_dpt": 3}, "settings.focus_range_dpt"),
+        ({"object_range_dpt": [-1, 3]}, "settings.object_range_dpt[0]"),
+        ({"diffraction": "no"}, "settings.diffraction"),
+        ({"age_years": 200}, "settings.age_years"),
+    ],
+)
+def test_a_wrong_profile_setting_is_named(settings_map, field):
+    parts = encode(ProfileRequest(1, {"kind": "preset"}))
+    error = refusal(changed_header(parts, settings=settings_map))
+    assert error.field == field
+
+
+@pytest.mark.parametrize(
+    ("color_bytes", "depth_bytes", "field"),
+    [
+        (35, 48, "views[0].color"),
+        (37, 48, "views[0].color"),
+        (36, 44, "views[0].depth"),
+    ],
+)
+def test_a_part_of_the_wrong_size_is_named(color_bytes, depth_bytes, field):
+    parts = [encode(frame())[0], bytes(color_bytes), bytes(depth_bytes)]
+    assert refusal(parts).field == field
+
+
+@pytest.mark.parametrize("n_parts", [0, 1, 3])
+def test_a_wrong_number_of_parts_is_refused(n_parts):
+    parts = [encode(frame())[0], *[bytes(36)] * n_parts]
+    assert refusal(parts).field == "parts"
+
+
+def test_an_image_beyond_the_part_limit_is_refused_before_it_is_looked_at():
+    limits = Limits(max_part_bytes=35)
+    with pytest.raises(errors.BadMessage, match="36 bytes"):
+        decode_request(as_bytes(encode(frame())), limits)
+
+
+def test_the_limit_holds_for_the_output_too():
+    limits = Limits(max_part_bytes=100)  # 36 bytes come in, 144 would go out
+    parts = as_bytes(encode(frame(output=LINEAR)))
+    with pytest.raises(errors.BadMessage, match="144 bytes"):
+        decode_request(parts, limits)
+
+
+def test_another_version_is_refused_whatever_else_is_in_the_message():
+    for version in (0, 2, "1", 1.0, True, None):
+        error = refusal([msgpack.packb({"version": version})], errors.VersionMismatch)
+        assert (error.field, error.allowed) == ("version", "1")
+
+
+def test_an_unknown_type_is_refused_with_the_known_ones():
+    for name in ("shutdown", 5, None, ["frame"]):
+        parts = [msgpack.packb({"type": name, "version": 1})]
+        error = refusal(parts, errors.UnknownType)
+        assert error.field == "type"
+        assert "profile" in error.allowed
+
+
+def nested_arrays(depth):
+    return b"\x91" * depth + b"\xc0"
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"",
+        b"\xc1",
+        b"\x81",
+        msgpack.packb({"type": "bye", "version": 1}) + b"\x00",
+        msgpack.packb([1, 2]),
+        msgpack.packb("text"),
+        b"\x82\xa1a\x01\xa1a\x02",  # the same key twice
+        b"\x81\x01\x02",  # a key that is no text
+        b"\x81\x91\x01\x02",  # a key that cannot be hashed
+        msgpack.packb({"x": msgpack.ExtType(5, b"abc")}),
+        msgpack.packb({"x": msgpack.Timestamp(1, 0)}),
+        msgpack.packb({"x": b"bytes"}),
+        b"\x81\xa1x\xa2\xff\xfe",  # not UTF-8
+        msgpack.packb({"x": list(range(65))}),
+        nested_arrays(3000),
+        b"\x81\xa1x\xdd\xff\xff\xff\xff",  # claims 4 G items
+        msgpack.packb({"x": "a" * 5000}),
+    ],
+)
+def test_a_header_that_is_no_plain_map_is_refused(header):
+    assert refusal([header]).field == "header"
+
+
+def test_no_parts_at_all_are_refused():
+    assert refusal([]).field == "header"
+
+
+def profile_parts(body):
+    return [encode(ProfileRequest(1, {}))[0], body]
+
+
+def test_a_profile_body_may_be_json_or_msgpack():
+    body = {"kind": "zernike", "zernike_um": {"2,0": 5.41}, "eye_side": "OD"}
+    for encoded in (json.dumps(body).encode(), b" \n" + json.dumps(body).encode()):
+        assert decode_request(profile_parts(encoded)).body == body
+    assert decode_request(profile_parts(msgpack.packb(body))).body == body
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"[1]",
+        b'{"a": 1',
+        b'{"a": 1, "a": 2}',
+        b'{"a": NaN}',
+        b'{"a": [1e999]}',
+        b'{"a": "\xff"}',
+        b'{"a": ' + b"[" * 100_000,
+        b'{"a": ' + b"9" * 10_000 + b"}",
+        msgpack.packb({"a": {"b": [1.0, float("nan")]}}),
+        msgpack.packb({"a": list(range(5000))}),
+        nested_arrays(100_000),
+        b"{" + b" " * 2**20,
+    ],
+)
+def test_a_profile_body_that_is_no_plain_map_is_refused(body):
+    assert refusal(profile_parts(body)).field.startswith("profile")
+
+
+def test_a_nan_inside_a_profile_is_named_by_its_path():
+    body = msgpack.packb({"measurements": [{"h_deg": 0.0}, {"h_deg": float("nan")}]})
+    assert refusal(profile_parts(body)).field == "profile.measurements[1].h_deg"
+
+
+def test_the_longest_error_text_fits_into_a_header():
+    reply = messages.ErrorReply("c" * 20, "ä" * 9000, "ß" * 9000, "€" * 9000, 2**53 - 1)
+    received = decode_reply(encode(reply))
+    assert received.message.endswith("...")
+    assert received.frame_id == 2**53 - 1
+
+
+def test_an_error_reply_becomes_the_exception_it_was_made_of():
+    for error_class in errors.ERROR_CLASSES.values():
+        error = error_class("text", field="f", allowed="a")
+        reply = decode_reply(encode(messages.ErrorReply.from_exception(error)))
+        assert type(reply.exception()) is error_class
+        assert str(reply.exception()) == "f: text (allowed: a)"
+    assert "later_code: text" in str(errors.error_from_code("later_code", "text"))
+
+
+def test_every_error_has_a_code_of_its_own():
+    codes = [error_class.code for error_class in errors.ERROR_CLASSES.values()]
+    assert len(errors._with_subclasses(errors.FilterError)) == len(set(codes))
+
+
+def test_ids_of_a_broken_message_are_still_found():
+    assert messages.peek_ids(frame_parts(views=3)) == (7, None)
+    assert messages.peek_ids(frame_parts(frame_id="7")) == (None, None)
+    assert messages.peek_ids([b"\xc1"]) == (None, None)
+    assert messages.peek_ids([]) == (None, None)
+
+
+json_like = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=20)
+    | st.binary(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=5)
+        | st.dictionaries(st.text(max_size=8), inner, max_size=5)
+    ),
+    max_leaves=12,
+)
+field_names = st.sampled_from(
+    ["type", "version", *sorted({key for m in REQUESTS for key in m.fields()})]
+)
+
+
+def decodes_or_is_refused(parts):
+    """Decode; only the protocol's own errors may come out, and each says where."""
+    try:
+        decode_request(parts)
+    except errors.ProtocolError as error:
+        assert error.field
+        str(error)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.lists(st.binary(max_size=200), max_size=4))
+def test_random_bytes_never_do_more_than_be_refused(parts):
+    decodes_or_is_refused(parts)
+
+
+@settings(max_examples=600, deadline=None)
+@given(st.sampled_from(REQUESTS), field_names, json_like, st.data())
+def test_a_message_with_one_strange_field_never_does_more_than_be_refused(
+    message, name, value, data
+):
+    parts = as_bytes(encode(message))
+    header = msgpack.unpackb(parts[0])
+    target = header
+    inner = [v for v in header.values() if isinstance(v, dict) and v]
+    inner += [v for v in header.get("views", []) if isinstance(v, dict)]
+    if inner and data.draw(st.booleans()):
+        target = data.draw(st.sampled_from(inner))
+        name = data.draw(st.sampled_from(sorted(target)))
+    target[name] = value
+    decodes_or_is_refused([msgpack.packb(header), *parts[1:]])
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(REQUESTS), st.data())
+def test_a_message_with_one_strange_byte_never_does_more_than_be_refused(message, data):
+    parts = as_bytes(encode(message))
+    index = data.draw(st.integers(0, len(parts) - 1))
+    place = data.draw(st.integers(0, max(0, len(parts[index]) - 1)))
+    byte = data.draw(st.binary(max_size=2))
+    parts[index] = parts[index][:place] + byte + parts[index][place + 1 :]
+    decodes_or_is_refused(parts)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.dictionaries(st.text(max_size=8), json_like, max_size=4))
+def test_strange_profiles_never_do_more_than_be_refused(body):
+    decodes_or_is_refused(profile_parts(msgpack.packb(body)))

@@ -1,0 +1,91 @@
+"""PROTOCOL.md shows every message, and the code reads what it shows."""
+
+import json
+import re
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from filter_service import errors, messages, wire_replies
+
+PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
+
+
+def examples():
+    """Return {type: header} of the indented maps, comments removed."""
+    found = {}
+    for block in re.findall(r"(?:^    .*\n)+", PAGE, flags=re.MULTILINE):
+        if '"type"' in block:
+            text = re.sub(r"#[^\n]*", "", block)
+            header = json.loads(text)
+            found[header["type"]] = header
+    return found
+
+
+EXAMPLES = examples()
+
+
+def parts_of(header):
+    """Return zeros of the sizes that a header asks for."""
+    parts = []
+    for view in header.get("views", []) if header["type"] != "profile" else []:
+        n_pixels = view["width_px"] * view["height_px"]
+        parts.append(bytes(3 * n_pixels))
+        if header["type"] == "frame":
+            parts.append(bytes(4 * n_pixels))
+    return parts if header["type"] != "profile" else [b'{"kind": "preset"}']
+
+
+def decode(header):
+    decoder = (
+        messages.decode_request
+        if header["type"] in messages._REQUESTS
+        else messages.decode_reply
+    )
+    return decoder([msgpack.packb(header), *parts_of(header)])
+
+
+def test_every_message_type_is_shown():
+    assert set(EXAMPLES) == {*messages._REQUESTS, *messages._REPLIES}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_is_read_and_shows_every_field(name):
+    header = EXAMPLES[name]
+    message = decode(header)
+    assert set(message.fields()) | {"type", "version"} == set(header)
+    again = msgpack.unpackb(messages.encode(message)[0])
+    assert again == msgpack.unpackb(msgpack.packb(header))
+
+
+def test_the_stage_times_of_the_example_are_of_the_stated_form():
+    result = decode(EXAMPLES["result"])
+    assert {"decode_ms", "queue_ms", "other_ms"} <= set(result.stage_times_ms)
+
+
+def test_every_error_code_that_the_service_sends_is_explained():
+    base_or_client = {
+        errors.ProtocolError,
+        errors.SessionError,
+        errors.RenderError,
+        errors.TransportError,
+        errors.ServiceTimeout,
+        errors.ConnectionLost,
+    }
+    sent = {
+        code
+        for code, error_class in errors.ERROR_CLASSES.items()
+        if error_class not in base_or_client
+    }
+    table = PAGE[PAGE.index("## 6. Errors") : PAGE.index("## 7.")]
+    assert sent == set(re.findall(r"`([a-z]+_[a-z_]+)`", table)) - {"allowed", "field"}
+
+
+def test_every_drop_reason_is_explained():
+    for reason in wire_replies.DROP_REASONS:
+        assert f"`{reason}`" in PAGE
+
+
+def test_the_page_states_the_version():
+    assert f"**Version {messages.PROTOCOL_VERSION}.**" in PAGE

@@ -1,0 +1,85 @@
+"""The README's commands, links, presets and settings are those that exist."""
+
+import json
+import re
+import shlex
+
+import pytest
+from typer.testing import CliRunner
+
+from estimator.profiles import parse_profile, preset_names
+from filter_service.__main__ import app
+from tests.source_tree import ROOT
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+MAX_LINES = 150
+
+
+def _make_targets() -> set[str]:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    return set(re.findall(r"^([a-z][a-z-]*):", makefile, re.MULTILINE))
+
+
+def _indented_commands(program: str) -> list[list[str]]:
+    lines = re.findall(rf"^    ({program} .*)$", README, re.MULTILINE)
+    return [shlex.split(line, comments=True)[1:] for line in lines]
+
+
+def _help(*arguments: str) -> str:
+    result = CliRunner().invoke(app, [*arguments, "--help"])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_readme_is_short():
+    assert len(README.splitlines()) <= MAX_LINES
+
+
+def test_every_make_target_of_the_readme_exists():
+    named = set(re.findall(r"(?:^    |`)make ([a-z-]+)", README, re.MULTILINE))
+    assert {"demo", "test"} <= named
+    assert named <= _make_targets()
+
+
+def test_every_public_make_target_is_phony_and_explained():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    phony = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
+    assert _make_targets() == phony
+    explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
+    assert {"demo", "test", "validate", "check", "clean", "help"} == explained
+
+
+@pytest.mark.parametrize(
+    "words", _indented_commands("ocufilter"), ids=lambda words: words[0]
+)
+def test_every_command_of_the_readme_is_one_that_help_knows(words):
+    text = _help(words[0])
+    options = [word for word in words if word.startswith("-")]
+    unknown = [option for option in options if option not in re.split(r"[\s,]", text)]
+    assert not unknown, text
+
+
+def test_the_readme_shows_every_command_of_the_program():
+    listed = re.findall(r"^  ([a-z]+)  ", _help().split("Commands:")[1], re.MULTILINE)
+    assert {words[0] for words in _indented_commands("ocufilter")} == set(listed)
+
+
+def test_every_profile_of_the_readme_is_accepted():
+    bodies = re.findall(r'^    (\{"kind".*?\})$', README, re.MULTILINE | re.DOTALL)
+    assert len(bodies) == 3
+    for body in bodies:
+        parse_profile(json.loads(body))
+
+
+def test_the_readme_names_all_presets():
+    sentence = re.search(r"Presets: ([^.]*)\.", README)[1]
+    assert tuple(re.findall(r"`(\w+)`", sentence)) == preset_names()
+
+
+def test_links_and_files_of_the_readme_exist():
+    linked = re.findall(r"\]\(([^)#]+)\)", README)
+    named = re.findall(r"`([\w/]+(?:\.md|/))`", README)
+    local = [name for name in linked + named if "://" not in name]
+    made_by_running = {"out/demo/"}
+    missing = [n for n in local if not (ROOT / n).exists() and n not in made_by_running]
+    assert not missing

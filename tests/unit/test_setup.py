@@ -1,0 +1,53 @@
+"""What installs the project agrees with itself, and commands start what exists."""
+
+import re
+import tomllib
+
+import pytest
+
+from filter_service.commands.programs import BENCH_MODULES
+from tests.source_tree import ROOT
+
+PINS = dict(
+    line.split("==")
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    if line and not line.startswith("#")
+)
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _required() -> list[str]:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)["project"]
+    extras = project["optional-dependencies"]
+    listed = [*project["dependencies"], *extras["clients"], *extras["dev"]]
+    return [re.match(r"[\w.-]+", requirement)[0] for requirement in listed]
+
+
+def test_every_requirement_has_a_pin():
+    pinned = {_normal(name) for name in PINS}
+    assert [name for name in _required() if _normal(name) not in pinned] == []
+
+
+def test_pyrender_is_installed_in_the_pinned_version():
+    setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
+    assert f"--no-deps pyrender=={PINS['pyrender']}" in setup
+
+
+@pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])
+def test_set_up_names_no_host(name):
+    assert "://" not in (ROOT / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("module", ["clients.demo", *BENCH_MODULES.values()])
+def test_every_program_that_a_command_starts_exists(module):
+    assert (ROOT / (module.replace(".", "/") + ".py")).is_file()
+
+
+def test_the_makefile_makes_every_benchmark_of_the_program():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    listed = re.search(r"^BENCHES := (.*)$", makefile, re.MULTILINE)[1].split()
+    assert listed == [bench.value for bench in BENCH_MODULES]

@@ -1,0 +1,99 @@
+"""A physical quantity's name ends in its unit, or is listed as having none."""
+
+import ast
+
+from tests.source_tree import PACKAGES, ROOT, python_files
+
+UNITS = (
+    *("mm", "um", "nm", "m", "mm3", "deg", "rad", "mrad", "arcmin", "dpt", "px"),
+    *("s", "ms", "hz", "db", "mb", "bytes", "years", "nit"),
+)
+KINDS = ("ratio", "index", "count", "fraction")
+"""Last words that say what kind of pure number this is."""
+
+DIMENSIONLESS = {
+    "kernel": "shares of light, unit sum",
+    "kernels": "shares of light, unit sum",
+    "color": "light, sRGB or linear as the header says",
+    "tangents": "of the angles to the image edges",
+    "uv": "texture position, 0 to 1",
+    "srgb": "encoded light, 0 to 1",
+    "background_srgb": "encoded light, 0 to 1",
+    "oversampling": "samples per sample",
+    "margin": "in lambda/D",
+    "pupil_samples": "samples across the pupil, a count that need not be whole",
+    "max_repeat_difference": "in units of the output it compares",
+    "t": "the sender's own clock, echoed unread",
+}
+"""Float fields without a unit, each with what it is instead."""
+
+FLOAT_TYPES = {"float", "float16", "float32", "float64"}
+
+
+def _type_words(annotation: ast.expr) -> set[str]:
+    return {n.id for n in ast.walk(annotation) if isinstance(n, ast.Name)} | {
+        n.attr for n in ast.walk(annotation) if isinstance(n, ast.Attribute)
+    }
+
+
+def _is_dataclass(node: ast.ClassDef) -> bool:
+    return any("dataclass" in ast.unparse(d) for d in node.decorator_list)
+
+
+def _is_mapping(annotation: ast.expr) -> bool:
+    return ast.unparse(annotation).startswith(("dict", "Mapping", "Callable"))
+
+
+def quantities(source: str) -> list[tuple[str, str, int]]:
+    """(class, field, line) of public dataclass fields that hold floats or arrays."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.ClassDef) or not _is_dataclass(node):
+            continue
+        if node.name.startswith("_"):
+            continue
+        for entry in node.body:
+            if not isinstance(entry, ast.AnnAssign) or _is_mapping(entry.annotation):
+                continue
+            name = entry.target.id
+            physical = _type_words(entry.annotation) & FLOAT_TYPES
+            if physical and not name.startswith("_"):
+                found.append((node.name, name, entry.lineno))
+    return found
+
+
+def has_unit(name: str) -> bool:
+    last = name.rsplit("_", 1)[-1]
+    return name in DIMENSIONLESS or last in KINDS or (last in UNITS and last != name)
+
+
+def _all_quantities():
+    for package in PACKAGES:
+        for path in python_files(package):
+            for kind, name, line in quantities(path.read_text(encoding="utf-8")):
+                where = f"{path.relative_to(ROOT)}:{line} {kind}.{name}"
+                yield path.relative_to(ROOT).as_posix(), name, where
+
+
+def test_every_quantity_names_its_unit():
+    found = list(_all_quantities())
+    files = {file for file, _, _ in found}
+    assert "estimator/profiles.py" in files  # the walk sees the eye,
+    assert any(file.startswith("filter_service/wire_") for file in files)  # the wire
+    wrong = [where for _, name, where in found if not has_unit(name)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_list_of_dimensionless_fields_holds_what_exists():
+    names = {name for _, name, _ in _all_quantities()}
+    assert sorted(DIMENSIONLESS.keys() - names) == []
+
+
+def test_the_walk_sees_a_field_without_unit():
+    source = (
+        "@dataclass(frozen=True)\nclass Eye:\n    pupil: float\n    axis_deg: float\n"
+        "    name: str\n    wave: NDArray[np.float64] | None = None\n"
+    )
+    names = [name for _, name, _ in quantities(source)]
+    assert names == ["pupil", "axis_deg", "wave"]
+    assert [name for name in names if not has_unit(name)] == ["pupil", "wave"]
