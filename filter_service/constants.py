@@ -11,7 +11,7 @@ SCAN_THREADS = 256
 
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS
-"""Buckets of one sorting pass; RADIX x THREADS counters fill 4 KiB shared memory."""
+"""Buckets of one sorting pass; with a group of 64 they fill 4 KiB of shared memory."""
 
 SORT_KEY_BITS = 16
 PAPER_SORT_KEY_BITS = 24

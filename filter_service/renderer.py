@@ -36,6 +36,9 @@ MAX_BAND_ENTRIES = 16 * 2**20
 SOFTWARE_PIXELS_PER_THREAD = 8
 """2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
 
+SOFTWARE_LIST_THREADS = 8
+"""Threads that make and sort a tile's list on a software renderer: one vector."""
+
 ACCUMULATIONS = ("coverage", "paper")
 OUTPUTS = ("linear", "srgb8")
 
@@ -340,6 +343,7 @@ class _Frame:
                 tile_grid=self.grid,
                 search_blocks=self.search_blocks,
                 order_always=int(self.paper_rule),
+                defines=self._list_threads,
             )
             self._run(
                 "scan_tiles",
@@ -392,6 +396,7 @@ class _Frame:
                     tile_grid=self.grid,
                     search_blocks=self.search_blocks,
                     **band,
+                    defines=self._list_threads,
                 )
             with self.timer.stage("sort_ms"):
                 self._run(
@@ -401,9 +406,10 @@ class _Frame:
                     *("ENTRIES", "ENTRIES_SPARE"),
                     **band,
                     defines={
+                        **self._list_threads,
                         "KEY_BITS": (
                             PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
-                        )
+                        ),
                     },
                 )
             with self.timer.stage("splat_ms"):
@@ -423,6 +429,11 @@ class _Frame:
                     **band,
                     defines=self._splat_variant(),
                 )
+
+    @property
+    def _list_threads(self) -> dict[str, int]:
+        software = self.gpu.is_software
+        return {"GROUP_THREADS": SOFTWARE_LIST_THREADS if software else THREADS}
 
     def _splat_variant(self) -> dict[str, int]:
         pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1

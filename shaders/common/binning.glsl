@@ -1,5 +1,5 @@
 // Walk over the fragments whose light reaches a tile.  Thread t takes the blocks
-// t, t + THREADS, ... around the tile and their fragments in order: a fixed order, so
+// t, t + GROUP_THREADS, ... around the tile and their fragments in order: a fixed order, so
 // the same frame gives the same list.
 // Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks` in scope.
 
@@ -19,7 +19,7 @@ int next_block(inout Walk walk) {
     while (walk.next < walk.width * walk.width) {
         ivec2 at = walk.tile - search_blocks
                  + ivec2(walk.next % walk.width, walk.next / walk.width);
-        walk.next += THREADS;
+        walk.next += GROUP_THREADS;
         if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, tile_grid))) continue;
         int block = at.y * tile_grid.x + at.x;
         float reach = uintBitsToFloat(blocks[block].y);

@@ -1,12 +1,13 @@
 // Counts the fragments whose light reaches each tile, and whether their order matters.
 // In:  FRAGMENT_PLACE, BLOCKS.   Out: TILE_COUNTS (count, order matters).
-// Dispatch: one group a tile.
+// Dispatch: one group of GROUP_THREADS a tile: 8 on a software renderer, whose vectors
+//      then all have work, THREADS on hardware.
 // Twin: reference.tile_lists.
 
 #include "common/tiles.glsl"
 #include "common/fragments.glsl"
 
-layout(local_size_x = THREADS) in;
+layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };

@@ -1,12 +1,12 @@
 // Writes each tile's list of fragment slots, in the order of the walk.
 // In:  FRAGMENT_PLACE, BLOCKS, TILE_OFFSETS.   Out: ENTRIES.
-// Dispatch: one group a tile of the band.
+// Dispatch: one group of GROUP_THREADS a tile of the band.
 // Twin: reference.tile_lists.
 
 #include "common/tiles.glsl"
 #include "common/fragments.glsl"
 
-layout(local_size_x = THREADS) in;
+layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };
@@ -20,7 +20,7 @@ uniform uint first_entry;
 
 #include "common/binning.glsl"
 
-shared uint counts[THREADS];
+shared uint counts[GROUP_THREADS];
 
 void main() {
     int index = first_tile + int(gl_WorkGroupID.x);

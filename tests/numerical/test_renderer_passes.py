@@ -252,3 +252,13 @@ def test_stage_times_name_every_pass(bench, view):
     )
     assert {"sort_ms", "splat_ms", "encode_ms", "readback_ms"} <= set(times_ms)
     assert all(value >= 0.0 for value in times_ms.values())
+
+
+def test_hardware_and_software_group_sizes_agree(bench, view, monkeypatch):
+    """Work groups differ by renderer; only the rounding of sums may follow."""
+    software = bench.render(view)
+    monkeypatch.setattr(bench.gpu, "is_software", not bench.gpu.is_software)
+    other = bench.render(view)
+    assert other.entry_count == software.entry_count
+    # sums of up to 1000 float32 weights in another order
+    assert psnr_db(other.color, software.color.astype(float)) >= 100.0
