@@ -8,7 +8,7 @@ UNITS = (
     *("mm", "um", "nm", "m", "mm3", "deg", "rad", "mrad", "arcmin", "dpt", "px"),
     *("s", "ms", "hz", "db", "mb", "bytes", "years", "nit"),
 )
-KINDS = ("ratio", "index", "count", "fraction")
+KINDS = ("ratio", "index", "count", "fraction", "constant")
 """Last words that say what kind of pure number this is."""
 
 DIMENSIONLESS = {

@@ -1,0 +1,215 @@
+"""The exceptions of the service, of its protocol and of its clients.
+
+    FilterError
+    ├── ProtocolError            the message itself is wrong
+    │   ├── BadMessage           a part or a field is missing, malformed or out of range
+    │   ├── UnknownType          the header names a message type nobody knows
+    │   ├── VersionMismatch      the two sides speak different protocol versions
+    │   └── CreditExceeded       more unanswered frames than the service granted
+    ├── SessionError             the message is fine, this session cannot do it
+    │   ├── NoSession            anything before hello, or after the service restarted
+    │   ├── TooManySessions      the service serves as many clients as it may
+    │   ├── NoProfile            a frame before any profile
+    │   ├── UnknownProfile       the profile's body is wrong or incomplete
+    │   ├── GridTooLarge         the profile needs more PSFs than the service allows
+    │   ├── BuildFailed          the PSFs of a profile could not be computed
+    │   ├── BuildCancelled       a newer profile took this one's place
+    │   └── WorkerCrashed        the process that computes PSFs died
+    ├── RenderError              a frame could not be filtered
+    │   ├── ShaderError          GLSL did not compile or link
+    │   ├── CameraMismatch       the frame's pixel pitch is not the PSF store's
+    │   ├── OutOfGpuMemory       a buffer or texture could not be made
+    │   └── RenderFailed         anything else that went wrong while filtering
+    └── TransportError           raised by the client library only
+        ├── ServiceTimeout       an answer did not come in time
+        └── ConnectionLost       the connection broke while an answer was awaited
+
+Each class has a ``code``, the word that travels in an ``error`` message; the client
+library turns an ``error`` back into the same class.  A message that raises one of
+these never ends the service: the client is told, and the loop goes on.
+"""
+
+from __future__ import annotations
+
+
+class FilterError(Exception):
+    """Root of all errors of the service.
+
+    Parameters
+    ----------
+    message : str
+        One sentence with the offending value.
+    field : str, optional
+        Path of the message or profile field at fault, as in ``views[0].width_px``.
+    allowed : str, optional
+        What would have been accepted.
+    """
+
+    code = "filter_error"
+
+    def __init__(
+        self, message: str, *, field: str | None = None, allowed: str | None = None
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.field = field
+        self.allowed = allowed
+
+    def __str__(self) -> str:
+        """Return one line: field, message and what is allowed."""
+        text = self.message if self.field is None else f"{self.field}: {self.message}"
+        return text if self.allowed is None else f"{text} (allowed: {self.allowed})"
+
+
+class ProtocolError(FilterError):
+    """The message breaks the protocol."""
+
+    code = "protocol_error"
+
+
+class BadMessage(ProtocolError):
+    """A part or a field is missing, malformed or out of range."""
+
+    code = "bad_message"
+
+
+class UnknownType(ProtocolError):
+    """The header names a message type that this side does not know."""
+
+    code = "unknown_type"
+
+
+class VersionMismatch(ProtocolError):
+    """The two sides speak different protocol versions."""
+
+    code = "version_mismatch"
+
+
+class CreditExceeded(ProtocolError):
+    """The client has more unanswered frames than the service granted."""
+
+    code = "credit_exceeded"
+
+
+class SessionError(FilterError):
+    """The message is well formed, but this session cannot do it."""
+
+    code = "session_error"
+
+
+class NoSession(SessionError):
+    """The client has not said hello, or the service has restarted since."""
+
+    code = "no_session"
+
+
+class TooManySessions(SessionError):
+    """The service already serves as many clients as it may."""
+
+    code = "too_many_sessions"
+
+
+class NoProfile(SessionError):
+    """A frame came before any profile."""
+
+    code = "no_profile"
+
+
+class UnknownProfile(SessionError):
+    """The profile's body is wrong or incomplete."""
+
+    code = "profile_invalid"
+
+
+class GridTooLarge(SessionError):
+    """The profile needs more or larger PSFs than the service allows."""
+
+    code = "grid_too_large"
+
+
+class BuildFailed(SessionError):
+    """The PSFs of a profile could not be computed."""
+
+    code = "build_failed"
+
+
+class BuildCancelled(SessionError):
+    """A newer profile took this one's place before it was ready."""
+
+    code = "build_cancelled"
+
+
+class WorkerCrashed(SessionError):
+    """The process that computes PSFs died; it has been started again."""
+
+    code = "worker_crashed"
+
+
+class RenderError(FilterError):
+    """A frame could not be filtered."""
+
+    code = "render_error"
+
+
+class ShaderError(RenderError):
+    """GLSL did not compile or link."""
+
+    code = "shader_error"
+
+
+class CameraMismatch(RenderError):
+    """The frame's pixel pitch is not the one that the PSF store was built for."""
+
+    code = "camera_mismatch"
+
+
+class OutOfGpuMemory(RenderError):
+    """A buffer or a texture could not be made."""
+
+    code = "out_of_gpu_memory"
+
+
+class RenderFailed(RenderError):
+    """Anything else that went wrong while a frame was filtered."""
+
+    code = "render_failed"
+
+
+class TransportError(FilterError):
+    """The connection between client and service failed."""
+
+    code = "transport_error"
+
+
+class ServiceTimeout(TransportError):
+    """An answer of the service did not come in time."""
+
+    code = "service_timeout"
+
+
+class ConnectionLost(TransportError):
+    """The connection broke while an answer was awaited."""
+
+    code = "connection_lost"
+
+
+def _with_subclasses(root: type[FilterError]) -> list[type[FilterError]]:
+    found = [root]
+    for child in root.__subclasses__():
+        found += _with_subclasses(child)
+    return found
+
+
+ERROR_CLASSES: dict[str, type[FilterError]] = {
+    error_class.code: error_class for error_class in _with_subclasses(FilterError)
+}
+
+
+def error_from_code(
+    code: str, message: str, *, field: str | None = None, allowed: str | None = None
+) -> FilterError:
+    """Return the exception that an error code names; FilterError for unknown codes."""
+    error_class = ERROR_CLASSES.get(code)
+    if error_class is None:
+        return FilterError(f"{code}: {message}", field=field, allowed=allowed)
+    return error_class(message, field=field, allowed=allowed)

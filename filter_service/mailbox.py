@@ -1,0 +1,128 @@
+"""The service's ROUTER socket: parts in, parts out, and who is gone."""
+
+from __future__ import annotations
+
+import enum
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
+# With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
+SEND_HIGH_WATER_MARK = 128
+# Counts messages, so it is what bounds memory: with the default of 1000 an overload of
+# 720p frames took 1.5 GB.  More wait in the kernel, and the client is held back.
+RECEIVE_HIGH_WATER_MARK = 4
+HEARTBEAT_INTERVAL_MS = 1000
+HEARTBEAT_TIMEOUT_MS = 4000
+RETRY_S = 0.001
+
+
+class Outcome(enum.Enum):
+    """What became of a reply."""
+
+    SENT = "sent"
+    GONE = "gone"  # the client is not connected any more
+    STALLED = "stalled"  # the client does not read
+
+
+class Mailbox:
+    """A bound ROUTER socket that never blocks and never drops silently.
+
+    Parameters
+    ----------
+    bind : str
+        Endpoint; ``tcp://127.0.0.1:*`` takes a free port.
+    max_part_bytes : int
+        A client that sends a larger part is cut off.
+    """
+
+    def __init__(self, bind: str, max_part_bytes: int) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        socket = self._socket
+        socket.linger = 0
+        socket.router_mandatory = 1
+        socket.sndhwm = SEND_HIGH_WATER_MARK
+        socket.rcvhwm = RECEIVE_HIGH_WATER_MARK
+        socket.maxmsgsize = max_part_bytes
+        socket.heartbeat_ivl = HEARTBEAT_INTERVAL_MS
+        socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+        try:
+            socket.bind(bind)
+        except zmq.ZMQError as error:
+            self.close()
+            raise OSError(f"cannot listen on {bind}: {error}") from None
+        self.endpoint = socket.last_endpoint.decode()
+        if self.endpoint.startswith("ipc://"):
+            Path(self.endpoint.removeprefix("ipc://")).chmod(0o600)
+        self._poller = zmq.Poller()
+        self._poller.register(socket, zmq.POLLIN)
+        self._watched: set[int] = set()
+
+    def watch(self, file_descriptors: set[int]) -> None:
+        """Let `wait` also return when one of these is readable."""
+        for gone in self._watched - file_descriptors:
+            self._poller.unregister(gone)
+        for new in file_descriptors - self._watched:
+            self._poller.register(new, zmq.POLLIN)
+        self._watched = set(file_descriptors)
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when there is something to read, or in time."""
+        self._poller.poll(max(0, round(1000 * timeout_s)))
+
+    def receive(self) -> tuple[bytes, list[memoryview]] | None:
+        """Return (identity, parts) of one waiting message without copying, or None."""
+        try:
+            frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+        return frames[0].bytes, [frame.buffer for frame in frames[1:]]
+
+    def send(
+        self, identity: bytes, parts: Sequence[Any]
+    ) -> tuple[Outcome, zmq.MessageTracker | None]:
+        """Send a message; large parts are not copied and must not change.
+
+        Returns
+        -------
+        outcome : Outcome
+        tracker : MessageTracker or None
+            Of the last large part: done once libzmq has let go of it.
+        """
+        tracker = None
+        try:
+            self._send_identity(identity)
+            for i, part in enumerate(parts):
+                more = zmq.SNDMORE if i < len(parts) - 1 else 0
+                large = memoryview(part).nbytes >= COPY_BELOW_BYTES
+                sent = self._socket.send(
+                    part, zmq.NOBLOCK | more, copy=not large, track=large
+                )
+                tracker = sent if large else tracker
+        except zmq.Again:
+            return Outcome.STALLED, None
+        except zmq.ZMQError as error:
+            if error.errno == zmq.EHOSTUNREACH:
+                return Outcome.GONE, None
+            raise
+        return Outcome.SENT, tracker
+
+    def _send_identity(self, identity: bytes) -> None:
+        """Name the receiver; whether it can take a message is decided here."""
+        flags = zmq.NOBLOCK | zmq.SNDMORE
+        try:
+            self._socket.send(identity, flags)
+        except zmq.Again:
+            # Room that a client has made is noticed about once per millisecond.
+            time.sleep(RETRY_S)
+            self._socket.send(identity, flags)
+
+    def close(self) -> None:
+        """Close at once; what is not sent is lost."""
+        self._socket.close(linger=0)
+        self._context.term()

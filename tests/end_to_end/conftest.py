@@ -1,0 +1,135 @@
+"""Real service processes on random ports; everything has a limit of 10 s."""
+
+import sys
+
+import numpy as np
+import pytest
+import zmq
+
+from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
+from clients.service_process import ServiceProcess
+from filter_service.messages import (
+    Camera,
+    Frame,
+    Hello,
+    ProfileRequest,
+    ViewHeader,
+    ViewImages,
+    decode_reply,
+    encode,
+)
+
+TIMEOUT_S = 10.0
+DOUBLE = (sys.executable, "-m", "tests.end_to_end.double_service")
+
+
+@pytest.fixture
+def start_service():
+    """Start services with the renderer double; they end with the test, cleanly."""
+    services = []
+
+    def start(*, filter_ms=2.0, **settings):
+        command = (*DOUBLE, "--filter-ms", str(filter_ms))
+        service = ServiceProcess(settings, command=command, start_timeout_s=TIMEOUT_S)
+        services.append(service)
+        return service
+
+    yield start
+    for service in services:
+        if service.process.poll() is None:
+            assert service.stop(TIMEOUT_S) == 0
+        service.kill()  # removes its folder where a test has ended it
+
+
+@pytest.fixture(scope="session")
+def shared_service():
+    """One service with the double for all tests that leave it as it was."""
+    settings = {"alive_interval_s": 0.1, "max_sessions": 8}
+    command = (*DOUBLE, "--filter-ms", "2")
+    with ServiceProcess(
+        settings, command=command, start_timeout_s=TIMEOUT_S
+    ) as service:
+        yield service
+        assert service.stop(TIMEOUT_S) == 0
+
+
+@pytest.fixture
+def client(shared_service):
+    with FilterClient(shared_service.endpoint, timeout_s=TIMEOUT_S) as client:
+        yield client
+
+
+class RawClient:
+    """A DEALER that sends whatever a test wants."""
+
+    def __init__(self, endpoint, **options):
+        self.context = zmq.Context()
+        self.socket = self.context.socket(zmq.DEALER)
+        self.socket.linger = 0
+        self.socket.sndtimeo = self.socket.rcvtimeo = int(1000 * TIMEOUT_S)
+        for name, value in options.items():
+            setattr(self.socket, name, value)
+        self.socket.connect(endpoint)
+
+    def send(self, parts):
+        self.socket.send_multipart(parts, copy=False)
+
+    def receive(self):
+        while True:
+            reply = decode_reply(self.socket.recv_multipart())
+            if reply.type_name not in ("alive", "progress"):
+                return reply
+
+    def ask(self, message):
+        self.send(encode(message))
+        return self.receive()
+
+    def begin(self, mark=1, **frame_size):
+        """Say hello, send a profile for `small_frame` and wait until it is ready."""
+        welcome = self.ask(Hello("raw"))
+        body = {"kind": "double", "mark": mark}
+        camera = small_frame(0, **frame_size).views[0].camera
+        accepted = self.ask(ProfileRequest(mark, body, cameras=(camera,)))
+        assert accepted.type_name == "accepted"
+        assert self.receive().type_name == "ready"
+        return welcome
+
+    def close(self):
+        self.socket.close(linger=0)
+        self.context.term()
+
+
+@pytest.fixture
+def raw_client():
+    clients = []
+
+    def connect(service, **options):
+        clients.append(RawClient(service.endpoint, **options))
+        return clients[-1]
+
+    yield connect
+    for client in clients:
+        client.close()
+
+
+def small_frame(frame_id, *, width_px=16, height_px=8, **changes):
+    camera = Camera(width_px, height_px, tangents_from_fov(60.0, width_px, height_px))
+    color = np.full((height_px, width_px, 3), 10, np.uint8)
+    depth_m = np.full((height_px, width_px), 2.0, np.float32)
+    fields = {
+        "frame_id": frame_id,
+        "views": (ViewHeader(camera),),
+        "pupil_diameter_mm": 4.0,
+        "focus_dpt": 0.0,
+        "images": (ViewImages(color, depth_m),),
+    }
+    return Frame(**fields | changes)
+
+
+def make_view(width_px=64, height_px=36, dtype=np.uint8, seed=0):
+    rng = np.random.default_rng(seed)
+    color = rng.random((height_px, width_px, 3), dtype=np.float32)
+    if dtype == np.uint8:
+        color = (255 * color).astype(np.uint8)
+    depth_m = np.full((height_px, width_px), 2.0, np.float32)
+    return RgbdView(color, depth_m, tangents_from_fov(60.0, width_px, height_px))

@@ -1,0 +1,28 @@
+"""Starts the real service loop with the doubles: ``python -m`` this, with --config."""
+
+import argparse
+import logging
+from pathlib import Path
+
+from filter_service.config import load_config
+from filter_service.server import serve
+from tests.end_to_end.doubles import RendererDouble, build, check_profile
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--filter-ms", type=float, default=0.0)
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO)
+    serve(
+        load_config(arguments.config),
+        renderer=RendererDouble(arguments.filter_ms),
+        build=build,
+        check_profile=check_profile,
+        gl_renderer="numpy double",
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""The demo from the command line: its files, its report, and how it fails."""
+
+import functools
+import json
+import subprocess
+import sys
+from itertools import pairwise
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients import demo, sheet, video
+from clients.demo_eyes import EYES
+from clients.pyrender_stream import parse_size, path_settings, profile_body
+from clients.scenes.scene import build_scene
+from clients.service_process import CHECKOUT, ServiceProcess
+from clients.streaming import FrameLog, percentiles
+
+N_FRAMES = 4
+SIZE_PX = (160, 90)
+
+
+@pytest.fixture(scope="module")
+def demo_run(tmp_path_factory):
+    """One small demo in a process of its own: its folder and what it printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    command = [sys.executable, "-m", "clients.demo", "--out", str(folder)]
+    command += ["--frames", str(N_FRAMES), "--size", "160x90", "--json"]
+    finished = subprocess.run(
+        command, cwd=CHECKOUT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    return folder, json.loads(finished.stdout)
+
+
+def test_demo_streams_every_frame_through_every_eye(demo_run):
+    _, report = demo_run
+    assert list(report["eyes"]) == [eye.preset for eye in EYES]
+    for eye in report["eyes"].values():
+        assert eye["frames"] == N_FRAMES
+        assert eye["drops"] == {}
+        ages = eye["frame_age_ms"]
+        assert 0 < ages["p50"] <= ages["p95"] <= ages["p99"]
+        assert {"splat_ms", "readback_ms"} <= set(eye["stages_ms"])
+
+
+def test_demo_changes_eyes_while_frames_go_on_through_the_old_one(demo_run):
+    _, report = demo_run
+    changes = [eye["eye_change"] for eye in report["eyes"].values()]
+    for before, after in pairwise(changes):
+        assert after["generation"] > before["generation"]
+        assert after["frames_through_previous_eye"] >= 1
+        assert after["previous_generation"] == before["generation"]
+
+
+def test_demo_writes_a_video_of_all_frames_and_a_contact_sheet(demo_run):
+    folder, report = demo_run
+    assert json.loads((folder / "latency.json").read_text()) == report
+    # Four pictures across, four rows of them.
+    with Image.open(folder / "contact_sheet.png") as sheet_image:
+        assert sheet_image.width > 4 * sheet.MIN_CELL_WIDTH_PX
+        assert sheet_image.height > 4 * sheet.MIN_CELL_WIDTH_PX * 90 / 160
+    cell_w, cell_h = sheet.cell_size_px(SIZE_PX)
+    # Four cells of one width with gaps of 10 px; two rows below a title of 42 px, with
+    # captions of 34 px.
+    frames = _decoded(report["video"], 4 * cell_w + 50, 42 + 2 * (cell_h + 44))
+    assert len(frames) == N_FRAMES
+    first, last = frames[0], frames[-1]
+    assert np.abs(first.astype(int) - last).mean() > 2
+    # Input, top left, and -6 D, third in its row, where the pupil is widest.
+    top, gap = 60, 10
+    widest = frames[1]
+    sharp = widest[top : top + cell_h // 2, gap : gap + cell_w]
+    left = gap + 2 * (cell_w + gap)
+    myopic = widest[top : top + cell_h // 2, left : left + cell_w]
+    assert _detail(sharp) > 1.5 * _detail(myopic)
+
+
+def _decoded(path, width, height):
+    """All frames (n, h, w, 3) of a video of that size."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(path)]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+
+
+def _detail(image):
+    """Mean step between neighbours in a row."""
+    return np.abs(np.diff(image.astype(int).mean(axis=-1), axis=1)).mean()
+
+
+def test_demo_reports_a_service_that_does_not_start(monkeypatch, capsys, tmp_path):
+    command = (sys.executable, "-c", "print('no GL here'); raise SystemExit(3)")
+    broken = functools.partial(ServiceProcess, command=command)
+    monkeypatch.setattr(demo, "ServiceProcess", broken)
+    assert demo.main(["--out", str(tmp_path), "--frames", "1"]) == 1
+    error = capsys.readouterr().err
+    assert "code 3" in error and "no GL here" in error
+
+
+def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_path):
+    change_eye, services = demo.change_eye, []
+
+    def primitives_only(name):
+        return build_scene("primitives")
+
+    def recorded():
+        services.append(ServiceProcess())
+        return services[0]
+
+    def change_then_kill(*args, **settings):
+        change = change_eye(*args, **settings)
+        services[0].process.kill()
+        return change
+
+    monkeypatch.setattr(demo, "build_scene", primitives_only)
+    monkeypatch.setattr(demo, "ServiceProcess", recorded)
+    monkeypatch.setattr(demo, "change_eye", change_then_kill)
+    arguments = ["--out", str(tmp_path), "--frames", "1", "--size", "64x36"]
+    assert demo.main([*arguments, "--json"]) == 1
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "connection" in output.err
+    assert f"serving on {services[0].endpoint}" in output.err
+
+
+@pytest.mark.parametrize("encoder", ["false", "/no/such/encoder"])
+def test_gif_stands_in_where_the_encoder_fails(encoder, monkeypatch, tmp_path):
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: encoder)
+    shades = [np.full((20, 40, 3), shade, np.uint8) for shade in (0, 120, 250)]
+    written = video.write_video(tmp_path / "film", lambda: iter(shades), 10)
+    assert written == tmp_path / "film.gif"
+    with Image.open(written) as gif:
+        assert gif.n_frames == 3 and gif.size == (40, 20)
+        gif.seek(2)
+        assert np.asarray(gif.convert("RGB")).mean() == pytest.approx(250, abs=3)
+
+
+def test_mp4_keeps_colours_and_order(tmp_path):
+    colors = ((200, 30, 30), (30, 200, 30), (30, 30, 200))
+    images = [np.full((64, 96, 3), color, np.uint8) for color in colors]
+    written = video.write_video(tmp_path / "film", lambda: iter(images), 10)
+    assert written == tmp_path / "film.mp4"
+    means = _decoded(written, 96, 64).mean(axis=(1, 2))
+    # Chroma at half resolution and video levels cost a few steps on flat colours.
+    assert means == pytest.approx(np.array(colors, float), abs=8)
+
+
+def test_odd_sizes_become_even_cells():
+    assert sheet.cell_size_px((481, 271)) == (480, 270)
+    assert sheet.cell_size_px((95, 53)) == (320, 178)
+    assert sheet.cell_size_px((1280, 720)) == (480, 270)
+
+
+@pytest.mark.parametrize(
+    ("focus_dpt", "text"), [(0.0, "far away"), (0.25, "4.0 m"), (2.5, "40 cm")]
+)
+def test_focus_is_said_as_a_distance(focus_dpt, text):
+    assert sheet.EyeState("Courtyard", 4.0, focus_dpt).distance() == text
+
+
+def test_percentiles_of_a_known_series():
+    assert percentiles([float(i) for i in range(101)]) == {
+        "p50": 50.0,
+        "p95": 95.0,
+        "p99": 99.0,
+    }
+    assert percentiles([]) == {"p50": None, "p95": None, "p99": None}
+    assert FrameLog().summary()["frames"] == 0
+
+
+def test_settings_cover_the_whole_path():
+    settings = path_settings("courtyard", "primitives")
+    low, high = settings["pupil_range_mm"]
+    assert low <= 3.0 and high >= 4.95
+    low, high = settings["focus_range_dpt"]
+    assert low <= 1 / 14 and high >= 4.0
+
+
+@pytest.mark.parametrize("text", ["480", "480x", "8x8", "axb", "480x270x3"])
+def test_bad_size_is_refused_with_what_is_allowed(text):
+    with pytest.raises(ValueError, match=r"size '.*'; allowed: WIDTHxHEIGHT"):
+        parse_size(text)
+
+
+def test_profile_is_a_preset_or_a_json_file(tmp_path):
+    assert profile_body("myopia") == {"kind": "preset", "name": "myopia"}
+    path = tmp_path / "eye.json"
+    path.write_text('{"kind": "prescription", "sphere_dpt": -2}')
+    assert profile_body(str(path)) == {"kind": "prescription", "sphere_dpt": -2}
+    path.write_text("[1, 2]")
+    with pytest.raises(ValueError, match="list; allowed: an object"):
+        profile_body(str(path))
+    path.write_text("{")
+    with pytest.raises(ValueError, match="is not JSON"):
+        profile_body(str(path))

@@ -1,0 +1,221 @@
+"""Frames through a running service: what comes back, and what happens to bad ones."""
+
+import time
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from clients.filter_client import FilteredFrame
+from filter_service import errors
+from filter_service.messages import Bye, Hello, Ping, encode
+from tests.end_to_end.conftest import make_view, small_frame
+
+SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+
+
+def double(mark, **more):
+    return {"kind": "double", "mark": mark, **more}
+
+
+@pytest.mark.parametrize("size", [(64, 36), (1, 1), (7, 301), (640, 480)])
+def test_a_frame_comes_back_filtered_in_8_bits(client, size):
+    view = make_view(*size)
+    client.set_profile(double(7), views=[view])
+    reply = client.filter(view, **SEE)
+    expected = 255 - view.color
+    expected[0, 0] = 7
+    np.testing.assert_array_equal(reply.color, expected)
+
+
+def test_a_linear_frame_comes_back_linear(client):
+    view = make_view(dtype=np.float32)
+    client.set_profile(double(7), views=[view])
+    reply = client.filter(view, **SEE, output="linear")
+    assert reply.color.dtype == np.float32
+    np.testing.assert_array_equal(reply.color[1:], 1 - view.color[1:])
+
+
+def test_a_result_says_what_it_was_made_with(client):
+    view = make_view()
+    view.depth_m[0, :3] = (0.0, -1.0, np.nan)
+    ready = client.set_profile(double(7), views=[view])
+    reply = client.filter(
+        view, pupil_diameter_mm=9.0, focus_dpt=1.5, accumulation="paper"
+    )
+    header = reply.header
+    assert (header.profile_id, header.generation) == (
+        ready.profile_id,
+        ready.generation,
+    )
+    assert (header.pupil_diameter_mm, header.focus_dpt) == (7.0, 1.5)
+    assert header.missing_depth_count == 3
+    assert header.notes == ("paper",)
+
+
+def test_stage_times_are_named_and_sum_to_the_total(client):
+    view = make_view()
+    client.set_profile(double(7), views=[view])
+    header = client.filter(view, **SEE).header
+    stages = header.stage_times_ms
+    assert {"decode_ms", "queue_ms", "filter_ms", "other_ms"} <= set(stages)
+    assert sum(stages.values()) == pytest.approx(header.total_ms, abs=1e-6)
+    assert stages["filter_ms"] >= 2.0  # what the double is told to take
+    assert 0 <= stages["other_ms"] < header.total_ms
+
+
+@pytest.mark.parametrize("second_size", [(64, 36), (32, 40)])
+def test_two_views_come_back_in_order(client, second_size):
+    left, right = make_view(64, 36, seed=1), make_view(*second_size, seed=2)
+    client.set_profile(double(9), views=[left, right])
+    reply = client.filter([left, right], **SEE)
+    for view, color in zip((left, right), reply.colors, strict=True):
+        np.testing.assert_array_equal(color[1:], 255 - view.color[1:])
+
+
+def test_the_caller_may_reuse_its_arrays_at_once(client):
+    view = make_view(640, 360)
+    client.set_profile(double(9), views=[view])
+    for value in range(20):
+        view.color[:] = value
+        frame_id = client.submit(view, **SEE)
+        view.color[:] = 200
+        (reply,) = client.poll(10.0)
+        assert isinstance(reply, FilteredFrame)
+        assert reply.frame_id == frame_id
+        assert np.all(reply.color[1:] == 255 - value)
+
+
+def test_a_frame_that_cannot_be_filtered_is_an_error_and_the_next_one_works(client):
+    view = make_view()
+    client.set_profile(double(7), views=[view])
+    with pytest.raises(errors.RenderFailed, match="breaks at 11 mm"):
+        client.filter(view, pupil_diameter_mm=11.0, focus_dpt=0.0)
+    assert client.filter(view, **SEE).color[0, 0, 0] == 7
+
+
+def test_images_too_large_for_the_service_are_refused_by_the_client(client):
+    with pytest.raises(ValueError, match="4097 x 1"):
+        client.submit(make_view(4097, 1), **SEE)
+
+
+def test_a_frame_before_hello_and_before_a_profile_is_answered(
+    shared_service, raw_client
+):
+    raw = raw_client(shared_service)
+    reply = raw.ask(small_frame(5))
+    assert (reply.code, reply.frame_id) == ("no_session", 5)
+    raw.ask(Hello("raw"))
+    reply = raw.ask(small_frame(6))
+    assert (reply.code, reply.frame_id) == ("no_profile", 6)
+
+
+def broken_frames():
+    color, depth_m = bytes(16 * 8 * 3), bytes(16 * 8 * 4)
+    header = msgpack.unpackb(encode(small_frame(3))[0])
+
+    def packed(**changes):
+        return msgpack.packb(header | changes)
+
+    bad_dtype = header["views"][0] | {"color": {"dtype": "float16", "space": "srgb"}}
+    return {
+        "parts": ([packed(), color], "bad_message", "parts", 3),
+        "more parts": ([packed(), color, depth_m, b""], "bad_message", "parts", 3),
+        "sizes": ([packed(), depth_m, color], "bad_message", "views[0].color", 3),
+        "dtype": (
+            [packed(views=[bad_dtype]), color, depth_m],
+            "bad_message",
+            "views[0].color.dtype",
+            3,
+        ),
+        "nan": (
+            [packed(focus_dpt=float("nan")), color, depth_m],
+            "bad_message",
+            "focus_dpt",
+            3,
+        ),
+        "oversize header": (
+            [packed(more="x" * 5000), color, depth_m],
+            "bad_message",
+            "header",
+            None,
+        ),
+        "garbage": ([b"\xc1\x00"], "bad_message", "header", None),
+        "empty": ([b""], "bad_message", "header", None),
+        "type": ([packed(type="frames")], "unknown_type", "type", 3),
+        "version": ([packed(version=2), color], "version_mismatch", "version", 3),
+    }
+
+
+@pytest.mark.parametrize("name", broken_frames())
+def test_a_broken_message_is_answered_by_field_and_the_session_lives_on(
+    name, shared_service, raw_client
+):
+    parts, code, field, frame_id = broken_frames()[name]
+    raw = raw_client(shared_service)
+    raw.begin(mark=4)
+    raw.send(parts)
+    reply = raw.receive()
+    assert (reply.code, reply.field, reply.frame_id) == (code, field, frame_id)
+    result = raw.ask(small_frame(8))
+    assert (result.type_name, result.frame_id) == ("result", 8)
+
+
+def test_a_part_beyond_the_limit_ends_only_the_connection_that_sent_it(
+    start_service, raw_client
+):
+    service = start_service(max_part_mb=1, max_profile_kb=1)
+    good, bad = raw_client(service), raw_client(service)
+    good.begin()
+    bad.begin()
+    bad.send([encode(small_frame(1))[0], bytes(2**20 + 1)])
+    assert good.ask(small_frame(1)).type_name == "result"
+    # libzmq connects again by itself; to the service it is somebody new.
+    bad.socket.rcvtimeo = 500
+    with pytest.raises(zmq.Again):
+        bad.receive()
+    assert bad.ask(small_frame(2)).code == "no_session"
+
+
+def test_a_client_that_ignores_its_credit_is_told_and_every_frame_is_answered(
+    start_service, raw_client
+):
+    service = start_service(filter_ms=100)
+    raw = raw_client(service)
+    assert raw.begin().credit == 2
+    for frame_id in range(6):
+        raw.send(encode(small_frame(frame_id)))
+    answers = [raw.receive() for _ in range(6)]
+    assert sorted(answer.frame_id for answer in answers) == list(range(6))
+    cheated = [a for a in answers if a.type_name == "error"]
+    assert {a.code for a in cheated} == {"credit_exceeded"}
+    # The first one or two are taken in at once, two may wait: the rest is too much.
+    assert 2 <= len(cheated) <= 4
+    assert raw.ask(small_frame(9)).type_name == "result"
+
+
+def test_of_two_waiting_frames_the_newer_is_filtered(start_service, raw_client):
+    service = start_service(filter_ms=300, credit=3)
+    raw = raw_client(service)
+    raw.begin()
+    raw.send(encode(small_frame(1)))
+    time.sleep(0.05)  # frame 1 is being filtered when the others come
+    raw.send(encode(small_frame(2)))
+    raw.send(encode(small_frame(3)))
+    answers = [raw.receive() for _ in range(3)]
+    kinds = {a.frame_id: a.type_name for a in answers}
+    assert kinds == {1: "result", 2: "dropped", 3: "result"}
+    assert [a.reason for a in answers if a.frame_id == 2] == ["superseded"]
+
+
+def test_bye_ends_a_session_and_too_many_sessions_are_refused(
+    start_service, raw_client
+):
+    service = start_service(max_sessions=1)
+    first, second = raw_client(service), raw_client(service)
+    first.begin()
+    assert second.ask(Hello("second")).code == "too_many_sessions"
+    first.send(encode(Bye()))
+    assert first.ask(Ping(2.5)).t == 2.5
+    assert second.ask(Hello("second")).type_name == "welcome"

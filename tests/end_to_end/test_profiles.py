@@ -1,0 +1,202 @@
+"""Profile changes while frames stream: no gap, no mix, every failure said."""
+
+import time
+
+import numpy as np
+import pytest
+
+from clients.filter_client import FilteredFrame
+from filter_service import errors
+from filter_service.messages import Accepted, Dropped, ErrorReply, Ready
+from tests.end_to_end.conftest import make_view
+
+SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+
+
+def double(mark, **more):
+    return {"kind": "double", "mark": mark, **more}
+
+
+def mark_of(reply):
+    """Return which eye a frame really went through."""
+    assert np.all(reply.color[0, 0] == reply.color[0, 0, 0])
+    return int(reply.color[0, 0, 0])
+
+
+def stream(client, view, *, until, limit_s=10.0):
+    """Submit frames and return all events until one of them ends the stream."""
+    events = []
+    end_s = time.monotonic() + limit_s
+    while time.monotonic() < end_s:
+        if client.n_unanswered < 1:
+            client.submit(view, **SEE)
+        for event in client.poll(0.5):
+            events.append((time.monotonic(), event))
+            if until(event):
+                return events
+    raise AssertionError(f"the stream did not end: {events[-3:]}")
+
+
+def test_frames_go_on_through_the_old_eye_until_the_new_one_is_ready(client):
+    view = make_view()
+    old = client.set_profile(double(11), views=[view])
+    new = client.set_profile(double(22, build_s=0.6), wait=False)
+    assert isinstance(new, Accepted)
+    assert (new.generation, new.is_building) == (old.generation + 1, True)
+    # Frames were never sent before, so the service knows no camera but the given one.
+    events = stream(
+        client,
+        view,
+        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 22,
+    )
+    frames = [(t, e) for t, e in events if isinstance(e, FilteredFrame)]
+    assert not [e for _, e in events if isinstance(e, Dropped | ErrorReply)]
+    for _, event in frames:
+        made_with = (event.header.generation, event.header.profile_id)
+        assert (
+            made_with
+            == {
+                11: (old.generation, old.profile_id),
+                22: (new.generation, new.profile_id),
+            }[mark_of(event)]
+        )
+    marks = [mark_of(event) for _, event in frames]
+    assert marks == sorted(marks), "an old eye came back"
+    assert marks.count(11) > 20, "the old eye did not serve during the build"
+    gaps_s = np.diff([t for t, _ in frames])
+    assert gaps_s.max() < 0.3, f"the stream stood still for {gaps_s.max():.2f} s"
+
+
+def test_profiles_in_quick_succession_never_mix(client):
+    view = make_view()
+    client.set_profile(double(1), views=[view])
+    client.filter(view, **SEE)
+    generations = {}
+    last = None
+    for mark in range(2, 12):
+        last = client.set_profile(double(mark, build_s=0.03), wait=False)
+        generations[last.generation] = mark
+        client.submit(view, **SEE)
+        for event in client.poll(0.02):
+            if isinstance(event, FilteredFrame):
+                assert mark_of(event) == generations.get(event.header.generation, 1)
+    events = stream(
+        client, view, until=lambda e: isinstance(e, Ready) and e.profile_id == 10
+    )
+    cancelled = [e for _, e in events if isinstance(e, ErrorReply)]
+    assert {e.code for e in cancelled} <= {"build_cancelled"}
+    reply = client.filter(view, **SEE)
+    assert (mark_of(reply), reply.header.generation) == (11, last.generation)
+
+
+def test_a_newer_profile_takes_the_place_of_one_being_built(client):
+    view = make_view()
+    slow = client.set_profile(double(5, build_s=60.0), views=[view], wait=False)
+    ready = client.set_profile(double(6), views=[view], timeout_s=10.0)
+    assert ready.generation == slow.generation + 1
+    (cancelled,) = [e for e in client.poll() if isinstance(e, ErrorReply)]
+    assert (cancelled.code, cancelled.profile_id) == (
+        "build_cancelled",
+        slow.profile_id,
+    )
+    assert mark_of(client.filter(view, **SEE)) == 6
+
+
+def test_a_build_that_does_not_listen_is_ended_by_force(start_service, raw_client):
+    from clients.filter_client import FilterClient
+
+    service = start_service(cancel_grace_s=0.2)
+    view = make_view()
+    with FilterClient(service.endpoint, timeout_s=10.0) as client:
+        client.set_profile(double(5, build_s=60.0, deaf=True), views=[view], wait=False)
+        time.sleep(1.0)  # it runs
+        client.set_profile(double(6), views=[view], timeout_s=10.0)
+        assert mark_of(client.filter(view, **SEE)) == 6
+
+
+def test_a_wrong_profile_is_named_by_field_and_the_stream_goes_on(client):
+    view = make_view()
+    good = client.set_profile(double(5), views=[view])
+    with pytest.raises(errors.UnknownProfile) as caught:
+        client.set_profile(double(900))
+    assert (caught.value.field, caught.value.allowed) == ("mark", "0 to 255")
+    reply = client.filter(view, **SEE)
+    assert (mark_of(reply), reply.header.generation) == (5, good.generation)
+
+
+def test_a_failed_build_is_told_and_the_old_eye_stays(client):
+    view = make_view()
+    client.set_profile(double(5), views=[view])
+    client.filter(view, **SEE)
+    with pytest.raises(errors.BuildFailed, match="told to fail"):
+        client.set_profile(double(6, fail=True))
+    assert mark_of(client.filter(view, **SEE)) == 5
+
+
+def test_frames_of_an_eye_whose_build_failed_get_the_reason(client):
+    view = make_view()
+    for _ in range(2):
+        with pytest.raises(errors.BuildFailed, match="told to fail"):
+            client.set_profile(double(6, fail=True), views=[view])
+        with pytest.raises(errors.BuildFailed, match="told to fail"):
+            client.filter(view, **SEE)
+    client.set_profile(double(7), views=[view])
+    assert mark_of(client.filter(view, **SEE)) == 7
+
+
+def test_a_worker_that_dies_is_told_and_works_again(client):
+    view = make_view()
+    client.set_profile(double(5), views=[view])
+    client.filter(view, **SEE)
+    with pytest.raises(errors.WorkerCrashed, match="SIGKILL"):
+        client.set_profile(double(6, crash=True))
+    assert mark_of(client.filter(view, **SEE)) == 5
+    client.set_profile(double(7), views=[view])
+    assert mark_of(client.filter(view, **SEE)) == 7
+
+
+def test_a_new_camera_is_prepared_for_while_its_frames_are_dropped(client):
+    first, second = make_view(64, 36), make_view(128, 72)
+    ready = client.set_profile(double(5, build_s=0.2), views=[first])
+    client.filter(first, **SEE)
+    client.submit(second, **SEE)
+    events = stream(client, second, until=lambda e: isinstance(e, FilteredFrame))
+    dropped = [e for _, e in events if isinstance(e, Dropped)]
+    assert {e.reason for e in dropped} == {"preparing"}
+    again = [e for _, e in events if isinstance(e, Ready)]
+    assert [e.generation for e in again] == [ready.generation]
+    # Both cameras are prepared now, and nothing is built again.
+    for view in (first, second, first):
+        assert mark_of(client.filter(view, **SEE)) == 5
+    assert not [e for e in client.poll() if isinstance(e, Ready)]
+
+
+def test_a_profile_without_cameras_is_prepared_when_the_first_frame_comes(client):
+    accepted = client.set_profile(double(5))
+    assert isinstance(accepted, Accepted)
+    assert not accepted.is_building
+    assert mark_of(client.filter(make_view(), **SEE)) == 5
+
+
+def test_large_stores_come_through_the_pipe_whole_and_do_not_stop_the_stream(client):
+    view = make_view()
+    client.set_profile(double(5), views=[view])
+    client.set_profile(double(99, ballast_mb=80.0, build_s=0.1), wait=False)
+    events = stream(
+        client,
+        view,
+        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 99,
+    )
+    frames_s = [t for t, e in events if isinstance(e, FilteredFrame)]
+    assert np.diff(frames_s).max() < 0.3
+
+
+def test_old_eyes_are_freed(client):
+    view = make_view()
+    memory_mb = []
+    for mark in range(12):
+        client.set_profile(double(mark, ballast_mb=20.0), views=[view])
+        assert mark_of(client.filter(view, **SEE)) == mark
+        memory_mb.append(client.ping()[1].memory_mb)
+    # After the first few there are always the new one, the old one and one arriving.
+    assert max(memory_mb[4:]) - min(memory_mb[4:]) < 45.0, memory_mb

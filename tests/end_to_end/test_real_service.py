@@ -1,0 +1,189 @@
+"""The real renderer and the real PSFs behind the socket."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.rgbd_view import tangents_from_fov
+from clients.service_process import CHECKOUT, ServiceProcess
+from filter_service import errors
+from filter_service.messages import Camera, Dropped
+
+SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
+# A narrow range of pupils and distances keeps the builds of these tests short.
+NARROW = {"pupil_range_mm": (3.9, 4.1), "object_range_dpt": (0, 1)}
+MYOPIA = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -12}
+PLAIN = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": 0}
+
+
+@pytest.fixture(scope="module")
+def real_service():
+    with ServiceProcess(start_timeout_s=30.0) as service:
+        yield service
+        assert service.stop(10.0) == 0
+
+
+@pytest.fixture
+def real_client(real_service):
+    with FilterClient(real_service.endpoint, timeout_s=10.0) as client:
+        yield client
+
+
+def edge_view(width_px=160, height_px=90):
+    """Return a white right half beside a black left half, 2 m away."""
+    color = np.zeros((height_px, width_px, 3), np.float32)
+    color[:, width_px // 2 :] = 1.0
+    depth_m = np.full((height_px, width_px), 2.0, np.float32)
+    return RgbdView(color, depth_m, tangents_from_fov(40.0, width_px, height_px))
+
+
+def edge_width_px(color):
+    """Return over how many columns the middle row rises from 5 % to 95 %."""
+    row = color[color.shape[0] // 2, :, 1]
+    return int(np.count_nonzero((row > 0.05) & (row < 0.95)))
+
+
+def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
+    view = edge_view()
+    widths_px = []
+    for profile in (PLAIN, MYOPIA):
+        ready = real_client.set_profile(profile, settings=NARROW, views=[view])
+        assert ready.psf_count > 0
+        reply = real_client.filter(view, **SEE)
+        widths_px.append(edge_width_px(reply.color))
+        stages_ms = reply.header.stage_times_ms
+        assert sum(stages_ms.values()) == pytest.approx(reply.header.total_ms)
+        assert stages_ms["splat_ms"] > 0
+    # About 11 dpt of defocus over 4 mm blur by 44 mrad, with 8 mrad per pixel.
+    assert widths_px[0] <= 1
+    assert 4 <= widths_px[1] <= 6
+
+
+def test_one_profile_sent_twice_and_two_views_work(real_client):
+    view = edge_view()
+    colors = []
+    for _ in range(2):
+        real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+        reply = real_client.filter([view, view], **SEE)
+        assert len(reply.colors) == 2
+        colors += reply.colors
+    for color in colors[1:]:
+        np.testing.assert_array_equal(color, colors[0])
+
+
+def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
+    view = edge_view()
+    old = real_client.set_profile(PLAIN, settings=NARROW, views=[view])
+    new = real_client.set_profile(
+        MYOPIA, settings={"pupil_range_mm": (3, 5)}, wait=False
+    )
+    widths_px = {old.generation: set(), new.generation: set()}
+    while len(widths_px[new.generation]) == 0:
+        if real_client.n_unanswered == 0:
+            real_client.submit(view, **SEE)
+        for event in real_client.poll(10.0):
+            assert not isinstance(event, Dropped)
+            if isinstance(event, FilteredFrame):
+                width_px = edge_width_px(event.color)
+                widths_px[event.header.generation].add(width_px)
+    assert max(widths_px[old.generation]) <= 1
+    assert min(widths_px[new.generation]) >= 4
+
+
+def test_a_wrong_profile_is_named_by_field(real_client):
+    with pytest.raises(errors.UnknownProfile) as caught:
+        real_client.set_profile(MYOPIA | {"sphere_dpt": -600})
+    assert caught.value.field == "sphere_dpt"
+    assert "-30 to 30" in caught.value.allowed
+    assert "-600" in caught.value.message
+    assert "allowed" not in caught.value.message
+
+
+def test_a_blur_beyond_the_cap_is_an_error_and_not_a_wrong_image(real_client):
+    telescope = Camera(2000, 10, (-0.05, 0.05, 0.00025, -0.00025))
+    with pytest.raises(errors.GridTooLarge, match="255"):
+        real_client.set_profile(MYOPIA, views=[telescope])
+
+
+def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_client):
+    view = edge_view()
+    real_client.set_profile(PLAIN, settings=NARROW, views=[view])
+    children = Path(f"/proc/{real_service.process.pid}/task").glob("*/children")
+    pids = {int(pid) for file in children for pid in file.read_text().split()}
+    workers = [
+        pid
+        for pid in pids
+        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
+    assert len(workers) == 1
+
+    def kill(progress):
+        os.kill(workers[0], signal.SIGKILL)
+
+    with pytest.raises(errors.WorkerCrashed, match="SIGKILL"):
+        real_client.set_profile(
+            {"kind": "preset", "name": "keratoconus"}, views=[view], on_progress=kill
+        )
+    assert edge_width_px(real_client.filter(view, **SEE).color) <= 1
+    real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+    assert edge_width_px(real_client.filter(view, **SEE).color) >= 4
+
+
+def test_the_latency_benchmark_reports_stages_that_explain_the_age(
+    real_service, tmp_path
+):
+    plot = tmp_path / "latency.png"
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-m", "clients.latency"),
+            *("--endpoint", real_service.endpoint, "--size", "96x54"),
+            *("--rate-hz", "20", "--seconds", "1", "--plot", str(plot), "--json"),
+            *("--settings", json.dumps(NARROW)),
+        ],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads(finished.stdout)
+    assert report["frames"]["scheduled"] == 20
+    n_dropped = sum(report["frames"]["dropped"].values())
+    assert report["frames"]["filtered"] + n_dropped == 20
+    median_ms = {row["method"]: row["median_ms"] for row in report["rows"]}
+    assert median_ms["age_ms"] >= median_ms["service_total_ms"]
+    assert median_ms["splat_ms"] > 0
+    assert all(row["error"] == 0 for row in report["rows"])
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert "frames filtered" in finished.stderr
+
+
+def test_the_benchmark_refuses_nonsense_by_option():
+    finished = subprocess.run(
+        [sys.executable, "-m", "clients.latency", "--size", "12"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert finished.returncode == 2
+    assert "--size is '12'" in finished.stderr
+
+
+def test_a_remote_interface_is_refused_by_the_program():
+    finished = subprocess.run(
+        [sys.executable, "-m", "filter_service", "serve", "--bind", "tcp://0.0.0.0:1"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert finished.returncode == 2
+    assert "allow_remote = true" in finished.stderr
