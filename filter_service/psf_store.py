@@ -30,6 +30,9 @@ class PsfStore:
         Where a kernel starts and its radius.
     blur_px : (n_psfs,)
         Geometric blur radius.
+    spread_px : (n_psfs,)
+        Radius of the disc with the kernel's sum of squares: how far it really smears,
+        which for a bright core in a wide skirt is much less than ``blur_px``.
     peak_ratio : (n_psfs,)
         Largest weight.
     """
@@ -43,6 +46,7 @@ class PsfStore:
     offsets: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     blur_px: NDArray[np.float64]
+    spread_px: NDArray[np.float64]
     peak_ratio: NDArray[np.float64]
     methods: dict[str, int] = field(default_factory=dict)
     max_lost_energy_ratio: float = 0.0
@@ -72,6 +76,8 @@ class FrameLayers:
         Bound on the weights of that interval.
     blur_px : (n,)
         Largest geometric blur radius over the channels.
+    spread_px : (n,)
+        Smallest spread over the channels; decides what may merge.
     recipes : (n, 3, 12), uint32
         Per channel four kernel offsets, four radii, four weights (float bits).
     """
@@ -80,6 +86,7 @@ class FrameLayers:
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
     blur_px: NDArray[np.float64]
+    spread_px: NDArray[np.float64]
     recipes: NDArray[np.uint32]
     pupil_diameter_mm: float
     focus_dpt: float
@@ -136,6 +143,7 @@ def frame_layers(
         radius_px=np.maximum(own_px, np.append(own_px[1:], own_px[-1])),
         peak_ratio=np.maximum(own_peak, np.append(own_peak[1:], own_peak[-1])),
         blur_px=blend.blur_px(object_dpt[:, None] + at_infinity_dpt).max(axis=1),
+        spread_px=(weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
         recipes=_recipes(store, psfs, weights),
         pupil_diameter_mm=pupil_mm,
         focus_dpt=store.eye.reachable_focus_dpt(focus_dpt),

@@ -291,7 +291,7 @@ class _Frame:
         self._reserve(
             LAYERS=1,
             PIXELS=16 * self.pixel_count,
-            PIXEL_BLUR=4 * self.pixel_count,
+            PIXEL_SPREAD=4 * self.pixel_count,
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,
             BLOCKS=16 * self.tile_count,
@@ -304,7 +304,7 @@ class _Frame:
             self._run(
                 "build_fragments",
                 self.grid,
-                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_BLUR"),
+                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_SPREAD"),
                 **common,
                 tangents=self.view.tangents,
                 depth_is_planar=int(self.view.depth_kind == "planar"),
@@ -318,7 +318,7 @@ class _Frame:
             self._run(
                 "merge_fragments",
                 self.grid,
-                *("PIXELS", "PIXEL_BLUR", "LAYERS"),
+                *("PIXELS", "PIXEL_SPREAD", "LAYERS"),
                 *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
                 **common,
                 blur_px_per_dpt=layers.blur_px_per_dpt,
@@ -491,7 +491,7 @@ def _layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
     table[:, 0, 1] = starts[:-1]
     table[:, 0, 2] = starts[:-1] + single
     table[:, 0, 3] = layers.radius_px
-    table[:, 1, 0] = layers.blur_px.astype(np.float32).view(np.uint32)
+    table[:, 1, 0] = layers.spread_px.astype(np.float32).view(np.uint32)
     scale = layers.peak_ratio.astype(np.float32)
     table[:, 1, 1] = scale.view(np.uint32)
     merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))

@@ -1,13 +1,13 @@
 // Layers of this frame: kernels at increasing object distance in dioptres.
 // Record k, for the interval from layer k to k + 1:
 //   (distance bits, kernel offset, merged kernel offset, kernel radius px),
-//   (blur radius bits px, scale bits, merged scale bits, 0).
+//   (spread bits px, scale bits, merged scale bits, 0).
 // The last layer only ends an interval; a single layer is its own interval.
 // Needs a buffer `layers` of uvec4 in scope.
 
 float layer_object_dpt(int k) { return uintBitsToFloat(layers[k * LAYER_WORDS].x); }
 
-float layer_blur_px(int k) { return uintBitsToFloat(layers[k * LAYER_WORDS + 1].x); }
+float layer_spread_px(int k) { return uintBitsToFloat(layers[k * LAYER_WORDS + 1].x); }
 
 // Interval that holds a distance; distances beyond the ends go to the end intervals.
 int find_interval(float object_dpt, int layer_count) {

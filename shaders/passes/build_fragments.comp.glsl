@@ -1,7 +1,7 @@
-// Turns colour and depth of the input frame into linear light, dioptres and blur size.
+// Turns colour and depth of the input frame into linear light, dioptres and kernel spread.
 // In:  COLOR_IN (bytes RGB, sRGB; or f32 RGB, linear when COLOR_IS_LINEAR),
 //      DEPTH_IN (f32 metres, all valid), LAYERS.
-// Out: PIXELS (linear RGB, object distance dpt), PIXEL_BLUR (blur radius px).
+// Out: PIXELS (linear RGB, object distance dpt), PIXEL_SPREAD (spread of the kernel, px).
 // Dispatch: one thread a pixel, 8 x 8 groups.
 // Twin: reference.build_fragments.  Source: section 6.1; radial depth as DESIGN 3.
 
@@ -13,7 +13,7 @@ layout(std430, binding = BINDING_COLOR_IN) readonly buffer ColorIn { uint color_
 layout(std430, binding = BINDING_DEPTH_IN) readonly buffer DepthIn { float depth_in[]; };
 layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
-layout(std430, binding = BINDING_PIXEL_BLUR) writeonly buffer Blur { float blur_px[]; };
+layout(std430, binding = BINDING_PIXEL_SPREAD) writeonly buffer Spread { float spread_px[]; };
 
 #include "common/layers.glsl"
 
@@ -53,9 +53,9 @@ void main() {
     float dpt = object_dpt(depth_in[pixel], vec2(at));
     dpt = clamp(dpt, layer_object_dpt(0), layer_object_dpt(layer_count - 1));
     int k = find_interval(dpt, layer_count);
-    float blur = layer_blur_px(k);
+    float spread = layer_spread_px(k);
     if (layer_count > 1)
-        blur = mix(blur, layer_blur_px(k + 1), interval_fraction(k, dpt, layer_count));
+        spread = mix(spread, layer_spread_px(k + 1), interval_fraction(k, dpt, layer_count));
     pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
-    blur_px[pixel] = blur;
+    spread_px[pixel] = spread;
 }

@@ -1,6 +1,6 @@
 // Merges similar pixels 2 x 2 where the blur hides the difference, and packs the
 // fragments of each 8 x 8 block, in scan order, to the front of the block's slots.
-// In:  PIXELS, PIXEL_BLUR, LAYERS.
+// In:  PIXELS, PIXEL_SPREAD, LAYERS.
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
 //      reach bits, has an edge, 0).
 // Dispatch: one group a block, one thread a pixel.
@@ -9,7 +9,7 @@
 layout(local_size_x = TILE_SIZE_PX, local_size_y = TILE_SIZE_PX) in;
 
 layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
-layout(std430, binding = BINDING_PIXEL_BLUR) readonly buffer Blur { float blur_px[]; };
+layout(std430, binding = BINDING_PIXEL_SPREAD) readonly buffer Spread { float spread_px[]; };
 layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
 layout(std430, binding = BINDING_FRAGMENT_COLOR) writeonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_FRAGMENT_PLACE) writeonly buffer Place { uvec4 places[]; };
@@ -50,17 +50,17 @@ bool quad_is_similar(ivec2 corner) {
     if (merge_enabled == 0 || !inside(corner + 1)) return false;
     vec4 low = pixels[pixel_index(corner)];
     vec4 high = low;
-    float blur = blur_px[pixel_index(corner)];
+    float spread = spread_px[pixel_index(corner)];
     for (int i = 1; i < int(QUAD); ++i) {
         uint pixel = pixel_index(corner + ivec2(i & 1, i >> 1));
         low = min(low, pixels[pixel]);
         high = max(high, pixels[pixel]);
-        blur = min(blur, blur_px[pixel]);
+        spread = min(spread, spread_px[pixel]);
     }
     vec3 contrast = high.rgb - low.rgb;
     float largest = max(contrast.r, max(contrast.g, contrast.b));
-    return blur >= MERGE_MIN_BLUR_PX
-        && largest <= MERGE_CONTRAST * pow(blur, MERGE_CONTRAST_POWER)
+    return spread >= MERGE_MIN_SPREAD_PX
+        && largest <= MERGE_CONTRAST * pow(spread, MERGE_CONTRAST_POWER)
         && (high.a - low.a) * blur_px_per_dpt <= MERGE_MAX_BLUR_STEP_PX;
 }
 

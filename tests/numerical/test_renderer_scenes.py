@@ -15,13 +15,7 @@ from tests.numerical.synthetic import psnr_db
 
 SIZE = {"width_px": 320, "height_px": 180}
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
-MERGING = [
-    ("myopia", "primitives"),
-    ("astigmatism", "courtyard"),
-    ("astigmatism", "primitives"),
-    ("keratoconus", "primitives"),
-    ("cataract", "primitives"),
-]
+MERGING = [(eye, scene) for eye in ("myopia", "astigmatism") for scene in SCENES]
 """Cases in which at least half of the pixels merge."""
 
 
