@@ -10,6 +10,8 @@ import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
+from filter_service.threads import UNSAFE_THREADING_LAYER
+
 SERVICE_PACKAGES = (
     "numpy",
     "scipy",
@@ -34,7 +36,7 @@ FIX_PACKAGES = "make demo, or: sh setup.sh"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
 FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
-UNSAFE_THREADING_LAYER = "workqueue"
+
 """Numba's fallback: two threads in parallel kernels at once end the process."""
 
 

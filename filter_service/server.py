@@ -378,7 +378,9 @@ def run(config: ServiceConfig) -> None:
     from filter_service.gpu import Gpu
     from filter_service.profile_build import build, check_profile
     from filter_service.renderer import FilterRenderer
+    from filter_service.threads import require_safe_threading_layer
 
+    require_safe_threading_layer()
     logging.basicConfig(level=logging.INFO, format="ocufilter: %(message)s")
     gpu = Gpu()
     try:

@@ -1,0 +1,39 @@
+"""Refuse numba's unsafe thread layer before it can kill the service.
+
+Without OpenMP (libgomp1) or TBB numba falls back to its work queue, which ends the
+process when two threads start parallel kernels at once.
+"""
+
+import numba
+from numba import njit, prange, threading_layer
+
+from filter_service.errors import RenderFailed
+
+UNSAFE_THREADING_LAYER = "workqueue"
+
+
+@njit(parallel=True, cache=True)
+def _count(n):
+    total = 0
+    for _ in prange(n):
+        total += 1
+    return total
+
+
+def require_safe_threading_layer() -> str:
+    """Start numba's threads and return the layer that carries them.
+
+    Raises
+    ------
+    RenderFailed
+        Only the work queue is to be had; names what to install.
+    """
+    numba.config.THREADING_LAYER = "threadsafe"
+    try:
+        _count(8)
+    except ValueError as error:
+        raise RenderFailed(
+            "numba has no thread layer that two threads may share; "
+            "install libgomp1 (apt-get install libgomp1) or tbb (pip install tbb)"
+        ) from error
+    return threading_layer()
