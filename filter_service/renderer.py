@@ -1,21 +1,12 @@
-"""Filters one view: pass order, buffer sizes and bands (order: shaders/README.md)."""
+"""Filters one view: checks, layers, strips that fit the buffers, and the answer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import (
-    BYTES_PER_WORD,
-    LAYER_WORDS,
-    PAPER_SORT_KEY_BITS,
-    QUAD,
-    RGB,
-    SORT_KEY_BITS,
-    THREADS,
-    TILE_SIZE_PX,
-)
-from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.constants import TILE_SIZE_PX
+from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
 from filter_service.frame import (
     View,
     check_view,
@@ -23,22 +14,15 @@ from filter_service.frame import (
     finite_color,
     object_dpt,
 )
+from filter_service.frame_passes import FramePasses, blend_layers
 from filter_service.gpu import Buffer, Gpu, StageTimer
 from filter_service.psf_grid import pixel_pitch_mrad
 from filter_service.psf_store import FrameLayers, PsfStore, frame_layers
 
 PITCH_TOLERANCE = 1e-3
-ENTRY_BYTES = 4
-MAX_BAND_ENTRIES = 16 * 2**20
-"""Tile list entries in flight; more go through in bands.  Keeps each list buffer at
-64 MB, half of the smallest storage block that the service runs on."""
 
-SOFTWARE_PIXELS_PER_THREAD = 8
-"""2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
-
-SOFTWARE_LIST_THREADS = 8
-"""Threads that make and sort a tile's list on a software renderer: one vector."""
-
+BYTES_PER_PIXEL = 16
+"""Of the largest per-pixel buffers: a strip's must fit one storage block."""
 ACCUMULATIONS = ("coverage", "paper")
 OUTPUTS = ("linear", "srgb8")
 
@@ -70,6 +54,9 @@ class Rendered:
         colour was not finite (taken as black).
     pupil_diameter_mm, focus_dpt : float
         As used.
+    fragment_count, merged_count, entry_count : int
+        Fragments, pixels merged into some, and tile list entries; rows that two strips
+        of a very large frame share count twice.
     """
 
     color: NDArray
@@ -91,7 +78,8 @@ class FilterRenderer:
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
-        self._layers_key: tuple | None = None
+        self._layers_of: LoadedStore | None = None
+        self._layers_state: tuple[float, float] = (0.0, 0.0)
         self._layers: FrameLayers | None = None
 
     def load(self, store: PsfStore) -> LoadedStore:
@@ -135,16 +123,27 @@ class FilterRenderer:
     def _render(
         self, view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
     ) -> Rendered:
-        frame = _Frame(self._gpu, view, accumulation == "paper", merge)
-        with frame.timer.wall("prepare_ms"):
+        timer = StageTimer(self._gpu)
+        with timer.wall("prepare_ms"):
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
-        layers = self._blended_layers(frame, handle, pupil_diameter_mm, focus_dpt)
-        frame.upload(color, depth.depth_m)
-        frame.build_fragments(layers)
-        frame.count_tiles()
-        frame.splat_bands()
-        picture = frame.read_back(output)
+            whole = replace(view, color=color, depth_m=depth.depth_m)
+        layers = self._blended_layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
+        counts = np.zeros(3, dtype=np.int64)
+        for strip in _strips(whole, layers, self._gpu.max_block_bytes):
+            passes = FramePasses(
+                self._gpu,
+                strip.view,
+                timer,
+                paper_rule=accumulation == "paper",
+                merge=merge,
+                scan_start_px=strip.first_row * view.width_px,
+                scan_total_px=view.width_px * view.height_px,
+            )
+            passes.run(layers)
+            picture[strip.wanted] = passes.read_back(output)[strip.kept]
+            counts += passes.fragment_count, passes.merged_count, passes.entry_count
         self._gpu.check("render")
         notes = list(layers.notes)
         if bad_color_count:
@@ -153,15 +152,15 @@ class FilterRenderer:
             )
         return Rendered(
             color=picture,
-            stage_times_ms=frame.timer.result_ms(),
+            stage_times_ms=timer.result_ms(),
             missing_depth_count=depth.missing_count,
             clamped_depth_count=depth.clamped_count,
             bad_color_count=bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            fragment_count=frame.fragment_count,
-            merged_count=frame.merged_count,
-            entry_count=frame.entry_count,
+            fragment_count=int(counts[0]),
+            merged_count=int(counts[1]),
+            entry_count=int(counts[2]),
             layer_count=len(layers.object_dpt),
             notes=notes,
         )
@@ -175,22 +174,20 @@ class FilterRenderer:
         return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
 
     def _blended_layers(
-        self, frame, handle, pupil_diameter_mm, focus_dpt
+        self, timer, handle, pupil_diameter_mm, focus_dpt
     ) -> FrameLayers:
         """Layers of this pupil and focus; those of the last frame when unchanged."""
-        key = (handle, pupil_diameter_mm, focus_dpt)
-        same = self._layers_key is not None and all(
-            a is b or a == b for a, b in zip(key, self._layers_key, strict=True)
-        )
-        with frame.timer.stage("psf_blend_ms"):
-            if not same:
+        state = (pupil_diameter_mm, focus_dpt)
+        with timer.stage("psf_blend_ms"):
+            if self._layers_of is not handle or self._layers_state != state:
+                self._layers_of = None  # stays so if what follows fails
                 self._layers = frame_layers(
                     handle.store,
                     pupil_diameter_mm=pupil_diameter_mm,
                     focus_dpt=focus_dpt,
                 )
-                frame.blend_layers(self._layers, handle.kernels)
-                self._layers_key = key
+                blend_layers(self._gpu, self._layers, handle.kernels)
+                self._layers_of, self._layers_state = handle, state
         return self._layers
 
 
@@ -219,294 +216,60 @@ def _check_pitch(view: View, store: PsfStore) -> None:
             )
 
 
-def _groups(count: int, size: int) -> int:
-    return (count + size - 1) // size
+@dataclass(frozen=True)
+class _Strip:
+    """Rows of a frame that go through the passes together.
+
+    ``view`` has the rows that send light to the wanted ones; ``wanted`` are the rows of
+    the frame to fill and ``kept`` the rows of the strip that do it.
+    """
+
+    view: View
+    first_row: int
+    wanted: slice
+    kept: slice
 
 
-class _Frame:
-    """The passes of one frame, in order; buffers are the context's named ones."""
+def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Strip]:
+    """Cut a frame so that each strip's buffers fit a storage block.
 
-    def __init__(self, gpu: Gpu, view: View, paper_rule: bool, merge: bool):
-        self.gpu = gpu
-        self.view = view
-        self.paper_rule = paper_rule
-        self.merge = merge
-        self.timer = StageTimer(gpu)
-        self.size = (view.width_px, view.height_px)
-        self.pixel_count = view.width_px * view.height_px
-        self.grid = tuple(_groups(side, TILE_SIZE_PX) for side in self.size)
-        self.tile_count = self.grid[0] * self.grid[1]
-        self.buffers: dict[str, Buffer] = {}
-        self.entry_count = 0
-
-    def _reserve(self, **n_bytes: int) -> None:
-        for name, size in n_bytes.items():
-            self.buffers[name] = self.gpu.storage(name, size)
-
-    def _run(
-        self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
-    ) -> None:
-        defines = uniforms.pop("defines", None)
-        atlas = self.gpu.atlas(1) if uniforms.pop("with_atlas", False) else None
-        self.gpu.dispatch(
-            name,
-            groups,
-            buffers={binding: self.buffers[binding] for binding in bindings},
-            uniforms=uniforms,
-            defines=defines,
-            atlas=atlas,
+    Strips start on tile rows, so that tiles and merged quads are those of the whole.
+    """
+    reach_px = int(layers.radius_px.max()) + 2
+    halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)
+    rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
+    if rows >= view.height_px:
+        return [_Strip(view, 0, slice(None), slice(None))]
+    step = rows - 2 * halo
+    if step < TILE_SIZE_PX:
+        raise OutOfGpuMemory(
+            f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
+            f"a storage block of {max_block_bytes / 1e6:.0f} MB"
         )
-
-    def blend_layers(self, layers: FrameLayers, store_kernels: Buffer) -> None:
-        """Upload the layer table and compute the layer kernels, single and merged."""
-        table, texel_count = _layer_table(layers)
-        largest = 2 * int(layers.radius_px.max()) + 2
-        self.buffers["STORE"] = store_kernels
-        self.buffers["LAYERS"] = self.gpu.upload("LAYERS", table)
-        self.buffers["RECIPES"] = self.gpu.upload("RECIPES", layers.recipes)
-        self.gpu.atlas(texel_count)
-        intervals = max(len(table) - 1, 1)
-        groups = (_groups(largest * largest, THREADS), intervals)
-        self._run(
-            "blend_psfs",
-            groups,
-            *("STORE", "RECIPES", "LAYERS"),
-            layer_count=len(table),
-            with_atlas=True,
-        )
-        self._run("merge_psfs", groups, "LAYERS", with_atlas=True)
-
-    def upload(self, color: NDArray, depth_m: NDArray) -> None:
-        """Send the frame; bytes are padded to whole words."""
-        with self.timer.stage("upload_ms"):
-            n_bytes = _groups(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
-            packed = _groups(self.pixel_count, BYTES_PER_WORD) * RGB * BYTES_PER_WORD
-            self._reserve(COLOR_IN=max(n_bytes, packed))
-            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
-            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
-
-    def build_fragments(self, layers: FrameLayers) -> None:
-        """Linear light, dioptres, blur; then merging into blocks."""
-        slots = self.tile_count * THREADS
-        self._reserve(
-            LAYERS=1,
-            PIXELS=16 * self.pixel_count,
-            PIXEL_SPREAD=4 * self.pixel_count,
-            FRAGMENT_COLOR=16 * slots,
-            FRAGMENT_PLACE=16 * slots,
-            BLOCKS=16 * self.tile_count,
-        )
-        common = {
-            "frame_size_px": self.size,
-            "layer_count": len(layers.object_dpt),
-        }
-        with self.timer.stage("fragments_ms"):
-            self._run(
-                "build_fragments",
-                self.grid,
-                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_SPREAD"),
-                **common,
-                tangents=self.view.tangents,
-                depth_is_planar=int(self.view.depth_kind == "planar"),
-                defines=(
-                    {"COLOR_IS_LINEAR": 1}
-                    if self.view.color.dtype == np.float32
-                    else None
-                ),
+    strips = []
+    for top in range(0, view.height_px, step):
+        bottom = min(top + step, view.height_px)
+        first, last = max(top - halo, 0), min(bottom + halo, view.height_px)
+        strips.append(
+            _Strip(
+                view=_rows_of(view, first, last),
+                first_row=first,
+                wanted=slice(top, bottom),
+                kept=slice(top - first, bottom - first),
             )
-        with self.timer.stage("merge_ms"):
-            self._run(
-                "merge_fragments",
-                self.grid,
-                *("PIXELS", "PIXEL_SPREAD", "LAYERS"),
-                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
-                **common,
-                blur_px_per_dpt=layers.blur_px_per_dpt,
-                merge_enabled=int(self.merge),
-                paper_order=int(self.paper_rule),
-            )
-        reach_px = int(layers.radius_px.max()) + 1.5
-        self.search_blocks = min(
-            _groups(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
         )
-
-    def count_tiles(self) -> None:
-        """Lengths and offsets of the tile lists, and the bands they are made in."""
-        self._reserve(
-            TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2)
-        )
-        with self.timer.stage("bin_ms"):
-            self._run(
-                "count_tiles",
-                self.grid,
-                *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
-                tile_grid=self.grid,
-                search_blocks=self.search_blocks,
-                order_always=int(self.paper_rule),
-                defines=self._list_threads,
-            )
-            self._run(
-                "scan_tiles",
-                (1, 1),
-                "TILE_COUNTS",
-                "TILE_OFFSETS",
-                tile_count=self.tile_count,
-            )
-        with self.timer.wall("plan_ms"):
-            self.bands = self._plan_bands()
-
-    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
-        """Bands as (first tile, tile count, first entry, entry count)."""
-        total, total_float = self._totals()
-        self.entry_count = round(total_float) if total_float > 2**31 else total
-        if self.entry_count <= MAX_BAND_ENTRIES:
-            return [(0, self.tile_count, 0, total)]
-        counts = self.gpu.read(
-            self.buffers["TILE_COUNTS"], (self.tile_count, 2), np.uint32
-        )[:, 0].astype(np.int64)
-        offsets, bands = _split(counts, MAX_BAND_ENTRIES)
-        self.buffers["TILE_OFFSETS"] = self.gpu.upload(
-            "TILE_OFFSETS", offsets.astype(np.uint32)
-        )
-        return bands
-
-    def _totals(self) -> tuple[int, float]:
-        data = self.buffers["TILE_OFFSETS"].read(8, offset=4 * self.tile_count)
-        return (
-            int(np.frombuffer(data, np.uint32, 1)[0]),
-            float(np.frombuffer(data, np.float32, 1, offset=4)[0]),
-        )
-
-    def splat_bands(self) -> None:
-        """Scatter, sort and splat, band by band."""
-        longest = max(band[3] for band in self.bands)
-        self._reserve(
-            ENTRIES=ENTRY_BYTES * longest,
-            ENTRIES_SPARE=ENTRY_BYTES * longest,
-            COLOR_OUT=16 * self.pixel_count,
-        )
-        for first_tile, tile_count, first_entry, _ in self.bands:
-            band = {"first_tile": first_tile, "first_entry": first_entry}
-            groups = (tile_count, 1)
-            with self.timer.stage("bin_ms"):
-                self._run(
-                    "scatter_fragments",
-                    groups,
-                    *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
-                    tile_grid=self.grid,
-                    search_blocks=self.search_blocks,
-                    **band,
-                    defines=self._list_threads,
-                )
-            with self.timer.stage("sort_ms"):
-                self._run(
-                    "sort_tiles",
-                    groups,
-                    *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
-                    *("ENTRIES", "ENTRIES_SPARE"),
-                    **band,
-                    defines={
-                        **self._list_threads,
-                        "KEY_BITS": (
-                            PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
-                        ),
-                    },
-                )
-            with self.timer.stage("splat_ms"):
-                self._run(
-                    "splat_tiles",
-                    groups,
-                    *(
-                        "FRAGMENT_COLOR",
-                        "FRAGMENT_PLACE",
-                        "TILE_COUNTS",
-                        "TILE_OFFSETS",
-                    ),
-                    *("ENTRIES", "LAYERS", "PIXELS", "COLOR_OUT"),
-                    with_atlas=True,
-                    frame_size_px=self.size,
-                    tile_grid=self.grid,
-                    **band,
-                    defines=self._splat_variant(),
-                )
-
-    @property
-    def _list_threads(self) -> dict[str, int]:
-        software = self.gpu.is_software
-        return {"GROUP_THREADS": SOFTWARE_LIST_THREADS if software else THREADS}
-
-    def _splat_variant(self) -> dict[str, int]:
-        pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
-        rows = TILE_SIZE_PX // pixels
-        rule = {"PAPER_RULE": 1} if self.paper_rule else {}
-        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **rule}
-
-    def read_back(self, output: str) -> NDArray:
-        """Fetch the filtered picture, encoded as asked."""
-        width, height = self.size
-        if output == "linear":
-            with self.timer.wall("readback_ms"):
-                pixels = self.gpu.read(
-                    self.buffers["COLOR_OUT"], (height, width, 4), np.float32
-                )
-                return np.ascontiguousarray(pixels[..., :RGB])
-        with self.timer.stage("encode_ms"):
-            quads = _groups(self.pixel_count, BYTES_PER_WORD)
-            self._run(
-                "encode_srgb",
-                (_groups(quads, THREADS), 1),
-                *("COLOR_OUT", "COLOR_IN"),
-                pixel_count=self.pixel_count,
-            )
-        with self.timer.wall("readback_ms"):
-            return self.gpu.read(
-                self.buffers["COLOR_IN"], (height, width, RGB), np.uint8
-            )
-
-    @property
-    def _block_counts(self) -> NDArray[np.uint32]:
-        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[
-            :, 0
-        ]
-
-    @property
-    def fragment_count(self) -> int:
-        """Fragments after merging."""
-        return int(self._block_counts.sum())
-
-    @property
-    def merged_count(self) -> int:
-        """Pixels that went into merged fragments."""
-        singles_saved = self.pixel_count - self.fragment_count
-        return singles_saved * 4 // 3
+    return strips
 
 
-def _layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
-    """Layer records (n, 2, 4) for common/layers.glsl, and texels of all kernels."""
-    widths = 2 * layers.radius_px + 1
-    single, merged = widths**2, (widths + 1) ** 2
-    starts = np.concatenate([[0], np.cumsum(single + merged)])
-    table = np.zeros((len(widths), LAYER_WORDS, 4), dtype=np.uint32)
-    table[:, 0, 0] = layers.object_dpt.astype(np.float32).view(np.uint32)
-    table[:, 0, 1] = starts[:-1]
-    table[:, 0, 2] = starts[:-1] + single
-    table[:, 0, 3] = layers.radius_px
-    table[:, 1, 0] = layers.spread_px.astype(np.float32).view(np.uint32)
-    scale = layers.peak_ratio.astype(np.float32)
-    table[:, 1, 1] = scale.view(np.uint32)
-    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
-    table[:, 1, 2] = merged_scale.view(np.uint32)
-    return table, int(starts[-1])
-
-
-def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
-    """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
-    bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
-    first = 0
-    while first < len(counts):
-        sums = np.cumsum(counts[first:])
-        tiles = max(int(np.searchsorted(sums, limit, side="right")), 1)
-        offsets[first : first + tiles] = sums[:tiles] - counts[first : first + tiles]
-        bands.append((first, tiles, 0, int(sums[tiles - 1])))
-        first += tiles
-    return offsets, bands
+def _rows_of(view: View, first: int, last: int) -> View:
+    """Rows first..last of a view, with the tangents of their edges."""
+    left, right, up, down = view.tangents
+    per_row = (down - up) / view.height_px
+    return replace(
+        view,
+        color=np.ascontiguousarray(view.color[first:last]),
+        depth_m=np.ascontiguousarray(view.depth_m[first:last]),
+        tangents=(left, right, up + first * per_row, up + last * per_row),
+    )

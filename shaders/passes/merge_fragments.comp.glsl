@@ -22,6 +22,7 @@ uniform ivec2 frame_size_px;
 uniform int layer_count;
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 uniform int merge_enabled;
+uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
 uniform int paper_order;          // sort as the paper does: metres plus scan position
 
 shared uint alive[2];             // bit per thread: it keeps a fragment
@@ -73,7 +74,7 @@ vec4 quad_mean(ivec2 corner) {
 float sort_depth(ivec2 at, float dpt) {
     if (paper_order == 0) return -dpt;
     float distance_m = dpt > 0.0 ? min(1.0 / dpt, PAPER_FAR_M) : PAPER_FAR_M;
-    float scan = float(at.y * frame_size_px.x + at.x) / float(frame_size_px.x * frame_size_px.y);
+    float scan = float(scan_px.x + at.y * frame_size_px.x + at.x) / float(scan_px.y);
     return distance_m + PAPER_TIE_BREAK_M * scan;
 }
 

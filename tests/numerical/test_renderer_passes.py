@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filter_service import constants, reference, renderer
+from filter_service import constants, frame_passes, reference
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.frame import View
 from tests.numerical.synthetic import Bench, psnr_db, tangents, texture
@@ -69,7 +69,7 @@ def test_blended_layers_equal_their_twin(bench, view):
     bench.render(view, pupil_diameter_mm=3.3, focus_dpt=7.0)
     layers = bench.layers(pupil_diameter_mm=3.3, focus_dpt=7.0)
     expected = reference.layer_kernels(bench.store, layers)
-    table, texels = renderer._layer_table(layers)
+    table, texels = frame_passes.layer_table(layers)
     with bench.gpu.context:
         line = np.frombuffer(bench.gpu.atlas(1).read(), np.uint32)
     line = line.reshape(-1, 4)[:texels, :3]
@@ -158,12 +158,38 @@ def test_same_input_gives_the_same_bytes(bench, view, accumulation):
     assert first.tobytes() == again.tobytes()
 
 
-def test_bands_change_nothing(bench, view, monkeypatch):
+@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_GROUPS"])
+def test_bands_change_nothing(bench, view, monkeypatch, limit):
     whole = bench.render(view)
-    monkeypatch.setattr(renderer, "MAX_BAND_ENTRIES", whole.entry_count // 7)
+    some = whole.entry_count // 7 if limit == "MAX_BAND_ENTRIES" else 50
+    monkeypatch.setattr(frame_passes, limit, some)
     banded = bench.render(view)
     assert banded.entry_count == whole.entry_count
     assert whole.color.tobytes() == banded.color.tobytes()
+
+
+@pytest.mark.parametrize("accumulation", ["coverage", "paper"])
+def test_strips_change_nothing(bench, view, monkeypatch, accumulation):
+    whole = bench.render(view, accumulation=accumulation)
+    rows = 56  # two halos of 16 px and three tile rows
+    monkeypatch.setattr(bench.gpu, "max_block_bytes", 16 * 152 * rows)
+    # named buffers are larger already; only the cutting into strips sees the limit
+    cut = bench.render(view, accumulation=accumulation)
+    assert cut.fragment_count > whole.fragment_count
+    assert np.abs(cut.color - whole.color).max() < 1e-3
+    assert psnr_db(cut.color, whole.color.astype(float)) >= 80.0
+
+
+def test_a_new_store_is_not_mistaken_for_the_last(gpu, rng):
+    first = Bench(gpu, MYOPIA, **SIZE)
+    second = Bench(gpu, {"kind": "preset", "name": "cataract"}, **SIZE)
+    view = first.view(texture(rng, 101, 150), 1.0)
+    expected = second.render(view).color
+    first.render(view)
+    handle = first.renderer.load(second.store)
+    options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0}
+    mixed = first.renderer.render(view, handle, **options).color
+    assert mixed.tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(

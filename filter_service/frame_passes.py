@@ -1,0 +1,362 @@
+"""The passes of one frame or strip of it: what runs when, on which buffers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    BYTES_PER_WORD,
+    LAYER_WORDS,
+    PAPER_SORT_KEY_BITS,
+    QUAD,
+    RGB,
+    SORT_KEY_BITS,
+    THREADS,
+    TILE_SIZE_PX,
+)
+from filter_service.frame import View
+from filter_service.gpu import Buffer, Gpu, StageTimer
+from filter_service.psf_store import FrameLayers
+
+ENTRY_BYTES = 4
+MAX_BAND_ENTRIES = 16 * 2**20
+"""Tile list entries in flight; more go through in bands.  Keeps each list buffer at
+64 MB, half of the smallest storage block that the service runs on."""
+
+MAX_GROUPS = 65535
+"""Work groups along one axis that every OpenGL 4.3 allows."""
+
+SOFTWARE_PIXELS_PER_THREAD = 8
+"""2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
+
+SOFTWARE_LIST_THREADS = 8
+"""Threads that make and sort a tile's list on a software renderer: one vector."""
+
+
+def group_count(count: int, size: int) -> int:
+    """Return how many groups of a size hold a count."""
+    return (count + size - 1) // size
+
+
+class FramePasses:
+    """The passes of one strip, in order; buffers are the context's named ones.
+
+    Parameters
+    ----------
+    view : View
+        The strip, with depth filled in.
+    scan_start_px, scan_total_px : int
+        Where the strip starts within the whole frame's scan, for the paper's order.
+    """
+
+    def __init__(
+        self,
+        gpu: Gpu,
+        view: View,
+        timer: StageTimer,
+        *,
+        paper_rule: bool,
+        merge: bool,
+        scan_start_px: int = 0,
+        scan_total_px: int | None = None,
+    ):
+        self.gpu = gpu
+        self.view = view
+        self.paper_rule = paper_rule
+        self.merge = merge
+        self.timer = timer
+        self.size = (view.width_px, view.height_px)
+        self.pixel_count = view.width_px * view.height_px
+        self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
+        self.tile_count = self.grid[0] * self.grid[1]
+        self.buffers: dict[str, Buffer] = {}
+        self.scan = (scan_start_px, scan_total_px or self.pixel_count)
+        self.entry_count = 0
+
+    def _reserve(self, **n_bytes: int) -> None:
+        for name, size in n_bytes.items():
+            self.buffers[name] = self.gpu.storage(name, size)
+
+    def _run(
+        self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
+    ) -> None:
+        defines = uniforms.pop("defines", None)
+        atlas = self.gpu.atlas(1) if uniforms.pop("with_atlas", False) else None
+        self.gpu.dispatch(
+            name,
+            groups,
+            buffers={binding: self.buffers[binding] for binding in bindings},
+            uniforms=uniforms,
+            defines=defines,
+            atlas=atlas,
+        )
+
+    def upload(self) -> None:
+        """Send the strip; bytes are padded to whole words."""
+        color, depth_m = self.view.color, self.view.depth_m
+        with self.timer.stage("upload_ms"):
+            n_bytes = group_count(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
+            packed = (
+                group_count(self.pixel_count, BYTES_PER_WORD) * RGB * BYTES_PER_WORD
+            )
+            self._reserve(COLOR_IN=max(n_bytes, packed))
+            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
+            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
+
+    def run(self, layers: FrameLayers) -> None:
+        """Filter the strip; `read_back` fetches the picture."""
+        self.upload()
+        self.build_fragments(layers)
+        self.count_tiles()
+        self.splat_bands()
+
+    def build_fragments(self, layers: FrameLayers) -> None:
+        """Linear light, dioptres, blur; then merging into blocks."""
+        slots = self.tile_count * THREADS
+        self._reserve(
+            LAYERS=1,
+            PIXELS=16 * self.pixel_count,
+            PIXEL_SPREAD=4 * self.pixel_count,
+            FRAGMENT_COLOR=16 * slots,
+            FRAGMENT_PLACE=16 * slots,
+            BLOCKS=16 * self.tile_count,
+        )
+        common = {
+            "frame_size_px": self.size,
+            "layer_count": len(layers.object_dpt),
+        }
+        with self.timer.stage("fragments_ms"):
+            self._run(
+                "build_fragments",
+                self.grid,
+                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_SPREAD"),
+                **common,
+                tangents=self.view.tangents,
+                depth_is_planar=int(self.view.depth_kind == "planar"),
+                defines=(
+                    {"COLOR_IS_LINEAR": 1}
+                    if self.view.color.dtype == np.float32
+                    else None
+                ),
+            )
+        with self.timer.stage("merge_ms"):
+            self._run(
+                "merge_fragments",
+                self.grid,
+                *("PIXELS", "PIXEL_SPREAD", "LAYERS"),
+                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
+                **common,
+                blur_px_per_dpt=layers.blur_px_per_dpt,
+                merge_enabled=int(self.merge),
+                paper_order=int(self.paper_rule),
+                scan_px=self.scan,
+            )
+        reach_px = int(layers.radius_px.max()) + 1.5
+        self.search_blocks = min(
+            group_count(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
+        )
+
+    def count_tiles(self) -> None:
+        """Lengths and offsets of the tile lists, and the bands they are made in."""
+        self._reserve(
+            TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2)
+        )
+        with self.timer.stage("bin_ms"):
+            self._run(
+                "count_tiles",
+                self.grid,
+                *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
+                tile_grid=self.grid,
+                search_blocks=self.search_blocks,
+                order_always=int(self.paper_rule),
+                defines=self._list_threads,
+            )
+            self._run(
+                "scan_tiles",
+                (1, 1),
+                "TILE_COUNTS",
+                "TILE_OFFSETS",
+                tile_count=self.tile_count,
+            )
+        with self.timer.wall("plan_ms"):
+            self.bands = self._plan_bands()
+
+    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
+        """Bands as (first tile, tile count, first entry, entry count)."""
+        total, total_float = self._totals()
+        self.entry_count = round(total_float) if total_float > 2**31 else total
+        fits = self.entry_count <= MAX_BAND_ENTRIES and self.tile_count <= MAX_GROUPS
+        if fits:
+            return [(0, self.tile_count, 0, total)]
+        counts = self.gpu.read(
+            self.buffers["TILE_COUNTS"], (self.tile_count, 2), np.uint32
+        )[:, 0].astype(np.int64)
+        offsets, bands = _split(counts, MAX_BAND_ENTRIES)
+        self.buffers["TILE_OFFSETS"] = self.gpu.upload(
+            "TILE_OFFSETS", offsets.astype(np.uint32)
+        )
+        return bands
+
+    def _totals(self) -> tuple[int, float]:
+        data = self.buffers["TILE_OFFSETS"].read(8, offset=4 * self.tile_count)
+        return (
+            int(np.frombuffer(data, np.uint32, 1)[0]),
+            float(np.frombuffer(data, np.float32, 1, offset=4)[0]),
+        )
+
+    def splat_bands(self) -> None:
+        """Scatter, sort and splat, band by band."""
+        longest = max(band[3] for band in self.bands)
+        self._reserve(
+            ENTRIES=ENTRY_BYTES * longest,
+            ENTRIES_SPARE=ENTRY_BYTES * longest,
+            COLOR_OUT=16 * self.pixel_count,
+        )
+        for first_tile, tile_count, first_entry, _ in self.bands:
+            band = {"first_tile": first_tile, "first_entry": first_entry}
+            groups = (tile_count, 1)
+            with self.timer.stage("bin_ms"):
+                self._run(
+                    "scatter_fragments",
+                    groups,
+                    *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
+                    tile_grid=self.grid,
+                    search_blocks=self.search_blocks,
+                    **band,
+                    defines=self._list_threads,
+                )
+            with self.timer.stage("sort_ms"):
+                self._run(
+                    "sort_tiles",
+                    groups,
+                    *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
+                    *("ENTRIES", "ENTRIES_SPARE"),
+                    **band,
+                    defines={
+                        **self._list_threads,
+                        "KEY_BITS": (
+                            PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
+                        ),
+                    },
+                )
+            with self.timer.stage("splat_ms"):
+                self._run(
+                    "splat_tiles",
+                    groups,
+                    *(
+                        "FRAGMENT_COLOR",
+                        "FRAGMENT_PLACE",
+                        "TILE_COUNTS",
+                        "TILE_OFFSETS",
+                    ),
+                    *("ENTRIES", "LAYERS", "PIXELS", "COLOR_OUT"),
+                    with_atlas=True,
+                    frame_size_px=self.size,
+                    tile_grid=self.grid,
+                    **band,
+                    defines=self._splat_variant(),
+                )
+
+    @property
+    def _list_threads(self) -> dict[str, int]:
+        software = self.gpu.is_software
+        return {"GROUP_THREADS": SOFTWARE_LIST_THREADS if software else THREADS}
+
+    def _splat_variant(self) -> dict[str, int]:
+        pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
+        rows = TILE_SIZE_PX // pixels
+        rule = {"PAPER_RULE": 1} if self.paper_rule else {}
+        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **rule}
+
+    def read_back(self, output: str) -> NDArray:
+        """Fetch the filtered picture, encoded as asked."""
+        width, height = self.size
+        if output == "linear":
+            with self.timer.wall("readback_ms"):
+                pixels = self.gpu.read(
+                    self.buffers["COLOR_OUT"], (height, width, 4), np.float32
+                )
+                return np.ascontiguousarray(pixels[..., :RGB])
+        with self.timer.stage("encode_ms"):
+            quads = group_count(self.pixel_count, BYTES_PER_WORD)
+            self._run(
+                "encode_srgb",
+                (group_count(quads, THREADS), 1),
+                *("COLOR_OUT", "COLOR_IN"),
+                pixel_count=self.pixel_count,
+            )
+        with self.timer.wall("readback_ms"):
+            return self.gpu.read(
+                self.buffers["COLOR_IN"], (height, width, RGB), np.uint8
+            )
+
+    @property
+    def _block_counts(self) -> NDArray[np.uint32]:
+        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[
+            :, 0
+        ]
+
+    @property
+    def fragment_count(self) -> int:
+        """Fragments after merging."""
+        return int(self._block_counts.sum())
+
+    @property
+    def merged_count(self) -> int:
+        """Pixels that went into merged fragments."""
+        singles_saved = self.pixel_count - self.fragment_count
+        return singles_saved * 4 // 3
+
+
+def layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
+    """Layer records (n, 2, 4) for common/layers.glsl, and texels of all kernels."""
+    widths = 2 * layers.radius_px + 1
+    single, merged = widths**2, (widths + 1) ** 2
+    starts = np.concatenate([[0], np.cumsum(single + merged)])
+    table = np.zeros((len(widths), LAYER_WORDS, 4), dtype=np.uint32)
+    table[:, 0, 0] = layers.object_dpt.astype(np.float32).view(np.uint32)
+    table[:, 0, 1] = starts[:-1]
+    table[:, 0, 2] = starts[:-1] + single
+    table[:, 0, 3] = layers.radius_px
+    table[:, 1, 0] = layers.spread_px.astype(np.float32).view(np.uint32)
+    scale = layers.peak_ratio.astype(np.float32)
+    table[:, 1, 1] = scale.view(np.uint32)
+    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
+    table[:, 1, 2] = merged_scale.view(np.uint32)
+    return table, int(starts[-1])
+
+
+def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
+    """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
+    bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
+    first = 0
+    while first < len(counts):
+        sums = np.cumsum(counts[first:])
+        tiles = max(int(np.searchsorted(sums, limit, side="right")), 1)
+        tiles = min(tiles, MAX_GROUPS)
+        offsets[first : first + tiles] = sums[:tiles] - counts[first : first + tiles]
+        bands.append((first, tiles, 0, int(sums[tiles - 1])))
+        first += tiles
+    return offsets, bands
+
+
+def blend_layers(gpu: Gpu, layers: FrameLayers, store_kernels: Buffer) -> None:
+    """Upload the layer table and compute the layer kernels, single and merged."""
+    table, texel_count = layer_table(layers)
+    largest = 2 * int(layers.radius_px.max()) + 2
+    buffers = {
+        "STORE": store_kernels,
+        "LAYERS": gpu.upload("LAYERS", table),
+        "RECIPES": gpu.upload("RECIPES", layers.recipes),
+    }
+    atlas = gpu.atlas(texel_count)
+    groups = (group_count(largest * largest, THREADS), max(len(table) - 1, 1))
+    gpu.dispatch(
+        "blend_psfs",
+        groups,
+        buffers=buffers,
+        uniforms={"layer_count": len(table)},
+        atlas=atlas,
+    )
+    gpu.dispatch(
+        "merge_psfs", groups, buffers={"LAYERS": buffers["LAYERS"]}, atlas=atlas
+    )
