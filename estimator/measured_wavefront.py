@@ -151,6 +151,39 @@ class MeasuredWavefront:
         zernike_um[0] = 0.0  # rescaling makes piston, which no image shows
         return zernike_um
 
+    # ----- what the PSF cache asks of any eye (also estimator/traced_eye.py)
+
+    def accommodation_nodes_dpt(
+        self, focus_range_dpt: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """Accommodations whose shape of the wavefront differs: here a single one."""
+        return np.zeros(1)
+
+    def total_defocus_dpt(
+        self,
+        *,
+        pupil_diameter_mm: float,
+        accommodation_dpt: float,
+        wavelength_nm: float,
+    ) -> float:
+        """Least-squares refraction less accommodation, for an object at infinity."""
+        return self.refraction_at_dpt(wavelength_nm) - accommodation_dpt
+
+    def zernike_at_defocus(
+        self,
+        *,
+        pupil_diameter_mm: float,
+        accommodation_dpt: float,
+        wavelength_nm: float,
+        total_defocus_dpt: float,
+    ) -> NDArray[np.float64]:
+        """Coefficients (28,), um, whose `total_defocus_dpt` has a given value."""
+        measured_dpt = self.refraction_at_dpt(self.wavelength_nm)
+        return self.zernike_with_defocus(
+            pupil_diameter_mm=pupil_diameter_mm,
+            added_defocus_dpt=total_defocus_dpt - measured_dpt,
+        )
+
     def state(
         self,
         *,

@@ -7,6 +7,7 @@ from typer.exceptions import Abort, TyperException
 
 from filter_service.commands.console import CommandFailed
 from filter_service.commands.doctor import doctor
+from filter_service.commands.estimate import estimate
 from filter_service.commands.filter_image import filter_image
 from filter_service.commands.programs import bench, demo
 from filter_service.commands.psf import psf
@@ -29,6 +30,7 @@ app = typer.Typer(
 app.command()(demo)
 app.command()(serve)
 app.command(name="filter")(filter_image)
+app.command()(estimate)
 app.command()(psf)
 app.command()(bench)
 app.command()(doctor)

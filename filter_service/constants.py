@@ -81,6 +81,9 @@ TEXTURE_ATLAS = 0
 LAYER_WORDS = 2
 """uvec4 words of one layer record."""
 
+RECIPE_WEIGHTS = 4
+"""Word at which a recipe's weights start."""
+
 WEIGHT_BITS = 16
 WEIGHT_MASK = 0xFFFF
 WEIGHT_MAX = 65535.0
@@ -88,8 +91,8 @@ WEIGHT_MAX = 65535.0
 interval's largest weight: one fetch for what would be two, 1.4 times the evaluations
 per second on a software renderer, and finer than half floats near the peak."""
 
-RECIPE_WORDS = 3
-"""uvec4 words of one blending recipe: four offsets, four radii, four weights."""
+RECIPE_WORDS = 6
+"""uvec4 words of one blending recipe: eight offsets, eight radii, eight weights."""
 
 BITS_PER_WORD = 32
 BYTES_PER_WORD = 4

@@ -4,18 +4,23 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import EyeProfile
 from estimator.psf import Psf, compute_psfs
-from estimator.units import REFERENCE_WAVELENGTH_NM
 from filter_service.constants import RGB
 from filter_service.errors import BuildCancelled
+from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, defocus_nodes_dpt, pupil_nodes_mm
-from filter_service.psf_store import PsfStore, channel_defocus_dpt
+from filter_service.psf_store import (
+    PsfStore,
+    channel_defocus_dpt,
+    channel_wavelengths_nm,
+)
 
 COMPUTED_BEYOND = 0.2
 """Kernels are computed out to this share of the light that trimming will drop."""
@@ -27,41 +32,69 @@ CHUNK = 192
 """PSFs between two looks at progress and cancellation."""
 
 
+@dataclass(frozen=True)
+class CachePlan:
+    """Nodes of a cache, before anything is computed.
+
+    Attributes
+    ----------
+    pupils_mm : (n_pupils,)
+    accommodations_dpt : (n_accommodations,)
+    defocus_dpt : list of (n,) arrays, one a pupil
+    """
+
+    pupils_mm: NDArray[np.float64]
+    accommodations_dpt: NDArray[np.float64]
+    defocus_dpt: list[NDArray[np.float64]]
+
+
 def total_defocus_range_dpt(
-    eye: MeasuredWavefront, spec: GridSpec
+    eye: Eye, spec: GridSpec, *, pupil_diameter_mm: float
 ) -> tuple[float, float]:
     """Smallest and largest total defocus over objects, foci and channels."""
-    relaxed_dpt = channel_defocus_dpt(eye, spec)
-    accommodation_dpt = [eye.accommodation_dpt(f) for f in spec.focus_range_dpt]
-    low = relaxed_dpt.min() + spec.object_range_dpt[0] - max(accommodation_dpt)
-    high = relaxed_dpt.max() + spec.object_range_dpt[1] - min(accommodation_dpt)
-    return float(low), float(high)
+    at_infinity_dpt = np.concatenate(
+        [
+            channel_defocus_dpt(
+                eye,
+                spec,
+                pupil_diameter_mm=pupil_diameter_mm,
+                accommodation_dpt=eye.accommodation_dpt(focus_dpt),
+            )
+            for focus_dpt in spec.focus_range_dpt
+        ]
+    )
+    low, high = spec.object_range_dpt
+    return float(at_infinity_dpt.min() + low), float(at_infinity_dpt.max() + high)
 
 
-def plan_nodes(eye: MeasuredWavefront, spec: GridSpec) -> tuple[np.ndarray, list]:
+def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
     """Pupil nodes and, for each, the defocus nodes that any pupil beside it needs."""
     low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
     pupils_mm = pupil_nodes_mm((low_mm, high_mm))
-    low_dpt, high_dpt = total_defocus_range_dpt(eye, spec)
+    ranges = [
+        total_defocus_range_dpt(eye, spec, pupil_diameter_mm=p) for p in pupils_mm
+    ]
     nodes = []
     for i, pupil_mm in enumerate(pupils_mm):
-        # Read from the pupil above at equal blur, so wider by the ratio of diameters.
-        widest_mm = pupils_mm[min(i + 1, len(pupils_mm) - 1)]
-        narrowest_mm = pupils_mm[max(i - 1, 0)]
-        ratios = (narrowest_mm / pupil_mm, widest_mm / pupil_mm)
+        # A pupil between two nodes reads both at equal blur, up to the other's own.
+        beside = range(max(i - 1, 0), min(i + 2, len(pupils_mm)))
         nodes.append(
             defocus_nodes_dpt(
-                min(low_dpt * r for r in ratios),
-                max(high_dpt * r for r in ratios),
+                min(ranges[j][0] * pupils_mm[j] / pupil_mm for j in beside),
+                max(ranges[j][1] * pupils_mm[j] / pupil_mm for j in beside),
                 blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
                 max_blur_step_px=spec.max_blur_step_px,
             )
         )
-    return pupils_mm, nodes
+    return CachePlan(
+        pupils_mm=pupils_mm,
+        accommodations_dpt=eye.accommodation_nodes_dpt(spec.focus_range_dpt),
+        defocus_dpt=nodes,
+    )
 
 
 def build_psf_store(
-    profile: EyeProfile,
+    eye: Eye | EyeProfile,
     spec: GridSpec,
     *,
     progress: Callable[[float, str], None] | None = None,
@@ -71,6 +104,8 @@ def build_psf_store(
 
     Parameters
     ----------
+    eye : Eye or EyeProfile
+        A profile is used as the measured wavefront.
     progress : callable, optional
         Called with a fraction 0..1 and a stage.
     cancelled : callable, optional
@@ -83,12 +118,11 @@ def build_psf_store(
         A kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
     """
     started_s = time.perf_counter()
-    eye = MeasuredWavefront.from_profile(profile)
-    pupils_mm, defocus_nodes = plan_nodes(eye, spec)
+    if isinstance(eye, EyeProfile):
+        eye = MeasuredWavefront.from_profile(eye)
+    plan = plan_cache(eye, spec)
     channels = RGB if spec.chromatic else 1
-    zernike_um, pupil_of, wavelength_of = _requests(
-        eye, spec, pupils_mm, defocus_nodes, channels
-    )
+    zernike_um, pupil_of, wavelength_of = _requests(eye, spec, plan, channels)
     psfs = []
     for first in range(0, len(zernike_um), CHUNK):
         if cancelled is not None and cancelled():
@@ -108,7 +142,7 @@ def build_psf_store(
         ]
         if progress is not None:
             progress(min(1.0, (first + CHUNK) / len(zernike_um)), "psfs")
-    return _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s)
+    return _packed(spec, eye, plan, channels, psfs, started_s)
 
 
 def trimmed(psf: Psf, *, kept_energy_ratio: float) -> Psf:
@@ -146,35 +180,43 @@ def _spread_px(kernel: np.ndarray) -> float:
     return 1.0 / math.sqrt(math.pi * float(np.square(kernel, dtype=np.float64).sum()))
 
 
-def _requests(eye, spec, pupils_mm, defocus_nodes, channels):
+def _requests(eye, spec, plan, channels):
     """Wavefronts (n, 28), pupils (n,) and wavelengths (n,), channel fastest."""
-    wavelengths_nm = (
-        spec.wavelengths_nm if spec.chromatic else (REFERENCE_WAVELENGTH_NM,)
-    )
-    measured_dpt = eye.refraction_at_dpt(eye.wavelength_nm)
-    zernike_um, pupil_of = [], []
-    for pupil_mm, nodes in zip(pupils_mm, defocus_nodes, strict=True):
-        for total_dpt in nodes:
-            coefficients = eye.zernike_with_defocus(
-                pupil_diameter_mm=pupil_mm, added_defocus_dpt=total_dpt - measured_dpt
-            )
-            zernike_um += [coefficients] * channels
-            pupil_of += [pupil_mm] * channels
-    wavelength_of = np.tile(wavelengths_nm, len(zernike_um) // channels)
-    return np.array(zernike_um), np.array(pupil_of), wavelength_of
+    wavelengths_nm = channel_wavelengths_nm(spec)[:channels]
+    requests = [
+        (pupil_mm, accommodation_dpt, total_dpt, wavelength_nm)
+        for pupil_mm, nodes in zip(plan.pupils_mm, plan.defocus_dpt, strict=True)
+        for accommodation_dpt in plan.accommodations_dpt
+        for total_dpt in nodes
+        for wavelength_nm in wavelengths_nm
+    ]
+    zernike_um = [
+        eye.zernike_at_defocus(
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=accommodation_dpt,
+            wavelength_nm=wavelength_nm,
+            total_defocus_dpt=total_dpt,
+        )
+        for pupil_mm, accommodation_dpt, total_dpt, wavelength_nm in requests
+    ]
+    pupil_of, _, _, wavelength_of = np.array(requests).T
+    return np.array(zernike_um), pupil_of, wavelength_of
 
 
-def _packed(spec, eye, pupils_mm, defocus_nodes, channels, psfs, started_s) -> PsfStore:
+def _packed(spec, eye, plan, channels, psfs, started_s) -> PsfStore:
     sizes = np.array([psf.kernel.size for psf in psfs])
     share = np.repeat(np.arange(len(psfs)), RGB // channels)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    node_counts = np.array([len(nodes) for nodes in defocus_nodes])
+    accommodations = len(plan.accommodations_dpt)
+    counts = np.repeat([len(nodes) for nodes in plan.defocus_dpt], accommodations)
+    first_psf = RGB * np.concatenate([[0], np.cumsum(counts)[:-1]])
     return PsfStore(
         spec=spec,
         eye=eye,
-        pupil_nodes_mm=pupils_mm,
-        defocus_nodes_dpt=defocus_nodes,
-        first_psf=RGB * np.concatenate([[0], np.cumsum(node_counts)[:-1]]),
+        pupil_nodes_mm=plan.pupils_mm,
+        accommodation_nodes_dpt=plan.accommodations_dpt,
+        defocus_nodes_dpt=plan.defocus_dpt,
+        first_psf=first_psf.reshape(-1, accommodations),
         kernels=np.concatenate([psf.kernel.ravel() for psf in psfs]).astype(np.float32),
         offsets=offsets[share],
         radius_px=np.array([psf.radius_px for psf in psfs])[share],

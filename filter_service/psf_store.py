@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.measured_wavefront import MeasuredWavefront
 from estimator.units import REFERENCE_WAVELENGTH_NM
 from filter_service.constants import RECIPE_WORDS, RGB
+from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, layer_distances_dpt
 
 
@@ -21,9 +21,10 @@ class PsfStore:
     Attributes
     ----------
     pupil_nodes_mm : (n_pupils,)
+    accommodation_nodes_dpt : (n_accommodations,)
     defocus_nodes_dpt : list of (n_defocus,) arrays, one a pupil, ascending
-    first_psf : (n_pupils,)
-        PSF index of a pupil's first node; node k and channel c follow at 3 k + c.
+    first_psf : (n_pupils, n_accommodations)
+        PSF index of the first node; node k and channel c follow at 3 k + c.
     kernels : (n_texels,), float32
         All kernels, rows downwards, one after the other.
     offsets, radius_px : (n_psfs,)
@@ -38,8 +39,9 @@ class PsfStore:
     """
 
     spec: GridSpec
-    eye: MeasuredWavefront
+    eye: Eye
     pupil_nodes_mm: NDArray[np.float64]
+    accommodation_nodes_dpt: NDArray[np.float64]
     defocus_nodes_dpt: list[NDArray[np.float64]]
     first_psf: NDArray[np.int64]
     kernels: NDArray[np.float32]
@@ -78,8 +80,8 @@ class FrameLayers:
         Largest geometric blur radius over the channels.
     spread_px : (n,)
         Smallest spread over the channels; decides what may merge.
-    recipes : (n, 3, 12), uint32
-        Per channel four kernel offsets, four radii, four weights (float bits).
+    recipes : (n, 3, 24), uint32
+        Per channel eight kernel offsets, eight radii, eight weights (float bits).
     """
 
     object_dpt: NDArray[np.float64]
@@ -94,12 +96,25 @@ class FrameLayers:
     notes: tuple[str, ...]
 
 
-def channel_defocus_dpt(eye: MeasuredWavefront, spec: GridSpec) -> NDArray[np.float64]:
-    """Total defocus (3,) of the relaxed eye per channel for an object at infinity."""
-    wavelengths_nm = spec.wavelengths_nm
-    if not spec.chromatic:
-        wavelengths_nm = (REFERENCE_WAVELENGTH_NM,) * RGB
-    return np.array([eye.refraction_at_dpt(w) for w in wavelengths_nm])
+def channel_wavelengths_nm(spec: GridSpec) -> tuple[float, ...]:
+    """Wavelengths of the three channels; all the same without chromatic blur."""
+    return spec.wavelengths_nm if spec.chromatic else (REFERENCE_WAVELENGTH_NM,) * RGB
+
+
+def channel_defocus_dpt(
+    eye: Eye, spec: GridSpec, *, pupil_diameter_mm: float, accommodation_dpt: float
+) -> NDArray[np.float64]:
+    """Total defocus (3,) per channel for an object at infinity."""
+    return np.array(
+        [
+            eye.total_defocus_dpt(
+                pupil_diameter_mm=pupil_diameter_mm,
+                accommodation_dpt=accommodation_dpt,
+                wavelength_nm=wavelength_nm,
+            )
+            for wavelength_nm in channel_wavelengths_nm(spec)
+        ]
+    )
 
 
 def frame_layers(
@@ -112,8 +127,8 @@ def frame_layers(
     """Plan a frame's layers for a pupil and focus.
 
     The pupil is clamped to the cache's range and to what was measured, with a note.
-    Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i is
-    read at total defocus t A / A_i, so no blended pair differs in size.
+    Neighbouring pupils and accommodations are blended at equal geometric blur: the node
+    of pupil A_i is read at total defocus t A / A_i, so no blended pair differs in size.
 
     Parameters
     ----------
@@ -122,13 +137,18 @@ def frame_layers(
 
     References
     ----------
-    Csoba & Kunkli 2023, section 6.4 (four cached neighbours) and 6.2.
+    Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
     """
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
     notes += store.eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-    relaxed_dpt = channel_defocus_dpt(store.eye, store.spec)
-    at_infinity_dpt = relaxed_dpt - store.eye.accommodation_dpt(focus_dpt)
-    blend = _Blend(store, pupil_mm)
+    accommodation_dpt = store.eye.accommodation_dpt(focus_dpt)
+    at_infinity_dpt = channel_defocus_dpt(
+        store.eye,
+        store.spec,
+        pupil_diameter_mm=pupil_mm,
+        accommodation_dpt=accommodation_dpt,
+    )
+    blend = _Blend(store, pupil_mm, accommodation_dpt)
     object_dpt = layer_distances_dpt(
         object_range_dpt or store.spec.object_range_dpt,
         focused_dpt=-at_infinity_dpt,
@@ -165,41 +185,48 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
     return clamped_mm, (note,)
 
 
-class _Blend:
-    """Cached neighbours of one pupil at any total defocus."""
+def _bracket(nodes: NDArray, value: float) -> list[tuple[int, float]]:
+    """Neighbouring nodes and their weights; one node twice where there is only one."""
+    last = len(nodes) - 1
+    upper = int(np.clip(np.searchsorted(nodes, value), min(1, last), last))
+    lower = max(upper - 1, 0)
+    span = nodes[upper] - nodes[lower]
+    fraction = (value - nodes[lower]) / span if span > 0 else 0.0
+    fraction = float(np.clip(fraction, 0.0, 1.0))
+    return [(lower, 1.0 - fraction), (upper, fraction)]
 
-    def __init__(self, store: PsfStore, pupil_mm: float):
-        nodes = store.pupil_nodes_mm
-        upper = int(
-            np.clip(
-                np.searchsorted(nodes, pupil_mm), min(1, len(nodes) - 1), len(nodes) - 1
-            )
-        )
-        lower = max(upper - 1, 0)
-        span = nodes[upper] - nodes[lower]
-        fraction = (pupil_mm - nodes[lower]) / span if span > 0 else 0.0
+
+class _Blend:
+    """Cached neighbours of one pupil and accommodation at any total defocus."""
+
+    def __init__(self, store: PsfStore, pupil_mm: float, accommodation_dpt: float):
         self.store = store
         self.pupil_mm = pupil_mm
-        self.sides = [(lower, 1.0 - fraction), (upper, fraction)]
+        self.corners = [
+            (pupil, accommodation, pupil_weight * accommodation_weight)
+            for pupil, pupil_weight in _bracket(store.pupil_nodes_mm, pupil_mm)
+            for accommodation, accommodation_weight in _bracket(
+                store.accommodation_nodes_dpt, accommodation_dpt
+            )
+        ]
 
     def neighbours(self, total_dpt: NDArray) -> tuple[NDArray, NDArray]:
-        """PSF indices and weights (n, 3, 4) for total defocus (n, 3), dpt."""
+        """PSF indices and weights (n, 3, 8) for total defocus (n, 3), dpt."""
         channels = np.arange(RGB)
         psfs, weights = [], []
-        for pupil_index, pupil_weight in self.sides:
-            nodes = self.store.defocus_nodes_dpt[pupil_index]
-            scaled = total_dpt * self.pupil_mm / self.store.pupil_nodes_mm[pupil_index]
+        for pupil, accommodation, corner_weight in self.corners:
+            nodes = self.store.defocus_nodes_dpt[pupil]
+            last = len(nodes) - 1
+            scaled = total_dpt * self.pupil_mm / self.store.pupil_nodes_mm[pupil]
             scaled = np.clip(scaled, nodes[0], nodes[-1])
-            upper = np.clip(
-                np.searchsorted(nodes, scaled), min(1, len(nodes) - 1), len(nodes) - 1
-            )
+            upper = np.clip(np.searchsorted(nodes, scaled), min(1, last), last)
             lower = np.maximum(upper - 1, 0)
             span = nodes[upper] - nodes[lower]
             safe = np.where(span > 0, span, 1.0)
             fraction = np.where(span > 0, (scaled - nodes[lower]) / safe, 0.0)
-            first = self.store.first_psf[pupil_index]
+            first = self.store.first_psf[pupil, accommodation]
             psfs += [first + RGB * lower + channels, first + RGB * upper + channels]
-            weights += [pupil_weight * (1.0 - fraction), pupil_weight * fraction]
+            weights += [corner_weight * (1.0 - fraction), corner_weight * fraction]
         return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
 
     def blur_px(self, total_dpt: NDArray) -> NDArray:
@@ -209,8 +236,9 @@ class _Blend:
 
 
 def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uint32]:
+    neighbours = psfs.shape[-1]
     recipes = np.empty((*psfs.shape[:2], RECIPE_WORDS * 4), dtype=np.uint32)
-    recipes[..., 0:4] = store.offsets[psfs]
-    recipes[..., 4:8] = store.radius_px[psfs]
-    recipes[..., 8:12] = weights.astype(np.float32).view(np.uint32)
+    recipes[..., :neighbours] = store.offsets[psfs]
+    recipes[..., neighbours : 2 * neighbours] = store.radius_px[psfs]
+    recipes[..., 2 * neighbours :] = weights.astype(np.float32).view(np.uint32)
     return recipes

@@ -35,8 +35,9 @@ def layer_kernels(store: PsfStore, layers: FrameLayers) -> NDArray[np.float64]:
     kernels = np.zeros((len(layers.object_dpt), size, size, 3))
     for k, by_channel in enumerate(layers.recipes):
         for channel, words in enumerate(by_channel):
-            weights = words[8:12].view(np.float32)
-            for offset, own, weight in zip(words[:4], words[4:8], weights, strict=True):
+            offsets, radii, bits = words.reshape(3, -1)
+            weights = bits.view(np.float32)
+            for offset, own, weight in zip(offsets, radii, weights, strict=True):
                 if weight > 0.0:
                     width = 2 * int(own) + 1
                     first = int(offset)

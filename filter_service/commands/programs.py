@@ -18,12 +18,14 @@ from filter_service.commands.console import CommandFailed, Json, checkout_root, 
 class Bench(StrEnum):
     """Benchmarks by what they time."""
 
+    ESTIMATE = "estimate"
     PSF = "psf"
     RENDER = "render"
     ROUNDTRIP = "roundtrip"
 
 
 BENCH_MODULES = {
+    Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
     Bench.PSF: "tests.benchmarks.bench_psf",
     Bench.RENDER: "tests.benchmarks.bench_render",
     Bench.ROUNDTRIP: "clients.latency",

@@ -1,6 +1,6 @@
 // Blends the cached PSFs into this frame's layers and packs neighbours in pairs.
-// In:  STORE (f32 kernels), RECIPES (3 words per layer and channel: offsets and radii of
-//      four kernels, four weights), LAYERS (common/layers.glsl).
+// In:  STORE (f32 kernels), RECIPES (per layer and channel offsets, radii and weights of
+//      eight kernels: two pupils x two accommodations x two defocus nodes), LAYERS (common/layers.glsl).
 // Out: the kernel atlas, single kernels.
 // Dispatch: x over texels of the largest kernel / THREADS, y = interval.
 // Twin: reference.layer_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
@@ -22,14 +22,20 @@ float cached(uint offset, int radius, ivec2 at) {
     return store[offset + uint((at.y + radius) * width + at.x + radius)];
 }
 
-float blended(uint recipe, ivec2 at) {
-    uvec4 offsets = recipes[recipe];
-    uvec4 radii = recipes[recipe + 1u];
-    vec4 weights = uintBitsToFloat(recipes[recipe + 2u]);
+// Weighted sum of four of a recipe's kernels.
+float blended_half(uint recipe, uint half_index, ivec2 at) {
+    vec4 weights = uintBitsToFloat(recipes[recipe + uint(RECIPE_WEIGHTS) + half_index]);
+    if (all(equal(weights, vec4(0.0)))) return 0.0;
+    uvec4 offsets = recipes[recipe + half_index];
+    uvec4 radii = recipes[recipe + 2u + half_index];
     return weights.x * cached(offsets.x, int(radii.x), at)
          + weights.y * cached(offsets.y, int(radii.y), at)
          + weights.z * cached(offsets.z, int(radii.z), at)
          + weights.w * cached(offsets.w, int(radii.w), at);
+}
+
+float blended(uint recipe, ivec2 at) {
+    return blended_half(recipe, 0u, at) + blended_half(recipe, 1u, at);
 }
 
 vec3 layer_weight(uint layer, ivec2 at) {

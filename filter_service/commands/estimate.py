@@ -1,0 +1,110 @@
+"""`ocufilter estimate`: the eye behind a profile, its fit and its picture."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from filter_service.commands.console import Json, check_range, print_json, say
+
+if TYPE_CHECKING:
+    from estimator.estimation import EstimatedEye
+
+TIME_LIMITS_S = (0.1, 86400.0)
+
+
+class Method(StrEnum):
+    """How the eye is found."""
+
+    REFINED = "refined"
+    SEARCH = "search"
+
+
+def estimate(
+    profile: Annotated[
+        str,
+        typer.Argument(help="A preset name, or a .json, .abp or .csv profile."),
+    ],
+    method: Annotated[
+        Method,
+        typer.Option(help="search is the pattern search of the earlier work."),
+    ] = Method.REFINED,
+    max_time_s: Annotated[
+        float, typer.Option(help="Time given to --method search, s.")
+    ] = 60.0,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.png", help="Cross-section with traced rays."),
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Find the 45-parameter eye that has a measured wavefront.
+
+    Coefficients are compared on the measured circle without tilt, which the chief
+    ray ties to coma.
+
+    ocufilter estimate keratoconus --plot eye.png
+    """
+    check_range("--max-time-s", max_time_s, TIME_LIMITS_S)
+
+    from estimator.estimation import estimate_eye
+    from estimator.profile_files import load_profile
+    from filter_service.image_files import check_output
+
+    if plot is not None:
+        check_output(plot, (".png",))
+    eye = load_profile(profile)
+    found = estimate_eye(eye, method=method.value, max_time_s=max_time_s)
+    if plot is not None:
+        from estimator.eye_plot import plot_eye
+
+        plot_eye(found, plot)
+    summary = _summary(found)
+    if json_output:
+        print_json(summary)
+    else:
+        _report(summary, plot)
+
+
+def _summary(found: "EstimatedEye") -> dict:
+    profile = found.profile
+    return {
+        "profile": found.name,
+        "method": found.method,
+        "parameters": found.parameters.to_mapping(),
+        "zernike_um": found.zernike_um.tolist(),
+        "residual_um": found.residual_um.tolist(),
+        "zernike_radius_mm": found.zernike_radius_mm,
+        "wavelength_nm": found.wavelength_nm,
+        "mean_abs_error_um": found.mean_abs_error_um,
+        "measurement_count": max(len(profile.measurements), 1),
+        "time_ms": found.time_ms,
+        "n_iterations": found.n_iterations,
+        "n_evaluations": found.n_evaluations,
+        "on_bound": list(found.on_bound),
+        "determined_ratio": found.determined_ratio,
+        "refraction_dpt": found.refraction_dpt,
+        "amplitude_dpt": found.amplitude_dpt,
+        "notes": list(found.notes),
+    }
+
+
+def _report(summary: dict, plot: Path | None) -> None:
+    for note in summary["notes"]:
+        say(f"note: {note}")
+    say(f"{'parameter':<38}{'value':>11}  determined")
+    for name, value in summary["parameters"].items():
+        ratio = summary["determined_ratio"].get(name)
+        known = "" if ratio is None else f"{100.0 * ratio:5.0f} %"
+        bound = "  on its bound" if name in summary["on_bound"] else ""
+        say(f"{name:<38}{value:>11.5g}  {known}{bound}")
+    say(
+        f"{summary['profile']}, {summary['method']}: mean error "
+        f"{summary['mean_abs_error_um']:.2g} um over 25 terms, "
+        f"{summary['time_ms']:.0f} ms, {summary['n_evaluations']} eyes traced; "
+        f"refraction {summary['refraction_dpt']:.2f} dpt, accommodates "
+        f"{summary['amplitude_dpt']:.1f} dpt"
+    )
+    if plot is not None:
+        say(f"{plot}: cross-section")
