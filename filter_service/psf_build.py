@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import EyeProfile
 from estimator.psf import Psf, compute_psfs
-from filter_service.constants import RGB
+from filter_service.constants import RGB, WEIGHT_MAX
 from filter_service.errors import BuildCancelled
 from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, defocus_nodes_dpt, pupil_nodes_mm
@@ -40,56 +40,76 @@ class CachePlan:
     ----------
     pupils_mm : (n_pupils,)
     accommodations_dpt : (n_accommodations,)
-    defocus_dpt : list of (n,) arrays, one a pupil
+    defocus_dpt : [pupil][accommodation] of (n,) arrays
     """
 
     pupils_mm: NDArray[np.float64]
     accommodations_dpt: NDArray[np.float64]
-    defocus_dpt: list[NDArray[np.float64]]
+    defocus_dpt: list[list[NDArray[np.float64]]]
 
 
-def total_defocus_range_dpt(
-    eye: Eye, spec: GridSpec, *, pupil_diameter_mm: float
-) -> tuple[float, float]:
-    """Smallest and largest total defocus over objects, foci and channels."""
-    at_infinity_dpt = np.concatenate(
+def _neighbours(index: int, count: int) -> range:
+    return range(max(index - 1, 0), min(index + 2, count))
+
+
+def _total_defocus_ranges_dpt(
+    eye: Eye, spec: GridSpec, pupils_mm: NDArray, used_dpt: NDArray
+) -> NDArray[np.float64]:
+    """Smallest and largest total defocus (n_pupils, n_accommodations, 2) at each node.
+
+    Over objects and channels, and over every accommodation that reads this node.
+    """
+    at_infinity_dpt = np.array(
         [
-            channel_defocus_dpt(
-                eye,
-                spec,
-                pupil_diameter_mm=pupil_diameter_mm,
-                accommodation_dpt=eye.accommodation_dpt(focus_dpt),
-            )
-            for focus_dpt in spec.focus_range_dpt
+            [
+                channel_defocus_dpt(
+                    eye, spec, pupil_diameter_mm=pupil_mm, accommodation_dpt=a
+                )
+                for a in used_dpt
+            ]
+            for pupil_mm in pupils_mm
         ]
     )
+    if len(used_dpt) == 1:  # one shape for all: accommodation is defocus alone
+        spread = [eye.accommodation_dpt(f) - used_dpt[0] for f in spec.focus_range_dpt]
+        lows = at_infinity_dpt.min(axis=2) - max(spread)
+        highs = at_infinity_dpt.max(axis=2) - min(spread)
+    else:
+        beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
+        lows = np.stack(
+            [at_infinity_dpt[:, list(j)].min(axis=(1, 2)) for j in beside], axis=1
+        )
+        highs = np.stack(
+            [at_infinity_dpt[:, list(j)].max(axis=(1, 2)) for j in beside], axis=1
+        )
     low, high = spec.object_range_dpt
-    return float(at_infinity_dpt.min() + low), float(at_infinity_dpt.max() + high)
+    return np.stack([lows + low, highs + high], axis=-1)
 
 
 def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
-    """Pupil nodes and, for each, the defocus nodes that any pupil beside it needs."""
+    """Pupil and accommodation nodes, and the defocus nodes that frames can read."""
     low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
     pupils_mm = pupil_nodes_mm((low_mm, high_mm))
-    ranges = [
-        total_defocus_range_dpt(eye, spec, pupil_diameter_mm=p) for p in pupils_mm
-    ]
-    nodes = []
+    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
+    ranges = _total_defocus_ranges_dpt(eye, spec, pupils_mm, used_dpt)
+    # A pupil between two nodes reads both at equal blur, up to the other's own.
+    scaled = ranges * pupils_mm[:, None, None]
+    defocus = []
     for i, pupil_mm in enumerate(pupils_mm):
-        # A pupil between two nodes reads both at equal blur, up to the other's own.
-        beside = range(max(i - 1, 0), min(i + 2, len(pupils_mm)))
-        nodes.append(
-            defocus_nodes_dpt(
-                min(ranges[j][0] * pupils_mm[j] / pupil_mm for j in beside),
-                max(ranges[j][1] * pupils_mm[j] / pupil_mm for j in beside),
-                blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
-                max_blur_step_px=spec.max_blur_step_px,
-            )
+        beside = list(_neighbours(i, len(pupils_mm)))
+        defocus.append(
+            [
+                defocus_nodes_dpt(
+                    float(scaled[beside, j, 0].min() / pupil_mm),
+                    float(scaled[beside, j, 1].max() / pupil_mm),
+                    blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
+                    max_blur_step_px=spec.max_blur_step_px,
+                )
+                for j in range(len(used_dpt))
+            ]
         )
     return CachePlan(
-        pupils_mm=pupils_mm,
-        accommodations_dpt=eye.accommodation_nodes_dpt(spec.focus_range_dpt),
-        defocus_dpt=nodes,
+        pupils_mm=pupils_mm, accommodations_dpt=used_dpt, defocus_dpt=defocus
     )
 
 
@@ -175,6 +195,16 @@ def trimmed(psf: Psf, *, kept_energy_ratio: float) -> Psf:
     )
 
 
+def _quantised(psfs: list[Psf]) -> NDArray[np.uint16]:
+    """All kernels one after the other, each in steps of its peak / WEIGHT_MAX."""
+    parts = [
+        np.rint(psf.kernel.ravel() * (WEIGHT_MAX / psf.kernel.max())).astype(np.uint16)
+        for psf in psfs
+    ]
+    whole_words = np.zeros(sum(part.size for part in parts) % 2, np.uint16)
+    return np.concatenate([*parts, whole_words])
+
+
 def _spread_px(kernel: np.ndarray) -> float:
     """Radius of the uniform disc that has this kernel's sum of squares."""
     return 1.0 / math.sqrt(math.pi * float(np.square(kernel, dtype=np.float64).sum()))
@@ -185,8 +215,10 @@ def _requests(eye, spec, plan, channels):
     wavelengths_nm = channel_wavelengths_nm(spec)[:channels]
     requests = [
         (pupil_mm, accommodation_dpt, total_dpt, wavelength_nm)
-        for pupil_mm, nodes in zip(plan.pupils_mm, plan.defocus_dpt, strict=True)
-        for accommodation_dpt in plan.accommodations_dpt
+        for pupil_mm, by_use in zip(plan.pupils_mm, plan.defocus_dpt, strict=True)
+        for accommodation_dpt, nodes in zip(
+            plan.accommodations_dpt, by_use, strict=True
+        )
         for total_dpt in nodes
         for wavelength_nm in wavelengths_nm
     ]
@@ -207,8 +239,7 @@ def _packed(spec, eye, plan, channels, psfs, started_s) -> PsfStore:
     sizes = np.array([psf.kernel.size for psf in psfs])
     share = np.repeat(np.arange(len(psfs)), RGB // channels)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    accommodations = len(plan.accommodations_dpt)
-    counts = np.repeat([len(nodes) for nodes in plan.defocus_dpt], accommodations)
+    counts = [len(nodes) for by_use in plan.defocus_dpt for nodes in by_use]
     first_psf = RGB * np.concatenate([[0], np.cumsum(counts)[:-1]])
     return PsfStore(
         spec=spec,
@@ -216,8 +247,8 @@ def _packed(spec, eye, plan, channels, psfs, started_s) -> PsfStore:
         pupil_nodes_mm=plan.pupils_mm,
         accommodation_nodes_dpt=plan.accommodations_dpt,
         defocus_nodes_dpt=plan.defocus_dpt,
-        first_psf=first_psf.reshape(-1, accommodations),
-        kernels=np.concatenate([psf.kernel.ravel() for psf in psfs]).astype(np.float32),
+        first_psf=first_psf.reshape(len(plan.pupils_mm), -1),
+        kernels=_quantised(psfs),
         offsets=offsets[share],
         radius_px=np.array([psf.radius_px for psf in psfs])[share],
         blur_px=np.array([psf.blur_radius_px for psf in psfs])[share],

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.units import REFERENCE_WAVELENGTH_NM
-from filter_service.constants import RECIPE_WORDS, RGB
+from filter_service.constants import RECIPE_WORDS, RGB, WEIGHT_MAX
 from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, layer_distances_dpt
 
@@ -22,11 +22,12 @@ class PsfStore:
     ----------
     pupil_nodes_mm : (n_pupils,)
     accommodation_nodes_dpt : (n_accommodations,)
-    defocus_nodes_dpt : list of (n_defocus,) arrays, one a pupil, ascending
+    defocus_nodes_dpt : [pupil][accommodation] of (n_defocus,) arrays, ascending
     first_psf : (n_pupils, n_accommodations)
         PSF index of the first node; node k and channel c follow at 3 k + c.
-    kernels : (n_texels,), float32
-        All kernels, rows downwards, one after the other.
+    kernels : (n_texels,), uint16
+        All kernels, rows downwards, one after the other; in steps of the kernel's peak
+        over WEIGHT_MAX, which is finer than half floats and half of what floats take.
     offsets, radius_px : (n_psfs,)
         Where a kernel starts and its radius.
     blur_px : (n_psfs,)
@@ -42,9 +43,9 @@ class PsfStore:
     eye: Eye
     pupil_nodes_mm: NDArray[np.float64]
     accommodation_nodes_dpt: NDArray[np.float64]
-    defocus_nodes_dpt: list[NDArray[np.float64]]
+    defocus_nodes_dpt: list[list[NDArray[np.float64]]]
     first_psf: NDArray[np.int64]
-    kernels: NDArray[np.float32]
+    kernels: NDArray[np.uint16]
     offsets: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     blur_px: NDArray[np.float64]
@@ -81,7 +82,8 @@ class FrameLayers:
     spread_px : (n,)
         Smallest spread over the channels; decides what may merge.
     recipes : (n, 3, 24), uint32
-        Per channel eight kernel offsets, eight radii, eight weights (float bits).
+        Per channel eight kernel offsets, eight radii, eight weights (float bits) that
+        turn steps of a kernel into its share of a layer.
     """
 
     object_dpt: NDArray[np.float64]
@@ -215,7 +217,7 @@ class _Blend:
         channels = np.arange(RGB)
         psfs, weights = [], []
         for pupil, accommodation, corner_weight in self.corners:
-            nodes = self.store.defocus_nodes_dpt[pupil]
+            nodes = self.store.defocus_nodes_dpt[pupil][accommodation]
             last = len(nodes) - 1
             scaled = total_dpt * self.pupil_mm / self.store.pupil_nodes_mm[pupil]
             scaled = np.clip(scaled, nodes[0], nodes[-1])
@@ -240,5 +242,6 @@ def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uin
     recipes = np.empty((*psfs.shape[:2], RECIPE_WORDS * 4), dtype=np.uint32)
     recipes[..., :neighbours] = store.offsets[psfs]
     recipes[..., neighbours : 2 * neighbours] = store.radius_px[psfs]
-    recipes[..., 2 * neighbours :] = weights.astype(np.float32).view(np.uint32)
+    per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
+    recipes[..., 2 * neighbours :] = per_step.astype(np.float32).view(np.uint32)
     return recipes

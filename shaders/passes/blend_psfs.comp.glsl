@@ -1,5 +1,5 @@
 // Blends the cached PSFs into this frame's layers and packs neighbours in pairs.
-// In:  STORE (f32 kernels), RECIPES (per layer and channel offsets, radii and weights of
+// In:  STORE (kernels, two 16-bit weights a word), RECIPES (per layer and channel offsets, radii and weights of
 //      eight kernels: two pupils x two accommodations x two defocus nodes), LAYERS (common/layers.glsl).
 // Out: the kernel atlas, single kernels.
 // Dispatch: x over texels of the largest kernel / THREADS, y = interval.
@@ -7,7 +7,7 @@
 
 layout(local_size_x = THREADS) in;
 
-layout(std430, binding = BINDING_STORE) readonly buffer Store { float store[]; };
+layout(std430, binding = BINDING_STORE) readonly buffer Store { uint store[]; };
 layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uvec4 recipes[]; };
 layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
 layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
@@ -19,7 +19,8 @@ uniform int layer_count;
 float cached(uint offset, int radius, ivec2 at) {
     if (abs(at.x) > radius || abs(at.y) > radius) return 0.0;
     int width = 2 * radius + 1;
-    return store[offset + uint((at.y + radius) * width + at.x + radius)];
+    uint index = offset + uint((at.y + radius) * width + at.x + radius);
+    return float((store[index / 2u] >> (uint(WEIGHT_BITS) * (index % 2u))) & WEIGHT_MASK);
 }
 
 // Weighted sum of four of a recipe's kernels.

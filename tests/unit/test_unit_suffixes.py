@@ -13,13 +13,13 @@ KINDS = ("ratio", "index", "count", "fraction", "constant")
 
 DIMENSIONLESS = {
     "kernel": "shares of light, unit sum",
-    "kernels": "shares of light, unit sum",
     "color": "light, sRGB or linear as the header says",
     "tangents": "of the angles to the image edges",
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
     "oversampling": "samples per sample",
+    "conic_constant": "shape of a conic, 0 sphere, -1 paraboloid",
     "margin": "in lambda/D",
     "pupil_samples": "samples across the pupil, a count that need not be whole",
     "max_repeat_difference": "in units of the output it compares",
