@@ -92,8 +92,8 @@ EYES = (
                 "each a little softer than without error.",
             ),
             "primitives": (
-                "Letter and ball are both fairly sharp:",
-                "a long range at a small cost.",
+                "The letter is nearly sharp; the ball,",
+                "close by, is soft and ringed.",
             ),
         },
     ),

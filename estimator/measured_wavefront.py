@@ -38,6 +38,40 @@ def accommodation_amplitude_dpt(
     return amplitude_dpt
 
 
+def request_notes(
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    max_pupil_diameter_mm: float,
+    pupil_limit: str,
+    refraction_dpt: float,
+    amplitude_dpt: float,
+) -> tuple[str, ...]:
+    """Say in words what of a pupil and focus an eye cannot meet.
+
+    ``pupil_limit`` says what the largest pupil is: "measured" or "traced".
+    """
+    notes = []
+    if pupil_diameter_mm > max_pupil_diameter_mm + 1e-9:
+        notes.append(
+            f"pupil {pupil_diameter_mm:g} mm capped at the {pupil_limit} "
+            f"{max_pupil_diameter_mm:g} mm"
+        )
+    asked_dpt = focus_dpt + refraction_dpt
+    if asked_dpt < -1e-9:
+        notes.append(
+            f"focus {focus_dpt:g} dpt is beyond the far point "
+            f"({-refraction_dpt:.3g} dpt): the eye stays relaxed"
+        )
+    elif asked_dpt > amplitude_dpt + 1e-9:
+        notes.append(
+            f"focus {focus_dpt:g} dpt is nearer than the near point "
+            f"({amplitude_dpt - refraction_dpt:.3g} dpt): "
+            f"accommodation stops at {amplitude_dpt:.3g} dpt"
+        )
+    return tuple(notes)
+
+
 @dataclass(frozen=True)
 class WavefrontState:
     """Wavefront of the eye at one pupil, object, focus and wavelength.
@@ -114,25 +148,14 @@ class MeasuredWavefront:
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
         """Say in words what of the request this eye cannot meet."""
-        notes = []
-        if pupil_diameter_mm > self.max_pupil_diameter_mm + 1e-9:
-            notes.append(
-                f"pupil {pupil_diameter_mm:g} mm capped at the measured "
-                f"{self.max_pupil_diameter_mm:g} mm"
-            )
-        asked_dpt = focus_dpt + self.refraction_dpt
-        if asked_dpt < -1e-9:
-            notes.append(
-                f"focus {focus_dpt:g} dpt is beyond the far point "
-                f"({-self.refraction_dpt:.3g} dpt): the eye stays relaxed"
-            )
-        elif asked_dpt > self.amplitude_dpt + 1e-9:
-            notes.append(
-                f"focus {focus_dpt:g} dpt is nearer than the near point "
-                f"({self.amplitude_dpt - self.refraction_dpt:.3g} dpt): "
-                f"accommodation stops at {self.amplitude_dpt:.3g} dpt"
-            )
-        return tuple(notes)
+        return request_notes(
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            max_pupil_diameter_mm=self.max_pupil_diameter_mm,
+            pupil_limit="measured",
+            refraction_dpt=self.refraction_dpt,
+            amplitude_dpt=self.amplitude_dpt,
+        )
 
     def zernike_with_defocus(
         self, *, pupil_diameter_mm: float, added_defocus_dpt: float

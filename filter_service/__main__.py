@@ -12,6 +12,7 @@ from filter_service.commands.filter_image import filter_image
 from filter_service.commands.programs import bench, demo
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
+from filter_service.commands.wavefront import wavefront
 
 EXIT_FAILURE = 1
 EXIT_BAD_INPUT = 2
@@ -31,6 +32,7 @@ app.command()(demo)
 app.command()(serve)
 app.command(name="filter")(filter_image)
 app.command()(estimate)
+app.command()(wavefront)
 app.command()(psf)
 app.command()(bench)
 app.command()(doctor)

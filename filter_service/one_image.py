@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.profiles import EyeProfile
+from filter_service.eye_model import prepare_eye
 from filter_service.frame import View, fill_missing_depth, object_dpt
 from filter_service.gpu import Gpu
 from filter_service.psf_build import build_psf_store
@@ -32,6 +33,7 @@ class ImageSettings:
     chromatic: bool = True
     merge: bool = True
     output: str = "linear"
+    eye_model: str = "wavefront"
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class FilteredImage:
     """A filtered image and how it came about."""
 
     rendered: Rendered
+    eye_notes: tuple[str, ...]
     grid: GridSpec
     gl_renderer: str
     build_ms: float
@@ -95,7 +98,8 @@ def filter_one_image(
         kept_energy_ratio=KEPT_ENERGY_RATIO,
     )
     clock_s = [time.perf_counter()]
-    store = build_psf_store(eye, grid, progress=progress)
+    prepared, eye_notes = prepare_eye(eye, grid, eye_model=settings.eye_model)
+    store = build_psf_store(prepared, grid, progress=progress)
     clock_s.append(time.perf_counter())
     gpu = Gpu()
     renderer = FilterRenderer(gpu)
@@ -114,6 +118,7 @@ def filter_one_image(
     build_ms, start_ms, render_ms = (1000.0 * step for step in np.diff(clock_s))
     return FilteredImage(
         rendered=rendered,
+        eye_notes=eye_notes,
         grid=grid,
         gl_renderer=gpu.info["renderer"],
         build_ms=float(build_ms),

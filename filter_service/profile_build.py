@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ from estimator.profiles import EyeProfile, parse_profile
 from estimator.psf import PsfTooLarge
 from filter_service.build_job import BuildJob, BuiltStore
 from filter_service.errors import BuildFailed, GridTooLarge, UnknownProfile
+from filter_service.eye_model import ABERRATION_SHARE, prepare_eye
 from filter_service.messages import ProfileSettings
 from filter_service.psf_build import build_psf_store
 from filter_service.psf_grid import GridSpec
@@ -47,6 +49,7 @@ def build(
     ------
     UnknownProfile, GridTooLarge, BuildFailed, BuildCancelled
     """
+    started_s = time.perf_counter()
     profile = check_profile(job.body, job.settings)
     try:
         spec = GridSpec(
@@ -58,7 +61,20 @@ def build(
             chromatic=job.settings.chromatic,
             max_blur_radius_px=job.max_blur_radius_px,
         )
-        store = build_psf_store(profile, spec, progress=progress, cancelled=cancelled)
+        eye, notes = prepare_eye(
+            profile,
+            spec,
+            eye_model=job.settings.eye_model,
+            progress=progress,
+            cancelled=cancelled,
+        )
+        done = ABERRATION_SHARE if notes else 0.0
+        store = build_psf_store(
+            eye,
+            spec,
+            progress=lambda part, stage: progress(done + (1.0 - done) * part, stage),
+            cancelled=cancelled,
+        )
     except PsfTooLarge as error:
         raise GridTooLarge(
             str(error),
@@ -69,7 +85,8 @@ def build(
         raise BuildFailed(str(error)) from error
     return BuiltStore(
         store=store,
-        build_ms=store.build_ms,
+        build_ms=1e3 * (time.perf_counter() - started_s),
         psf_count=store.psf_count,
         memory_mb=store.memory_mb,
+        notes=notes,
     )

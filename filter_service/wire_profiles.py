@@ -10,6 +10,7 @@ from filter_service.wire_checks import (
     MAX_ID,
     check_float,
     take_bool,
+    take_choice,
     take_float,
     take_int,
     take_list,
@@ -28,6 +29,8 @@ from filter_service.wire_images import (
 )
 from filter_service.wire_text import clip, clip_notes, take_notes
 
+EYE_MODELS = ("traced", "wavefront")
+
 
 @dataclass(frozen=True)
 class ProfileSettings:
@@ -35,9 +38,10 @@ class ProfileSettings:
 
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)
     focus_range_dpt: tuple[float, float] = (0.0, 6.0)
-    object_range_dpt: tuple[float, float] = (0.0, 8.0)
+    object_range_dpt: tuple[float, float] = (0.0, 10.0)
     diffraction: bool = True
     chromatic: bool = True
+    eye_model: str = "traced"
     age_years: float | None = None
 
     def fields(self) -> dict[str, Any]:
@@ -77,7 +81,14 @@ class ProfileSettings:
             path="settings.age_years",
             default=None,
         )
-        return cls(**ranges, **switches, age_years=age_years)
+        eye_model = take_choice(
+            source,
+            "eye_model",
+            choices=EYE_MODELS,
+            path="settings.eye_model",
+            default=default.eye_model,
+        )
+        return cls(**ranges, **switches, eye_model=eye_model, age_years=age_years)
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,13 @@ class Accumulation(StrEnum):
     PAPER = "paper"
 
 
+class EyeModel(StrEnum):
+    """Where the wavefronts come from."""
+
+    TRACED = "traced"
+    WAVEFRONT = "wavefront"
+
+
 class DepthKind(StrEnum):
     """What the depth file measures."""
 
@@ -84,6 +91,13 @@ def filter_image(
         Accumulation,
         typer.Option(help="coverage conserves light; paper is the published rule."),
     ] = Accumulation.COVERAGE,
+    eye_model: Annotated[
+        EyeModel,
+        typer.Option(
+            help="wavefront: the measurement by formula, up to its own pupil; traced: "
+            "an estimated eye, ray-traced at any pupil and focus."
+        ),
+    ] = EyeModel.WAVEFRONT,
     depth_kind: Annotated[
         DepthKind, typer.Option(help="planar: view-space z; radial: distance.")
     ] = DepthKind.PLANAR,
@@ -132,6 +146,7 @@ def filter_image(
         chromatic=not no_chromatic,
         merge=not no_merge,
         output="linear" if linear else "srgb8",
+        eye_model=eye_model.value,
     )
     with progress_bar("PSFs", quiet=json_output) as progress:
         filtered = one_image.filter_one_image(view, eye, settings, progress=progress)
@@ -187,7 +202,7 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "render_ms": filtered.render_ms,
         "stage_times_ms": dict(rendered.stage_times_ms),
         "gl_renderer": filtered.gl_renderer,
-        "notes": list(rendered.notes),
+        "notes": [*filtered.eye_notes, *rendered.notes],
     }
 
 

@@ -34,6 +34,8 @@ HOME = {
     "msgpack": ("filter_service/messages.py", "filter_service/wire_checks.py"),
     "numba": (
         "estimator/psf_*.py",  # kernels of the PSF engines
+        "estimator/raytrace_kernels.py",
+        "estimator/wavefront_*.py",  # aiming and fitting
         "filter_service/reference*.py",  # twins of the passes
         "filter_service/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
@@ -44,7 +46,11 @@ HOME = {
     "pyglet": ("clients/*",),
     "imageio": ("clients/*",),
     "imageio_ffmpeg": ("clients/*",),  # videos
-    "matplotlib": ("clients/*", "tests/*"),  # plots of measurements
+    "matplotlib": (
+        "clients/*",
+        "tests/*",  # plots of measurements
+        "estimator/eye_plot.py",  # `ocufilter estimate --plot`
+    ),
     "OpenEXR": ("filter_service/image_files.py",),
     "PIL": (
         "filter_service/image_files.py",

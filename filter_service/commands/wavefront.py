@@ -1,0 +1,210 @@
+"""`ocufilter wavefront`: the aberrations of one eye at one field, ray-traced."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from filter_service.commands.console import (
+    CommandFailed,
+    Json,
+    check_range,
+    print_json,
+    say,
+)
+
+if TYPE_CHECKING:
+    from estimator.surfaces import EyeSurfaces
+    from estimator.wavefront import Aberrations
+
+PUPIL_LIMITS_MM = (0.05, 12.0)
+WAVELENGTH_LIMITS_NM = (365.0, 1014.0)
+FIELD_LIMITS_DEG = (-75.0, 75.0)
+OBJECT_LIMITS_DPT = (-20.0, 20.0)
+FOCUS_LIMITS_DPT = (0.0, 20.0)
+
+
+class Fit(StrEnum):
+    """What the least squares are of."""
+
+    OPD = "opd"
+    SLOPE = "slope"
+
+
+def wavefront(
+    eye: Annotated[
+        str,
+        typer.Argument(
+            help="A .json with surfaces or the 45 parameters, any profile file, or a "
+            "preset name; a profile that is a measurement is estimated first."
+        ),
+    ],
+    wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    stop_mm: Annotated[
+        float | None, typer.Option(help="Diameter of the stop (iris), mm.")
+    ] = None,
+    pupil_mm: Annotated[
+        float | None, typer.Option(help="Entrance pupil at 555 nm, mm, instead.")
+    ] = None,
+    h_deg: Annotated[float, typer.Option(help="Source to the right, deg.")] = 0.0,
+    v_deg: Annotated[float, typer.Option(help="Source above, deg.")] = 0.0,
+    focus_dpt: Annotated[
+        float | None,
+        typer.Option(help="Distance focused at, dpt; relaxed if not given."),
+    ] = None,
+    object_dpt: Annotated[
+        float, typer.Option(help="Distance of the source, dpt; 0 is infinity.")
+    ] = 0.0,
+    fit: Annotated[
+        Fit, typer.Option(help="Least squares of the wavefront or of its slopes.")
+    ] = Fit.OPD,
+    json_output: Json = False,
+) -> None:
+    """Trace the wavefront of an eye and print its Zernike coefficients.
+
+    They are OSA coefficients, um, on the circle about the chief ray that encloses
+    the projected pupil.
+
+    ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
+    """
+    _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt)
+
+    from estimator.wavefront import wavefront_aberrations
+
+    name, surfaces, notes = _load(eye, focus_dpt)
+    found = wavefront_aberrations(
+        surfaces,
+        wavelength_nm=wavelength_nm,
+        stop_diameter_mm=stop_mm,
+        pupil_diameter_mm=pupil_mm,
+        h_deg=h_deg,
+        v_deg=v_deg,
+        object_dpt=object_dpt,
+        fit=fit.value,
+    )
+    if not found.rms_residual_um >= 0.0:
+        raise CommandFailed(
+            f"{name}, h {h_deg:g} v {v_deg:g} deg: "
+            + ("; ".join(found.notes) or "too little of the pupil to fit")
+        )
+    summary = {
+        **_facts(found),
+        "eye": name,
+        "fit": fit.value,
+        "wavelength_nm": wavelength_nm,
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "object_dpt": object_dpt,
+        "focus_dpt": focus_dpt,
+        "pupil_diameter_mm": pupil_mm,
+        "notes": [*notes, *found.notes],
+    }
+    if json_output:
+        print_json(summary)
+    else:
+        _report(summary)
+
+
+def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt):
+    if (stop_mm is None) == (pupil_mm is None):
+        raise ValueError("give either --stop-mm or --pupil-mm")
+    if stop_mm is not None:
+        check_range("--stop-mm", stop_mm, PUPIL_LIMITS_MM)
+    if pupil_mm is not None:
+        check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
+    check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
+    check_range("--h-deg", h_deg, FIELD_LIMITS_DEG)
+    check_range("--v-deg", v_deg, FIELD_LIMITS_DEG)
+    if focus_dpt is not None:
+        check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
+    check_range("--object-dpt", object_dpt, OBJECT_LIMITS_DPT)
+
+
+def _explicit_body(source: str) -> dict | None:
+    """Content of a JSON file that gives surfaces; None for any other source."""
+    from estimator.explicit_eye import is_explicit_eye
+
+    path = Path(source)
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return None
+    try:
+        body = json.loads(path.read_text(encoding="utf-8-sig"))
+    except ValueError:
+        return None  # the reader of profiles says what is wrong with it
+    return body if is_explicit_eye(body) else None
+
+
+def _load(
+    source: str, focus_dpt: float | None
+) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
+    """Name, surfaces and notes of what the user named."""
+    body = _explicit_body(source)
+    if body is not None:
+        from estimator.explicit_eye import parse_explicit_eye
+
+        if focus_dpt is not None:
+            raise ValueError(
+                "--focus-dpt: an eye given by its surfaces does not accommodate; "
+                "allowed for profiles and for the 45 parameters"
+            )
+        return str(body.get("name", Path(source).name)), parse_explicit_eye(body), ()
+
+    from estimator.estimation import estimate_eye
+    from estimator.eye import eye_surfaces
+    from estimator.profile_files import load_profile
+
+    profile = load_profile(source)
+    found = estimate_eye(profile)
+    notes = found.notes
+    if profile.correction is not None:
+        notes = (*notes, "the worn correction is not in these coefficients")
+    if focus_dpt is None:
+        surfaces = eye_surfaces(found.parameters, retina=found.retina)
+        return profile.name, surfaces, notes
+    focused = found.focused(focus_dpt)
+    return profile.name, focused.surfaces, (*notes, *focused.notes)
+
+
+def _facts(found: "Aberrations") -> dict:
+    from estimator.raytrace import STATUS_WORDS
+
+    ellipse = found.pupil_ellipse
+    return {
+        "zernike_um": found.zernike_um.tolist(),
+        "zernike_radius_mm": found.zernike_radius_mm,
+        "pupil_ellipse": {
+            "centre_x_mm": ellipse.centre_x_mm,
+            "centre_y_mm": ellipse.centre_y_mm,
+            "semi_major_mm": ellipse.semi_major_mm,
+            "semi_minor_mm": ellipse.semi_minor_mm,
+            "major_axis_deg": ellipse.major_axis_deg,
+            "ratio": ellipse.axis_ratio,
+        },
+        "rms_residual_um": found.rms_residual_um,
+        "stop_diameter_mm": found.stop_diameter_mm,
+        "open_ratio": found.open_ratio,
+        "status": STATUS_WORDS[found.worst_status],
+        "retinal_point_mm": found.retinal_point_mm.tolist(),
+        "pupil_point_mm": found.pupil_point_mm.tolist(),
+    }
+
+
+def _report(summary: dict) -> None:
+    from estimator.zernike import nm_from_index
+
+    for note in summary["notes"]:
+        say(f"note: {note}")
+    say("  j  (n, m)        um")
+    for j, value in enumerate(summary["zernike_um"]):
+        n, m = nm_from_index(j)
+        if j > 0:
+            say(f"{j:>3}  ({n},{m:>2})  {value:>+12.6f}")
+    ellipse = summary["pupil_ellipse"]
+    say(
+        f"{summary['eye']}, {summary['wavelength_nm']:g} nm, h {summary['h_deg']:g} "
+        f"v {summary['v_deg']:g} deg: circle of {summary['zernike_radius_mm']:.4f} mm, "
+        f"pupil {ellipse['semi_major_mm']:.4f} x {ellipse['semi_minor_mm']:.4f} mm, "
+        f"residual {summary['rms_residual_um']:.2g} um"
+    )

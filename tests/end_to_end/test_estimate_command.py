@@ -1,0 +1,56 @@
+"""`ocufilter estimate` as a person runs it."""
+
+import json
+
+import numpy as np
+from PIL import Image
+
+from estimator.eye_parameters import PARAMETER_NAMES
+from tests.end_to_end.test_cli import refusal, run, run_json
+
+
+def test_estimate_prints_the_eye_its_coefficients_and_its_error():
+    found = run_json("estimate", "astigmatism")
+    assert tuple(found["parameters"]) == PARAMETER_NAMES
+    assert len(found["zernike_um"]) == len(found["residual_um"]) == 28
+    assert found["zernike_radius_mm"] == 2.5
+    assert found["wavelength_nm"] == 587.56
+    error_um = np.mean(np.abs(found["residual_um"][3:]))
+    assert found["mean_abs_error_um"] <= 5e-4
+    assert abs(error_um - found["mean_abs_error_um"]) < 1e-12
+    assert found["time_ms"] > 0.0
+    assert set(found["determined_ratio"]) == set(PARAMETER_NAMES)
+    assert found["on_bound"] == []
+
+
+def test_estimated_parameters_are_a_profile_of_their_own(tmp_path):
+    found = run_json("estimate", "keratoconus")
+    path = tmp_path / "eye.json"
+    path.write_text(json.dumps({"kind": "eye", "parameters": found["parameters"]}))
+    again = run_json("estimate", path)
+    assert again["method"] == "given"
+    assert again["parameters"] == found["parameters"]
+    assert abs(again["refraction_dpt"] - found["refraction_dpt"]) < 1.0  # other pupil
+
+
+def test_plot_is_a_picture_with_a_report(tmp_path):
+    path = tmp_path / "eye.png"
+    finished = run("estimate", "myopia", "--plot", path)
+    assert finished.returncode == 0, finished.stderr
+    assert "eye_length_mm" in finished.stdout and "refraction -6" in finished.stdout
+    pixels = np.asarray(Image.open(path).convert("RGB"))
+    assert min(pixels.shape[:2]) > 300
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 10
+
+
+def test_search_stops_when_told():
+    found = run_json("estimate", "myopia", "--method", "search", "--max-time-s", "0.5")
+    assert found["method"] == "search"
+    assert found["determined_ratio"] == {}
+
+
+def test_estimate_refuses_what_it_does_not_know(tmp_path):
+    assert "kerataconus" in refusal("estimate", "kerataconus")
+    assert "network" in refusal("estimate", "myopia", "--method", "network")
+    assert "--max-time-s" in refusal("estimate", "myopia", "--max-time-s", "0")
+    assert "png" in refusal("estimate", "myopia", "--plot", tmp_path / "eye.pdf")

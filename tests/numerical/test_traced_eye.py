@@ -1,0 +1,156 @@
+"""The ray-traced eye behind the PSF cache, against direct traces and the measurement."""
+
+import numpy as np
+import pytest
+
+from estimator.estimation import estimate_eye
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.prescription import C20
+from estimator.profiles import parse_profile, preset_names
+from estimator.psf import compute_psfs
+from estimator.traced_eye import TracedEye
+from estimator.units import RGB_WAVELENGTHS_NM
+from estimator.wavefront import wavefront_aberrations
+from estimator.zernike import remove_central_tilt, rescale_pupil
+from filter_service import reference
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_store import frame_layers
+
+PUPILS_MM = (3.0, 4.0, 5.0, 6.0)
+
+
+def traced(body, *, wavelengths_nm=RGB_WAVELENGTHS_NM, pupils_mm=PUPILS_MM):
+    estimated = estimate_eye(parse_profile(body))
+    return estimated, TracedEye.trace(
+        estimated,
+        pupil_diameters_mm=pupils_mm,
+        focus_range_dpt=(0.0, 6.0),
+        wavelengths_nm=wavelengths_nm,
+    )
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_relaxed_eye_has_the_measured_wavefront(name):
+    profile = parse_profile({"kind": "preset", "name": name})
+    pupil_mm, wavelength_nm = profile.pupil_diameter_mm, profile.wavelength_nm
+    _, eye = traced(
+        {"kind": "preset", "name": name},
+        wavelengths_nm=(wavelength_nm,),
+        pupils_mm=(pupil_mm,),
+    )
+    relaxed = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": 0.0}
+    if eye.grid.accommodations_dpt[0] > 0.0:  # a little hyperopic at 555 nm
+        relaxed["accommodation_dpt"] = float(eye.grid.accommodations_dpt[0])
+    total_dpt = eye.total_defocus_dpt(**relaxed, wavelength_nm=wavelength_nm)
+    zernike_um = eye.zernike_at_defocus(
+        **relaxed, wavelength_nm=wavelength_nm, total_defocus_dpt=total_dpt
+    )
+    measured = remove_central_tilt(profile.zernike_um)
+    error_um = np.abs(zernike_um - measured)[3:]
+    assert error_um.mean() <= 5e-4
+
+
+def test_larger_pupils_are_traced_and_not_extrapolated():
+    body = {"kind": "preset", "name": "cataract"}  # measured at 4 mm
+    estimated, eye = traced(body)
+    direct = wavefront_aberrations(
+        estimated.surfaces(0.0), wavelength_nm=549.0, pupil_diameter_mm=6.0
+    )
+    ours = eye.zernike_at_defocus(
+        pupil_diameter_mm=6.0,
+        accommodation_dpt=0.0,
+        wavelength_nm=549.0,
+        total_defocus_dpt=1.0,
+    )
+    scaled = rescale_pupil(
+        direct.zernike_um, radius_ratio=3.0 / direct.zernike_radius_mm
+    )
+    higher = np.arange(28) > 5
+    assert np.abs(ours - scaled)[higher].max() < 1e-9
+    assert eye.usable_pupil_mm(6.0) == 6.0
+    assert not eye.notes(pupil_diameter_mm=6.0, focus_dpt=1.5)
+
+
+@pytest.mark.parametrize("focus_dpt", [0.5, 2.0, 4.7])
+def test_an_object_at_the_focus_is_in_focus(focus_dpt):
+    body = {"kind": "prescription", "sphere_dpt": 0.0}
+    _, eye = traced(body, wavelengths_nm=(555.0,), pupils_mm=(5.0, 6.0))
+    total_dpt = focus_dpt + eye.total_defocus_dpt(
+        pupil_diameter_mm=6.0,  # a prescription is written down on a 6 mm circle
+        accommodation_dpt=eye.accommodation_dpt(focus_dpt),
+        wavelength_nm=555.0,
+    )
+    assert total_dpt == pytest.approx(0.0, abs=0.01)
+
+
+def test_worn_correction_moves_the_far_point():
+    body = {"kind": "prescription", "sphere_dpt": -4.0}
+    _, bare = traced(body)
+    _, worn = traced({**body, "correction": {"sphere_dpt": -4.0}})
+    assert bare.refraction_dpt == pytest.approx(-4.0, abs=0.01)
+    assert worn.refraction_dpt == pytest.approx(0.0, abs=0.01)
+    state = {"pupil_diameter_mm": 5.0, "accommodation_dpt": 0.0, "wavelength_nm": 549.0}
+    assert worn.total_defocus_dpt(**state) - bare.total_defocus_dpt(
+        **state
+    ) == pytest.approx(4.0, abs=0.01)
+
+
+def test_accommodation_makes_spherical_aberration_more_negative():
+    """As in every measured eye (Cheng et al. 2004: about -0.05 um per dpt at 5 mm)."""
+    _, eye = traced({"kind": "preset", "name": "emmetropia"})
+    by_use = eye.grid.zernike_um[0, 0, PUPILS_MM.index(5.0), :, 1, 12]
+    assert np.all(np.diff(by_use) < 0.0)
+
+
+def test_blended_kernels_equal_traced_ones_between_nodes():
+    body = {"kind": "preset", "name": "emmetropia"}
+    estimated, _ = traced(body)
+    spec = GridSpec(
+        pixel_pitch_mrad=(1.3, 1.3), pupil_range_mm=(4.0, 5.0), focus_range_dpt=(0, 6)
+    )
+    from filter_service.eye_model import prepare_eye
+
+    eye, notes = prepare_eye(parse_profile(body), spec, eye_model="traced")
+    assert "estimated" in notes[0]
+    store = build_psf_store(eye, spec)
+    pupil_mm, focus_dpt, object_dpt = 4.5, 3.37, 4.2
+    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    blended = reference.layer_kernels(store, layers)
+    k = int(np.argmin(np.abs(layers.object_dpt - object_dpt)))
+    direct = wavefront_aberrations(
+        estimated.surfaces(focus_dpt), wavelength_nm=549.0, pupil_diameter_mm=pupil_mm
+    )
+    zernike_um = rescale_pupil(
+        direct.zernike_um, radius_ratio=pupil_mm / 2 / direct.zernike_radius_mm
+    )
+    zernike_um[C20] -= layers.object_dpt[k] * (pupil_mm / 2) ** 2 / (4 * np.sqrt(3))
+    truth = compute_psfs(
+        zernike_um[None],
+        pupil_diameter_mm=pupil_mm,
+        wavelength_nm=549.0,
+        pixel_pitch_mrad=1.3,
+        radius_px=blended.shape[1] // 2,
+    )[0].kernel
+    error = np.linalg.norm(blended[k, ..., 1] - truth) / np.linalg.norm(truth)
+    assert error < 0.1
+
+
+def test_wavefront_and_traced_eye_agree_where_both_hold():
+    """At the measured pupil, relaxed: the same PSF to a few per cent."""
+    profile = parse_profile({"kind": "preset", "name": "keratoconus"})
+    measured = MeasuredWavefront.from_profile(profile)
+    _, eye = traced({"kind": "preset", "name": "keratoconus"}, pupils_mm=(5.0,))
+    state = {"pupil_diameter_mm": 5.0, "accommodation_dpt": 0.0, "wavelength_nm": 549.0}
+    kernels = [
+        compute_psfs(
+            one.zernike_at_defocus(**state, total_defocus_dpt=-1.5)[None],
+            pupil_diameter_mm=5.0,
+            wavelength_nm=549.0,
+            pixel_pitch_mrad=1.3,
+            radius_px=20,
+        )[0].kernel
+        for one in (measured, eye)
+    ]
+    difference = np.linalg.norm(kernels[0] - kernels[1])
+    assert difference < 0.05 * np.linalg.norm(kernels[0])

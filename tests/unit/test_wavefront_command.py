@@ -1,0 +1,142 @@
+"""`ocufilter wavefront` from a JSON file to JSON on stdout, and its refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from estimator.zernike import rescale_pupil
+from filter_service.__main__ import _exit_code
+from tests.numerical.schematic_eyes import reference
+
+CASE = next(
+    c
+    for c in reference()["zernike_cases"]
+    if c["field_deg"] == 20 and c["stop_diameter_mm"] == 4.0
+)
+VIEW = ["--stop-mm", "4", "--wavelength-nm", "555", "--v-deg", "-20"]
+
+
+@pytest.fixture
+def eye_file(tmp_path):
+    eye = reference()["eye"]
+    body = {
+        "surfaces": [
+            {
+                "radius_mm": s["R"],
+                "conic_constant": s["k"],
+                "z_mm": s["z"],
+                "medium_after": s["after"],
+            }
+            for s in eye["surfaces"]
+            if s["name"] != "stop"
+        ],
+        "stop_z_mm": 3.6,
+        "retina": {
+            "radius_mm": eye["retina_R_mm"],
+            "conic_constant": 0.0,
+            "z_mm": eye["retina_z_ESN1999_mm"],
+        },
+        "indices": None,
+    }
+    path = tmp_path / "eye.json"
+    path.write_text(json.dumps(body), encoding="utf-8")
+    return path
+
+
+def _json(capsys, *arguments):
+    assert _exit_code(["wavefront", *map(str, arguments), "--json"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    return json.loads(out)
+
+
+@pytest.mark.parametrize(("fit", "key"), [("opd", "C_um"), ("slope", "C_slope_um")])
+def test_reference_set_through_the_command_line(eye_file, capsys, fit, key):
+    found = _json(capsys, eye_file, *VIEW, "--fit", fit)
+    radius_mm = CASE["circle"]["radius_mm"]
+    zernike_um = rescale_pupil(
+        found["zernike_um"], radius_ratio=radius_mm / found["zernike_radius_mm"]
+    )
+    assert np.abs(zernike_um - CASE["circle"][key])[1:].max() < 1e-4
+    assert 0.0 < found["rms_residual_um"] < 1e-3
+    assert found["notes"] == []
+    ellipse = found["pupil_ellipse"]
+    assert abs(ellipse["ratio"] - CASE["pupil_ellipse"]["ratio"]) < 1e-6
+
+
+def test_pupil_and_stop_are_told_apart(eye_file, capsys):
+    view = ["--wavelength-nm", "555"]
+    stop = _json(capsys, eye_file, "--stop-mm", "4", *view)
+    pupil = _json(capsys, eye_file, "--pupil-mm", "4", *view)
+    assert abs(4.0 / pupil["stop_diameter_mm"] - 1.13325) < 1e-5
+    assert pupil["zernike_radius_mm"] < 2.0 < stop["zernike_radius_mm"]
+
+
+def test_a_near_object_makes_the_eye_hyperopic_by_its_vergence(eye_file, capsys):
+    view = ["--stop-mm", "1", "--wavelength-nm", "555"]
+    far = _json(capsys, eye_file, *view)
+    near = _json(capsys, eye_file, *view, "--object-dpt", "3")
+    change_um = near["zernike_um"][4] - far["zernike_um"][4]
+    added_dpt = -4 * np.sqrt(3) * change_um / far["zernike_radius_mm"] ** 2
+    assert 3.0 < added_dpt < 3.05  # seen at the cornea, 3 mm nearer
+
+
+def test_without_json_it_prints_a_table(eye_file, capsys):
+    assert _exit_code(["wavefront", str(eye_file), *VIEW]) == 0
+    out = capsys.readouterr().out
+    assert len(out.splitlines()) == 29
+    assert "circle of 2.2570 mm" in out
+
+
+def _refused(capsys, *arguments):
+    code = _exit_code(["wavefront", *map(str, arguments)])
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return code, captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--wavelength-nm", "555"], "either --stop-mm or --pupil-mm"),
+        (["--stop-mm", "4", "--wavelength-nm", "300"], "--wavelength-nm 300"),
+        ([*VIEW, "--h-deg", "90"], "--h-deg 90: allowed is -75 to 75"),
+        ([*VIEW, "--focus-dpt", "2"], "does not accommodate"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(eye_file, capsys, arguments, message):
+    code, text = _refused(capsys, eye_file, *arguments)
+    assert code == 2
+    assert message in text
+
+
+def test_a_wrong_surface_is_named(eye_file, capsys):
+    body = json.loads(eye_file.read_text(encoding="utf-8"))
+    del body["surfaces"][2]["z_mm"]
+    eye_file.write_text(json.dumps(body), encoding="utf-8")
+    code, text = _refused(capsys, eye_file, *VIEW)
+    assert code == 2
+    assert "surfaces[2].z_mm" in text
+
+
+def test_a_lost_chief_ray_is_a_failure_in_words(eye_file, capsys):
+    body = json.loads(eye_file.read_text(encoding="utf-8"))
+    body["surfaces"][1]["clear_radius_mm"] = 0.2
+    eye_file.write_text(json.dumps(body), encoding="utf-8")
+    code, text = _refused(capsys, eye_file, *VIEW)
+    assert code == 1
+    assert "no chief ray: outside a clear radius" in text
+
+
+def test_the_45_parameters_are_an_eye_too(tmp_path, capsys):
+    from estimator.eye_parameters import EyeParameters
+
+    path = tmp_path / "mean.json"
+    body = {"kind": "eye", "parameters": EyeParameters.mean_eye().to_mapping()}
+    path.write_text(json.dumps(body), encoding="utf-8")
+    view = ["--pupil-mm", "4", "--wavelength-nm", "555", "--h-deg", "10"]
+    relaxed = _json(capsys, path, *view)
+    focused = _json(capsys, path, *view, "--focus-dpt", "4")
+    assert focused["zernike_um"][4] - relaxed["zernike_um"][4] > 0.5
