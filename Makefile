@@ -22,6 +22,7 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	    $(PYTHON) -m filter_service bench $$bench --json > out/$$bench.json && \
 	    mv out/$$bench.json $(RESULTS)/$$bench.json || exit 1; \
 	done
+	$(PYTHON) -m tests.benchmarks.bench_wavefront
 
 check: setup  ## lint and formatting
 	$(PYTHON) -m ruff check .
