@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 
 from estimator import prescription as rx
 from estimator.accommodation import AccommodatingEye, FocusedEye
-from estimator.bounded_fit import BoundedFit, FitFailed, fit_bounded
+from estimator.bounded_fit import (
+    BoundedFit,
+    FitFailed,
+    difference_jacobian_um,
+    fit_bounded,
+)
 from estimator.estimation_prior import Prior, prior_for_refraction
 from estimator.eye_parameters import (
     PARAMETER_NAMES,
@@ -69,9 +74,6 @@ class EstimatedEye:
         Over the 25 terms without piston and tilt, and over all measurements.
     on_bound : tuple of str
         Parameters that sit on a bound of their allowed range.
-    determined_ratio : dict
-        Per parameter, the share of the prior variance that a measurement with 0.01 um
-        noise per coefficient takes away: 0 is the prior, 1 is known.
     """
 
     name: str
@@ -87,13 +89,25 @@ class EstimatedEye:
     n_iterations: int
     n_evaluations: int
     on_bound: tuple[str, ...]
-    determined_ratio: dict[str, float]
     notes: tuple[str, ...]
 
     @property
     def retina(self) -> RetinaShape | None:
         """Return the retina of the profile, None for a sphere."""
         return self.profile.retina
+
+    @cached_property
+    def determined_ratio(self) -> dict[str, float]:
+        """Return how well each parameter is determined; costs one Jacobian.
+
+        The share of the prior variance that a measurement with 0.01 um noise per
+        coefficient takes away: 0 is the prior alone, 1 is known.
+        """
+        if self.profile.eye is not None:
+            return dict.fromkeys(PARAMETER_NAMES, 1.0)
+        problem = _Problem(self.profile)
+        unit = problem.prior.to_unit(self.parameters.to_vector())
+        return _determined_ratio(problem.jacobian_um(unit))
 
     @cached_property
     def accommodating(self) -> AccommodatingEye:
@@ -175,7 +189,6 @@ def estimate_eye(
         values_um=fit.values_um,
         start_s=start_s,
         counts=(fit.n_iterations, fit.n_evaluations),
-        determined_ratio=_determined_ratio(fit.jacobian_um),
     )
 
 
@@ -189,7 +202,11 @@ class _Problem:
 
     def __init__(self, profile: EyeProfile):
         self.profile = profile
-        self.measurements = profile.measurements
+        self.measurements = profile.measurements or (
+            Measurement(
+                profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
+            ),
+        )
         self.target_um = np.concatenate(
             [compared_terms(m.zernike_um) for m in self.measurements]
         )
@@ -225,9 +242,18 @@ class _Problem:
             raise FitFailed("light passes none of the start eyes at this pupil")
         return vectors[np.nanargmin(distance)]
 
+    def _model(self, units: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.compared_um(self.prior.from_unit(units))
+
+    def jacobian_um(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        value_um = self._model(unit[None])[0]
+        return difference_jacobian_um(
+            self._model, unit, value_um, high=self.prior.unit_bounds()[1]
+        )
+
     def refine(self, start_vectors: NDArray[np.float64]) -> BoundedFit:
         return fit_bounded(
-            lambda units: self.compared_um(self.prior.from_unit(units)),
+            self._model,
             target_um=self.target_um,
             start=self.prior.to_unit(self.nearest(start_vectors)),
             bounds=self.prior.unit_bounds(),
@@ -242,7 +268,6 @@ class _Problem:
         values_um: NDArray[np.float64],
         start_s: float,
         counts: tuple[int, int],
-        determined_ratio: dict[str, float],
     ) -> EstimatedEye:
         error_um = float(np.mean(np.abs(values_um - self.target_um)))
         on_bound = self._on_bound(vector)
@@ -266,7 +291,6 @@ class _Problem:
             n_iterations=counts[0],
             n_evaluations=counts[1],
             on_bound=on_bound,
-            determined_ratio=determined_ratio,
             notes=_notes(error_um),
         )
 
@@ -309,7 +333,6 @@ def _searched(problem: _Problem, start_s: float, max_time_s: float) -> Estimated
         values_um=problem.compared_um(vector[None])[0],
         start_s=start_s,
         counts=(found.n_iterations, found.n_evaluations),
-        determined_ratio={},
     )
 
 
@@ -328,6 +351,5 @@ def _given(profile: EyeProfile, start_s: float) -> EstimatedEye:
         n_iterations=0,
         n_evaluations=0,
         on_bound=(),
-        determined_ratio=dict.fromkeys(PARAMETER_NAMES, 1.0),
         notes=(),
     )

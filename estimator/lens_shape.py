@@ -24,8 +24,6 @@ a diameter of 9.5 mm and 157.5 mm³."""
 ANTERIOR_THICKNESS_RATIO = HEIGHT_RATIO / (1.0 + HEIGHT_RATIO)
 """Share of the thickness, rim included, that lies before the equator."""
 
-LENS_RULES = ("C", "compat")
-
 
 @dataclass(frozen=True)
 class LensShape:

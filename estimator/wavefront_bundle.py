@@ -72,17 +72,9 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     if status != TRACED:
         return status, math.nan
     chief[1] = ray[:3]
+    path_mm = ray[6]
     status = stop_response(packed, indices, chief, frame, ray, response, sag)
-    return status, ray_path(packed, indices, chief, frame, sag)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def ray_path(packed, indices, chief, frame, sag):
-    """Optical path of the chief ray from the retina to the cornea's first surface."""
-    ray, sample, axes = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.ones((3, 3))
-    back_to_stop(packed, indices, chief, frame, 0.0, 0.0, ray, sag)
-    leave_eye(packed, indices, chief, axes, 0.0, ray, sample, sag)
-    return ray[6]
+    return status, path_mm
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -173,22 +165,27 @@ def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, s
     radii, solution = np.zeros(n_rings + 1), np.zeros((n_rings + 1, 2))
     for k in range(azimuths.shape[0]):
         edge[k] = 1.0
-        radii[1:] = stop_radius * rings
-        done, status = _walk_spoke(
-            light, radii, azimuths[k], response, solution, samples[k], sag
-        )
-        if status == TRACED:
-            continue
-        worst = max(worst, status)
-        low, high = radii[done], radii[done + 1]
-        low = _open_radius(light, low, high, azimuths[k], solution[done], response, sag)
-        edge[k] = low / stop_radius * (1.0 - _EDGE_MARGIN)
-        radii[1:] = stop_radius * edge[k] * rings
-        done, status = _walk_spoke(
-            light, radii, azimuths[k], response, solution, samples[k], sag
-        )
-        if status != TRACED:
-            edge[k] = 0.0
+        for attempt in range(2):
+            radii[1:] = stop_radius * edge[k] * rings
+            done, status = _walk_spoke(
+                light, radii, azimuths[k], response, solution, samples[k], sag
+            )
+            if status == TRACED:
+                break
+            worst = max(worst, status)
+            if attempt == 1:
+                edge[k] = 0.0
+                break
+            low = _open_radius(
+                light,
+                radii[done],
+                radii[done + 1],
+                azimuths[k],
+                solution[done],
+                response,
+                sag,
+            )
+            edge[k] = low / stop_radius * (1.0 - _EDGE_MARGIN)
     return worst
 
 

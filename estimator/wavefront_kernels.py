@@ -97,12 +97,16 @@ def _solve_chief(packed, indices, axes, base_z, start, ray, sag):
         miss = math.hypot(x, y)
         if miss < _CHIEF_TOLERANCE_MM:
             break
-        if _chief_shot(packed, indices, axes, base_z, a + h, b, ray, sag) != TRACED:
-            return NOT_CONVERGED
-        xa, ya = (ray[0] - x) / h, (ray[1] - y) / h
-        if _chief_shot(packed, indices, axes, base_z, a, b + h, ray, sag) != TRACED:
-            return NOT_CONVERGED
-        xb, yb = (ray[0] - x) / h, (ray[1] - y) / h
+        xa, ya, xb, yb = 0.0, 0.0, 0.0, 0.0
+        for k in range(2):
+            ta, tb = (a + h, b) if k == 0 else (a, b + h)
+            status = _chief_shot(packed, indices, axes, base_z, ta, tb, ray, sag)
+            if status != TRACED:
+                return status
+            if k == 0:
+                xa, ya = (ray[0] - x) / h, (ray[1] - y) / h
+            else:
+                xb, yb = (ray[0] - x) / h, (ray[1] - y) / h
         determinant = xa * yb - xb * ya
         da, db = (xb * y - yb * x) / determinant, (ya * x - xa * y) / determinant
         share, better = 1.0, False
@@ -132,16 +136,18 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
     """
     base_z = entrance_pupil_z(packed, indices)
     field_axes(h_rad, v_rad, axes)
-    start[0], start[1] = 0.0, 0.0
-    status = _solve_chief(packed, indices, axes, base_z, start, ray, sag)
+    status = NOT_CONVERGED
+    for step in range(-1, _CONTINUATION_STEPS + 1):
+        if step <= 0:
+            start[0], start[1] = 0.0, 0.0
+        share = 1.0 if step < 0 else step / _CONTINUATION_STEPS
+        field_axes(share * h_rad, share * v_rad, axes)
+        status = _solve_chief(packed, indices, axes, base_z, start, ray, sag)
+        # The straight aim ends it by success, the approach by failure.
+        if (status == TRACED) == (step < 0):
+            break
     if status != TRACED:
-        start[0], start[1] = 0.0, 0.0
-        for step in range(_CONTINUATION_STEPS + 1):
-            share = step / _CONTINUATION_STEPS
-            field_axes(share * h_rad, share * v_rad, axes)
-            status = _solve_chief(packed, indices, axes, base_z, start, ray, sag)
-            if status != TRACED:
-                return status
+        return status
     n_before, n_surfaces = int(packed[-1, N_BEFORE_STOP]), packed.shape[0] - 1
     status = inwards(packed, indices, ray, n_before, n_surfaces, sag)
     if status != TRACED:

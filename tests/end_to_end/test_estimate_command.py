@@ -46,7 +46,7 @@ def test_plot_is_a_picture_with_a_report(tmp_path):
 def test_search_stops_when_told():
     found = run_json("estimate", "myopia", "--method", "search", "--max-time-s", "0.5")
     assert found["method"] == "search"
-    assert found["determined_ratio"] == {}
+    assert found["n_evaluations"] > 90
 
 
 def test_estimate_refuses_what_it_does_not_know(tmp_path):
