@@ -187,3 +187,36 @@ def test_a_remote_interface_is_refused_by_the_program():
     )
     assert finished.returncode == 2
     assert "allow_remote = true" in finished.stderr
+
+
+def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(
+    real_client,
+):
+    view, stages = edge_view(), []
+    ready = real_client.set_profile(
+        {"kind": "preset", "name": "cataract"},  # measured at 4 mm
+        settings={"pupil_range_mm": (4.0, 5.0), "object_range_dpt": (0, 1)},
+        views=[view],
+        on_progress=lambda progress: stages.append(progress.stage),
+    )
+    assert {"eye", "aberrations", "psfs"} <= set(stages)
+    assert any("mean error" in note for note in ready.notes)
+    reply = real_client.filter(view, **SEE | {"pupil_diameter_mm": 5.0})
+    assert reply.header.pupil_diameter_mm == pytest.approx(5.0)
+    assert not any("capped" in note for note in reply.header.notes)
+
+
+def test_the_light_option_is_the_measured_wavefront_up_to_its_pupil(real_client):
+    view = edge_view()
+    real_client.set_profile(
+        {"kind": "preset", "name": "cataract"},
+        settings={
+            "pupil_range_mm": (3.0, 5.0),
+            "object_range_dpt": (0, 1),
+            "eye_model": "wavefront",
+        },
+        views=[view],
+    )
+    reply = real_client.filter(view, **SEE | {"pupil_diameter_mm": 5.0})
+    assert reply.header.pupil_diameter_mm == pytest.approx(4.0)
+    assert any("capped" in note for note in reply.header.notes)
