@@ -66,14 +66,19 @@ class EyeBuilds:
             The session goes on as before.
         """
         self._check_profile(request.body, request.settings)
-        if session.building is not None:
-            replaced, _ = session.building
-            self.cancel(session)
+        # Accepted in the same pass counts as well: its build has not begun, but its
+        # sender awaits an ending too.
+        replaced = [session.building[0]] if session.building is not None else []
+        unfinished = session.unfinished_eye()
+        if unfinished is not None and unfinished not in replaced:
+            replaced.append(unfinished)
+        self.cancel(session)
+        for old in replaced:
             error = BuildCancelled(
                 f"profile {request.profile_id} took the place of "
-                f"profile {replaced.profile_id}"
+                f"profile {old.profile_id}"
             )
-            self._tell_failure(session, replaced, error)
+            self._tell_failure(session, old, error)
         eye = session.add_profile(request)
         free_retired(session)
         self._send(

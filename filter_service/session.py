@@ -190,6 +190,13 @@ class Session:
         self.eyes = [eye, *in_use]
         return eye
 
+    def unfinished_eye(self) -> Eye | None:
+        """Return the newest eye if its profile has had no ending yet."""
+        if not self.eyes or self.eyes[0].stores:
+            return None
+        newest = self.eyes[0]
+        return newest if newest.wanted or not newest.failures else None
+
     def next_build(self) -> tuple[Eye, Pitch] | None:
         """Return what should be built next, if anything."""
         if not self.eyes or not self.eyes[0].wanted:

@@ -7,8 +7,15 @@ import pytest
 
 from clients.filter_client import FilteredFrame
 from filter_service import errors
-from filter_service.messages import Accepted, Dropped, ErrorReply, Ready
-from tests.end_to_end.conftest import make_view
+from filter_service.messages import (
+    Accepted,
+    Dropped,
+    ErrorReply,
+    ProfileRequest,
+    Ready,
+    encode,
+)
+from tests.end_to_end.conftest import make_view, small_frame
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 
@@ -100,6 +107,25 @@ def test_a_newer_profile_takes_the_place_of_one_being_built(client):
         slow.profile_id,
     )
     assert mark_of(client.filter(view, **SEE)) == 6
+
+
+def test_every_profile_of_a_burst_has_an_ending(shared_service, raw_client):
+    """Sent without a pause, several are taken in before the first build begins."""
+    raw = raw_client(shared_service)
+    raw.begin()
+    camera = small_frame(0).views[0].camera
+    burst = range(200, 212)
+    for profile_id in burst:
+        body = {"kind": "double", "mark": 1, "build_s": 0.05}
+        raw.send(encode(ProfileRequest(profile_id, body, cameras=(camera,))))
+    endings = {}
+    while set(endings) != set(burst):
+        reply = raw.receive()
+        if reply.type_name != "accepted":
+            assert reply.profile_id not in endings
+            endings[reply.profile_id] = getattr(reply, "code", reply.type_name)
+    assert endings.pop(burst[-1]) == "ready"
+    assert set(endings.values()) == {"build_cancelled"}
 
 
 def test_a_build_that_does_not_listen_is_ended_by_force(start_service, raw_client):
