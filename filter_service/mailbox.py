@@ -6,6 +6,8 @@ import enum
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from socket import AF_UNIX, SOCK_STREAM
+from socket import socket as unix_socket
 from typing import Any
 
 import zmq
@@ -19,6 +21,26 @@ RECEIVE_HIGH_WATER_MARK = 4
 HEARTBEAT_INTERVAL_MS = 1000
 HEARTBEAT_TIMEOUT_MS = 4000
 RETRY_S = 0.001
+
+
+def _check_path_is_free(bind: str) -> None:
+    """Refuse an ``ipc://`` path that holds a file or a live endpoint.
+
+    Binding removes whatever is at the path; only a dead socket may go that way.
+    """
+    if not bind.startswith("ipc://"):
+        return
+    path = Path(bind.removeprefix("ipc://"))
+    if not path.exists():
+        return
+    if not path.is_socket():
+        raise FileExistsError(f"{path} is there already and is no socket")
+    with unix_socket(AF_UNIX, SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return
+    raise FileExistsError(f"another service listens on {path}")
 
 
 class Outcome(enum.Enum):
@@ -52,8 +74,9 @@ class Mailbox:
         socket.heartbeat_ivl = HEARTBEAT_INTERVAL_MS
         socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
         try:
+            _check_path_is_free(bind)
             socket.bind(bind)
-        except zmq.ZMQError as error:
+        except (zmq.ZMQError, OSError) as error:
             self.close()
             raise OSError(f"cannot listen on {bind}: {error}") from None
         self.endpoint = socket.last_endpoint.decode()

@@ -229,7 +229,7 @@ class FilterServer:
             )
             self._next_session_id += 1
             self._sessions[identity] = session
-            log.info("session %d begins (%s)", session.session_id, hello.client)
+            log.info("session %d begins (%r)", session.session_id, hello.client)
         server = {
             "name": "ocufilter",
             "version": package_version(),

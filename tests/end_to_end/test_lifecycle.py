@@ -204,6 +204,18 @@ def test_an_endpoint_in_use_is_said(shared_service):
         )
 
 
+def test_an_ipc_path_that_is_taken_is_left_alone(start_service, tmp_path):
+    precious = tmp_path / "precious.txt"
+    precious.write_text("mine")
+    with pytest.raises(RuntimeError, match="is no socket"):
+        start_service(bind=f"ipc://{precious}")
+    assert precious.read_text() == "mine"
+    path = tmp_path / "ocufilter"
+    start_service(bind=f"ipc://{path}")
+    with pytest.raises(RuntimeError, match="another service"):
+        start_service(bind=f"ipc://{path}")
+
+
 def test_an_ipc_endpoint_serves_its_owner_only(start_service, raw_client, tmp_path):
     path = tmp_path / "ocufilter"
     service = start_service(bind=f"ipc://{path}")
