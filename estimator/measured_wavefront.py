@@ -64,9 +64,14 @@ def request_notes(
             f"({-refraction_dpt:.3g} dpt): the eye stays relaxed"
         )
     elif asked_dpt > amplitude_dpt + 1e-9:
+        near_dpt = amplitude_dpt - refraction_dpt
+        reached = (
+            f"is nearer than the near point ({near_dpt:.3g} dpt)"
+            if near_dpt >= 0.0
+            else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
+        )
         notes.append(
-            f"focus {focus_dpt:g} dpt is nearer than the near point "
-            f"({amplitude_dpt - refraction_dpt:.3g} dpt): "
+            f"focus {focus_dpt:g} dpt {reached}: "
             f"accommodation stops at {amplitude_dpt:.3g} dpt"
         )
     return tuple(notes)

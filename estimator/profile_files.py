@@ -55,7 +55,11 @@ def profile_body(
         raise ProfileError("profile", f"'{source}' is not known", allowed)
     if not path.is_file():
         raise ProfileError("profile", f"file '{source}' does not exist", allowed)
-    body = reader(path.read_text(encoding="utf-8-sig"), path.name)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ProfileError(path.name, "is not a text file", "UTF-8 text") from None
+    body = reader(text, path.name)
     if reader is _read_csv:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
         body.update({k: v for k, v in given.items() if v is not None})
@@ -64,9 +68,23 @@ def profile_body(
 
 def _read_json(text: str, name: str) -> dict:
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_without_repeats)
     except json.JSONDecodeError as error:
         raise ProfileError(name, f"not JSON ({error})", "one JSON object") from None
+
+
+def _without_repeats(pairs: list[tuple[str, object]]) -> dict:
+    body: dict = {}
+    for key, value in pairs:
+        _set_once(body, key, value, where=key)
+    return body
+
+
+def _set_once(body: dict, key: str, value: object, *, where: str) -> None:
+    """Set a field that must not be there yet: of two values neither can be trusted."""
+    if key in body:
+        raise ProfileError(where, f"'{key}' is given twice", "each field once")
+    body[key] = value
 
 
 def _value(text: str, where: str) -> float:
@@ -88,10 +106,10 @@ def _read_abp(text: str, name: str) -> dict:
         content = line.split("#", 1)[0].strip()
         where = f"{name}, line {number}"
         if setting := _ABP_SETTING.fullmatch(content):
-            body[keys[setting[1]]] = _value(setting[2], where)
+            _set_once(body, keys[setting[1]], _value(setting[2], where), where=where)
         elif term := _ABP_TERM.fullmatch(content):
             key = f"{int(term[1])},{int(term[2])}"
-            body["zernike_um"][key] = _value(term[3], where)
+            _set_once(body["zernike_um"], key, _value(term[3], where), where=where)
         elif content:
             allowed = "'Ap = mm', 'Wa = nm', 'Z[n, m] = um' or a # comment"
             raise ProfileError(where, f"cannot read '{content}'", allowed)
@@ -103,12 +121,13 @@ def _read_csv(text: str, name: str) -> dict:
     for number, line in enumerate(text.splitlines(), start=1):
         content, where = line.strip(), f"{name}, line {number}"
         if setting := _CSV_SETTING.fullmatch(content):
-            body[setting[1]] = _value(setting[2], where)
+            _set_once(body, setting[1], _value(setting[2], where), where=where)
         elif content and not content.startswith("#"):
             parts = [part.strip() for part in content.split(",")]
             if parts == ["n", "m", "um"]:
                 continue
             if len(parts) != 3 or not all(p.lstrip("-").isdigit() for p in parts[:2]):
                 raise ProfileError(where, f"cannot read '{content}'", "n,m,um")
-            body["zernike_um"][f"{parts[0]},{parts[1]}"] = _value(parts[2], where)
+            key = f"{int(parts[0])},{int(parts[1])}"
+            _set_once(body["zernike_um"], key, _value(parts[2], where), where=where)
     return body

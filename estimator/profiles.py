@@ -179,6 +179,9 @@ def _common(data: Mapping) -> dict:
 
 
 def _prescription(data: Mapping, *, path: str = "") -> rx.Prescription:
+    if data.get("cylinder_dpt") and "axis_deg" not in data:
+        allowed = "a number from 0 to 180"
+        raise ProfileError(f"{path}axis_deg", "is missing beside a cylinder", allowed)
     return rx.Prescription(
         sphere_dpt=fields.number(data, "sphere_dpt", -30.0, 30.0, path=path),
         cylinder_dpt=fields.number(
@@ -333,6 +336,10 @@ def _coefficients(data: Mapping, *, path: str = "") -> NDArray[np.float64]:
 def _term_index(key: str, allowed: str, *, path: str) -> int:
     try:
         n, m = (int(part) for part in key.split(","))
+    except ValueError:
+        problem = "is not of the form 'n,m'"
+        raise ProfileError(f"{path}zernike_um.{key}", problem, allowed) from None
+    try:
         j = index_from_nm(n, m)
     except ValueError as error:
         raise ProfileError(f"{path}zernike_um.{key}", str(error), allowed) from None

@@ -44,6 +44,36 @@ def test_bad_field_is_named_with_its_range(change, field):
     assert caught.value.allowed in str(caught.value)
 
 
+def test_a_cylinder_needs_its_axis():
+    body = {"kind": "prescription", "sphere_dpt": -6, "cylinder_dpt": -1}
+    with pytest.raises(ProfileError) as caught:
+        parse_profile(body)
+    assert caught.value.field == "axis_deg"
+    assert parse_profile({**body, "cylinder_dpt": 0}).kind == "prescription"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("eye.json", '{"kind": "preset", "name": "myopia", "name": "cataract"}'),
+        ("eye.abp", "Ap = 5\nWa = 500\nZ[2,0] = 1\nZ[2, 0] = 2\n"),
+        ("eye.csv", "# pupil_diameter_mm: 5\n# wavelength_nm: 500\n2,0,1\n2,0,3\n"),
+    ],
+)
+def test_a_field_given_twice_is_refused(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(ProfileError, match="twice"):
+        load_profile(path)
+
+
+def test_a_binary_file_is_refused_by_name(tmp_path):
+    path = tmp_path / "eye.abp"
+    path.write_bytes(b"\x80\x81\x82")
+    with pytest.raises(ProfileError, match=r"eye\.abp"):
+        load_profile(path)
+
+
 @pytest.mark.parametrize("body", [None, [], "myopia", {1: 2}, {}])
 def test_a_profile_that_is_no_object_is_refused(body):
     with pytest.raises(ProfileError):
