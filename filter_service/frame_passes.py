@@ -46,6 +46,8 @@ class FramePasses:
         The strip, with depth filled in.
     scan_start_px, scan_total_px : int
         Where the strip starts within the whole frame's scan, for the paper's order.
+    white_level : float
+        Light against which the contrast of a merged quad counts.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class FramePasses:
         merge: bool,
         scan_start_px: int = 0,
         scan_total_px: int | None = None,
+        white_level: float = 1.0,
     ):
         self.gpu = gpu
         self.view = view
@@ -70,6 +73,7 @@ class FramePasses:
         self.tile_count = self.grid[0] * self.grid[1]
         self.buffers: dict[str, Buffer] = {}
         self.scan = (scan_start_px, scan_total_px or self.pixel_count)
+        self.white_level = white_level
         self.entry_count = 0
 
     def _reserve(self, **n_bytes: int) -> None:
@@ -147,6 +151,7 @@ class FramePasses:
                 **common,
                 blur_px_per_dpt=layers.blur_px_per_dpt,
                 merge_enabled=int(self.merge),
+                white_level=self.white_level,
                 paper_order=int(self.paper_rule),
                 scan_px=self.scan,
             )

@@ -140,6 +140,7 @@ class FilterRenderer:
                 merge=merge,
                 scan_start_px=strip.first_row * view.width_px,
                 scan_total_px=view.width_px * view.height_px,
+                white_level=_white_level(color),
             )
             passes.run(layers)
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
@@ -189,6 +190,17 @@ class FilterRenderer:
                 blend_layers(self._gpu, self._layers, handle.kernels)
                 self._layers_of, self._layers_state = handle, state
         return self._layers
+
+
+def _white_level(color: NDArray) -> float:
+    """Light against which a merged quad's contrast counts.
+
+    1 for 8-bit input; brighter for scenes in absolute or HDR units, whose mean is
+    taken as a quarter of white.
+    """
+    if color.dtype == np.uint8:
+        return 1.0
+    return max(1.0, 4.0 * float(color.mean()))
 
 
 @dataclass(frozen=True)

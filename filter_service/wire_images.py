@@ -22,7 +22,7 @@ from filter_service.wire_checks import (
 Part = bytes | bytearray | memoryview
 
 MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
-MAX_PUPIL_MM = 12.0
+MAX_PUPIL_MM = 9.0
 MAX_PREPARED_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
 MAX_IMAGE_SIDE_PX = 16384

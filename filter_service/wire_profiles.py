@@ -76,7 +76,7 @@ class ProfileSettings:
         age_years = take_float(
             source,
             "age_years",
-            low=0,
+            low=3,
             high=120,
             path="settings.age_years",
             default=None,

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from filter_service.frame import View
     from filter_service.one_image import FilteredImage
 
-PUPIL_LIMITS_MM = (1.0, 9.0)
-FOCUS_LIMITS_DPT = (0.0, 12.0)
+PUPIL_LIMITS_MM = (0.5, 9.0)
+FOCUS_LIMITS_DPT = (0.0, 20.0)
 FOV_LIMITS_DEG = (1.0, 150.0)
 
 

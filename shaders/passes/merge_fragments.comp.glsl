@@ -21,6 +21,7 @@ layout(std430, binding = BINDING_BLOCKS) writeonly buffer Blocks { uvec4 blocks[
 uniform ivec2 frame_size_px;
 uniform int layer_count;
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
+uniform float white_level;
 uniform int merge_enabled;
 uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
 uniform int paper_order;          // sort as the paper does: metres plus scan position
@@ -61,7 +62,7 @@ bool quad_is_similar(ivec2 corner) {
     vec3 contrast = high.rgb - low.rgb;
     float largest = max(contrast.r, max(contrast.g, contrast.b));
     return spread >= MERGE_MIN_SPREAD_PX
-        && largest <= MERGE_CONTRAST * pow(spread, MERGE_CONTRAST_POWER)
+        && largest <= white_level * MERGE_CONTRAST * pow(spread, MERGE_CONTRAST_POWER)
         && (high.a - low.a) * blur_px_per_dpt <= MERGE_MAX_BLUR_STEP_PX;
 }
 

@@ -112,6 +112,15 @@ def test_merging_keeps_every_pixel_once(bench, view):
     assert np.all(covered == 1)
 
 
+def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
+    image, depth_m = texture(rng, 101, 150), depth_scene()
+    merged = [
+        bench.render(bench.view(image * np.float32(unit), depth_m)).merged_count
+        for unit in (10.0, 1000.0)
+    ]
+    assert merged[0] == merged[1] > 0
+
+
 def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
     bench.render(view)
     alive, x, y, reach, _ = fragments(bench)

@@ -1,4 +1,4 @@
-"""The ray-traced eye behind the PSF cache, against direct traces and the measurement."""
+"""The ray-traced eye behind the PSF cache, against direct traces and measurements."""
 
 import numpy as np
 import pytest
