@@ -65,8 +65,8 @@ class RendererDouble:
         pitch = (1000 * (right - left) / width_px, 1000 * (up - down) / height_px)
         if not is_same_pitch(pitch, handle.pixel_pitch_mrad):
             raise CameraMismatch(f"pitch {pitch}", field="tangents")
-        if pupil_diameter_mm == 11.0:
-            raise ArithmeticError("the double breaks at 11 mm")
+        if pupil_diameter_mm == 8.75:
+            raise ArithmeticError("the double breaks at 8.75 mm")
         start_s = time.perf_counter()
         time.sleep(self.filter_ms / 1000)
         if output == "srgb8":
