@@ -90,7 +90,7 @@ def test_the_caller_may_reuse_its_arrays_at_once(client):
 def test_a_frame_that_cannot_be_filtered_is_an_error_and_the_next_one_works(client):
     view = make_view()
     client.set_profile(double(7), views=[view])
-    with pytest.raises(errors.RenderFailed, match="breaks at 8.75 mm"):
+    with pytest.raises(errors.RenderFailed, match=r"breaks at 8\.75 mm"):
         client.filter(view, pupil_diameter_mm=8.75, focus_dpt=0.0)
     assert client.filter(view, **SEE).color[0, 0, 0] == 7
 
