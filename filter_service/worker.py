@@ -67,13 +67,14 @@ def _build_one(
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
-    next_s = 0.0
+    next_s, last_stage = 0.0, None
 
     def progress(fraction: float, stage: str) -> None:
-        nonlocal next_s
+        nonlocal next_s, last_stage
         now_s = time.monotonic()
-        if now_s >= next_s:
-            next_s = now_s + PROGRESS_INTERVAL_S
+        # The first word of a stage is never held back: a short one has no second.
+        if now_s >= next_s or stage != last_stage:
+            next_s, last_stage = now_s + PROGRESS_INTERVAL_S, stage
             pipe.send(("progress", ticket, min(max(float(fraction), 0.0), 1.0), stage))
 
     return progress
