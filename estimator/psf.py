@@ -5,98 +5,112 @@ PSF store.  `psf_reference.py` is the slow float64 truth beside it.
 """
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.psf_arguments import (
+    checked_choice,
+    checked_ellipse,
+    checked_positive,
+    checked_scale,
+    checked_zernike_um,
+)
+from estimator.psf_enz import RELEASED_DEGREE, EnzOutsideDomain, enz_kernels
 from estimator.psf_fourier import FourierAccuracy, fourier_kernels
-from estimator.psf_geometric import AIRY_RADIUS_PX, geometric_kernels
+from estimator.psf_geometric import geometric_kernels
+from estimator.psf_pupil import pupil_frames
 from estimator.psf_survey import (
     PupilSurvey,
     edge_light_outside,
     needed_radius_px,
     survey_pupils,
 )
-from estimator.psf_types import Psf, PsfTooLarge, disc_mask
-from estimator.zernike import N_TERMS, wavefront_polynomial
+from estimator.psf_switch import geometric_shares
+from estimator.psf_types import (
+    KernelBuffer,
+    Psf,
+    PsfTooLarge,
+    disc_mask,
+    empty_buffer,
+)
+from estimator.stiles_crawford import StilesCrawford
+from estimator.zernike import wavefront_polynomial
 
-__all__ = ["ACCURACY", "Psf", "PsfTooLarge", "choose_method", "compute_psfs"]
+__all__ = [
+    "ACCURACY",
+    "EnzOutsideDomain",
+    "Psf",
+    "PsfBatch",
+    "PsfTooLarge",
+    "compute_psf_batch",
+    "compute_psfs",
+    "disc_mask",
+]
 
-METHODS = ("auto", "fourier", "geometric")
+METHODS = ("auto", "fourier", "geometric", "enz", "enz_unchecked")
 
 ACCURACY = {
     "normal": FourierAccuracy(
-        oversampling=1.0, min_samples_per_px=10, margin=8.0, filter_half_width=4
+        oversampling=1.0, min_samples_per_px=7, margin=8.0, filter_half_width=4
     ),
     "fine": FourierAccuracy(
         oversampling=2.0, min_samples_per_px=8, margin=16.0, filter_half_width=8
     ),
 }
 
-GEOMETRIC_FROM_WAVE_NUMBER = 192.0
-"""n = 2 g D / lambda from which ray optics filters images to >= 50 dB of the truth."""
-
 MIN_ENERGY_RATIO = 0.999
 
+EDGE_LIGHT_TRUSTED = 0.03
+"""Share up to which the edge-light formula is nearer the truth than a kernel's sum."""
 
-def choose_method(
-    wave_number: ArrayLike, *, diffraction: bool = True
-) -> NDArray[np.str_]:
-    """Engine that holds for each PSF: wave optics for small blur, rays for large.
 
-    Parameters
+@dataclass(frozen=True)
+class PsfBatch:
+    """P point-spread functions, one kernel behind the other; items are `Psf`.
+
+    Attributes
     ----------
-    wave_number : (P,)
-        n = 2 g D / lambda, g half the larger slope extent of the pupil, rad.
-    diffraction : bool
-        False means ray optics whatever the blur.
-
-    Returns
-    -------
-    method : (P,) of "fourier" or "geometric"
+    flat_kernels : (total,) float32
+        PSF p fills (2R+1)² elements from ``offset_count[p]``, rows first.
+    offset_count, radius_px : (P,) int64
+    lost_energy_ratio, blur_radius_px : (P,)
+    geometric_ratio : (P,)
+        Share of ray optics: 0 is ``wave_method``, 1 "geometric".
+    wave_method : str
+        "fourier", "enz" or "enz_unchecked".
     """
-    is_geometric = np.asarray(wave_number) >= GEOMETRIC_FROM_WAVE_NUMBER
-    if not diffraction:
-        is_geometric = np.ones_like(is_geometric)
-    return np.where(is_geometric, "geometric", "fourier")
 
+    flat_kernels: NDArray[np.float32]
+    offset_count: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    lost_energy_ratio: NDArray[np.float64]
+    blur_radius_px: NDArray[np.float64]
+    geometric_ratio: NDArray[np.float64]
+    wave_method: str
 
-def _checked_pitch(pixel_pitch_mrad: ArrayLike) -> tuple[float, float]:
-    pitch = np.broadcast_to(np.asarray(pixel_pitch_mrad, dtype=np.float64), (2,))
-    if not (np.all(np.isfinite(pitch)) and np.all(pitch > 0)):
-        raise ValueError(f"pixel_pitch_mrad {pixel_pitch_mrad}: must be positive")
-    return float(pitch[0]), float(pitch[1])
+    def __len__(self) -> int:
+        return self.radius_px.size
 
-
-def _checked_positive(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, count)):
-        raise ValueError(
-            f"{name} has shape {array.shape}: must be scalar or ({count},)"
+    def __getitem__(self, index: int) -> Psf:
+        radius = int(self.radius_px[index])
+        start, side = int(self.offset_count[index]), 2 * radius + 1
+        words = {0.0: self.wave_method, 1.0: "geometric"}
+        share = float(self.geometric_ratio[index])
+        return Psf(
+            kernel=self.flat_kernels[start : start + side * side].reshape(side, side),
+            radius_px=radius,
+            lost_energy_ratio=float(self.lost_energy_ratio[index]),
+            method=words.get(share, f"{self.wave_method}+geometric"),
+            blur_radius_px=float(self.blur_radius_px[index]),
         )
-    if not (np.all(np.isfinite(array)) and np.all(array > 0)):
-        raise ValueError(f"{name} {values}: must be positive and finite")
-    return np.ascontiguousarray(np.broadcast_to(array, (count,)))
-
-
-def _checked_zernike(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    array = np.asarray(zernike_um, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != N_TERMS:
-        raise ValueError(f"zernike_um has shape {array.shape}: must be (P, {N_TERMS})")
-    if not np.all(np.isfinite(array)):
-        raise ValueError("zernike_um holds NaN or infinite coefficients")
-    return array
-
-
-def _checked_choice(name: str, value: str, allowed) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} {value!r}: must be one of {', '.join(allowed)}")
 
 
 def _choose_radii(
     survey: PupilSurvey,
     *,
-    pixel_pitch_mrad: tuple[float, float],
     radius_px: int | None,
     diffraction: bool,
     max_radius_px: int,
@@ -107,11 +121,7 @@ def _choose_radii(
             raise ValueError(f"radius_px {radius_px}: must be 0 or more")
         radii = np.full(survey.blur_radius_px.shape, radius_px, np.int64)
     elif diffraction:
-        radii = needed_radius_px(
-            survey,
-            pixel_pitch_mrad=pixel_pitch_mrad,
-            lost_energy_ratio=1.0 - min_energy_ratio,
-        )
+        radii = needed_radius_px(survey, lost_energy_ratio=1.0 - min_energy_ratio)
     else:
         blur = survey.blur_radius_px
         # Half a pixel's diagonal keeps the corners of the last pixels in the disc.
@@ -124,79 +134,54 @@ def _choose_radii(
     return radii
 
 
-def _airy_kernels(survey, members, pixel_pitch_mrad, workers):
-    """Pixel-integrated Airy pattern of every pupil and wavelength in use."""
-    keys = sorted(
-        set(
-            zip(
-                survey.pupil_diameter_mm[members].tolist(),
-                survey.wavelength_nm[members].tolist(),
-                strict=True,
-            )
-        )
-    )
-    if not keys:
-        return {}
-    perfect = survey_pupils(
-        np.zeros((len(keys), N_TERMS)),
-        pupil_diameter_mm=np.array([k[0] for k in keys]),
-        wavelength_nm=np.array([k[1] for k in keys]),
-        pixel_pitch_mrad=pixel_pitch_mrad,
-    )
-    kernels = fourier_kernels(
-        perfect,
-        np.arange(len(keys)),
-        radius_px=np.full(len(keys), AIRY_RADIUS_PX),
-        pixel_pitch_mrad=pixel_pitch_mrad,
-        accuracy=ACCURACY["fine"],
-        workers=workers,
-    )
-    return dict(zip(keys, kernels, strict=True))
-
-
-EDGE_LIGHT_TRUSTED = 0.03
-"""Share up to which the edge-light formula is nearer the truth than a kernel's sum."""
-
-
-def _finish(kernel, radius_px, method, blur_radius_px, outside_ratio) -> Psf:
-    """Cut to the disc and bring to unit sum.
+def _batch(
+    survey: PupilSurvey, output: KernelBuffer, diffraction: bool, method: str
+) -> PsfBatch:
+    """Refuse dark kernels, and say what each lost.
 
     The light outside is known in closed form while it is little; a kernel's own sum
     carries the method's energy error of a few 1e-3.
     """
-    kernel = kernel * disc_mask(radius_px)
-    total = float(kernel.sum(dtype=np.float64))
-    if not total > 0:
+    dark = np.flatnonzero(~(output.total_ratio > 0.0))
+    if dark.size:
+        p = int(dark[0])
         raise ValueError(
-            f"a PSF has no light within {radius_px} px of the chief ray; "
-            f"its blur radius is {blur_radius_px:.1f} px"
+            f"PSF {p} has no light within {output.radius_px[p]} px of the chief ray; "
+            f"its blur radius is {survey.blur_radius_px[p]:.1f} px"
         )
-    kernel *= np.float32(1.0 / total)
-    return Psf(
-        kernel=kernel,
-        radius_px=radius_px,
-        lost_energy_ratio=(
-            outside_ratio if outside_ratio < EDGE_LIGHT_TRUSTED else 1.0 - total
-        ),
-        method=method,
-        blur_radius_px=blur_radius_px,
+    lost = 1.0 - output.total_ratio
+    if diffraction:
+        outside = edge_light_outside(survey, radius_px=output.radius_px)
+        lost = np.where(outside < EDGE_LIGHT_TRUSTED, outside, lost)
+    return PsfBatch(
+        flat_kernels=output.flat_kernels,
+        offset_count=output.offset_count,
+        radius_px=output.radius_px,
+        lost_energy_ratio=lost,
+        blur_radius_px=survey.blur_radius_px,
+        geometric_ratio=output.geometric_ratio,
+        wave_method=method if method.startswith("enz") else "fourier",
     )
 
 
-def compute_psfs(
+def compute_psf_batch(
     zernike_um: ArrayLike,
     *,
     pupil_diameter_mm: ArrayLike,
     wavelength_nm: ArrayLike,
-    pixel_pitch_mrad: ArrayLike,
+    pixel_pitch_mrad: ArrayLike | None = None,
+    pixel_from_mrad: ArrayLike | None = None,
+    pupil_ellipse: ArrayLike | None = None,
+    stiles_crawford: StilesCrawford | None = None,
     radius_px: int | None = None,
     method: str = "auto",
     accuracy: str = "normal",
+    enz_degree: int = RELEASED_DEGREE,
     diffraction: bool = True,
     max_radius_px: int = 255,
     min_energy_ratio: float = MIN_ENERGY_RATIO,
     workers: int | None = None,
-) -> list[Psf]:
+) -> PsfBatch:
     """Point-spread functions of many wavefronts, integrated over pixels.
 
     Parameters
@@ -205,14 +190,29 @@ def compute_psfs(
         Wavefronts on circles of half the pupil diameter; tilt moves the kernel,
         piston does nothing.
     pupil_diameter_mm, wavelength_nm : (P,) or scalar
+        Diameter of the circle the coefficients are on: the pupil, where no ellipse is
+        given.
     pixel_pitch_mrad : (x, y) or scalar
-        Visual angle of a pixel.
+        Visual angle of a pixel; or, instead,
+    pixel_from_mrad : (P, 2, 2) or (2, 2)
+        Jacobian of the image at each PSF's place: visual angle (x right, y up, in the
+        pupil axes of the field) to pixels (x right, y up), see `pinhole.py`.
+    pupil_ellipse : (P, 5) or (5,), optional
+        Pupil on the circle: centre x, centre y, semi-major and semi-minor axis in mm,
+        angle of the major axis in rad from x.  Only it passes light; the circle where
+        it is None.
+    stiles_crawford : StilesCrawford, optional
+        Directional sensitivity of the cones; none where it is None.
     radius_px : int, optional
         Kernel radius of all PSFs; chosen for each where it is None.
-    method : "auto", "fourier" or "geometric"
-        "auto" asks `choose_method`.
+    method : "auto", "fourier", "geometric", "enz" or "enz_unchecked"
+        "auto" asks `psf_switch.geometric_shares`; "enz" refuses what its series does
+        not hold, and "enz_unchecked" does not: only for tables that show where it
+        breaks.
     accuracy : "normal" or "fine"
         Wave method: relative L2 error of at most 3e-2 or 1e-2.
+    enz_degree : int
+        Largest Zernike degree of "enz"; the default is the paper's.
     diffraction : bool
         False: ray optics only, and a perfect eye gives exactly one pixel.
     max_radius_px : int
@@ -224,12 +224,14 @@ def compute_psfs(
 
     Returns
     -------
-    psfs : list of P Psf
+    PsfBatch
 
     Raises
     ------
     PsfTooLarge
         A PSF needs more than ``max_radius_px``.
+    EnzOutsideDomain
+        The ENZ series of this degree does not hold a wavefront.
     ValueError
         Wrong shapes, values out of range, or no light inside a given radius.
 
@@ -238,63 +240,58 @@ def compute_psfs(
     Pupil point u (mm, x to the person's right, y up) sends light to theta = grad W
     (mrad): PSF(theta) = |int exp(2 pi i (W - theta.u) / lambda) du|².
     """
-    zernike_um = _checked_zernike(zernike_um)
+    zernike_um = checked_zernike_um(zernike_um)
     count = zernike_um.shape[0]
-    _checked_choice("method", method, METHODS)
-    _checked_choice("accuracy", accuracy, ACCURACY)
+    checked_choice("method", method, METHODS)
+    checked_choice("accuracy", accuracy, ACCURACY)
     if not 0.0 < min_energy_ratio < 1.0:
         raise ValueError(f"min_energy_ratio {min_energy_ratio}: must be in (0, 1)")
-    if method == "fourier" and not diffraction:
-        raise ValueError("method 'fourier' includes diffraction: use 'geometric'")
-    pitch = _checked_pitch(pixel_pitch_mrad)
+    if method != "auto" and method != "geometric" and not diffraction:
+        raise ValueError(f"method {method!r} includes diffraction: use 'geometric'")
+    circle_mm = checked_positive("pupil_diameter_mm", pupil_diameter_mm, count) / 2.0
+    wavelength_nm = checked_positive("wavelength_nm", wavelength_nm, count)
     survey = survey_pupils(
-        wavefront_polynomial(zernike_um),
-        pupil_diameter_mm=_checked_positive(
-            "pupil_diameter_mm", pupil_diameter_mm, count
-        ),
-        wavelength_nm=_checked_positive("wavelength_nm", wavelength_nm, count),
-        pixel_pitch_mrad=pitch,
+        pupil_frames(
+            wavefront_polynomial(zernike_um),
+            circle_radius_mm=circle_mm,
+            wavelength_nm=wavelength_nm,
+            pixel_from_mrad=checked_scale(pixel_pitch_mrad, pixel_from_mrad, count),
+            pupil_ellipse=checked_ellipse(pupil_ellipse, circle_mm),
+            apodisation=(
+                stiles_crawford.amplitude(wavelength_nm) if stiles_crawford else None
+            ),
+        )
     )
     radii = _choose_radii(
         survey,
-        pixel_pitch_mrad=pitch,
         radius_px=radius_px,
         diffraction=diffraction,
         max_radius_px=max_radius_px,
         min_energy_ratio=min_energy_ratio,
     )
-    if method == "auto":
-        methods = choose_method(survey.wave_number, diffraction=diffraction)
+    if method == "auto" and diffraction:
+        shares = geometric_shares(survey)
     else:
-        methods = np.full(count, method)
-    workers = workers or len(os.sched_getaffinity(0))
-    kernels = _run_engines(
-        survey, methods, radii, pitch, ACCURACY[accuracy], diffraction, workers
-    )
-    if diffraction:
-        outside = edge_light_outside(survey, pixel_pitch_mrad=pitch, radius_px=radii)
-    else:
-        outside = np.full(count, np.inf)
-    return [
-        _finish(kernel, int(radius), str(name), float(blur), float(out))
-        for kernel, radius, name, blur, out in zip(
-            kernels, radii, methods, survey.blur_radius_px, outside, strict=True
-        )
-    ]
+        shares = np.full(count, 1.0 if method in ("auto", "geometric") else 0.0)
+    output = empty_buffer(radii, shares)
+    with ThreadPoolExecutor(workers or len(os.sched_getaffinity(0))) as pool:
+        common = {"output": output, "pool": pool}
+        if method.startswith("enz"):
+            enz_kernels(
+                survey,
+                np.arange(count),
+                degree=enz_degree,
+                is_checked=method == "enz",
+                accuracy=ACCURACY["fine"],
+                **common,
+            )
+        else:
+            wave, rays = np.flatnonzero(shares < 1.0), np.flatnonzero(shares > 0.0)
+            fourier_kernels(survey, wave, accuracy=ACCURACY[accuracy], **common)
+            geometric_kernels(survey, rays, diffraction=diffraction, **common)
+    return _batch(survey, output, diffraction, method)
 
 
-def _run_engines(survey, methods, radii, pitch, accuracy, diffraction, workers):
-    kernels: list[NDArray[np.float32] | None] = [None] * methods.size
-    wave = np.flatnonzero(methods == "fourier")
-    rays = np.flatnonzero(methods == "geometric")
-    common = {"radius_px": radii, "pixel_pitch_mrad": pitch, "workers": workers}
-    for p, kernel in zip(
-        wave, fourier_kernels(survey, wave, accuracy=accuracy, **common), strict=True
-    ):
-        kernels[p] = kernel
-    airy = _airy_kernels(survey, rays, pitch, workers) if diffraction else None
-    for p, kernel in zip(
-        rays, geometric_kernels(survey, rays, airy_kernels=airy, **common), strict=True
-    ):
-        kernels[p] = kernel
-    return kernels
+def compute_psfs(zernike_um: ArrayLike, **options) -> list[Psf]:
+    """Point-spread functions of many wavefronts, as a list; see `compute_psf_batch`."""
+    return list(compute_psf_batch(zernike_um, **options))

@@ -9,6 +9,9 @@ import math
 import numpy as np
 from numba import njit
 
+from estimator.psf_tail import add_tail
+from estimator.psf_types import finish_kernel
+
 
 def _even_polynomial(function) -> tuple[np.float32, ...]:
     """Polynomial in z = t², t in [-1/2, 1/2], through 7 Chebyshev nodes."""
@@ -22,6 +25,12 @@ def _even_polynomial(function) -> tuple[np.float32, ...]:
 _C = _even_polynomial(lambda t: np.cos(2.0 * np.pi * t))
 _S = _even_polynomial(lambda t: np.sin(2.0 * np.pi * t) / t)
 _HALF = np.float32(0.5)
+
+EDGE_HALF_WIDTH = 8
+"""Samples by which the smoothed pupil reaches beyond its edge."""
+
+EDGE_STEPS = 256
+"""Entries per sample of the tabulated edge."""
 
 
 # The loops below run over whole slices from 0: an index that numba can prove positive
@@ -49,44 +58,175 @@ def _fill_row(row, x, mask, cosine, sine, out_re_im):
 
 
 @njit(cache=True, nogil=True)
-def fill_pupils(turns, mask, x, y, field):
-    """Write mask * exp(2 pi i W) of every wavefront into the corner of its field.
+def _chord(y, r, shear, samples_x, middle):
+    """First and last column, as reals, of an ellipse scaled by r in the row at y."""
+    square = (r * r - y * y) * (1.0 - shear * shear)
+    if r <= 0.0 or square <= 0.0:
+        return 0.0, -1.0
+    half, centre = 0.5 * samples_x * math.sqrt(square), 0.5 * samples_x * shear * y
+    return middle + centre - half, middle + centre + half
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _edge_places(x, y, shear, half, places):
+    """Entries of the edge's table, as reals, for consecutive samples of a row.
+
+    From the distance to the edge in samples, taken by the slope of
+    q = (x² - 2 r x y + y²) / (1 - r²): exact for a circle, right to first order.
+    """
+    one, steps = np.float32(1.0), np.float32(EDGE_STEPS)
+    least, most = np.float32(0.0), np.float32(2 * EDGE_HALF_WIDTH * EDGE_STEPS)
+    inverse = np.float32(1.0 / (1.0 - shear * shear))
+    per_x, per_y = np.float32(1.0 / half[0]), np.float32(1.0 / half[1])
+    r, v = np.float32(shear), np.float32(y)
+    for i in range(places.shape[0]):
+        u = x[i]
+        across, along = (u - r * v) * inverse, (v - r * u) * inverse
+        radius = np.sqrt(u * across + v * along)
+        slope_x, slope_y = across * per_x, along * per_y
+        steep = np.sqrt(slope_x * slope_x + slope_y * slope_y)
+        depth = (one - radius) * radius / (steep + np.float32(1e-12))
+        place = (depth + np.float32(EDGE_HALF_WIDTH)) * steps
+        places[i] = min(max(place, least), most)
+
+
+@njit(cache=True, nogil=True)
+def _edge_row(first, end, x, y, shear, half, edge, places, row):
+    """Smoothed pupil near its edge, for the samples from first to end of a row."""
+    if end <= first:
+        return
+    _edge_places(x[first:end], y, shear, half, places[: end - first])
+    for i in range(first, end):
+        place = places[i - first]
+        k = min(int(place), edge.size - 2)
+        row[i] = edge[k] + (place - np.float32(k)) * (edge[k + 1] - edge[k])
+
+
+@njit(cache=True, nogil=True)
+def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
+    """Write the smoothed elliptical pupil of one frame and the spans of its rows.
 
     Parameters
     ----------
-    turns : (B, 7, 7) float64
-        Phase polynomial in turns, ``[b, i, j]`` multiplies y^i x^j.
+    samples : (2,)
+        Samples across the bounding box, not whole numbers.
+    shear : float
+    log_amplitude : (6,)
+    edge : (2 EDGE_HALF_WIDTH EDGE_STEPS + 1,) float32
+        Response of the low-pass to a step.
+    mask : (My, Mx) float32, written
+    spans : (My, 2) int64, written
+        First and end column of each row's light.
+    """
+    my, mx = mask.shape
+    ax, ay = 0.5 * samples[0], 0.5 * samples[1]
+    axes, places = (ax, ay), np.empty(mx, np.float32)
+    x = ((np.arange(mx) - (mx - 1) / 2.0) / ax).astype(np.float32)
+    mean, half = 0.5 * (ax * ax + ay * ay), 0.5 * (ax * ax - ay * ay)
+    least = math.sqrt(mean - math.hypot(half, shear * ax * ay))
+    border = (EDGE_HALF_WIDTH + 0.5) / least
+    middle = (mx - 1) / 2.0
+    is_apodised = False
+    for c in log_amplitude:
+        is_apodised = is_apodised or c != 0.0
+    for j in range(my):
+        y = (j - (my - 1) / 2.0) / ay
+        row = mask[j]
+        outer = _chord(y, 1.0 + border, shear, samples[0], middle)
+        inner = _chord(y, 1.0 - border, shear, samples[0], middle)
+        first, end = max(0, math.floor(outer[0])), min(mx, math.ceil(outer[1]) + 1)
+        if outer[1] < outer[0]:
+            first, end = 0, 0
+        in_first, in_end = math.ceil(inner[0]), math.floor(inner[1]) + 1
+        if in_end <= in_first:
+            in_first, in_end = end, end
+        spans[j, 0], spans[j, 1] = first, max(first, end)
+        _edge_row(first, in_first, x, y, shear, axes, edge, places, row)
+        row[in_first:in_end] = edge[-1]
+        _edge_row(in_end, end, x, y, shear, axes, edge, places, row)
+        if is_apodised:
+            c0, c1, c2, c3, c4, c5 = log_amplitude
+            for i in range(first, end):
+                exponent = c0 + x[i] * (c1 + c3 * x[i] + c4 * y) + y * (c2 + c5 * y)
+                row[i] *= np.float32(math.exp(exponent))
+
+
+@njit(cache=True, nogil=True)
+def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
+    """Write mask * exp(2 pi i W) into the corner of a field.
+
+    Parameters
+    ----------
+    turns : (7, 7) float64
+        Phase polynomial in turns, ``[i, j]`` multiplies y^i x^j.
     mask : (My, Mx) float32
-    x, y : (Mx,), (My,) float64, unit pupil
+    spans : (My, 2) int64
+    samples_x, samples_y : float
+    field : (>= My, N) complex64, zero on entry
+    """
+    my, mx = mask.shape
+    row = np.empty(7, np.float32)
+    cosine, sine = np.empty(mx, np.float32), np.empty(mx, np.float32)
+    x = np.empty(mx, np.float32)
+    for i in range(mx):
+        x[i] = (i - (mx - 1) / 2.0) * 2.0 / samples_x
+    for j in range(my):
+        first, end = spans[j, 0], spans[j, 1]
+        if first >= end:
+            continue
+        y = (j - (my - 1) / 2.0) * 2.0 / samples_y
+        for a in range(7):
+            value = 0.0
+            for power in range(6 - a, -1, -1):
+                value = value * y + turns[power, a]
+            # Whole turns go before the cast: float32 keeps 1e-6 of the rest.
+            row[a] = value - math.floor(value) if a == 0 else value
+        _fill_row(
+            row,
+            x[first:end],
+            mask[j, first:end],
+            cosine,
+            sine,
+            field[j, first:end].view(np.float32),
+        )
+
+
+@njit(cache=True, nogil=True)
+def fill_pupils(frames, power_x, power_y, grid, center_px, edge, field):
+    """Fill a batch of fields with their pupils, windows centred on whole samples.
+
+    Parameters
+    ----------
+    frames : (polynomial (B, 28) um, half (B, 2), shear (B,), log_amplitude (B, 6),
+        wavelength_um (B,))
+    power_x, power_y : (28,) int64
+    grid : (samples (B, 2), size (B, 2) int64)
+        Samples across the box, and columns and rows that hold light.
+    center_px : (B, 2)
+    edge : step response
     field : (B, My, N) complex64, zero on entry
     """
-    x32 = x.astype(np.float32)
-    row = np.empty(7, np.float32)
-    cosine, sine = np.empty(x.size, np.float32), np.empty(x.size, np.float32)
-    for iy in range(mask.shape[0]):
-        first = 0
-        last = mask.shape[1]
-        while first < last and mask[iy, first] == 0.0:
-            first += 1
-        while last > first and mask[iy, last - 1] == 0.0:
-            last -= 1
-        if first == last:
-            continue
-        for b in range(turns.shape[0]):
-            for a in range(7):
-                value = 0.0
-                for power in range(6 - a, -1, -1):
-                    value = value * y[iy] + turns[b, power, a]
-                # Whole turns go before the cast: float32 keeps 1e-6 of the rest.
-                row[a] = value - math.floor(value) if a == 0 else value
-            _fill_row(
-                row,
-                x32[first:last],
-                mask[iy, first:last],
-                cosine,
-                sine,
-                field[b, iy, first:last].view(np.float32),
-            )
+    polynomial, half, shear, log_amplitude, wavelength_um = frames
+    samples, size = grid
+    turns = np.zeros((7, 7))
+    mask = np.empty((size[:, 1].max(), size[:, 0].max()), np.float32)
+    spans = np.empty((mask.shape[0], 2), np.int64)
+    for b in range(polynomial.shape[0]):
+        columns, rows = size[b]
+        is_new = b == 0 or shear[b] != shear[b - 1]
+        is_new = is_new or samples[b, 0] != samples[b - 1, 0]
+        is_new = is_new or samples[b, 1] != samples[b - 1, 1]
+        for i in range(6):
+            is_new = is_new or log_amplitude[b, i] != log_amplitude[b - 1, i]
+        part = mask[:rows, :columns]
+        if is_new:
+            fill_mask(samples[b], shear[b], log_amplitude[b], edge, part, spans[:rows])
+        per_um = 1.0 / wavelength_um[b]
+        for j in range(polynomial.shape[1]):
+            turns[power_y[j], power_x[j]] = polynomial[b, j] * per_um
+        turns[0, 1] -= half[b, 0] * center_px[b, 0] * per_um
+        turns[1, 0] -= half[b, 1] * center_px[b, 1] * per_um
+        fill_pupil(turns, part, spans[:rows], samples[b, 0], samples[b, 1], field[b])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -110,20 +250,20 @@ def _accumulate(weight, source, out):
         out[i] += weight * source[i]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def integrate_pixels(field, center, window, kx, ky, filter_x, filter_y, scale, kernel):
+@njit(cache=True, nogil=True)
+def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel):
     """Integrate |field|² over the pixels of a window and write them to the kernel.
 
     Parameters
     ----------
-    field : (N, N) complex64
+    field : (Ny, Nx) complex64
         Spectrum of the pupil, not shifted: sample j stands for center + j, or
         center + j - N beyond the middle.
     center : (2,) int64
         Window centre (x, y) in angular samples.
     window : (4,) int64
         Pixel offsets x0, x1, y0, y1 (y upward, ends included) to fill.
-    kx, ky : int
+    k : (2,) int64
         Samples per pixel.
     filter_x, filter_y : (2*reach+1,) float32
     scale : float
@@ -131,35 +271,78 @@ def integrate_pixels(field, center, window, kx, ky, filter_x, filter_y, scale, k
     kernel : (2R+1, 2R+1) float32
         Image orientation; only the window is written.
     """
-    n = field.shape[0]
-    half = n // 2
+    kx, ky = k
+    n_rows, n_columns = field.shape
+    half_x, half_y = n_columns // 2, n_rows // 2
     radius = kernel.shape[0] // 2
     reach_x, reach_y = filter_x.shape[0] // 2, filter_y.shape[0] // 2
-    x0, x1, y0, y1 = window[0], window[1], window[2], window[3]
+    x0, x1, y0, y1 = window
     n_x, n_y = x1 - x0 + 1, y1 - y0 + 1
     if n_x <= 0 or n_y <= 0:
         return
     pad = reach_x + kx
-    line = np.zeros(n + 2 * pad, np.float32)
-    start = x0 * kx - center[0] + half - reach_x + pad
-    sums = np.zeros((n_y, n_x), np.float32)
-    row = np.empty(n_x, np.float32)
-    first_row = max(0, y0 * ky - center[1] + half - reach_y)
-    last_row = min(n - 1, y1 * ky - center[1] + half + reach_y)
+    line = np.empty(n_columns, np.float32)
+    sums = np.zeros((n_y, n_columns + 2 * pad), np.float32)
+    first_row = max(0, y0 * ky - center[1] + half_y - reach_y)
+    last_row = min(n_rows - 1, y1 * ky - center[1] + half_y + reach_y)
+    # Rows first: each meets about two pixels, and whole rows add up vectorised.
     for j in range(first_row, last_row + 1):
-        parts = field[(j + half) % n].view(np.float32)
-        _intensity(parts[:n], line[pad + half : pad + n])
-        _intensity(parts[n:], line[pad : pad + half])
-        for q in range(n_x):
-            first = start + q * kx
-            row[q] = _dot(line[first : first + filter_x.shape[0]], filter_x)
-        # Row j meets the pixels whose filter covers it.
-        position = j - half + center[1]
+        parts = field[(j + half_y) % n_rows].view(np.float32)
+        _intensity(parts[:n_columns], line[half_x:])
+        _intensity(parts[n_columns:], line[:half_x])
+        position = j - half_y + center[1]
         q_low = max(y0, -((reach_y - position) // ky))
         q_high = min(y1, (position + reach_y) // ky)
         for q in range(q_low, q_high + 1):
             weight = filter_y[position - q * ky + reach_y]
-            _accumulate(weight, row, sums[q - y0])
+            _accumulate(weight, line, sums[q - y0, pad : pad + n_columns])
+    start = x0 * kx - center[0] + half_x - reach_x + pad
     for q in range(n_y):
         for i in range(n_x):
-            kernel[radius - (y0 + q), radius + x0 + i] = scale * sums[q, i]
+            first = start + i * kx
+            value = _dot(sums[q, first : first + filter_x.shape[0]], filter_x)
+            kernel[radius - (y0 + q), radius + x0 + i] = scale * value
+
+
+@njit(cache=True, nogil=True)
+def integrate_batch(field, grid, filters, tails, output):
+    """Turn a batch of spectra into kernels in the output buffer.
+
+    Parameters
+    ----------
+    field : (B, Ny, Nx) complex64
+    grid : (center (B, 2) int64, k (B, 2) int64, scale (B,))
+    filters : (table (n, longest) float32, length (n,) int64, which (B, 2) int64)
+    tails : (edge_slope_px (B, n, 2), half (B, 2), shear (B,), edge_um (B,))
+    output : (flat float32, offset (B,), radius_px (B,), share (B,), total (B,))
+        Kernels are added, brought to a sum of ``share``; ``total`` is written.
+    """
+    center, k, scale = grid
+    table, length, which = filters
+    edge, half, shear, edge_um = tails
+    flat, offset, radius_px, share, total = output
+    window = np.empty(4, np.int64)
+    for b in range(field.shape[0]):
+        radius = radius_px[b]
+        side = 2 * radius + 1
+        kernel = np.zeros((side, side), np.float32)
+        for axis in range(2):
+            inside = field.shape[2 - axis] / 2.0 - 1.0
+            low = math.ceil((center[b, axis] - inside) / k[b, axis] + 0.5)
+            high = math.floor((center[b, axis] + inside) / k[b, axis] - 0.5)
+            window[2 * axis] = max(low, -radius)
+            window[2 * axis + 1] = min(high, radius)
+        integrate_pixels(
+            field[b],
+            center[b],
+            window,
+            k[b],
+            table[which[b, 0], : length[which[b, 0]]],
+            table[which[b, 1], : length[which[b, 1]]],
+            scale[b],
+            kernel,
+        )
+        add_tail(kernel, window, 0.0, edge[b], half[b], shear[b], edge_um[b])
+        total[b] = finish_kernel(
+            kernel, share[b], flat[offset[b] : offset[b] + side * side]
+        )

@@ -7,22 +7,91 @@ inside every pixel.  Slow (milliseconds to minutes); tests and benchmarks only.
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.psf_arguments import checked_scale
+from estimator.stiles_crawford import StilesCrawford
 from estimator.zernike import EXPONENTS, wavefront_polynomial, zernike_gradient
 
 ROWS_AT_A_TIME = 1 << 24
 """Field values held at a time (256 MiB): rows of pixels are done in such parts."""
 
 
-def _slope_limit_mrad(zernike_um: NDArray, radius_mm: float) -> float:
-    """Largest slope over the pupil, from a dense polar grid."""
-    rho, angle = np.meshgrid(np.linspace(0, 1, 33), np.linspace(0, 2 * np.pi, 129))
-    gradient = zernike_gradient(rho * np.cos(angle), rho * np.sin(angle)) @ zernike_um
-    return float(np.hypot(gradient[..., 0], gradient[..., 1]).max()) / radius_mm
+@dataclass(frozen=True)
+class _Pupil:
+    """One elliptical pupil: u = centre + matrix w (mm) over the unit disc w.
+
+    ``matrix`` is turned so that J^-T matrix is upper triangular: the second pixel
+    coordinate then has one phase on each chord of constant w_y.
+    """
+
+    zernike_um: NDArray[np.float64]
+    circle_mm: float
+    wavelength_um: float
+    centre_mm: NDArray[np.float64]
+    matrix_mm: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    per_mm2: float
+    bright_mm: NDArray[np.float64]
+
+    def circle_point(self, x, y):
+        """Unit-disc points to points of the Zernike circle."""
+        u = self.centre_mm[0] + self.matrix_mm[0, 0] * x + self.matrix_mm[0, 1] * y
+        v = self.centre_mm[1] + self.matrix_mm[1, 0] * x + self.matrix_mm[1, 1] * y
+        return u / self.circle_mm, v / self.circle_mm
+
+    def amplitude(self, x, y):
+        """Apodisation at unit-disc points."""
+        u, v = self.circle_point(x, y)
+        u, v = u * self.circle_mm - self.bright_mm[0], v * self.circle_mm
+        return np.exp(-self.per_mm2 * (u**2 + (v - self.bright_mm[1]) ** 2))
+
+    def slope_limit(self) -> float:
+        """Largest |dW/dw| over the pupil, um, from a dense polar grid."""
+        rho, angle = np.meshgrid(np.linspace(0, 1, 33), np.linspace(0, 2 * np.pi, 129))
+        x, y = self.circle_point(rho * np.cos(angle), rho * np.sin(angle))
+        gradient = zernike_gradient(x, y) @ self.zernike_um
+        gradient = gradient / self.circle_mm @ self.matrix_mm
+        return float(np.hypot(gradient[..., 0], gradient[..., 1]).max())
+
+    @property
+    def image_matrix(self) -> NDArray[np.float64]:
+        """J^-T matrix: phase is p . (image_matrix w) for pixels p."""
+        return np.linalg.inv(self.jacobian).T @ self.matrix_mm
+
+
+def _pupil(
+    zernike_um, pupil_diameter_mm, wavelength_nm, jacobian, ellipse, apodisation
+):
+    circle_mm = pupil_diameter_mm / 2.0
+    if ellipse is None:
+        ellipse = (0.0, 0.0, circle_mm, circle_mm, 0.0)
+    cx, cy, major, minor, angle = (float(value) for value in ellipse)
+    turn = np.array(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    )
+    matrix = turn @ np.diag([major, minor])
+    image = np.linalg.inv(jacobian).T @ matrix
+    norm = math.hypot(*image[1])
+    # Turns the last row of `image` into (0, norm).
+    swing = np.array([[image[1, 1], image[1, 0]], [-image[1, 0], image[1, 1]]]) / norm
+    per_mm2, bright_mm = 0.0, np.zeros(2)
+    if apodisation is not None:
+        per_mm2, bright_mm = (np.asarray(part)[0] for part in apodisation)
+    return _Pupil(
+        zernike_um=np.asarray(zernike_um, dtype=np.float64),
+        circle_mm=circle_mm,
+        wavelength_um=wavelength_nm / 1000.0,
+        centre_mm=np.array([cx, cy]),
+        matrix_mm=matrix @ swing,
+        jacobian=np.asarray(jacobian, dtype=np.float64),
+        per_mm2=float(per_mm2),
+        bright_mm=bright_mm,
+    )
 
 
 def _node_count(bandwidth: float) -> int:
@@ -87,22 +156,50 @@ def _polynomial_values(coefficients, x, y):
     return total
 
 
-def _chords(theta_x_mrad, theta_y_mrad, *, pupil, zernike_um, refine):
+def _chords(pupil: _Pupil, x_px, y_px, refine):
     """Quadrature of the pupil that resolves all directions asked for.
 
-    Returns x, weight, phase (chords, nodes) and y (chords,) on the unit disc, and the
-    factor from theta to phase per unit of x.
+    Returns x, weight, phase (chords, nodes) and y (chords,): x and y multiply a
+    direction in pixels to a phase.
     """
-    pupil_diameter_mm, wavelength_nm = pupil
-    radius_mm = pupil_diameter_mm / 2.0
-    per_um = 2.0 * math.pi * 1000.0 / wavelength_nm
-    limit = _slope_limit_mrad(zernike_um, radius_mm) + math.hypot(
-        np.abs(theta_x_mrad).max(), np.abs(theta_y_mrad).max()
-    )
-    n_nodes = math.ceil(refine * _node_count(per_um * radius_mm * limit))
+    image = pupil.image_matrix
+    per_um = 2.0 * math.pi / pupil.wavelength_um
+    far = np.array([np.abs(x_px).max(), np.abs(y_px).max()])
+    limit = pupil.slope_limit() + float(np.hypot(*(np.abs(image).T @ far)))
+    n_nodes = math.ceil(refine * _node_count(per_um * limit))
     x, y, weight = _chord_nodes(math.ceil(1.15 * n_nodes), n_nodes)
-    wavefront = _polynomial_values(wavefront_polynomial(zernike_um), x, y[:, None])
-    return x, weight, per_um * wavefront, y, per_um * radius_mm
+    y_all = np.broadcast_to(y[:, None], x.shape)
+    wavefront = _polynomial_values(
+        wavefront_polynomial(pupil.zernike_um), *pupil.circle_point(x, y_all)
+    )
+    across = per_um * (image[0, 0] * x + image[0, 1] * y_all)
+    weight = weight * pupil.amplitude(x, y_all)
+    return across, weight, per_um * wavefront, per_um * image[1, 1] * y
+
+
+def _field(pupil: _Pupil, x_px, y_px, x_offset_px, refine, workers):
+    """Complex field (ny, no, nx) on a tensor grid of directions in pixels."""
+    x, weight, phase_rad, y = _chords(
+        pupil, x_px[[0, -1], None] + x_offset_px, y_px, refine
+    )
+    step = float(x_px[1] - x_px[0]) if x_px.size > 1 else 0.0
+    chords = np.empty((y.size, x_offset_px.size, x_px.size), np.complex128)
+
+    def integrate(part: slice) -> None:
+        _chord_integrals(
+            phase_rad[part],
+            weight[part],
+            np.ascontiguousarray(x[part]),
+            x_px[0],
+            step,
+            x_offset_px,
+            chords[part],
+        )
+
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        list(pool.map(integrate, [slice(i, i + 16) for i in range(0, y.size, 16)]))
+    field = np.exp(-1j * np.outer(y_px, y)) @ chords.reshape(y.size, -1)
+    return field.reshape(y_px.size, x_offset_px.size, x_px.size) / math.pi
 
 
 def reference_field(
@@ -112,7 +209,7 @@ def reference_field(
     wavelength_nm: float,
     theta_x_mrad: ArrayLike,
     theta_y_mrad: ArrayLike,
-    theta_x_offset_mrad: ArrayLike = (0.0,),
+    pupil_ellipse: ArrayLike | None = None,
     refine: float = 1.0,
     workers: int = 2,
 ) -> NDArray[np.complex128]:
@@ -123,8 +220,8 @@ def reference_field(
     zernike_um : (28,), um
     theta_x_mrad, theta_y_mrad : (nx,), (ny,)
         Directions, x right, y up; ``theta_x_mrad`` evenly spaced.
-    theta_x_offset_mrad : (no,)
-        Added to every ``theta_x_mrad``.
+    pupil_ellipse : (5,), optional
+        As in `psf.compute_psf_batch`.
     refine : float
         Factor on the number of nodes, for convergence tests.
     workers : int
@@ -132,37 +229,24 @@ def reference_field(
 
     Returns
     -------
-    field : (ny, no, nx) complex128
-        (1/pi) int_unit_disc exp(2 pi i / lambda (W - R u.theta)) d²u.
+    field : (ny, nx) complex128
+        Mean of exp(2 pi i / lambda (W - u.theta)) over the pupil.
     """
+    pupil = _pupil(
+        zernike_um, pupil_diameter_mm, wavelength_nm, np.eye(2), pupil_ellipse, None
+    )
     theta_x = np.asarray(theta_x_mrad, dtype=np.float64)
     theta_y = np.asarray(theta_y_mrad, dtype=np.float64)
-    offset = np.asarray(theta_x_offset_mrad, dtype=np.float64)
-    x, weight, phase_rad, y, scale = _chords(
-        theta_x[[0, -1], None] + offset,
-        theta_y,
-        pupil=(pupil_diameter_mm, wavelength_nm),
-        zernike_um=np.asarray(zernike_um, dtype=np.float64),
-        refine=refine,
-    )
-    step = float(theta_x[1] - theta_x[0]) if theta_x.size > 1 else 0.0
-    chords = np.empty((y.size, offset.size, theta_x.size), np.complex128)
+    return _field(pupil, theta_x, theta_y, np.zeros(1), refine, workers)[:, 0]
 
-    def integrate(part: slice) -> None:
-        _chord_integrals(
-            phase_rad[part],
-            weight[part],
-            x[part],
-            scale * theta_x[0],
-            scale * step,
-            scale * offset,
-            chords[part],
-        )
 
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        list(pool.map(integrate, [slice(i, i + 16) for i in range(0, y.size, 16)]))
-    field = np.exp(-1j * scale * np.outer(theta_y, y)) @ chords.reshape(y.size, -1)
-    return field.reshape(theta_y.size, offset.size, theta_x.size) / math.pi
+def _passed_light(pupil: _Pupil) -> float:
+    """Mean of the squared amplitude over the pupil."""
+    if pupil.per_mm2 == 0.0:
+        return 1.0
+    x, y, weight = _chord_nodes(64, 48)
+    y = np.broadcast_to(y[:, None], x.shape)
+    return float((weight * pupil.amplitude(x, y) ** 2).sum() / math.pi)
 
 
 def reference_kernel(
@@ -170,8 +254,11 @@ def reference_kernel(
     *,
     pupil_diameter_mm: float,
     wavelength_nm: float,
-    pixel_pitch_mrad: ArrayLike,
     radius_px: int,
+    pixel_pitch_mrad: ArrayLike | None = None,
+    pixel_from_mrad: ArrayLike | None = None,
+    pupil_ellipse: ArrayLike | None = None,
+    stiles_crawford: StilesCrawford | None = None,
     refine: float = 1.0,
     workers: int = 2,
 ) -> NDArray[np.float64]:
@@ -181,8 +268,9 @@ def reference_kernel(
     ----------
     zernike_um : (28,), um
         Wavefront on the circle of half the pupil diameter; tilt acts.
-    pixel_pitch_mrad : (x, y) or scalar
     radius_px : int
+    pixel_pitch_mrad, pixel_from_mrad, pupil_ellipse, stiles_crawford
+        As in `psf.compute_psf_batch`, for one PSF.
     refine : float
         Factor on all node counts, for convergence tests.
     workers : int
@@ -198,15 +286,28 @@ def reference_kernel(
     -----
     Checked against closed forms and an independent polar quadrature
     (tests/numerical/test_psf_reference.py): field to 1e-12, pixels to 1e-9 of the
-    brightest.  The intensity is band-limited to D/lambda, so Gauss-Legendre nodes
-    inside a pixel converge faster than exponentially.
+    brightest.  The intensity is band-limited to the pupil's width over lambda, so
+    Gauss-Legendre nodes inside a pixel converge faster than exponentially.
     """
-    pitch = np.broadcast_to(np.asarray(pixel_pitch_mrad, dtype=np.float64), (2,))
-    wavelength_um = wavelength_nm / 1000.0
-    pixels = np.arange(-radius_px, radius_px + 1)
-    # |E|² swings by at most 2 pi D / lambda per mrad; half a pixel is the unit of
-    # Gauss-Legendre's interval.
-    swing = math.pi * pupil_diameter_mm / wavelength_um * pitch
+    jacobian = checked_scale(pixel_pitch_mrad, pixel_from_mrad, 1)[0]
+    apodisation = (
+        stiles_crawford.amplitude(np.array([wavelength_nm], dtype=np.float64))
+        if stiles_crawford
+        else None
+    )
+    pupil = _pupil(
+        zernike_um,
+        pupil_diameter_mm,
+        wavelength_nm,
+        jacobian,
+        pupil_ellipse,
+        apodisation,
+    )
+    pixels = np.arange(-radius_px, radius_px + 1).astype(np.float64)
+    # |E|² swings by at most 4 pi a / lambda per pixel, a the pupil's half width; half
+    # a pixel is the unit of Gauss-Legendre's interval.
+    half_width_um = np.hypot(*pupil.image_matrix.T)
+    swing = 2.0 * math.pi * half_width_um / pupil.wavelength_um
     (node_x, weight_x), (node_y, weight_y) = (
         np.polynomial.legendre.leggauss(
             math.ceil(refine * (b / 2.0 + 2.0 * b ** (1.0 / 3.0) + 4.0))
@@ -217,20 +318,14 @@ def reference_kernel(
     rows = max(1, ROWS_AT_A_TIME // (node_y.size * pixels.size * node_x.size))
     for first in range(0, pixels.size, rows):
         part = slice(first, first + rows)
-        theta_y = (pixels[part, None] + node_y / 2.0) * pitch[1]
-        field = reference_field(
-            zernike_um,
-            pupil_diameter_mm=pupil_diameter_mm,
-            wavelength_nm=wavelength_nm,
-            theta_x_mrad=pixels * pitch[0],
-            theta_y_mrad=theta_y.ravel(),
-            theta_x_offset_mrad=node_x / 2.0 * pitch[0],
-            refine=refine,
-            workers=workers,
-        ).reshape(*theta_y.shape, node_x.size, pixels.size)
+        y_px = pixels[part, None] + node_y / 2.0
+        field = _field(
+            pupil, pixels, y_px.ravel(), node_x / 2.0, refine, workers
+        ).reshape(*y_px.shape, node_x.size, pixels.size)
         intensity = field.real**2 + field.imag**2
         kernel[part] = np.einsum(
             "g,h,pghq->pq", weight_y / 2.0, weight_x / 2.0, intensity, optimize=True
         )
-    density = math.pi * (pupil_diameter_mm / 2.0 / wavelength_um) ** 2
-    return kernel[::-1] * density * pitch[0] * pitch[1]
+    area = math.pi * abs(float(np.linalg.det(pupil.image_matrix)))
+    density = area / pupil.wavelength_um**2 / _passed_light(pupil)
+    return kernel[::-1] * density

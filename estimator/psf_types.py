@@ -1,9 +1,11 @@
 """What the PSF engines share: the result, the refusal, and the kernel's disc."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 
@@ -77,3 +79,65 @@ def disc_mask(radius_px: int) -> NDArray[np.bool_]:
     mask = offset[:, None] ** 2 + offset**2 <= (radius_px + 0.5) ** 2
     mask.setflags(write=False)
     return mask
+
+
+@dataclass(frozen=True)
+class KernelBuffer:
+    """Where the engines put the kernels of one call, one behind the other.
+
+    Attributes
+    ----------
+    flat_kernels : (total,) float32
+        All kernels; PSF p starts at ``offset_count[p]``.
+    offset_count, radius_px : (P,) int64
+    geometric_ratio : (P,)
+        Share of ray optics in a kernel; both engines add theirs.
+    total_ratio : (P,)
+        Light inside the disc, by the kernels' own sums.
+    """
+
+    flat_kernels: NDArray[np.float32]
+    offset_count: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    geometric_ratio: NDArray[np.float64]
+    total_ratio: NDArray[np.float64]
+
+
+def empty_buffer(
+    radius_px: NDArray[np.int64],
+    geometric_ratio: NDArray[np.float64],
+) -> KernelBuffer:
+    """Buffer of zeros for kernels of the given radii."""
+    counts = (2 * radius_px + 1) ** 2
+    ends = np.cumsum(counts)
+    return KernelBuffer(
+        flat_kernels=np.zeros(int(ends[-1]) if ends.size else 0, np.float32),
+        offset_count=ends - counts,
+        radius_px=radius_px,
+        geometric_ratio=geometric_ratio,
+        total_ratio=np.zeros(radius_px.size),
+    )
+
+
+@njit(cache=True, nogil=True)
+def finish_kernel(kernel, share, flat):
+    """Cut a kernel to its disc and add it at a sum of ``share``; its light in the disc.
+
+    Returns ``share`` times the light; adds nothing where there is none.
+    """
+    radius = kernel.shape[0] // 2
+    side = 2 * radius + 1
+    total = 0.0
+    for dy in range(-radius, radius + 1):
+        reach = math.floor(math.sqrt((radius + 0.5) ** 2 - dy * dy))
+        for dx in range(-reach, reach + 1):
+            total += kernel[dy + radius, dx + radius]
+    if not total > 0.0:
+        return 0.0
+    scale = np.float32(share / total)
+    for dy in range(-radius, radius + 1):
+        reach = math.floor(math.sqrt((radius + 0.5) ** 2 - dy * dy))
+        start = (dy + radius) * side + radius
+        for dx in range(-reach, reach + 1):
+            flat[start + dx] += scale * kernel[dy + radius, dx + radius]
+    return share * total

@@ -16,6 +16,7 @@ import time
 import numpy as np
 
 from estimator.psf import compute_psfs
+from estimator.psf_pupil import pupil_frames
 from estimator.psf_survey import survey_pupils
 from estimator.psf_types import disc_mask
 from estimator.zernike import wavefront_polynomial
@@ -53,12 +54,13 @@ METHODS = (
 
 
 def _survey(zernike_um, pupil_mm, wavelength_nm, pitch_mrad):
-    return survey_pupils(
+    frames = pupil_frames(
         wavefront_polynomial(zernike_um[None]),
-        pupil_diameter_mm=np.array([pupil_mm]),
+        circle_radius_mm=np.array([pupil_mm / 2.0]),
         wavelength_nm=np.array([wavelength_nm]),
-        pixel_pitch_mrad=(pitch_mrad, pitch_mrad),
+        pixel_from_mrad=np.eye(2)[None] / pitch_mrad,
     )
+    return survey_pupils(frames)
 
 
 def _batch(zernike_um, pupil_mm, count):

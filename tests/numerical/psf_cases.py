@@ -1,15 +1,18 @@
 """Shared by the PSF tests and `bench_psf.py`: wavefronts, a test image, error measures.
 
-No tests here.  The wavefronts and where they come from: tests/data/psf_cases.json.
+No tests here.  The wavefronts and where they come from: tests/data/psf_cases.json, and
+psf_field_cases.json for traced eyes over the visual field.
 """
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import scipy.fft
 from PIL import Image, ImageDraw, ImageFont
 
+from estimator.pinhole import pixel_from_mrad
 from estimator.psf_reference import reference_kernel
 from estimator.psf_types import disc_mask
 from estimator.zernike import index_from_nm, remove_central_tilt, rescale_pupil
@@ -18,6 +21,11 @@ CASES = json.loads(
     (Path(__file__).parents[1] / "data" / "psf_cases.json").read_text(encoding="utf-8")
 )
 CASE_NAMES = tuple(CASES["cases"])
+FIELD_CASES = json.loads(
+    (Path(__file__).parents[1] / "data" / "psf_field_cases.json").read_text("utf-8")
+)
+EYE_NAMES = tuple(FIELD_CASES["eyes"])
+ECCENTRICITIES_DEG = {(0, 0): 0, (16, 12): 20, (33, 24): 40}
 DENSITIES_MRAD = CASES["pixel_pitch_mrad"]
 PUPILS_MM = tuple(CASES["pupil_diameters_mm"])
 
@@ -41,6 +49,63 @@ def configurations() -> list[tuple[str, float, float]]:
     rows = [(name, d, 550.0) for name in CASE_NAMES for d in PUPILS_MM]
     rows += [(name, 5.0, w) for name in CASE_NAMES for w in (450.0, 650.0)]
     return rows + [(name, 2.0, 650.0) for name in CASE_NAMES]
+
+
+@dataclass(frozen=True)
+class FieldCase:
+    """One traced eye, direction, pupil and pixel size, as the PSF engines take it."""
+
+    eye: str
+    eccentricity_deg: int
+    pupil_diameter_mm: float
+    density: str
+    zernike_um: np.ndarray
+    options: dict
+
+    def __str__(self):
+        return (
+            f"{self.eye}-{self.eccentricity_deg}deg-{self.pupil_diameter_mm:g}mm-"
+            f"{self.density}"
+        )
+
+
+def field_case(eye, eccentricity_deg, pupil_diameter_mm, density) -> FieldCase:
+    """Look a case up; its Jacobian is that of a pinhole with this pixel at its axis."""
+    for row in FIELD_CASES["eyes"][eye]:
+        place = ECCENTRICITIES_DEG[row["h_deg"], row["v_deg"]]
+        if (place, row["pupil_diameter_mm"]) == (eccentricity_deg, pupil_diameter_mm):
+            break
+    else:
+        raise KeyError(eye, eccentricity_deg, pupil_diameter_mm)
+    side_px = 2000.0 / DENSITIES_MRAD[density]
+    jacobian = pixel_from_mrad(
+        row["h_deg"], row["v_deg"], tangents=(-1, 1, 1, -1), size_px=(side_px, side_px)
+    )
+    options = {
+        "pupil_diameter_mm": 2.0 * row["zernike_radius_mm"],
+        "wavelength_nm": FIELD_CASES["wavelength_nm"],
+        "pupil_ellipse": np.array(row["ellipse_mm"]),
+        "pixel_from_mrad": jacobian,
+    }
+    return FieldCase(
+        eye,
+        eccentricity_deg,
+        pupil_diameter_mm,
+        density,
+        np.array(row["zernike_um"]),
+        options,
+    )
+
+
+def field_cases() -> list[FieldCase]:
+    """Six eyes x 0, 20 and 40 degrees x pupils of 2 to 7 mm x three pixel sizes."""
+    return [
+        field_case(eye, degrees, pupil_mm, density)
+        for density in DENSITIES_MRAD
+        for eye in EYE_NAMES
+        for degrees in ECCENTRICITIES_DEG.values()
+        for pupil_mm in (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+    ]
 
 
 def compared_radius_px(blur_radius_px: float) -> int:

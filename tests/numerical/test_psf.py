@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from estimator.psf import (
-    GEOMETRIC_FROM_WAVE_NUMBER,
-    choose_method,
     compute_psfs,
 )
 from estimator.psf_reference import reference_kernel
@@ -343,9 +341,3 @@ def test_finer_grid_of_the_wave_method_has_smaller_error():
         )
         errors.append(kernel_errors(physical_kernel(psf, 8), reference)[0])
     assert errors[1] < 0.7 * errors[0]
-
-
-def test_auto_switches_at_the_documented_wave_number():
-    limit = GEOMETRIC_FROM_WAVE_NUMBER
-    assert choose_method([limit - 0.1, limit]).tolist() == ["fourier", "geometric"]
-    assert choose_method([1.0], diffraction=False).tolist() == ["geometric"]

@@ -13,6 +13,8 @@ KINDS = ("ratio", "index", "count", "fraction", "constant")
 
 DIMENSIONLESS = {
     "kernel": "shares of light, unit sum",
+    "flat_kernels": "shares of light, kernels one behind the other",
+    "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",
     "tangents": "of the angles to the image edges",
     "uv": "texture position, 0 to 1",

@@ -1,0 +1,418 @@
+"""PSFs by the extended Nijboer-Zernike (ENZ) series, where it holds.
+
+The method of Csoba & Kunkli 2023 (section 4): the pupil function is expanded in Zernike
+functions with complex coefficients beta, and every Zernike function has a known image
+V.  Defocus is carried outside the expansion, with its sign; tilt shifts the image.  The
+series needs Zernike degrees up to about 2 pi times the waves (peak to valley) of all
+other aberrations, so it is for good eyes and small pupils: outside, it refuses.
+"""
+
+import math
+from concurrent.futures import Executor
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import eval_jacobi
+
+from estimator.psf_fourier import FourierAccuracy, pixel_filter, plan_grids
+from estimator.psf_survey import PupilSurvey
+from estimator.psf_tail import add_tail
+from estimator.psf_types import KernelBuffer, finish_kernel
+from estimator.zernike import monomial_matrix, zernike_values
+
+RELEASED_DEGREE = 30
+"""Zernike degree of the paper's released program: 4.5 waves of non-defocus PV."""
+
+MAX_DEGREE = 120
+MIN_CAPTURED_RATIO = 0.99
+"""Share of the pupil's energy that the expansion must hold."""
+
+DEGREE_PER_WAVE = 2.0 * math.pi
+"""Degree that holds 99 % of the energy per wave of PV: measured 0.9 to 1.4 times it."""
+
+_RADIAL_STEPS = 32
+"""Samples of V per lambda / pupil radius; cubic interpolation errs by 4e-5."""
+
+
+class EnzOutsideDomain(ValueError):
+    """The aberrations need a higher Zernike degree than the series has.
+
+    Attributes
+    ----------
+    index : int
+        Which PSF of the call it is.
+    degree_count, needed_degree_count : int
+    """
+
+    def __init__(self, *, index: int, degree: int, needed: int, captured: float | None):
+        share = "" if captured is None else f" and hold {captured:.1%} of the pupil"
+        super().__init__(
+            f"PSF {index} is outside the domain of the ENZ series: its non-defocus "
+            f"aberrations need Zernike degree {needed}{share}; degree {degree} is in "
+            f"use (at least {MIN_CAPTURED_RATIO:.0%} must be held): use the fourier or "
+            "auto method"
+        )
+        self.index, self.degree_count = index, degree
+        self.needed_degree_count = needed
+
+
+def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
+    """Zernike's R_n^|m|, by the recurrence of Jacobi polynomials: stable at any n."""
+    m, rho = abs(m), np.asarray(rho, np.float64)
+    return rho**m * eval_jacobi((n - m) // 2, 0, m, 2.0 * rho**2 - 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _bessel_orders(x, count, out):
+    """J_0 .. J_(count-1) at x >= 0 by Miller's downward recurrence."""
+    out[:count] = 0.0
+    if x < 1e-12:
+        out[0] = 1.0
+        return
+    start = 2 * ((int(max(float(count), x)) + 30 + int(6.0 * x ** (1.0 / 3.0))) // 2)
+    above, here, norm = 0.0, 1e-300, 0.0
+    for order in range(start, 0, -1):
+        below = 2.0 * order / x * here - above
+        above, here = here, below
+        if order - 1 < count:
+            out[order - 1] = here
+        if (order - 1) % 2 == 0:
+            norm += here if order == 1 else 2.0 * here
+        if abs(here) > 1e200:
+            here, above, norm = here * 1e-200, above * 1e-200, norm * 1e-200
+            for k in range(order - 1, count):
+                out[k] *= 1e-200
+    for k in range(count):
+        out[k] /= norm
+
+
+@njit(cache=True, nogil=True)
+def _hankel_table(r, rho, weighted, out):
+    """Sum over nodes: out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
+
+    ``weighted`` is (nodes, 2 M + 1) for m = -M .. M.
+    """
+    top = weighted.shape[1] // 2
+    bessel = np.empty(top + 1)
+    for q in range(r.size):
+        out[q] = 0.0
+        for g in range(rho.size):
+            _bessel_orders(2.0 * math.pi * r[q] * rho[g], top + 1, bessel)
+            for m in range(-top, top + 1):
+                out[q, m + top] += weighted[g, m + top] * bessel[abs(m)]
+
+
+def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
+    """V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.
+
+    Parameters
+    ----------
+    r : (k,)
+        Image radius in lambda / pupil radius (lambda / NA); 0 is no special case.
+    defocus_rad : float
+        f, signed; 0 is no special case: (-1)^((n-|m|)/2) J_(n+1)(2 pi r) / (2 pi r).
+
+    Returns
+    -------
+    V : (k,) complex128
+
+    Notes
+    -----
+    Gauss-Legendre quadrature.  The Bessel-Bessel series of Braat et al. 2008 is the
+    same integral with exp(i f rho²) expanded by Bauer's formula; it needs f/2 + 15
+    terms, a table of weights, and limits of its own at r = 0 and f = 0.
+    """
+    r = np.atleast_1d(np.asarray(r, np.float64))
+    rho, weight = _radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
+    weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
+    weighted[:, -1] = (
+        weight * rho * np.exp(1j * defocus_rad * rho**2) * radial_polynomial(n, m, rho)
+    )
+    out = np.empty((r.size, weighted.shape[1]), np.complex128)
+    _hankel_table(r, rho, weighted, out)
+    return out[:, -1]
+
+
+def _radial_nodes(degree: int, defocus_rad: float, r: float):
+    """Gauss-Legendre nodes on 0..1 for degree, defocus and image radius together."""
+    swing = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
+    count = math.ceil(swing / 2.0 + 3.0 * swing ** (1.0 / 3.0)) + 8
+    # Rounded up: few sets of nodes then serve all PSFs.
+    node, weight = _legendre(32 * math.ceil(count / 32))
+    return (node + 1.0) / 2.0, weight / 2.0
+
+
+@lru_cache(maxsize=64)
+def _legendre(count: int):
+    return np.polynomial.legendre.leggauss(count)
+
+
+@lru_cache(maxsize=8)
+def _basis(degree: int, n_nodes: int):
+    """Nodes and every sqrt(n+1) R_n^m on them: {m: (n, nodes)} for m = 0 .. degree."""
+    node, weight = _legendre(n_nodes)
+    rho, weight = (node + 1.0) / 2.0, weight / 2.0
+    radial = {
+        m: np.array(
+            [
+                math.sqrt(n + 1.0) * radial_polynomial(n, m, rho)
+                for n in range(m, degree + 1, 2)
+            ]
+        )
+        for m in range(degree + 1)
+    }
+    return rho, weight, radial
+
+
+def zernike_betas(
+    zernike_um: NDArray[np.float64],
+    *,
+    wavelength_um: float,
+    degree: int,
+    log_amplitude=None,
+) -> dict[int, NDArray[np.complex128]]:
+    """Coefficients beta_n^m of the pupil function, {m: values for n = |m|, |m|+2 ...}.
+
+    Parameters
+    ----------
+    zernike_um : (28,)
+        On the unit disc; every term acts.
+    degree : int
+        Largest n.
+    log_amplitude : callable, optional
+        Logarithm of the apodisation at unit-disc points (x, y).
+
+    Notes
+    -----
+    Projection by Gauss-Legendre times trapezoid, converged for any wavefront that the
+    degree can hold.  The sum of |beta|² is the share of the energy that is held.
+    """
+    n_nodes, n_angles = 2 * degree + 40, 4 * degree + 64
+    rho, weight, radial = _basis(degree, n_nodes)
+    angle = 2.0 * math.pi * np.arange(n_angles) / n_angles
+    x, y = rho[:, None] * np.cos(angle), rho[:, None] * np.sin(angle)
+    field = np.exp(2j * math.pi / wavelength_um * (zernike_values(x, y) @ zernike_um))
+    if log_amplitude is not None:
+        field = field * np.exp(log_amplitude(x, y))
+    harmonics = np.fft.fft(field, axis=1) / n_angles
+    return {
+        m: 2.0 * (radial[abs(m)] * (weight * rho)) @ harmonics[:, m]
+        for m in range(-degree, degree + 1)
+    }
+
+
+@njit(cache=True, nogil=True)
+def _intensities(qx, qy, step_x, step_y, table, per_r, out):
+    """|U|² on a tensor grid of pixels' samples, by cubic interpolation of the table.
+
+    U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
+    """
+    top = table.shape[1] // 2
+    for j in range(step_y.size):
+        for i in range(step_x.size):
+            ax = qx[0] * step_x[i] + qy[0] * step_y[j]
+            ay = qx[1] * step_x[i] + qy[1] * step_y[j]
+            r = math.sqrt(ax * ax + ay * ay)
+            turn = complex(1.0, 0.0)
+            if r > 1e-12:
+                turn = complex(ax / r, ay / r)
+            place = r * per_r + 1.0
+            k = min(int(place), table.shape[0] - 3)
+            t = place - k
+            w0 = -t * (t - 1.0) * (t - 2.0) / 6.0
+            w1 = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
+            w2 = -(t + 1.0) * t * (t - 2.0) / 2.0
+            w3 = (t + 1.0) * t * (t - 1.0) / 6.0
+            total = complex(0.0, 0.0)
+            phase = complex(1.0, 0.0)
+            for m in range(top + 1):
+                c = top + m
+                plus = w0 * table[k - 1, c] + w1 * table[k, c]
+                plus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
+                total += plus * phase
+                if m > 0:
+                    c = top - m
+                    minus = w0 * table[k - 1, c] + w1 * table[k, c]
+                    minus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
+                    total += minus * phase.conjugate()
+                phase *= turn
+            out[j, i] = total.real * total.real + total.imag * total.imag
+
+
+class _Series:
+    """One PSF's series: expansion, check, and its image on the pixel grid."""
+
+    def __init__(self, survey: PupilSurvey, index: int, degree: int, is_checked: bool):
+        frames = survey.frames
+        self.survey, self.index, self.degree = survey, index, degree
+        self.wavelength_um = float(frames.wavelength_nm[index]) / 1000.0
+        self.half = frames.half_width_um_per_px[index]
+        self.shear = float(frames.shear_ratio[index])
+        zernike_um = np.linalg.solve(
+            monomial_matrix().T, frames.disc_polynomial_um[index]
+        )
+        # W = sqrt(3) C20 (2 rho² - 1) + ...; tilt 2 C rho cos and sin.
+        per_um = 2.0 * math.pi / self.wavelength_um
+        self.defocus_rad = per_um * 2.0 * math.sqrt(3.0) * zernike_um[4]
+        self.shift = 2.0 * zernike_um[[2, 1]] / self.wavelength_um
+        self.residual_um = zernike_um.copy()
+        self.residual_um[[0, 1, 2, 4]] = 0.0
+        self.betas = self._expand(frames, is_checked)
+
+    def _log_amplitude(self, log_amplitude):
+        if not log_amplitude.any():
+            return None
+        room = math.sqrt(1.0 - self.shear**2)
+
+        def at(x, y):
+            y = self.shear * x + room * y
+            powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+            return powers @ log_amplitude
+
+        return at
+
+    def _expand(self, frames, is_checked):
+        rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
+        x, y = rho * np.cos(angle), rho * np.sin(angle)
+        waves = zernike_values(x, y) @ self.residual_um / self.wavelength_um
+        self.needed = math.ceil(DEGREE_PER_WAVE * float(np.ptp(waves)))
+        far = {"index": self.index, "degree": self.degree, "needed": self.needed}
+        if is_checked and self.needed > 1.4 * self.degree:
+            raise EnzOutsideDomain(**far, captured=None)
+        betas = zernike_betas(
+            self.residual_um,
+            wavelength_um=self.wavelength_um,
+            degree=self.degree,
+            log_amplitude=self._log_amplitude(frames.log_amplitude[self.index]),
+        )
+        held = sum(float((np.abs(b) ** 2).sum()) for b in betas.values())
+        held /= float(self.survey.passed_ratio[self.index])
+        if is_checked and held < MIN_CAPTURED_RATIO:
+            far["needed"] = max(self.needed, self.degree + 1)
+            raise EnzOutsideDomain(**far, captured=held)
+        return betas
+
+    def _radial_table(self, reach: float):
+        """2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m on radii -1, 0, 1 ... steps."""
+        rho, weight = _radial_nodes(self.degree, abs(self.defocus_rad), reach)
+        weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
+        weighted = np.empty((rho.size, 2 * self.degree + 1), np.complex128)
+        for m in range(-self.degree, self.degree + 1):
+            ring = np.zeros(rho.size, np.complex128)
+            for k, beta in enumerate(self.betas[m]):
+                n = abs(m) + 2 * k
+                ring += beta * math.sqrt(n + 1.0) * radial_polynomial(n, m, rho)
+            weighted[:, m + self.degree] = 2.0 * (-1j) ** abs(m) * weight * ring
+        r = np.arange(math.ceil(reach * _RADIAL_STEPS) + 4) / _RADIAL_STEPS
+        table = np.empty((r.size + 1, weighted.shape[1]), np.complex128)
+        _hankel_table(r, rho, weighted, table[1:])
+        # J_m is even or odd in r as m is: the sample before 0 makes it cubic there.
+        signs = (-1.0) ** np.abs(np.arange(-self.degree, self.degree + 1))
+        table[0] = signs * table[2]
+        return table
+
+    def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
+        """(2R+1, 2R+1) shares of the light inside a window, edge light beyond."""
+        survey, p = self.survey, slice(self.index, self.index + 1)
+        plan = plan_grids(
+            extent_px=survey.extent_px[p], unit_px=survey.unit_px[p], accuracy=accuracy
+        )
+        k = np.maximum(
+            plan.samples_per_px_count[0], np.ceil(2.0 / survey.unit_px[self.index])
+        ).astype(int)
+        half_px = plan.length_count[0] / plan.samples_per_px_count[0] / 2.0
+        middle = (survey.slope_low_px + survey.slope_high_px)[self.index] / 2.0
+        low = np.maximum(np.ceil(middle - half_px + 0.5), -radius).astype(int)
+        high = np.minimum(np.floor(middle + half_px - 0.5), radius).astype(int)
+        kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float32)
+        window = np.array([low[0], high[0], low[1], high[1]])
+        if np.all(high >= low):
+            spans = zip((high - low + 1).tolist(), k.tolist(), strict=True)
+            filters = [_filter_matrix(n, c) for n, c in spans]
+            samples = [
+                a + (np.arange(f.shape[1]) - _reach(int(c))) / c
+                for a, f, c in zip(low, filters, k, strict=True)
+            ]
+            pixels = filters[1] @ self._intensity(*samples) @ filters[0].T
+            rows = slice(radius - high[1], radius - low[1] + 1)
+            kernel[rows, radius + low[0] : radius + high[0] + 1] = pixels[::-1]
+        half, shear = self.half, self.shear
+        edge = survey.edge_slope_px[self.index]
+        edge_um = float(survey.edge_light_um[self.index])
+        add_tail(kernel, window, 0.0, edge, half, shear, edge_um)
+        return kernel
+
+    def _intensity(self, x_px, y_px):
+        """Share of the light per sample-pixel area at a grid of image points."""
+        room = math.sqrt(1.0 - self.shear**2)
+        # q = T^T p / lambda, t = T w with T lower triangular.
+        qx = np.array([self.half[0], 0.0]) / self.wavelength_um
+        qy = np.array([self.shear, room]) * self.half[1] / self.wavelength_um
+        # Tilt moves the image: p - T^-T shift.
+        shift_y = self.shift[1] / qy[1]
+        shift_x = (self.shift[0] - qy[0] * shift_y) / qx[0]
+        x, y = x_px - shift_x, y_px - shift_y
+        far = np.abs(x).max() * np.hypot(*qx) + np.abs(y).max() * np.hypot(*qy)
+        out = np.empty((y.size, x.size))
+        _intensities(qx, qy, x, y, self._radial_table(float(far)), _RADIAL_STEPS, out)
+        area = math.pi * self.half[0] * self.half[1] * room
+        passed = float(self.survey.passed_ratio[self.index])
+        return out * area / self.wavelength_um**2 / passed
+
+
+_FILTER_REACH = 8
+
+
+def _reach(samples_per_px: int) -> int:
+    return (samples_per_px + 1) // 2 + _FILTER_REACH
+
+
+def _filter_matrix(n_px: int, samples_per_px: int) -> NDArray[np.float64]:
+    """(pixels, samples): pixel integrals of samples 1/k apart, in shares of a pixel."""
+    weights = pixel_filter(samples_per_px, _FILTER_REACH) / samples_per_px
+    matrix = np.zeros((n_px, (n_px - 1) * samples_per_px + weights.size))
+    for q in range(n_px):
+        start = q * samples_per_px
+        matrix[q, start : start + weights.size] = weights
+    return matrix
+
+
+def enz_kernels(
+    survey: PupilSurvey,
+    members: NDArray[np.int64],
+    *,
+    degree: int,
+    is_checked: bool,
+    accuracy: FourierAccuracy,
+    output: KernelBuffer,
+    pool: Executor,
+) -> None:
+    """Add pixel-integrated PSFs by the ENZ series to a buffer.
+
+    Parameters
+    ----------
+    survey : PupilSurvey
+    members : (M,)
+    degree : int
+        Largest Zernike degree of the expansion.
+    is_checked : bool
+        False leaves out the domain's check: for tables that show where it breaks.
+    accuracy, output, pool
+        As in `psf_fourier.fourier_kernels`.
+
+    Raises
+    ------
+    EnzOutsideDomain
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"enz_degree {degree}: must be 0 to {MAX_DEGREE}")
+
+    def work(p: int) -> None:
+        radius, start = int(output.radius_px[p]), int(output.offset_count[p])
+        kernel = _Series(survey, p, degree, is_checked).kernel(radius, accuracy)
+        part = output.flat_kernels[start : start + kernel.size]
+        output.total_ratio[p] = finish_kernel(kernel, 1.0, part)
+
+    list(pool.map(work, members.tolist()))
