@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimation import EstimatedEye
 from estimator.wavefront import wavefront_grid
+from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ def aberration_grid(
     wavelengths_nm: ArrayLike,
     h_deg: ArrayLike = (0.0,),
     v_deg: ArrayLike = (0.0,),
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
     progress: Callable[[float], None] | None = None,
 ) -> AberrationGrid:
     """Trace every combination of the axes.
@@ -52,6 +55,8 @@ def aberration_grid(
     ----------
     accommodations_dpt : (n_accommodations,)
         Within the eye's amplitude.
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront_nodes`.
     progress : callable, optional
         Called with a fraction after each accommodation; may raise to cancel.
 
@@ -79,6 +84,8 @@ def aberration_grid(
             fields_deg=fields_deg.reshape(-1, 2),
             wavelengths_nm=wavelengths_nm,
             pupil_diameters_mm=pupils_mm,
+            n_rings=n_rings,
+            n_azimuths=n_azimuths,
         )
         parts.append(found)
         if progress is not None:

@@ -2,17 +2,26 @@
 
 Pupil, object, focus and wavelength act on the measurement by closed formulas
 (DESIGN 4): coefficients rescale downwards, defocus shifts by vergence,
-accommodation and chromatic difference.  On axis only.
+accommodation and chromatic difference.  It knows one field, and takes it for all.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator import prescription as rx
 from estimator.chromatic import chromatic_refraction_dpt
+from estimator.field_wavefronts import (
+    N_RIM,
+    FieldWavefronts,
+    polynomial_in_mm,
+    total_defocus_dpt,
+    with_defocus,
+    zernike_from_polynomial,
+)
+from estimator.focusing import FocusingEye
 from estimator.profiles import EyeProfile
 from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.zernike import remove_central_tilt, rescale_pupil
@@ -38,45 +47,6 @@ def accommodation_amplitude_dpt(
     return amplitude_dpt
 
 
-def request_notes(
-    *,
-    pupil_diameter_mm: float,
-    focus_dpt: float,
-    max_pupil_diameter_mm: float,
-    pupil_limit: str,
-    refraction_dpt: float,
-    amplitude_dpt: float,
-) -> tuple[str, ...]:
-    """Say in words what of a pupil and focus an eye cannot meet.
-
-    ``pupil_limit`` says what the largest pupil is: "measured" or "traced".
-    """
-    notes = []
-    if pupil_diameter_mm > max_pupil_diameter_mm + 1e-9:
-        notes.append(
-            f"pupil {pupil_diameter_mm:g} mm capped at the {pupil_limit} "
-            f"{max_pupil_diameter_mm:g} mm"
-        )
-    asked_dpt = focus_dpt + refraction_dpt
-    if asked_dpt < -1e-9:
-        notes.append(
-            f"focus {focus_dpt:g} dpt is beyond the far point "
-            f"({-refraction_dpt:.3g} dpt): the eye stays relaxed"
-        )
-    elif asked_dpt > amplitude_dpt + 1e-9:
-        near_dpt = amplitude_dpt - refraction_dpt
-        reached = (
-            f"is nearer than the near point ({near_dpt:.3g} dpt)"
-            if near_dpt >= 0.0
-            else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
-        )
-        notes.append(
-            f"focus {focus_dpt:g} dpt {reached}: "
-            f"accommodation stops at {amplitude_dpt:.3g} dpt"
-        )
-    return tuple(notes)
-
-
 @dataclass(frozen=True)
 class WavefrontState:
     """Wavefront of the eye at one pupil, object, focus and wavelength.
@@ -90,19 +60,13 @@ class WavefrontState:
     notes: tuple[str, ...]
 
 
-class MeasuredWavefront:
+class MeasuredWavefront(FocusingEye):
     """Wavefront-only eye: measured coefficients plus defocus by formula.
 
-    Attributes
-    ----------
-    refraction_dpt : float
-        Least-squares spherical equivalent M at 555 nm, from C(2,0) on the measured
-        pupil, correction included.
-    amplitude_dpt : float
-        Largest accommodation.
-    max_pupil_diameter_mm : float
-        Above it the pupil is capped.
+    Its M is from C(2,0) on the measured pupil.
     """
+
+    pupil_limit = "measured"
 
     def __init__(self, profile: EyeProfile):
         radius_mm = profile.pupil_diameter_mm / 2.0
@@ -139,29 +103,6 @@ class MeasuredWavefront:
             - chromatic_refraction_dpt(self.wavelength_nm)
         )
 
-    def accommodation_dpt(self, focus_dpt: float) -> float:
-        """Accommodation a = clamp(f + M(555 nm), 0, amplitude) for a focus distance."""
-        return min(max(focus_dpt + self.refraction_dpt, 0.0), self.amplitude_dpt)
-
-    def reachable_focus_dpt(self, focus_dpt: float) -> float:
-        """Distance, dpt, that the eye is really focused at when asked for this one."""
-        return self.accommodation_dpt(focus_dpt) - self.refraction_dpt
-
-    def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Pupil asked for, capped at the measured one."""
-        return min(pupil_diameter_mm, self.max_pupil_diameter_mm)
-
-    def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say in words what of the request this eye cannot meet."""
-        return request_notes(
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            max_pupil_diameter_mm=self.max_pupil_diameter_mm,
-            pupil_limit="measured",
-            refraction_dpt=self.refraction_dpt,
-            amplitude_dpt=self.amplitude_dpt,
-        )
-
     def zernike_with_defocus(
         self, *, pupil_diameter_mm: float, added_defocus_dpt: float
     ) -> NDArray[np.float64]:
@@ -190,27 +131,74 @@ class MeasuredWavefront:
     def total_defocus_dpt(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-    ) -> float:
-        """Least-squares refraction less accommodation, for an object at infinity."""
-        return self.refraction_at_dpt(wavelength_nm) - accommodation_dpt
+        h_deg: ArrayLike = 0.0,
+        v_deg: ArrayLike = 0.0,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction, dpt, on the pupil itself; object at infinity.
 
-    def zernike_at_defocus(
+        All arguments broadcast, and the result has their shape.
+        """
+        _, _, pupil_mm, used_dpt, wavelength_nm = np.broadcast_arrays(
+            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
+        )
+        radius_mm = self._radius_mm(pupil_mm)
+        shift_dpt = chromatic_refraction_dpt(wavelength_nm) - chromatic_refraction_dpt(
+            self.wavelength_nm
+        )
+        relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
+        return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+
+    def wavefronts(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-        total_defocus_dpt: float,
-    ) -> NDArray[np.float64]:
-        """Coefficients (28,), um, whose `total_defocus_dpt` has a given value."""
-        measured_dpt = self.refraction_at_dpt(self.wavelength_nm)
-        return self.zernike_with_defocus(
-            pupil_diameter_mm=pupil_diameter_mm,
-            added_defocus_dpt=total_defocus_dpt - measured_dpt,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+        total_defocus_dpt: ArrayLike,
+    ) -> FieldWavefronts:
+        """Wavefronts with the given total defocus; P in C order of the broadcast.
+
+        Raises
+        ------
+        ValueError
+            A pupil larger than the measured one.
+        """
+        _, _, pupil_mm, _, _, total_dpt = np.broadcast_arrays(
+            h_deg,
+            v_deg,
+            pupil_diameter_mm,
+            accommodation_dpt,
+            wavelength_nm,
+            total_defocus_dpt,
         )
+        radius_mm = self._radius_mm(pupil_mm)
+        rim_mm = np.zeros((radius_mm.size, N_RIM))
+        rim_mm[:, 2] = rim_mm[:, 4] = radius_mm
+        return with_defocus(
+            self._on_circles(radius_mm), rim_mm, radius_mm, total_defocus_dpt=total_dpt
+        )
+
+    def _on_circles(self, radius_mm: NDArray) -> NDArray[np.float64]:
+        """Measured coefficients (P, 28) on circles (P,); piston zero."""
+        polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)
+        return zernike_from_polynomial(polynomial_um, radius_mm)
+
+    def _radius_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
+        """Half of pupils, flat; refuses those that are larger than the measured one."""
+        largest_mm = self.max_pupil_diameter_mm
+        if pupil_mm.size and not (
+            pupil_mm.min() > 0.0 and pupil_mm.max() <= largest_mm + 1e-6
+        ):
+            raise ValueError(
+                f"pupil_diameter_mm {pupil_mm.min():g} to {pupil_mm.max():g}: allowed "
+                f"is above 0 to {largest_mm:g}"
+            )
+        return pupil_mm.ravel() / 2.0
 
     def state(
         self,

@@ -1,8 +1,8 @@
 """An estimated eye as the PSF cache asks for it: every wavefront ray-traced.
 
 Answers the same questions as `measured_wavefront.MeasuredWavefront`, without its
-limits: pupils larger than the measured one are traced, not extrapolated, and
-accommodation changes the lens and with it all aberrations.
+limits: pupils larger than the measured one are traced, not extrapolated, accommodation
+changes the lens and with it all aberrations, and every field has its own.
 """
 
 from collections.abc import Callable
@@ -10,76 +10,102 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator import prescription as rx
 from estimator.aberration_grid import AberrationGrid, aberration_grid
 from estimator.estimation import EstimatedEye
-from estimator.measured_wavefront import request_notes
-from estimator.units import SPHERE_PER_C20
-from estimator.zernike import rescale_pupil
+from estimator.field_interpolation import (
+    FieldInterpolation,
+    accommodation_nodes_dpt,
+    field_nodes_deg,
+)
+from estimator.field_wavefronts import (
+    FieldWavefronts,
+    circumscribed_radius_mm,
+    correction_polynomial,
+    distinct_rows,
+    total_defocus_dpt,
+    with_defocus,
+    zernike_from_polynomial,
+)
+from estimator.focusing import FocusingEye
+from estimator.wavefront import FIELD_LIMIT_DEG
 
 MAX_PUPIL_MM = 8.0
 """Largest pupil an iris opens to."""
 
 ACCOMMODATION_STEP_DPT = 1.0
-"""Largest step between traced accommodations; blending is at equal defocus, so only the
-slow change of the other aberrations is interpolated."""
+"""Largest step between accommodations whose PSFs are blended; blending is at equal
+defocus, so only the slow change of the other aberrations is interpolated."""
 
-ON_AXIS = (0, 0)
+FIELD_PUPIL_RATIOS = (0.64, 1.0)
+"""Pupils traced over the field, of the largest one."""
+
+LARGE_PUPIL_MM = 7.2
+LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
+"""The same where the largest pupil is larger than that."""
+
+FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
+"""Rays per wavefront over the field: 70, 1e-3 um from many at 7 mm, 0.013 at worst."""
+
+ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
+SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
+"""Step by which the traced field is made smaller until light passes all of it."""
+
+AXIS_PROGRESS = 0.1
+
+MARGIN = 1e-3
+"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
+
+FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
 
 class TraceFailed(ValueError):
     """No light passes the eye at the smallest pupil asked for."""
 
 
-class TracedEye:
-    """On-axis wavefronts of an estimated eye on the nodes of an aberration grid.
+class TracedEye(FocusingEye):
+    """Wavefronts of an estimated eye over a range of fields, pupils and foci.
+
+    On axis the circle circumscribed about the pupil is the pupil asked for: the traced
+    rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
+    and at other fields by the same factor.  The worn correction is taken off at every
+    field alike, see `field_wavefronts.correction_polynomial`.
+
+    Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
+    the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
+    open area.  Fields that light does not pass answer as the nearest of the traced
+    fields, whose range is made smaller until all of its nodes pass.
 
     Attributes
     ----------
     grid : AberrationGrid
-    refraction_dpt, amplitude_dpt : float
-        M at 555 nm and the measured pupil, through the worn correction; reach.
+        On axis.
+    field_range_deg : ((h_low, h_high), (v_low, v_high))
+        Fields that may be asked for.
+    traced_range_deg : the same
+        Fields beyond it answer as its edge.
     """
 
-    def __init__(self, eye: EstimatedEye, grid: AberrationGrid):
-        on_axis = grid.zernike_um[ON_AXIS]
-        open_mm = grid.pupil_diameters_mm[
-            np.isfinite(on_axis).all(axis=(1, 2, 3))
-            & (grid.open_ratio[ON_AXIS] > 0.999).all(axis=(1, 2))
-        ]
-        if open_mm.size == 0:
-            raise TraceFailed(
-                f"no light passes the eye at {grid.pupil_diameters_mm[0]:g} mm"
-            )
-        self.grid = grid
+    pupil_limit = "traced"
+
+    def __init__(
+        self,
+        eye: EstimatedEye,
+        axis: FieldInterpolation,
+        field: FieldInterpolation | None = None,
+        *,
+        field_range_deg: FieldRange = ON_AXIS_DEG,
+        traced_range_deg: FieldRange = ON_AXIS_DEG,
+    ):
+        self.grid = axis.grid
         self.refraction_dpt = eye.refraction_dpt
         self.amplitude_dpt = eye.amplitude_dpt
-        self.max_pupil_diameter_mm = float(open_mm[-1])
-        self._correction = (
-            rx.power_vector(eye.profile.correction)
-            if (eye.profile.correction)
-            else None
-        )
-        self._zernike_um = self._on_nominal_circles(on_axis)
-
-    def _on_nominal_circles(self, on_axis: NDArray) -> NDArray[np.float64]:
-        """Coefficients (n_pupils, n_accommodations, n_wavelengths, 28) at pupil / 2.
-
-        The traced rim lies within a per cent of the paraxial entrance pupil.
-        """
-        radius_mm = self.grid.pupil_diameters_mm[:, None, None] / 2.0
-        ratio = radius_mm / self.grid.zernike_radius_mm[ON_AXIS]
-        finite = np.isfinite(ratio)
-        scaled = rescale_pupil(
-            np.nan_to_num(on_axis), radius_ratio=np.where(finite, ratio, 1.0)
-        )
-        scaled[..., 0] = 0.0
-        if self._correction is not None:
-            for k, r in enumerate(radius_mm.ravel()):
-                scaled[k] -= rx.zernike_from_power_vector(
-                    *self._correction, zernike_radius_mm=float(r)
-                )
-        return scaled
+        self.max_pupil_diameter_mm = largest_open_pupil_mm(axis.grid)
+        self.field_range_deg = field_range_deg
+        self.traced_range_deg = traced_range_deg
+        self._field = field or axis
+        has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
+        self._on_axis = self._field if has_axis else axis
+        self._correction = correction_polynomial(eye.profile.correction)
 
     @classmethod
     def trace(
@@ -89,98 +115,223 @@ class TracedEye:
         pupil_diameters_mm: ArrayLike,
         focus_range_dpt: tuple[float, float],
         wavelengths_nm: ArrayLike,
+        field_range_deg: FieldRange = ON_AXIS_DEG,
         progress: Callable[[float], None] | None = None,
     ) -> "TracedEye":
-        """Trace the grid that a range of pupils and foci needs, on axis."""
+        """Trace what a range of pupils, foci and fields needs.
+
+        Parameters
+        ----------
+        pupil_diameters_mm : (n,)
+            On axis each of them is traced; elsewhere only the largest and one or two
+            smaller, from which all others follow.
+        field_range_deg : ((h_low, h_high), (v_low, v_high))
+            Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
+        progress : callable, optional
+            Called with a fraction; may raise to cancel.
+
+        Raises
+        ------
+        TraceFailed
+            No light passes on axis.
+        ValueError
+            A field range that is not ascending.
+        """
+        _check_field_range(field_range_deg)
         used_dpt = [eye.accommodating.accommodation_dpt(f) for f in focus_range_dpt]
-        low_dpt, high_dpt = min(used_dpt), max(used_dpt)
-        count = 1 + int(np.ceil((high_dpt - low_dpt) / ACCOMMODATION_STEP_DPT - 1e-9))
+        states = {
+            "accommodations_dpt": accommodation_nodes_dpt(min(used_dpt), max(used_dpt)),
+            "wavelengths_nm": np.unique(wavelengths_nm),
+        }
+        on_axis_only = not np.any(field_range_deg)
+        axis_share = 1.0 if on_axis_only else AXIS_PROGRESS
+        axis_grid = aberration_grid(
+            eye,
+            pupil_diameters_mm=np.unique(pupil_diameters_mm),
+            **states,
+            progress=_share(progress, 0.0, axis_share),
+        )
+        axis = FieldInterpolation(axis_grid)
+        if on_axis_only:
+            return cls(eye, axis)
+        field, traced_range_deg = _trace_field(
+            eye,
+            axis,
+            field_range_deg,
+            pupil_diameters_mm=field_pupils_mm(
+                axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
+            ),
+            **states,
+            progress=_share(progress, axis_share, 1.0),
+        )
         return cls(
             eye,
-            aberration_grid(
-                eye,
-                pupil_diameters_mm=pupil_diameters_mm,
-                accommodations_dpt=np.linspace(low_dpt, high_dpt, max(count, 1)),
-                wavelengths_nm=np.unique(wavelengths_nm),
-                progress=progress,
-            ),
-        )
-
-    def accommodation_dpt(self, focus_dpt: float) -> float:
-        """Accommodation a = clamp(f + M(555 nm), 0, amplitude) for a focus distance."""
-        return min(max(focus_dpt + self.refraction_dpt, 0.0), self.amplitude_dpt)
-
-    def reachable_focus_dpt(self, focus_dpt: float) -> float:
-        """Distance, dpt, that the eye is really focused at when asked for this one."""
-        return self.accommodation_dpt(focus_dpt) - self.refraction_dpt
-
-    def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Pupil asked for, capped where the iris or the traced light ends."""
-        return min(pupil_diameter_mm, self.max_pupil_diameter_mm)
-
-    def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say in words what of the request this eye cannot meet."""
-        return request_notes(
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            max_pupil_diameter_mm=self.max_pupil_diameter_mm,
-            pupil_limit="traced",
-            refraction_dpt=self.refraction_dpt,
-            amplitude_dpt=self.amplitude_dpt,
+            axis,
+            field,
+            field_range_deg=field_range_deg,
+            traced_range_deg=traced_range_deg,
         )
 
     def accommodation_nodes_dpt(
         self, focus_range_dpt: tuple[float, float]
     ) -> NDArray[np.float64]:
-        """Return the traced accommodations."""
-        return self.grid.accommodations_dpt
+        """Accommodations (n,), ascending, between which PSFs may be blended."""
+        used_dpt = [self.accommodation_dpt(f) for f in focus_range_dpt]
+        low_dpt, high_dpt = min(used_dpt), max(used_dpt)
+        count = 1 + int(np.ceil((high_dpt - low_dpt) / ACCOMMODATION_STEP_DPT - 1e-9))
+        return np.linspace(low_dpt, high_dpt, max(count, 1))
 
     def total_defocus_dpt(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-    ) -> float:
-        """Least-squares refraction for an object at infinity, between traced nodes.
+        h_deg: ArrayLike = 0.0,
+        v_deg: ArrayLike = 0.0,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction, dpt, on the pupil's circle; object at infinity.
 
-        What is interpolated is the small difference to M(lambda) - a.
+        All arguments broadcast, and the result has their shape.
         """
-        pupils_mm = self.grid.pupil_diameters_mm
-        used_dpt = self.grid.accommodations_dpt
-        c20_um = self._zernike_um[:, :, self._wavelength(wavelength_nm), rx.C20]
-        m_dpt = -SPHERE_PER_C20 * c20_um / (pupils_mm[:, None] / 2.0) ** 2
-        over_pupils = [
-            np.interp(pupil_diameter_mm, pupils_mm, column)
-            for column in (m_dpt + used_dpt).T
-        ]
-        return float(
-            np.interp(accommodation_dpt, used_dpt, over_pupils) - accommodation_dpt
+        states = np.broadcast_arrays(
+            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
         )
+        zernike_um, _, radius_mm, number = self._distinct(states)
+        return total_defocus_dpt(zernike_um, radius_mm)[number].reshape(states[0].shape)
 
-    def zernike_at_defocus(
+    def wavefronts(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-        total_defocus_dpt: float,
-    ) -> NDArray[np.float64]:
-        """Coefficients (28,), um, of a traced node with its defocus replaced."""
-        pupil = _nearest(self.grid.pupil_diameters_mm, pupil_diameter_mm)
-        used = _nearest(self.grid.accommodations_dpt, accommodation_dpt)
-        zernike_um = self._zernike_um[pupil, used, self._wavelength(wavelength_nm)]
-        zernike_um = zernike_um.copy()
-        radius_mm = pupil_diameter_mm / 2.0
-        zernike_um[rx.C20] = -total_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
-        return zernike_um
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+        total_defocus_dpt: ArrayLike,
+    ) -> FieldWavefronts:
+        """Wavefronts with the given total defocus; P in C order of the broadcast.
 
-    def _wavelength(self, wavelength_nm: float) -> int:
-        return _nearest(self.grid.wavelengths_nm, wavelength_nm)
+        Raises
+        ------
+        ValueError
+            A state outside of what was traced.
+        """
+        *states, total_dpt = np.broadcast_arrays(
+            *(h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm),
+            total_defocus_dpt,
+        )
+        zernike_um, rim_mm, radius_mm, number = self._distinct(states)
+        return with_defocus(
+            zernike_um[number],
+            rim_mm[number],
+            radius_mm[number],
+            total_defocus_dpt=total_dpt,
+        )
+
+    def _distinct(self, states: list[NDArray]) -> tuple[NDArray, ...]:
+        """Coefficients, rims and radii of distinct states, and the number of each."""
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
+        self._check_states(h_deg, v_deg, pupil_mm, used_dpt)
+        h_deg, v_deg = (
+            np.clip(angle, *limits)
+            for angle, limits in zip((h_deg, v_deg), self.traced_range_deg, strict=True)
+        )
+        rest = {
+            "pupil_diameter_mm": self._field.usable_pupils_mm(h_deg, v_deg, pupil_mm),
+            "accommodation_dpt": used_dpt,
+            "wavelength_nm": wavelength_nm,
+        }
+        polynomial_um, rim_mm = self._field.at(h_deg=h_deg, v_deg=v_deg, **rest)
+        zeros = np.zeros(h_deg.size)
+        _, axis_rim_mm = self._on_axis.at(h_deg=zeros, v_deg=zeros, **rest)
+        scale = rest["pupil_diameter_mm"] / 2.0 / circumscribed_radius_mm(axis_rim_mm)
+        rim_mm = rim_mm * scale[:, None]
+        radius_mm = circumscribed_radius_mm(rim_mm)
+        zernike_um = zernike_from_polynomial(
+            polynomial_um - self._correction, radius_mm
+        )
+        return zernike_um, rim_mm, radius_mm, number
+
+    def _check_states(self, h_deg, v_deg, pupil_mm, used_dpt) -> None:
+        traced_dpt = self.grid.accommodations_dpt
+        limits = {
+            "h_deg": (h_deg, *self.field_range_deg[0]),
+            "v_deg": (v_deg, *self.field_range_deg[1]),
+            "pupil_diameter_mm": (pupil_mm, 0.1, self.max_pupil_diameter_mm),
+            "accommodation_dpt": (used_dpt, traced_dpt[0], traced_dpt[-1]),
+        }
+        for name, (values, low, high) in limits.items():
+            if values.size and not (
+                values.min() >= low - MARGIN and values.max() <= high + MARGIN
+            ):
+                raise ValueError(
+                    f"{name} {values.min():g} to {values.max():g}: traced are "
+                    f"{low:g} to {high:g}"
+                )
 
 
-def _nearest(nodes: NDArray[np.float64], value: float) -> int:
-    index = int(np.argmin(np.abs(nodes - value)))
-    if abs(nodes[index] - value) > 1e-6 * max(abs(value), 1.0):
-        raise ValueError(f"{value} is not one of the traced nodes {nodes.tolist()}")
-    return index
+def largest_open_pupil_mm(grid: AberrationGrid) -> float:
+    """Largest pupil of an on-axis grid that is open at all its states.
+
+    Raises
+    ------
+    TraceFailed
+        There is none.
+    """
+    is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
+    if not is_open.any():
+        raise TraceFailed(
+            f"no light passes the eye at {grid.pupil_diameters_mm[0]:g} mm"
+        )
+    return float(grid.pupil_diameters_mm[is_open][-1])
+
+
+def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
+    """Pupils (n,) to trace over the field for a range of them."""
+    large = high_mm > LARGE_PUPIL_MM
+    ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
+    pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
+    return np.unique(pupils_mm)
+
+
+def _trace_field(
+    eye: EstimatedEye, axis: FieldInterpolation, field_range_deg: FieldRange, **axes
+) -> tuple[FieldInterpolation, FieldRange]:
+    """Trace a range of fields, drawn in towards the axis until light passes it all."""
+    limited = np.clip(field_range_deg, -FIELD_LIMIT_DEG, FIELD_LIMIT_DEG)
+    share = 1.0
+    while share > SMALLEST_SHARE:
+        (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
+        field = FieldInterpolation(
+            aberration_grid(
+                eye,
+                h_deg=field_nodes_deg(h_low, h_high),
+                v_deg=field_nodes_deg(v_low, v_high),
+                n_rings=FIELD_RINGS,
+                n_azimuths=FIELD_AZIMUTHS,
+                **axes,
+            )
+        )
+        if field.passes:
+            return field, tuple(map(tuple, traced))
+        share *= SHRINK_RATIO
+    return axis, ON_AXIS_DEG
+
+
+def _share(
+    progress: Callable[[float], None] | None, low: float, high: float
+) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    return lambda done: progress(low + (high - low) * done)
+
+
+def _check_field_range(field_range_deg: FieldRange) -> None:
+    for low, high in field_range_deg:
+        if not -90.0 < low <= high < 90.0:
+            raise ValueError(
+                f"field_range_deg {field_range_deg}: needs -90 < low <= high < 90 twice"
+            )

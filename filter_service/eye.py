@@ -3,11 +3,13 @@
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.field_wavefronts import FieldWavefronts
 
 
 class Eye(Protocol):
-    """Seen on axis: wavefronts over pupil, accommodation, wavelength and defocus.
+    """Wavefronts over field, pupil, accommodation, wavelength and defocus.
 
     Object distance adds its vergence to the total defocus, so a PSF depends on it
     through that sum alone.
@@ -33,18 +35,25 @@ class Eye(Protocol):
     def total_defocus_dpt(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-    ) -> float:
-        """Least-squares refraction at this state for an object at infinity."""
+        h_deg: ArrayLike = 0.0,
+        v_deg: ArrayLike = 0.0,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction for an object at infinity, in the broadcast shape.
 
-    def zernike_at_defocus(
+        On the circle about the pupil, worn correction included.
+        """
+
+    def wavefronts(
         self,
         *,
-        pupil_diameter_mm: float,
-        accommodation_dpt: float,
-        wavelength_nm: float,
-        total_defocus_dpt: float,
-    ) -> NDArray[np.float64]:
-        """Coefficients (28,), um, with the given total defocus."""
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+        total_defocus_dpt: ArrayLike,
+    ) -> FieldWavefronts:
+        """Wavefronts (P,) with the given total defocus, in C order of the broadcast."""

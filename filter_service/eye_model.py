@@ -64,6 +64,7 @@ def prepare_eye(
         pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
         focus_range_dpt=spec.focus_range_dpt,
         wavelengths_nm=channel_wavelengths_nm(spec),
+        field_range_deg=spec.field_range_deg,
         progress=lambda done: report(
             ESTIMATION_SHARE + (ABERRATION_SHARE - ESTIMATION_SHARE) * done,
             "aberrations",
