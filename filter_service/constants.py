@@ -63,9 +63,9 @@ BYTE_MAX = 255.0
 
 PLACE_BITS = 16
 PLACE_MASK = 0xFFFF
-INTERVAL_MASK = 0xFFFF
-MERGED_BIT = 0x10000
-EDGE_BIT = 0x20000
+KERNEL_MASK = 0xFFFFFFF
+MERGED_BIT = 0x10000000
+EDGE_BIT = 0x20000000
 """Packing of a fragment's position and state words (shaders/README.md)."""
 
 ATLAS_WIDTH_BITS = 12
@@ -75,11 +75,25 @@ texel fetch costs half of a storage buffer load on a software renderer, and a te
 may be larger than a storage block."""
 
 IMAGE_ATLAS = 0
+IMAGE_NODES = 1
 TEXTURE_ATLAS = 0
-"""Image and texture units of the kernel atlas."""
+TEXTURE_NODES = 1
+TEXTURE_STORE = 2
+"""Image and texture units: the frame's kernels, those of field nodes, the cache."""
 
-LAYER_WORDS = 2
-"""uvec4 words of one layer record."""
+STORE_SIDE_BITS = 12
+STORE_SIDE = 1 << STORE_SIDE_BITS
+"""Edge of a page of the cache, a texture array addressed as one line: no storage block
+could hold a cache over the whole field."""
+
+KERNEL_WORDS = 2
+"""uvec4 words of one kernel record."""
+
+MAX_LAYERS = 2048
+"""Layers of a frame; the note of what it uses is then 256 bytes of shared memory."""
+
+RECIPE_TAPS = 8
+"""Cached kernels that one layer of a field node is blended from."""
 
 RECIPE_WEIGHTS = 4
 """Word at which a recipe's weights start."""
@@ -104,7 +118,7 @@ BINDINGS = {
     "BINDING_COLOR_IN": 0,
     "BINDING_DEPTH_IN": 1,
     "BINDING_PIXELS": 2,
-    "BINDING_PIXEL_SPREAD": 3,
+    "BINDING_PIXEL_LAYER": 3,
     "BINDING_FRAGMENT_COLOR": 4,
     "BINDING_FRAGMENT_PLACE": 5,
     "BINDING_BLOCKS": 6,
@@ -112,9 +126,24 @@ BINDINGS = {
     "BINDING_TILE_OFFSETS": 8,
     "BINDING_ENTRIES": 9,
     "BINDING_ENTRIES_SPARE": 10,
-    "BINDING_LAYERS": 11,
-    "BINDING_STORE": 13,
-    "BINDING_RECIPES": 14,
+    "BINDING_KERNELS": 11,
+    "BINDING_KERNEL_OF": 12,
+    "BINDING_LAYER_DPT": 13,
+    "BINDING_USED": 14,
     "BINDING_COLOR_OUT": 15,
+    # The passes that build PSFs share no dispatch with those of a frame; core OpenGL
+    # promises eight bindings.
+    "BINDING_PSF_RECORDS": 0,
+    "BINDING_PSF_FIELD": 1,
+    "BINDING_PSF_TABLES": 2,
+    "BINDING_PSF_STRIPES": 3,
+    "BINDING_PSF_KERNELS": 4,
+    "BINDING_PSF_TOTALS": 5,
+    "BINDING_PSF_IMAGES": 6,
+    "BINDING_NODES": 0,
+    "BINDING_PARTS": 1,
+    "BINDING_RECIPES": 2,
+    "BINDING_WORK": 3,
 }
-"""Storage buffer bindings; the reference software renderer allows 16 per stage."""
+"""Storage buffer bindings; the reference software renderer allows 16 per stage.  Those
+of the blending passes take numbers of the frame's again."""

@@ -1,13 +1,13 @@
 """The passes of one frame or strip of it: what runs when, on which buffers."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import (
     BYTES_PER_WORD,
-    LAYER_WORDS,
     PAPER_SORT_KEY_BITS,
-    QUAD,
     RGB,
     SORT_KEY_BITS,
     THREADS,
@@ -15,15 +15,19 @@ from filter_service.constants import (
 )
 from filter_service.frame import View
 from filter_service.gpu import Buffer, Gpu, StageTimer
+from filter_service.image_cells import ImageCells
+from filter_service.kernel_passes import (
+    MAX_GROUPS,
+    KernelSet,
+    used_pairs,
+    words_per_cell,
+)
 from filter_service.psf_store import FrameLayers
 
 ENTRY_BYTES = 4
 MAX_BAND_ENTRIES = 16 * 2**20
 """Tile list entries in flight; more go through in bands.  Keeps each list buffer at
 64 MB, half of the smallest storage block that the service runs on."""
-
-MAX_GROUPS = 65535
-"""Work groups along one axis that every OpenGL 4.3 allows."""
 
 SOFTWARE_PIXELS_PER_THREAD = 8
 """2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
@@ -44,8 +48,13 @@ class FramePasses:
     ----------
     view : View
         The strip, with depth filled in.
-    scan_start_px, scan_total_px : int
-        Where the strip starts within the whole frame's scan, for the paper's order.
+    layers : FrameLayers
+    image : ImageCells
+        Cells of the whole frame.
+    first_row : int
+        Of the strip within the frame.
+    frame_pixel_count : int, optional
+        Of the whole frame, where it is larger than the strip.
     white_level : float
         Light against which the contrast of a merged quad counts.
     """
@@ -56,10 +65,12 @@ class FramePasses:
         view: View,
         timer: StageTimer,
         *,
+        layers: FrameLayers,
+        image: ImageCells,
         paper_rule: bool,
         merge: bool,
-        scan_start_px: int = 0,
-        scan_total_px: int | None = None,
+        first_row: int = 0,
+        frame_pixel_count: int | None = None,
         white_level: float = 1.0,
     ):
         self.gpu = gpu
@@ -72,9 +83,16 @@ class FramePasses:
         self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
         self.tile_count = self.grid[0] * self.grid[1]
         self.buffers: dict[str, Buffer] = {}
-        self.scan = (scan_start_px, scan_total_px or self.pixel_count)
+        self.layers = layers
+        self.image = image
+        self.first_row = first_row
+        self.scan = (
+            first_row * view.width_px,
+            frame_pixel_count or self.pixel_count,
+        )
         self.white_level = white_level
         self.entry_count = 0
+        self.kernel_count = 0
 
     def _reserve(self, **n_bytes: int) -> None:
         for name, size in n_bytes.items():
@@ -84,14 +102,14 @@ class FramePasses:
         self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
     ) -> None:
         defines = uniforms.pop("defines", None)
-        atlas = self.gpu.atlas(1) if uniforms.pop("with_atlas", False) else None
+        textures = uniforms.pop("textures", None)
         self.gpu.dispatch(
             name,
             groups,
             buffers={binding: self.buffers[binding] for binding in bindings},
             uniforms=uniforms,
             defines=defines,
-            atlas=atlas,
+            textures=textures,
         )
 
     def upload(self) -> None:
@@ -106,34 +124,36 @@ class FramePasses:
             self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
             self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
 
-    def run(self, layers: FrameLayers) -> None:
-        """Filter the strip; `read_back` fetches the picture."""
+    def run(self, kernels: Callable[[NDArray[np.bool_]], KernelSet]) -> None:
+        """Filter the strip; `read_back` fetches the picture.
+
+        Parameters
+        ----------
+        kernels : callable
+            From the used (cell, interval) pairs to the kernels for them.
+        """
         self.upload()
-        self.build_fragments(layers)
+        self.merge_fragments(kernels(self.build_fragments()))
         self.count_tiles()
         self.splat_bands()
 
-    def build_fragments(self, layers: FrameLayers) -> None:
-        """Linear light, dioptres, blur; then merging into blocks."""
-        slots = self.tile_count * THREADS
-        self._reserve(
-            LAYERS=1,
-            PIXELS=16 * self.pixel_count,
-            PIXEL_SPREAD=4 * self.pixel_count,
-            FRAGMENT_COLOR=16 * slots,
-            FRAGMENT_PLACE=16 * slots,
-            BLOCKS=16 * self.tile_count,
+    def build_fragments(self) -> NDArray[np.bool_]:
+        """Linear light, dioptres and layers; returns the used pairs."""
+        n_words = words_per_cell(self.layers)
+        used = np.zeros((self.image.count, n_words), np.uint32)
+        self._reserve(PIXELS=16 * self.pixel_count, PIXEL_LAYER=4 * self.pixel_count)
+        self.buffers["LAYER_DPT"] = self.gpu.upload(
+            "LAYER_DPT", self.layers.object_dpt.astype(np.float32)
         )
-        common = {
-            "frame_size_px": self.size,
-            "layer_count": len(layers.object_dpt),
-        }
+        self.buffers["USED"] = self.gpu.upload("USED", used)
         with self.timer.stage("fragments_ms"):
             self._run(
                 "build_fragments",
                 self.grid,
-                *("COLOR_IN", "DEPTH_IN", "LAYERS", "PIXELS", "PIXEL_SPREAD"),
-                **common,
+                *("COLOR_IN", "DEPTH_IN", "LAYER_DPT"),
+                *("PIXELS", "PIXEL_LAYER", "USED"),
+                **self._common,
+                words_per_cell=n_words,
                 tangents=self.view.tangents,
                 depth_is_planar=int(self.view.depth_kind == "planar"),
                 defines=(
@@ -142,20 +162,44 @@ class FramePasses:
                     else None
                 ),
             )
+        with self.timer.wall("psf_plan_ms"):
+            words = self.gpu.read(self.buffers["USED"], used.shape, np.uint32)
+            return used_pairs(words, self.layers)
+
+    @property
+    def _common(self) -> dict:
+        return {
+            "frame_size_px": self.size,
+            "layer_count": len(self.layers.object_dpt),
+            "cell_px": self.image.cell_px,
+            "cell_columns": self.image.grid[0],
+            "first_row": self.first_row,
+        }
+
+    def merge_fragments(self, kernels: KernelSet) -> None:
+        """Merge pixels into fragments, in blocks."""
+        slots = self.tile_count * THREADS
+        self.buffers.update(kernels.buffers)
+        self.kernel_count = kernels.kernels.count
+        self._reserve(
+            FRAGMENT_COLOR=16 * slots,
+            FRAGMENT_PLACE=16 * slots,
+            BLOCKS=16 * self.tile_count,
+        )
         with self.timer.stage("merge_ms"):
             self._run(
                 "merge_fragments",
                 self.grid,
-                *("PIXELS", "PIXEL_SPREAD", "LAYERS"),
+                *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
                 *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
-                **common,
-                blur_px_per_dpt=layers.blur_px_per_dpt,
+                **self._common,
+                blur_px_per_dpt=self.layers.blur_px_per_dpt,
                 merge_enabled=int(self.merge),
                 white_level=self.white_level,
                 paper_order=int(self.paper_rule),
                 scan_px=self.scan,
             )
-        reach_px = int(layers.radius_px.max()) + 1.5
+        reach_px = int(kernels.kernels.radius_px.max()) + 1.5
         self.search_blocks = min(
             group_count(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
         )
@@ -253,8 +297,8 @@ class FramePasses:
                         "TILE_COUNTS",
                         "TILE_OFFSETS",
                     ),
-                    *("ENTRIES", "LAYERS", "PIXELS", "COLOR_OUT"),
-                    with_atlas=True,
+                    *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
+                    textures={"ATLAS": self.gpu.atlas("kernels", 1)},
                     frame_size_px=self.size,
                     tile_grid=self.grid,
                     **band,
@@ -312,24 +356,6 @@ class FramePasses:
         return singles_saved * 4 // 3
 
 
-def layer_table(layers: FrameLayers) -> tuple[NDArray[np.uint32], int]:
-    """Layer records (n, 2, 4) for common/layers.glsl, and texels of all kernels."""
-    widths = 2 * layers.radius_px + 1
-    single, merged = widths**2, (widths + 1) ** 2
-    starts = np.concatenate([[0], np.cumsum(single + merged)])
-    table = np.zeros((len(widths), LAYER_WORDS, 4), dtype=np.uint32)
-    table[:, 0, 0] = layers.object_dpt.astype(np.float32).view(np.uint32)
-    table[:, 0, 1] = starts[:-1]
-    table[:, 0, 2] = starts[:-1] + single
-    table[:, 0, 3] = layers.radius_px
-    table[:, 1, 0] = layers.spread_px.astype(np.float32).view(np.uint32)
-    scale = layers.peak_ratio.astype(np.float32)
-    table[:, 1, 1] = scale.view(np.uint32)
-    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
-    table[:, 1, 2] = merged_scale.view(np.uint32)
-    return table, int(starts[-1])
-
-
 def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
     """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
     bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
@@ -342,26 +368,3 @@ def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
         bands.append((first, tiles, 0, int(sums[tiles - 1])))
         first += tiles
     return offsets, bands
-
-
-def blend_layers(gpu: Gpu, layers: FrameLayers, store_kernels: Buffer) -> None:
-    """Upload the layer table and compute the layer kernels, single and merged."""
-    table, texel_count = layer_table(layers)
-    largest = 2 * int(layers.radius_px.max()) + 2
-    buffers = {
-        "STORE": store_kernels,
-        "LAYERS": gpu.upload("LAYERS", table),
-        "RECIPES": gpu.upload("RECIPES", layers.recipes),
-    }
-    atlas = gpu.atlas(texel_count)
-    groups = (group_count(largest * largest, THREADS), max(len(table) - 1, 1))
-    gpu.dispatch(
-        "blend_psfs",
-        groups,
-        buffers=buffers,
-        uniforms={"layer_count": len(table)},
-        atlas=atlas,
-    )
-    gpu.dispatch(
-        "merge_psfs", groups, buffers={"LAYERS": buffers["LAYERS"]}, atlas=atlas
-    )

@@ -12,10 +12,13 @@ from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
 from filter_service.shader_source import legend, load_shader
 
 Buffer = moderngl.Buffer
+Pages = moderngl.TextureArray
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than asked, so that slowly rising needs
 do not reallocate every frame."""
+
+ATLAS_TEXEL_BYTES = 16
 
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 
@@ -53,13 +56,16 @@ class Gpu:
         self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
         self._buffers: dict[str, moderngl.Buffer] = {}
         self._programs: dict[tuple, moderngl.ComputeShader] = {}
-        self._atlas: moderngl.Texture | None = None
+        self._atlases: dict[str, moderngl.Texture] = {}
 
     def close(self) -> None:
         """Free everything; the object is of no use afterwards."""
         for buffer in self._buffers.values():
             buffer.release()
         self._buffers.clear()
+        for atlas in self._atlases.values():
+            atlas.release()
+        self._atlases.clear()
         self._programs.clear()
         self.context.release()
 
@@ -104,37 +110,69 @@ class Gpu:
             buffer.write(data.reshape(-1).view(np.uint8))
         return buffer
 
-    def make_buffer(self, data: NDArray) -> moderngl.Buffer:
-        """Return a buffer of its own for data that outlives a frame."""
-        if data.nbytes > self.max_block_bytes:
-            raise OutOfGpuMemory(
-                f"{data.nbytes / 1e6:.0f} MB of PSFs, a storage block holds "
-                f"{self.max_block_bytes / 1e6:.0f} MB here; narrow the pupil, focus or "
-                "object range, or use a smaller image"
-            )
-        return self.context.buffer(
-            np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    def pages(self, n_words: int) -> Pages:
+        """Texture array of 16-bit words for data that outlives a frame.
+
+        Pages of STORE_SIDE lines of STORE_SIDE words; the last line, or page, is whole.
+
+        Raises
+        ------
+        OutOfGpuMemory
+            More pages than a texture array may have, or than the device holds.
+        """
+        side = constants.STORE_SIDE
+        lines = max(-(-n_words // side), 1)
+        count = -(-lines // side)
+        limit = int(self.context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
+        size = (side, min(lines, side), count)
+        if count <= limit:
+            try:
+                pages = self.context.texture_array(size, 1, dtype="u2")
+            except moderngl.Error as error:
+                raise OutOfGpuMemory(
+                    f"{2e-6 * n_words:.0f} MB of PSFs: {error}"
+                ) from error
+            pages.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            return pages
+        raise OutOfGpuMemory(
+            f"{2e-6 * n_words:.0f} MB of PSFs, a texture array holds "
+            f"{2e-6 * limit * side * side:.0f} MB here; narrow the pupil, focus or "
+            "object range, or use a smaller image"
         )
 
-    def atlas(self, n_texels: int) -> moderngl.Texture:
-        """Texture of four uints for this many texels in lines of ATLAS_WIDTH."""
+    def write_pages(self, pages: Pages, first_line: int, lines: NDArray) -> None:
+        """Copy whole lines (n, STORE_SIDE) of words to pages, from a line on."""
+        side = constants.STORE_SIDE
+        while len(lines):
+            page, row = divmod(first_line, side)
+            count = min(len(lines), side - row)
+            pages.write(
+                np.ascontiguousarray(lines[:count]),
+                viewport=(0, row, page, side, count, 1),
+            )
+            first_line, lines = first_line + count, lines[count:]
+
+    def atlas(self, name: str, n_texels: int) -> moderngl.Texture:
+        """Named, grow-only texture of four uints a texel, in lines of ATLAS_WIDTH."""
         rows = -(-n_texels // constants.ATLAS_WIDTH)
-        if self._atlas is not None and self._atlas.height >= rows:
-            return self._atlas
+        atlas = self._atlases.get(name)
+        if atlas is not None and atlas.height >= rows:
+            return atlas
         limit = int(self.context.info["GL_MAX_TEXTURE_SIZE"])
         if rows > limit:
             raise OutOfGpuMemory(
-                f"layer kernels need {n_texels} texels, "
+                f"the frame's kernels need {n_texels} texels, "
                 f"a texture holds {limit * constants.ATLAS_WIDTH} here"
             )
-        if self._atlas is not None:
-            self._atlas.release()
-        wanted = min(int(rows * GROWTH) + 1, limit)
-        self._atlas = self.context.texture(
-            (constants.ATLAS_WIDTH, wanted), 4, dtype="u4"
-        )
-        self._atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        return self._atlas
+        wanted = rows
+        if atlas is not None:
+            atlas.release()
+            del self._atlases[name]
+            wanted = min(int(rows * GROWTH) + 1, limit)
+        atlas = self.context.texture((constants.ATLAS_WIDTH, wanted), 4, dtype="u4")
+        atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._atlases[name] = atlas
+        return atlas
 
     def read(self, buffer: moderngl.Buffer, shape: tuple, dtype) -> NDArray:
         """Read the start of a buffer as an array."""
@@ -145,8 +183,10 @@ class Gpu:
 
     @property
     def memory_mb(self) -> float:
-        """Bytes held by the named buffers."""
-        return sum(buffer.size for buffer in self._buffers.values()) / 1e6
+        """Bytes held by the named buffers and atlases."""
+        buffers = sum(buffer.size for buffer in self._buffers.values())
+        texels = sum(a.width * a.height for a in self._atlases.values())
+        return (buffers + ATLAS_TEXEL_BYTES * texels) / 1e6
 
     # ----- programs
 
@@ -169,7 +209,8 @@ class Gpu:
         buffers: dict[str, moderngl.Buffer],
         uniforms: dict | None = None,
         defines: dict | None = None,
-        atlas: moderngl.Texture | None = None,
+        images: dict[str, moderngl.Texture] | None = None,
+        textures: dict[str, moderngl.Texture | Pages] | None = None,
     ) -> None:
         """Run a pass and order its writes before what follows.
 
@@ -182,8 +223,8 @@ class Gpu:
             A uniform that the compiler removed is skipped.
         defines : dict, optional
             Variant of the pass.
-        atlas : Texture, optional
-            The kernel atlas, bound as image and as texture.
+        images, textures : dict, optional
+            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture.
         """
         program = self.program(name, **(defines or {}))
         for binding, buffer in buffers.items():
@@ -192,9 +233,11 @@ class Gpu:
             member = program.get(key, None)
             if member is not None:
                 member.value = value
-        if atlas is not None:
-            atlas.bind_to_image(constants.IMAGE_ATLAS, read=True, write=True)
-            atlas.use(constants.TEXTURE_ATLAS)
+        for name_of, image in (images or {}).items():
+            unit = getattr(constants, f"IMAGE_{name_of}")
+            image.bind_to_image(unit, read=True, write=True)
+        for name_of, texture in (textures or {}).items():
+            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
         program.run(max(groups[0], 1), max(groups[1], 1), 1)
         self.context.memory_barrier()
 

@@ -1,122 +1,54 @@
-"""Builds the PSF cache of a profile for a camera: CPU only, no GL, cancellable."""
+"""Builds the PSF cache of an eye for a camera: CPU only, no GL, cancellable."""
 
-import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import EyeProfile
-from estimator.psf import Psf, compute_psfs
-from filter_service.constants import RGB, WEIGHT_MAX
+from estimator.psf import PsfBatch, compute_psf_batch
+from filter_service.constants import RGB
 from filter_service.errors import BuildCancelled
 from filter_service.eye import Eye
-from filter_service.psf_grid import GridSpec, defocus_nodes_dpt, pupil_nodes_mm
-from filter_service.psf_store import (
-    PsfStore,
-    channel_defocus_dpt,
-    channel_wavelengths_nm,
-)
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_pack import PackedKernels, pack_kernels
+from filter_service.psf_plan import CachePlan, plan_cache
+from filter_service.psf_store import PsfStore, channel_wavelengths_nm
 
 COMPUTED_BEYOND = 0.2
 """Kernels are computed out to this share of the light that trimming will drop."""
 
-MAX_CENTROID_SHIFT_PX = 0.005
-"""Trimming stops where it would move a kernel's centroid farther than this."""
-
-CHUNK = 192
+CHUNK = 768
 """PSFs between two looks at progress and cancellation."""
 
 
 @dataclass(frozen=True)
-class CachePlan:
-    """Nodes of a cache, before anything is computed.
+class _Requests:
+    """States (n,) whose PSFs make up a cache, channel fastest."""
 
-    Attributes
-    ----------
-    pupils_mm : (n_pupils,)
-    accommodations_dpt : (n_accommodations,)
-    defocus_dpt : [pupil][accommodation] of (n,) arrays
-    """
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    pupil_diameter_mm: NDArray[np.float64]
+    accommodation_dpt: NDArray[np.float64]
+    total_defocus_dpt: NDArray[np.float64]
+    wavelength_nm: NDArray[np.float64]
 
-    pupils_mm: NDArray[np.float64]
-    accommodations_dpt: NDArray[np.float64]
-    defocus_dpt: list[list[NDArray[np.float64]]]
-
-
-def _neighbours(index: int, count: int) -> range:
-    return range(max(index - 1, 0), min(index + 2, count))
-
-
-def _total_defocus_ranges_dpt(
-    eye: Eye, spec: GridSpec, pupils_mm: NDArray, used_dpt: NDArray
-) -> NDArray[np.float64]:
-    """Smallest and largest total defocus (n_pupils, n_accommodations, 2) at each node.
-
-    Over objects and channels, and over every accommodation that reads this node.
-    """
-    at_infinity_dpt = np.array(
-        [
-            [
-                channel_defocus_dpt(
-                    eye, spec, pupil_diameter_mm=pupil_mm, accommodation_dpt=a
-                )
-                for a in used_dpt
-            ]
-            for pupil_mm in pupils_mm
-        ]
-    )
-    if len(used_dpt) == 1:  # one shape for all: accommodation is defocus alone
-        spread = [eye.accommodation_dpt(f) - used_dpt[0] for f in spec.focus_range_dpt]
-        lows = at_infinity_dpt.min(axis=2) - max(spread)
-        highs = at_infinity_dpt.max(axis=2) - min(spread)
-    else:
-        beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
-        lows = np.stack(
-            [at_infinity_dpt[:, list(j)].min(axis=(1, 2)) for j in beside], axis=1
-        )
-        highs = np.stack(
-            [at_infinity_dpt[:, list(j)].max(axis=(1, 2)) for j in beside], axis=1
-        )
-    low, high = spec.object_range_dpt
-    return np.stack([lows + low, highs + high], axis=-1)
-
-
-def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
-    """Pupil and accommodation nodes, and the defocus nodes that frames can read."""
-    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
-    pupils_mm = pupil_nodes_mm((low_mm, high_mm))
-    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
-    ranges = _total_defocus_ranges_dpt(eye, spec, pupils_mm, used_dpt)
-    # A pupil between two nodes reads both at equal blur, up to the other's own.
-    scaled = ranges * pupils_mm[:, None, None]
-    defocus = []
-    for i, pupil_mm in enumerate(pupils_mm):
-        beside = list(_neighbours(i, len(pupils_mm)))
-        defocus.append(
-            [
-                defocus_nodes_dpt(
-                    float(scaled[beside, j, 0].min() / pupil_mm),
-                    float(scaled[beside, j, 1].max() / pupil_mm),
-                    blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
-                    max_blur_step_px=spec.max_blur_step_px,
-                )
-                for j in range(len(used_dpt))
-            ]
-        )
-    return CachePlan(
-        pupils_mm=pupils_mm, accommodations_dpt=used_dpt, defocus_dpt=defocus
-    )
+    def part(self, chosen: slice) -> dict[str, NDArray]:
+        """Arguments of `Eye.wavefronts` for some of them."""
+        return {name: values[chosen] for name, values in vars(self).items()}
 
 
 def build_psf_store(
     eye: Eye | EyeProfile,
     spec: GridSpec,
     *,
+    plan: CachePlan | None = None,
     progress: Callable[[float, str], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> PsfStore:
@@ -126,135 +58,122 @@ def build_psf_store(
     ----------
     eye : Eye or EyeProfile
         A profile is used as the measured wavefront.
+    plan : CachePlan, optional
+        Nodes other than those that `psf_plan.plan_cache` chooses.
     progress : callable, optional
         Called with a fraction 0..1 and a stage.
     cancelled : callable, optional
-        Asked between chunks of about 200 PSFs.
+        Asked between chunks of a few hundred PSFs.
 
     Raises
     ------
     filter_service.errors.BuildCancelled
     estimator.psf.PsfTooLarge
         A kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
+    filter_service.psf_plan.PlanTooLarge
     """
     started_s = time.perf_counter()
     if isinstance(eye, EyeProfile):
         eye = MeasuredWavefront.from_profile(eye)
-    plan = plan_cache(eye, spec)
+    plan = plan or plan_cache(eye, spec)
     channels = RGB if spec.chromatic else 1
-    zernike_um, pupil_of, wavelength_of = _requests(eye, spec, plan, channels)
-    psfs = []
-    for first in range(0, len(zernike_um), CHUNK):
-        if cancelled is not None and cancelled():
-            raise BuildCancelled("a newer profile took over")
-        part = slice(first, first + CHUNK)
-        computed = compute_psfs(
-            zernike_um[part],
-            pupil_diameter_mm=pupil_of[part],
-            wavelength_nm=wavelength_of[part],
-            pixel_pitch_mrad=spec.pixel_pitch_mrad,
-            diffraction=spec.diffraction,
-            max_radius_px=spec.max_blur_radius_px,
-            min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
+    requests = _requests(spec, plan, channels)
+    count = requests.h_deg.size
+    methods: Counter[str] = Counter()
+    packed, blur_px = [], []
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for first in range(0, count, CHUNK):
+            if cancelled is not None and cancelled():
+                raise BuildCancelled("a newer profile took over")
+            batch = _computed(eye, spec, requests.part(slice(first, first + CHUNK)))
+            packed.append(
+                pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool)
+            )
+            blur_px.append(batch.blur_radius_px)
+            methods += _methods(batch)
+            if progress is not None:
+                progress(min(1.0, (first + CHUNK) / count), "psfs")
+    build_ms = 1e3 * (time.perf_counter() - started_s)
+    return _store(spec, eye, plan, packed, np.concatenate(blur_px), methods, build_ms)
+
+
+def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
+    v_deg, h_deg, pupils_mm, used_dpt = (
+        axis.ravel()
+        for axis in np.meshgrid(
+            *(plan.v_deg, plan.h_deg, plan.pupils_mm, plan.accommodations_dpt),
+            indexing="ij",
         )
-        psfs += [
-            trimmed(psf, kept_energy_ratio=spec.kept_energy_ratio) for psf in computed
+    )
+    of_group = np.repeat(np.arange(h_deg.size), np.diff(plan.defocus.starts))
+    wavelengths_nm = np.array(channel_wavelengths_nm(spec)[:channels])
+
+    def each(values: NDArray) -> NDArray[np.float64]:
+        return np.repeat(values, channels)
+
+    shift_dpt = plan.channel_shift_dpt[of_group, :channels]
+    return _Requests(
+        h_deg=each(h_deg[of_group]),
+        v_deg=each(v_deg[of_group]),
+        pupil_diameter_mm=each(pupils_mm[of_group]),
+        accommodation_dpt=each(used_dpt[of_group]),
+        total_defocus_dpt=(plan.defocus.values[:, None] + shift_dpt).ravel(),
+        wavelength_nm=np.tile(wavelengths_nm, of_group.size),
+    )
+
+
+def _computed(eye: Eye, spec: GridSpec, states: dict[str, NDArray]) -> PsfBatch:
+    found = eye.wavefronts(**states)
+    return compute_psf_batch(
+        found.zernike_um,
+        pupil_diameter_mm=found.circle_diameter_mm,
+        pupil_ellipse=found.pupil_ellipse,
+        wavelength_nm=states["wavelength_nm"],
+        pixel_from_mrad=spec.pixel_from_mrad(states["h_deg"], states["v_deg"]),
+        diffraction=spec.diffraction,
+        max_radius_px=spec.max_blur_radius_px,
+        min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
+    )
+
+
+def _methods(batch: PsfBatch) -> Counter[str]:
+    """PSFs by the method that has the larger share in them."""
+    by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
+    counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
+    return Counter({name: number for name, number in counts.items() if number})
+
+
+def _store(
+    spec: GridSpec,
+    eye: Eye,
+    plan: CachePlan,
+    packed: list[PackedKernels],
+    blur_px: NDArray,
+    methods: Counter,
+    build_ms: float,
+) -> PsfStore:
+    def joined(name: str) -> NDArray:
+        return np.concatenate([getattr(part, name) for part in packed])
+
+    ends = np.cumsum([part.weights.size for part in packed])
+    offsets = np.concatenate(
+        [
+            part.offsets + end - part.weights.size
+            for part, end in zip(packed, ends, strict=True)
         ]
-        if progress is not None:
-            progress(min(1.0, (first + CHUNK) / len(zernike_um)), "psfs")
-    return _packed(spec, eye, plan, channels, psfs, started_s)
-
-
-def trimmed(psf: Psf, *, kept_energy_ratio: float) -> Psf:
-    """Cut a kernel's faint rim off and bring it back to unit sum."""
-    full_px = psf.radius_px
-    axis = np.arange(-full_px, full_px + 1)
-    ring = np.ceil(np.hypot(axis[:, None], axis[None]) - 0.5).astype(np.int64).ravel()
-    kernel = psf.kernel.astype(np.float64)
-    light = np.bincount(ring, kernel.ravel())
-    moment_x = np.bincount(ring, (kernel * axis[None]).ravel())
-    moment_y = np.bincount(ring, (kernel * axis[:, None]).ravel())
-    kept = np.cumsum(light)[: full_px + 1]
-    centroid_x, centroid_y = (
-        np.cumsum(m)[: full_px + 1] / np.maximum(kept, 1e-12)
-        for m in (moment_x, moment_y)
     )
-    shift_px = np.hypot(centroid_x - centroid_x[-1], centroid_y - centroid_y[-1])
-    good = (kept >= kept_energy_ratio) & (shift_px <= MAX_CENTROID_SHIFT_PX)
-    # The rule must hold from the radius on, not by a crossing on the way.
-    radius_px = full_px - int(np.argmin(np.append(good[::-1], False))) + 1
-    if radius_px >= full_px:
-        return psf
-    part = slice(full_px - radius_px, full_px + radius_px + 1)
-    inner = np.where(ring.reshape(kernel.shape) <= radius_px, kernel, 0.0)[part, part]
-    return replace(
-        psf,
-        kernel=(inner / inner.sum()).astype(np.float32),
-        radius_px=radius_px,
-        lost_energy_ratio=psf.lost_energy_ratio + 1.0 - float(kept[radius_px]),
-    )
-
-
-def _quantised(psfs: list[Psf]) -> NDArray[np.uint16]:
-    """All kernels one after the other, each in steps of its peak / WEIGHT_MAX."""
-    parts = [
-        np.rint(psf.kernel.ravel() * (WEIGHT_MAX / psf.kernel.max())).astype(np.uint16)
-        for psf in psfs
-    ]
-    whole_words = np.zeros(sum(part.size for part in parts) % 2, np.uint16)
-    return np.concatenate([*parts, whole_words])
-
-
-def _spread_px(kernel: np.ndarray) -> float:
-    """Radius of the uniform disc that has this kernel's sum of squares."""
-    return 1.0 / math.sqrt(math.pi * float(np.square(kernel, dtype=np.float64).sum()))
-
-
-def _requests(eye, spec, plan, channels):
-    """Wavefronts (n, 28), pupils (n,) and wavelengths (n,), channel fastest."""
-    wavelengths_nm = channel_wavelengths_nm(spec)[:channels]
-    requests = [
-        (pupil_mm, accommodation_dpt, total_dpt, wavelength_nm)
-        for pupil_mm, by_use in zip(plan.pupils_mm, plan.defocus_dpt, strict=True)
-        for accommodation_dpt, nodes in zip(
-            plan.accommodations_dpt, by_use, strict=True
-        )
-        for total_dpt in nodes
-        for wavelength_nm in wavelengths_nm
-    ]
-    zernike_um = [
-        eye.zernike_at_defocus(
-            pupil_diameter_mm=pupil_mm,
-            accommodation_dpt=accommodation_dpt,
-            wavelength_nm=wavelength_nm,
-            total_defocus_dpt=total_dpt,
-        )
-        for pupil_mm, accommodation_dpt, total_dpt, wavelength_nm in requests
-    ]
-    pupil_of, _, _, wavelength_of = np.array(requests).T
-    return np.array(zernike_um), pupil_of, wavelength_of
-
-
-def _packed(spec, eye, plan, channels, psfs, started_s) -> PsfStore:
-    sizes = np.array([psf.kernel.size for psf in psfs])
-    share = np.repeat(np.arange(len(psfs)), RGB // channels)
-    offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    counts = [len(nodes) for by_use in plan.defocus_dpt for nodes in by_use]
-    first_psf = RGB * np.concatenate([[0], np.cumsum(counts)[:-1]])
+    copies = 1 if spec.chromatic else RGB  # channels that share a kernel
     return PsfStore(
         spec=spec,
         eye=eye,
-        pupil_nodes_mm=plan.pupils_mm,
-        accommodation_nodes_dpt=plan.accommodations_dpt,
-        defocus_nodes_dpt=plan.defocus_dpt,
-        first_psf=first_psf.reshape(len(plan.pupils_mm), -1),
-        kernels=_quantised(psfs),
-        offsets=offsets[share],
-        radius_px=np.array([psf.radius_px for psf in psfs])[share],
-        blur_px=np.array([psf.blur_radius_px for psf in psfs])[share],
-        spread_px=np.array([_spread_px(psf.kernel) for psf in psfs])[share],
-        peak_ratio=np.array([float(psf.kernel.max()) for psf in psfs])[share],
-        methods=dict(Counter(psf.method for psf in psfs)),
-        max_lost_energy_ratio=max(psf.lost_energy_ratio for psf in psfs),
-        build_ms=1e3 * (time.perf_counter() - started_s),
+        plan=plan,
+        kernels=joined("weights"),
+        offsets=np.repeat(offsets, copies),
+        radius_px=np.repeat(joined("radius_px"), copies),
+        blur_px=np.repeat(blur_px, copies),
+        spread_px=np.repeat(joined("spread_px"), copies),
+        peak_ratio=np.repeat(joined("peak_ratio"), copies),
+        methods=dict(methods),
+        max_lost_energy_ratio=float(joined("lost_energy_ratio").max()),
+        build_ms=build_ms,
     )

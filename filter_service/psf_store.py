@@ -1,4 +1,4 @@
-"""The PSF cache of one eye and camera, and its blending recipe for one frame.
+"""The PSF cache of one eye and camera, and the layers of one frame.
 
 Plain arrays without GL: the worker fills it, the renderer uploads it.
 """
@@ -9,22 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.units import REFERENCE_WAVELENGTH_NM
-from filter_service.constants import RECIPE_WORDS, RGB, WEIGHT_MAX
+from filter_service.constants import RGB
 from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, layer_distances_dpt
+from filter_service.psf_nodes import bracket_axis
+from filter_service.psf_plan import CachePlan
 
 
 @dataclass(frozen=True)
 class PsfStore:
-    """Kernels over pupil, total defocus and channel.
+    """Kernels over field, pupil, accommodation, total defocus and channel.
+
+    Node n of ``plan.defocus`` and channel c have PSF 3 n + c.
 
     Attributes
     ----------
-    pupil_nodes_mm : (n_pupils,)
-    accommodation_nodes_dpt : (n_accommodations,)
-    defocus_nodes_dpt : [pupil][accommodation] of (n_defocus,) arrays, ascending
-    first_psf : (n_pupils, n_accommodations)
-        PSF index of the first node; node k and channel c follow at 3 k + c.
+    plan : CachePlan
+        Where the nodes are.
     kernels : (n_texels,), uint16
         All kernels, rows downwards, one after the other; in steps of the kernel's peak
         over WEIGHT_MAX, which is finer than half floats and half of what floats take.
@@ -41,10 +42,7 @@ class PsfStore:
 
     spec: GridSpec
     eye: Eye
-    pupil_nodes_mm: NDArray[np.float64]
-    accommodation_nodes_dpt: NDArray[np.float64]
-    defocus_nodes_dpt: list[list[NDArray[np.float64]]]
-    first_psf: NDArray[np.int64]
+    plan: CachePlan
     kernels: NDArray[np.uint16]
     offsets: NDArray[np.int64]
     radius_px: NDArray[np.int64]
@@ -68,30 +66,24 @@ class PsfStore:
 
 @dataclass(frozen=True)
 class FrameLayers:
-    """Layers of one frame: distances, sizes and what to blend from the cache.
+    """How an eye in one state reads its cache, and the layers that frames then have.
 
     Attributes
     ----------
-    object_dpt : (n,)
-    radius_px : (n,)
-        Kernel radius of the interval from this layer to the next.
-    peak_ratio : (n,)
-        Bound on the weights of that interval.
-    blur_px : (n,)
-        Largest geometric blur radius over the channels.
-    spread_px : (n,)
-        Smallest spread over the channels; decides what may merge.
-    recipes : (n, 3, 24), uint32
-        Per channel eight kernel offsets, eight radii, eight weights (float bits) that
-        turn steps of a kernel into its share of a layer.
+    object_dpt : (n_layers,)
+        Object distances, ascending; the same over the whole field.
+    at_infinity_dpt : (n_fields, 3)
+        Total defocus for an object at infinity, per field node and channel.
+    corners : list of (pupil node, accommodation node, weight)
+        Cached neighbours of the state.
+    max_radius_px : int
+        No kernel of these layers is larger.
     """
 
     object_dpt: NDArray[np.float64]
-    radius_px: NDArray[np.int64]
-    peak_ratio: NDArray[np.float64]
-    blur_px: NDArray[np.float64]
-    spread_px: NDArray[np.float64]
-    recipes: NDArray[np.uint32]
+    at_infinity_dpt: NDArray[np.float64]
+    corners: tuple[tuple[int, int, float], ...]
+    max_radius_px: int
     pupil_diameter_mm: float
     focus_dpt: float
     blur_px_per_dpt: float
@@ -104,18 +96,21 @@ def channel_wavelengths_nm(spec: GridSpec) -> tuple[float, ...]:
 
 
 def channel_defocus_dpt(
-    eye: Eye, spec: GridSpec, *, pupil_diameter_mm: float, accommodation_dpt: float
+    eye: Eye,
+    spec: GridSpec,
+    *,
+    h_deg: NDArray,
+    v_deg: NDArray,
+    pupil_diameter_mm: float,
+    accommodation_dpt: float,
 ) -> NDArray[np.float64]:
-    """Total defocus (3,) per channel for an object at infinity."""
-    return np.array(
-        [
-            eye.total_defocus_dpt(
-                pupil_diameter_mm=pupil_diameter_mm,
-                accommodation_dpt=accommodation_dpt,
-                wavelength_nm=wavelength_nm,
-            )
-            for wavelength_nm in channel_wavelengths_nm(spec)
-        ]
+    """Total defocus (n_fields, 3) per channel for an object at infinity."""
+    return eye.total_defocus_dpt(
+        h_deg=np.asarray(h_deg, float)[:, None],
+        v_deg=np.asarray(v_deg, float)[:, None],
+        pupil_diameter_mm=pupil_diameter_mm,
+        accommodation_dpt=accommodation_dpt,
+        wavelength_nm=np.array(channel_wavelengths_nm(spec)),
     )
 
 
@@ -129,8 +124,6 @@ def frame_layers(
     """Plan a frame's layers for a pupil and focus.
 
     The pupil is clamped to the cache's range and to what was measured, with a note.
-    Neighbouring pupils and accommodations are blended at equal geometric blur: the node
-    of pupil A_i is read at total defocus t A / A_i, so no blended pair differs in size.
 
     Parameters
     ----------
@@ -141,34 +134,42 @@ def frame_layers(
     ----------
     Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
     """
+    plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
-    notes += store.eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-    accommodation_dpt = store.eye.accommodation_dpt(focus_dpt)
+    notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
+    accommodation_dpt = eye.accommodation_dpt(focus_dpt)
+    v_deg, h_deg = (
+        axis.ravel() for axis in np.meshgrid(plan.v_deg, plan.h_deg, indexing="ij")
+    )
     at_infinity_dpt = channel_defocus_dpt(
-        store.eye,
+        eye,
         store.spec,
+        h_deg=h_deg,
+        v_deg=v_deg,
         pupil_diameter_mm=pupil_mm,
         accommodation_dpt=accommodation_dpt,
     )
-    blend = _Blend(store, pupil_mm, accommodation_dpt)
+    corners = tuple(
+        (pupil, used, pupil_weight * used_weight)
+        for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
+        for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
+        if pupil_weight * used_weight > 0.0
+    )
+    state = (store, pupil_mm, corners, at_infinity_dpt)
+    gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
     object_dpt = layer_distances_dpt(
         object_range_dpt or store.spec.object_range_dpt,
-        focused_dpt=-at_infinity_dpt,
-        blur_radius_px=lambda d: blend.blur_px(d[:, None] + at_infinity_dpt),
+        focused_dpt=-at_infinity_dpt[gaze],
+        blur_radius_px=lambda distance_dpt: _blur_px(*state, distance_dpt),
         max_blur_step_px=store.spec.max_blur_step_px,
     )
-    psfs, weights = blend.neighbours(object_dpt[:, None] + at_infinity_dpt)
-    own_px = np.where(weights > 0.0, store.radius_px[psfs], 0).max(axis=(1, 2))
-    own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
     return FrameLayers(
         object_dpt=object_dpt,
-        radius_px=np.maximum(own_px, np.append(own_px[1:], own_px[-1])),
-        peak_ratio=np.maximum(own_peak, np.append(own_peak[1:], own_peak[-1])),
-        blur_px=blend.blur_px(object_dpt[:, None] + at_infinity_dpt).max(axis=1),
-        spread_px=(weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
-        recipes=_recipes(store, psfs, weights),
+        at_infinity_dpt=at_infinity_dpt,
+        corners=corners,
+        max_radius_px=_max_radius_px(*state, object_dpt),
         pupil_diameter_mm=pupil_mm,
-        focus_dpt=store.eye.reachable_focus_dpt(focus_dpt),
+        focus_dpt=eye.reachable_focus_dpt(focus_dpt),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
     )
@@ -176,7 +177,7 @@ def frame_layers(
 
 def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
     usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
-    low_mm, high_mm = store.pupil_nodes_mm[0], store.pupil_nodes_mm[-1]
+    low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
     clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
     if abs(clamped_mm - usable_mm) <= 1e-9:
         return clamped_mm, ()
@@ -187,61 +188,73 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
     return clamped_mm, (note,)
 
 
-def _bracket(nodes: NDArray, value: float) -> list[tuple[int, float]]:
-    """Neighbouring nodes and their weights; one node twice where there is only one."""
-    last = len(nodes) - 1
-    upper = int(np.clip(np.searchsorted(nodes, value), min(1, last), last))
-    lower = max(upper - 1, 0)
-    span = nodes[upper] - nodes[lower]
-    fraction = (value - nodes[lower]) / span if span > 0 else 0.0
-    fraction = float(np.clip(fraction, 0.0, 1.0))
-    return [(lower, 1.0 - fraction), (upper, fraction)]
+def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
+    lower, upper, share = bracket_axis(nodes, value)
+    return [(int(lower), 1.0 - float(share)), (int(upper), float(share))]
 
 
-class _Blend:
-    """Cached neighbours of one pupil and accommodation at any total defocus."""
+def neighbours(
+    store: PsfStore,
+    pupil_mm: float,
+    corners: tuple[tuple[int, int, float], ...],
+    fields: NDArray[np.int64],
+    total_dpt: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """PSFs and weights (n, 3, 2 n_corners) that make up n states of total defocus.
 
-    def __init__(self, store: PsfStore, pupil_mm: float, accommodation_dpt: float):
-        self.store = store
-        self.pupil_mm = pupil_mm
-        self.corners = [
-            (pupil, accommodation, pupil_weight * accommodation_weight)
-            for pupil, pupil_weight in _bracket(store.pupil_nodes_mm, pupil_mm)
-            for accommodation, accommodation_weight in _bracket(
-                store.accommodation_nodes_dpt, accommodation_dpt
-            )
-        ]
+    Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i is
+    read at total defocus t A / A_i, so no blended pair differs in size.
 
-    def neighbours(self, total_dpt: NDArray) -> tuple[NDArray, NDArray]:
-        """PSF indices and weights (n, 3, 8) for total defocus (n, 3), dpt."""
-        channels = np.arange(RGB)
-        psfs, weights = [], []
-        for pupil, accommodation, corner_weight in self.corners:
-            nodes = self.store.defocus_nodes_dpt[pupil][accommodation]
-            last = len(nodes) - 1
-            scaled = total_dpt * self.pupil_mm / self.store.pupil_nodes_mm[pupil]
-            scaled = np.clip(scaled, nodes[0], nodes[-1])
-            upper = np.clip(np.searchsorted(nodes, scaled), min(1, last), last)
-            lower = np.maximum(upper - 1, 0)
-            span = nodes[upper] - nodes[lower]
-            safe = np.where(span > 0, span, 1.0)
-            fraction = np.where(span > 0, (scaled - nodes[lower]) / safe, 0.0)
-            first = self.store.first_psf[pupil, accommodation]
-            psfs += [first + RGB * lower + channels, first + RGB * upper + channels]
-            weights += [corner_weight * (1.0 - fraction), corner_weight * fraction]
-        return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
-
-    def blur_px(self, total_dpt: NDArray) -> NDArray:
-        """Geometric blur radius (n, 3), px."""
-        psfs, weights = self.neighbours(total_dpt)
-        return (self.store.blur_px[psfs] * weights).sum(axis=-1)
+    Parameters
+    ----------
+    fields : (n,)
+        Field nodes.
+    total_dpt : (n, 3)
+    """
+    plan = store.plan
+    channels = np.arange(RGB)
+    psfs, weights = [], []
+    for pupil, used, corner_weight in corners:
+        groups = (
+            fields * plan.pupils_mm.size + pupil
+        ) * plan.accommodations_dpt.size + used
+        lower, upper, share = plan.defocus.bracket(
+            groups[:, None],
+            total_dpt * (pupil_mm / plan.pupils_mm[pupil])
+            - plan.channel_shift_dpt[groups],
+        )
+        psfs += [RGB * lower + channels, RGB * upper + channels]
+        weights += [corner_weight * (1.0 - share), corner_weight * share]
+    return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
 
 
-def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uint32]:
-    neighbours = psfs.shape[-1]
-    recipes = np.empty((*psfs.shape[:2], RECIPE_WORDS * 4), dtype=np.uint32)
-    recipes[..., :neighbours] = store.offsets[psfs]
-    recipes[..., neighbours : 2 * neighbours] = store.radius_px[psfs]
-    per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
-    recipes[..., 2 * neighbours :] = per_step.astype(np.float32).view(np.uint32)
-    return recipes
+def _blur_px(store, pupil_mm, corners, at_infinity_dpt, distance_dpt) -> NDArray:
+    """Geometric blur radius (n, n_fields * 3), px, of n object distances."""
+    n_fields = len(at_infinity_dpt)
+    fields = np.tile(np.arange(n_fields), len(distance_dpt))
+    total_dpt = distance_dpt[:, None, None] + at_infinity_dpt
+    psfs, weights = neighbours(
+        store, pupil_mm, corners, fields, total_dpt.reshape(-1, RGB)
+    )
+    blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
+    return blur_px.reshape(len(distance_dpt), n_fields * RGB)
+
+
+def _max_radius_px(store, pupil_mm, corners, at_infinity_dpt, object_dpt) -> int:
+    """Largest kernel that the range of distances can read."""
+    plan = store.plan
+    fields = np.arange(len(at_infinity_dpt))
+    largest = 0
+    for pupil, used, _ in corners:
+        groups = (
+            fields * plan.pupils_mm.size + pupil
+        ) * plan.accommodations_dpt.size + used
+        scale = pupil_mm / plan.pupils_mm[pupil]
+        shift_dpt = plan.channel_shift_dpt[groups]
+        low = ((at_infinity_dpt + object_dpt[0]) * scale - shift_dpt).min(axis=1)
+        high = ((at_infinity_dpt + object_dpt[-1]) * scale - shift_dpt).max(axis=1)
+        first, _, _ = plan.defocus.bracket(groups, low)
+        _, last, _ = plan.defocus.bracket(groups, high)
+        for start, end in zip(RGB * first, RGB * (last + 1), strict=True):
+            largest = max(largest, int(store.radius_px[start:end].max()))
+    return largest

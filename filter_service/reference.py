@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 
 from filter_service.constants import MIN_COVERAGE, PAPER_FAR_M, PAPER_TIE_BREAK_M
 from filter_service.frame import View, fill_missing_depth, object_dpt
+from filter_service.frame_kernels import (
+    FrameKernels,
+    NodeKernels,
+    frame_kernels,
+    interval_count,
+)
+from filter_service.image_cells import ImageCells, image_cells
 from filter_service.psf_store import FrameLayers, PsfStore
 
 
@@ -28,12 +35,13 @@ def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
     return np.floor(255.0 * encoded + 0.5).astype(np.uint8)
 
 
-def layer_kernels(store: PsfStore, layers: FrameLayers) -> NDArray[np.float64]:
-    """Kernels (n_layers, size, size, 3) on one common odd size, blended in float64."""
-    radius = int(layers.radius_px.max())
-    size = 2 * radius + 1
-    kernels = np.zeros((len(layers.object_dpt), size, size, 3))
-    for k, by_channel in enumerate(layers.recipes):
+def recipe_kernels(
+    store: PsfStore, nodes: NodeKernels, radius_px: int
+) -> NDArray[np.float64]:
+    """Kernels (n_recipes, size, size, 3) of field nodes at layers, float64."""
+    size = 2 * radius_px + 1
+    kernels = np.zeros((len(nodes.recipes), size, size, 3))
+    for k, by_channel in enumerate(nodes.recipes):
         for channel, words in enumerate(by_channel):
             offsets, radii, bits = words.reshape(3, -1)
             weights = bits.view(np.float32)
@@ -42,11 +50,34 @@ def layer_kernels(store: PsfStore, layers: FrameLayers) -> NDArray[np.float64]:
                     width = 2 * int(own) + 1
                     first = int(offset)
                     cached = store.kernels[first : first + width * width]
-                    part = slice(radius - int(own), radius + int(own) + 1)
+                    part = slice(radius_px - int(own), radius_px + int(own) + 1)
                     kernels[k, part, part, channel] += float(weight) * cached.reshape(
                         width, width
                     ).astype(np.float64)
     return kernels
+
+
+def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
+    """Kernels (n, 2, size, size, 3) of a frame, at both ends of their intervals."""
+    radius = int(kernels.radius_px.max())
+    of_recipe = recipe_kernels(store, kernels.nodes, radius)
+    nodes = kernels.nodes
+    ends = np.stack([of_recipe[nodes.near], of_recipe[nodes.far]], axis=1)
+    out = np.zeros((kernels.count, *ends.shape[1:]))
+    for k in range(kernels.count):
+        for part, weight in zip(kernels.parts[k], kernels.weight_ratio[k], strict=True):
+            if weight > 0.0:
+                out[k] += weight * ends[part]
+    return out
+
+
+def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
+    """Cell (height, width) of each pixel."""
+    if image.cell_px == 0:
+        return np.zeros((view.height_px, view.width_px), np.int64)
+    rows = np.arange(view.height_px) // image.cell_px
+    columns = np.arange(view.width_px) // image.cell_px
+    return rows[:, None] * image.grid[0] + columns
 
 
 def gather(
@@ -69,15 +100,25 @@ def gather(
     linear = view.color.astype(np.float64)
     if view.color.dtype == np.uint8:
         linear = linear_from_srgb(view.color)
+    n_intervals = interval_count(layers)
     position = np.interp(
         distance_dpt, layers.object_dpt, np.arange(len(layers.object_dpt))
     )
+    interval = np.minimum(position.astype(np.int64), n_intervals - 1)
+    image = image_cells(store.spec, store.plan)
+    cell = cell_index(view, image)
+    used = np.zeros((image.count, n_intervals), bool)
+    used[cell, interval] = True
+    kernels = frame_kernels(store, layers, image, used)
+    kernel = np.zeros(used.shape, np.int64)
+    kernel[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     out = np.empty_like(linear)
     _gather(
         linear,
-        position,
+        kernel[cell, interval],
+        position - interval,
         _sort_key(distance_dpt, accumulation),
-        layer_kernels(store, layers),
+        kernel_pairs(store, kernels),
         accumulation == "paper",
         out,
     )
@@ -95,9 +136,9 @@ def _sort_key(distance_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
 
 
 @njit(parallel=True, cache=True)
-def _gather(linear, position, key, kernels, paper_rule, out):
-    height, width = position.shape
-    n_layers, size = kernels.shape[0], kernels.shape[1]
+def _gather(linear, kernel, fraction, key, kernels, paper_rule, out):
+    height, width = kernel.shape
+    size = kernels.shape[2]
     radius = size // 2
     for y in prange(height):
         found_key = np.empty(size * size)
@@ -107,14 +148,13 @@ def _gather(linear, position, key, kernels, paper_rule, out):
             count = 0
             for sy in range(max(0, y - radius), min(height, y + radius + 1)):
                 for sx in range(max(0, x - radius), min(width, x + radius + 1)):
-                    near = min(int(position[sy, sx]), max(n_layers - 2, 0))
-                    fraction = position[sy, sx] - near
+                    k, share = kernel[sy, sx], fraction[sy, sx]
                     any_light = False
                     for c in range(3):
-                        weight = kernels[near, y - sy + radius, x - sx + radius, c]
-                        if fraction > 0.0:
-                            far = kernels[near + 1, y - sy + radius, x - sx + radius, c]
-                            weight += fraction * (far - weight)
+                        weight = kernels[k, 0, y - sy + radius, x - sx + radius, c]
+                        if share > 0.0:
+                            far = kernels[k, 1, y - sy + radius, x - sx + radius, c]
+                            weight += share * (far - weight)
                         found_weight[count, c] = weight
                         any_light = any_light or weight > 0.0
                     if any_light:

@@ -1,11 +1,13 @@
 """Filters one view: checks, layers, strips that fit the buffers, and the answer."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import TILE_SIZE_PX
+from filter_service.camera_match import serves
+from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
 from filter_service.frame import (
     View,
@@ -14,15 +16,19 @@ from filter_service.frame import (
     finite_color,
     object_dpt,
 )
-from filter_service.frame_passes import FramePasses, blend_layers
-from filter_service.gpu import Buffer, Gpu, StageTimer
-from filter_service.psf_grid import pixel_pitch_mrad
+from filter_service.frame_passes import FramePasses
+from filter_service.gpu import Gpu, Pages, StageTimer
+from filter_service.image_cells import ImageCells, image_cells
+from filter_service.kernel_passes import KernelMaker
 from filter_service.psf_store import FrameLayers, PsfStore, frame_layers
-
-PITCH_TOLERANCE = 1e-3
+from filter_service.wire_images import Camera
 
 BYTES_PER_PIXEL = 16
 """Of the largest per-pixel buffers: a strip's must fit one storage block."""
+
+UPLOAD_LINES = 512
+"""Lines of the cache copied in one step: 4 MB, a millisecond or so."""
+
 ACCUMULATIONS = ("coverage", "paper")
 OUTPUTS = ("linear", "srgb8")
 
@@ -32,11 +38,12 @@ class LoadedStore:
     """A PSF store whose kernels are on the GPU."""
 
     store: PsfStore
-    kernels: Buffer
+    pages: Pages
+    image: ImageCells
 
     def release(self) -> None:
         """Free the GPU copy."""
-        self.kernels.release()
+        self.pages.release()
 
 
 @dataclass(frozen=True)
@@ -54,9 +61,9 @@ class Rendered:
         colour was not finite (taken as black).
     pupil_diameter_mm, focus_dpt : float
         As used.
-    fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice.
+    fragment_count, merged_count, entry_count, kernel_count : int
+        Fragments, pixels merged into some, tile list entries, and kernels made; rows
+        that two strips of a very large frame share count twice.
     """
 
     color: NDArray
@@ -69,6 +76,7 @@ class Rendered:
     fragment_count: int
     merged_count: int
     entry_count: int
+    kernel_count: int
     layer_count: int
     notes: list[str]
 
@@ -81,13 +89,39 @@ class FilterRenderer:
         self._layers_of: LoadedStore | None = None
         self._layers_state: tuple[float, float] = (0.0, 0.0)
         self._layers: FrameLayers | None = None
+        self._kernels = KernelMaker(gpu)
 
     def load(self, store: PsfStore) -> LoadedStore:
-        """Copy a store's kernels to the GPU."""
+        """Copy a store's kernels to the GPU at once."""
+        *_, loaded = self.load_steps(store)
+        return loaded
+
+    def load_steps(
+        self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
+    ) -> Iterator[LoadedStore | None]:
+        """Copy a store's kernels in steps of a few MB, so that frames go on between.
+
+        Yields
+        ------
+        LoadedStore or None
+            None after each step, and in the end the loaded store.  The copy is given up
+            when the iterator is closed before.
+        """
+        n_lines = -(-store.kernels.size // STORE_SIDE)
         with self._gpu.context:
-            return LoadedStore(
-                store=store, kernels=self._gpu.make_buffer(store.kernels)
-            )
+            pages = self._gpu.pages(store.kernels.size)
+        try:
+            for first in range(0, n_lines, lines_per_step):
+                lines = _lines(store.kernels, first, first + lines_per_step)
+                with self._gpu.context:
+                    self._gpu.write_pages(pages, first, lines)
+                yield None
+        except GeneratorExit:
+            pages.release()
+            raise
+        yield LoadedStore(
+            store=store, pages=pages, image=image_cells(store.spec, store.plan)
+        )
 
     def render(
         self,
@@ -107,13 +141,13 @@ class FilterRenderer:
         BadMessage
             Arrays or options that cannot be used.
         CameraMismatch
-            The pixel pitch differs by more than 0.1 % from the store's.
+            The store is for another camera, see `camera_match`.
         OutOfGpuMemory, RenderFailed
         """
         check_view(view)
         _check_choice("accumulation", accumulation, ACCUMULATIONS)
         _check_choice("output", output, OUTPUTS)
-        _check_pitch(view, handle.store)
+        _check_camera(view, handle.store)
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
             return self._render(
@@ -128,23 +162,34 @@ class FilterRenderer:
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
-        layers = self._blended_layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
-        counts = np.zeros(3, dtype=np.int64)
+        counts = np.zeros(4, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
                 strip.view,
                 timer,
+                layers=layers,
+                image=handle.image,
                 paper_rule=accumulation == "paper",
                 merge=merge,
-                scan_start_px=strip.first_row * view.width_px,
-                scan_total_px=view.width_px * view.height_px,
+                first_row=strip.first_row,
+                frame_pixel_count=view.width_px * view.height_px,
                 white_level=_white_level(color),
             )
-            passes.run(layers)
+            passes.run(
+                lambda used: self._kernels.kernels(
+                    handle.store, handle.pages, layers, handle.image, used, timer
+                )
+            )
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
-            counts += passes.fragment_count, passes.merged_count, passes.entry_count
+            counts += (
+                passes.fragment_count,
+                passes.merged_count,
+                passes.entry_count,
+                passes.kernel_count,
+            )
         self._gpu.check("render")
         notes = list(layers.notes)
         if bad_color_count:
@@ -162,6 +207,7 @@ class FilterRenderer:
             fragment_count=int(counts[0]),
             merged_count=int(counts[1]),
             entry_count=int(counts[2]),
+            kernel_count=int(counts[3]),
             layer_count=len(layers.object_dpt),
             notes=notes,
         )
@@ -174,22 +220,28 @@ class FilterRenderer:
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
         return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
 
-    def _blended_layers(
-        self, timer, handle, pupil_diameter_mm, focus_dpt
-    ) -> FrameLayers:
+    def _frame_layers(self, timer, handle, pupil_diameter_mm, focus_dpt) -> FrameLayers:
         """Layers of this pupil and focus; those of the last frame when unchanged."""
         state = (pupil_diameter_mm, focus_dpt)
-        with timer.stage("psf_blend_ms"):
-            if self._layers_of is not handle or self._layers_state != state:
-                self._layers_of = None  # stays so if what follows fails
+        if self._layers_of is not handle or self._layers_state != state:
+            self._layers_of = None  # stays so if what follows fails
+            with timer.wall("psf_plan_ms"):
                 self._layers = frame_layers(
                     handle.store,
                     pupil_diameter_mm=pupil_diameter_mm,
                     focus_dpt=focus_dpt,
                 )
-                blend_layers(self._gpu, self._layers, handle.kernels)
-                self._layers_of, self._layers_state = handle, state
+            self._layers_of, self._layers_state = handle, state
         return self._layers
+
+
+def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
+    """Words as whole lines (n, STORE_SIDE); the last is filled up with zeros."""
+    part = words[first * STORE_SIDE : end * STORE_SIDE]
+    missing = -part.size % STORE_SIDE
+    if missing:
+        part = np.concatenate([part, np.zeros(missing, words.dtype)])
+    return part.reshape(-1, STORE_SIDE)
 
 
 def _white_level(color: NDArray) -> float:
@@ -215,17 +267,13 @@ def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:
         raise BadMessage(f"{value!r}", field=field, allowed=", ".join(options))
 
 
-def _check_pitch(view: View, store: PsfStore) -> None:
-    pitch_mrad = pixel_pitch_mrad(
-        width_px=view.width_px, height_px=view.height_px, tangents=view.tangents
-    )
-    for mine, built in zip(pitch_mrad, store.spec.pixel_pitch_mrad, strict=True):
-        if abs(mine / built - 1.0) > PITCH_TOLERANCE:
-            raise CameraMismatch(
-                f"pixel pitch {pitch_mrad} mrad, PSFs are for "
-                f"{store.spec.pixel_pitch_mrad} mrad",
-                field="tangents",
-            )
+def _check_camera(view: View, store: PsfStore) -> None:
+    camera = Camera(view.width_px, view.height_px, tuple(view.tangents))
+    if not serves(store.spec, camera):
+        raise CameraMismatch(
+            f"PSFs are for {store.spec.camera}, the view's is {camera}",
+            field="tangents",
+        )
 
 
 @dataclass(frozen=True)
@@ -247,7 +295,7 @@ def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Stri
 
     Strips start on tile rows, so that tiles and merged quads are those of the whole.
     """
-    reach_px = int(layers.radius_px.max()) + 2
+    reach_px = layers.max_radius_px + 2
     halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)

@@ -1,13 +1,13 @@
 // A fragment: one pixel or one merged 2 x 2 quad of the input, with its blur.
 // color.rgb is linear light; color.a the sort depth (smaller = nearer).
-// place: x | y << 16 (first pixel), interval | flags, bits of the layer fraction,
-// kernel radius in px.
+// place: x | y << 16 (first pixel), kernel | flags, bits of the fraction of the kernel's
+// interval, kernel radius in px.
 
 struct Fragment {
     vec3 linear_rgb;
     float sort_depth;
     ivec2 origin_px;
-    uint layer_interval;
+    uint kernel;
     float layer_fraction;
     int radius_px;
     bool is_merged;
@@ -15,7 +15,7 @@ struct Fragment {
 };
 
 uvec4 pack_place(Fragment fragment) {
-    uint state = fragment.layer_interval;
+    uint state = fragment.kernel;
     state |= fragment.is_merged ? MERGED_BIT : 0u;
     state |= fragment.is_edge ? EDGE_BIT : 0u;
     uint place = uint(fragment.origin_px.x) | (uint(fragment.origin_px.y) << PLACE_BITS);

@@ -1,26 +1,30 @@
-// Blends the cached PSFs into this frame's layers and packs neighbours in pairs.
-// In:  STORE (kernels, two 16-bit weights a word), RECIPES (per layer and channel offsets, radii and weights of
-//      eight kernels: two pupils x two accommodations x two defocus nodes), LAYERS (common/layers.glsl).
-// Out: the kernel atlas, single kernels.
-// Dispatch: x over texels of the largest kernel / THREADS, y = interval.
-// Twin: reference.layer_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
+// Blends cached PSFs into node kernels: field node, both ends of an interval of layers.
+// In:  the store (16-bit weights, a texture array addressed as one line), RECIPES (per
+//      layer and channel offsets, radii and weights of eight cached kernels: two pupils
+//      x two accommodations x two defocus nodes), NODES (records: near recipe, far
+//      recipe, offset, radius; scale bits), WORK.
+// Out: the node atlas.
+// Dispatch: one group of THREADS texels per item of WORK.
+// Twin: reference.recipe_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
 
 layout(local_size_x = THREADS) in;
 
-layout(std430, binding = BINDING_STORE) readonly buffer Store { uint store[]; };
 layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uvec4 recipes[]; };
-layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
-layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
+layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; };
+layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+layout(binding = TEXTURE_STORE) uniform usampler2DArray store;
+layout(rgba32ui, binding = IMAGE_NODES) writeonly uniform uimage2D node_atlas;
 
 #include "common/atlas.glsl"
-
-uniform int layer_count;
+#include "common/work.glsl"
 
 float cached(uint offset, int radius, ivec2 at) {
     if (abs(at.x) > radius || abs(at.y) > radius) return 0.0;
-    int width = 2 * radius + 1;
-    uint index = offset + uint((at.y + radius) * width + at.x + radius);
-    return float((store[index / 2u] >> (uint(WEIGHT_BITS) * (index % 2u))) & WEIGHT_MASK);
+    uint texel = offset + uint((at.y + radius) * (2 * radius + 1) + at.x + radius);
+    ivec3 place = ivec3(texel & uint(STORE_SIDE - 1),
+                        (texel >> uint(STORE_SIDE_BITS)) & uint(STORE_SIDE - 1),
+                        texel >> uint(2 * STORE_SIDE_BITS));
+    return float(texelFetch(store, place, 0).r);
 }
 
 // Weighted sum of four of a recipe's kernels.
@@ -39,22 +43,22 @@ float blended(uint recipe, ivec2 at) {
     return blended_half(recipe, 0u, at) + blended_half(recipe, 1u, at);
 }
 
-vec3 layer_weight(uint layer, ivec2 at) {
-    uint recipe = layer * uint(RGB * RECIPE_WORDS);
+vec3 recipe_weight(uint index, ivec2 at) {
+    uint recipe = index * uint(RGB * RECIPE_WORDS);
     return vec3(blended(recipe, at), blended(recipe + uint(RECIPE_WORDS), at),
                 blended(recipe + 2u * uint(RECIPE_WORDS), at));
 }
 
 void main() {
-    uint interval = gl_WorkGroupID.y;
-    uvec4 place = layers[interval * uint(LAYER_WORDS)];
-    float scale = uintBitsToFloat(layers[interval * uint(LAYER_WORDS) + 1u].y);
+    uint node;
+    int texel;
+    if (!take_work(node, texel)) return;
+    uvec4 place = nodes[node * uint(KERNEL_WORDS)];
+    float scale = uintBitsToFloat(nodes[node * uint(KERNEL_WORDS) + 1u].x);
     int radius = int(place.w);
     int width = 2 * radius + 1;
-    int texel = int(gl_GlobalInvocationID.x);
     if (texel >= width * width) return;
     ivec2 at = ivec2(texel % width, texel / width) - radius;
-    uint far = min(interval + 1u, uint(layer_count - 1));
-    uvec4 packed_pair = pack_weights(layer_weight(interval, at), layer_weight(far, at), scale);
-    imageStore(atlas, atlas_position(int(place.y) + texel), packed_pair);
+    uvec4 ends = pack_weights(recipe_weight(place.x, at), recipe_weight(place.y, at), scale);
+    imageStore(node_atlas, atlas_position(int(place.z) + texel), ends);
 }

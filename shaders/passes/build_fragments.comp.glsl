@@ -1,9 +1,11 @@
-// Turns colour and depth of the input frame into linear light, dioptres and kernel spread.
+// Turns colour and depth of the input frame into linear light, dioptres and layer
+// positions, and notes which kernels the frame needs.
 // In:  COLOR_IN (bytes RGB, sRGB; or f32 RGB, linear when COLOR_IS_LINEAR),
-//      DEPTH_IN (f32 metres, all valid), LAYERS.
-// Out: PIXELS (linear RGB, object distance dpt), PIXEL_SPREAD (spread of the kernel, px).
-// Dispatch: one thread a pixel, 8 x 8 groups.
-// Twin: reference.build_fragments.  Source: section 6.1; radial depth as DESIGN 3.
+//      DEPTH_IN (f32 metres, all valid), LAYER_DPT.
+// Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
+//      cell and interval).
+// Dispatch: one thread a pixel, 8 x 8 groups; a group lies in one cell.
+// Twin: reference.used_pairs.  Source: section 6.1; radial depth as DESIGN 3.
 
 #include "common/color.glsl"
 
@@ -11,16 +13,21 @@ layout(local_size_x = TILE_SIZE_PX, local_size_y = TILE_SIZE_PX) in;
 
 layout(std430, binding = BINDING_COLOR_IN) readonly buffer ColorIn { uint color_in[]; };
 layout(std430, binding = BINDING_DEPTH_IN) readonly buffer DepthIn { float depth_in[]; };
-layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
+layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float layer_dpt[]; };
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
-layout(std430, binding = BINDING_PIXEL_SPREAD) writeonly buffer Spread { float spread_px[]; };
+layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
+layout(std430, binding = BINDING_USED) buffer Used { uint used[]; };
 
 #include "common/layers.glsl"
+#include "common/cells.glsl"
 
 uniform ivec2 frame_size_px;
 uniform int layer_count;
+uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
+
+shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 
 uint byte_at(uint index) {
     uint word = color_in[index / uint(BYTES_PER_WORD)];
@@ -46,16 +53,38 @@ float object_dpt(float depth_m, vec2 position) {
     return isinf(depth_m) ? 0.0 : 1.0 / (depth_m * stretch);
 }
 
+// Layer position of a distance between the first and the last layer.
+float layer_position(float dpt) {
+    int low = 0;
+    int high = max(layer_count - 2, 0);
+    while (low < high) {
+        int middle = (low + high + 1) / 2;
+        if (layer_dpt[middle] <= dpt) low = middle;
+        else high = middle - 1;
+    }
+    if (layer_count < 2) return 0.0;
+    float span = max(layer_dpt[low + 1] - layer_dpt[low], MIN_BLUR_RANGE);
+    return float(low) + clamp((dpt - layer_dpt[low]) / span, 0.0, 1.0);
+}
+
 void main() {
+    uint thread = gl_LocalInvocationIndex;
+    for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
+        group_used[word] = 0u;
+    barrier();  // no bit is left from before
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(at, frame_size_px))) return;
-    uint pixel = uint(at.y * frame_size_px.x + at.x);
-    float dpt = object_dpt(depth_in[pixel], vec2(at));
-    dpt = clamp(dpt, layer_object_dpt(0), layer_object_dpt(layer_count - 1));
-    int k = find_interval(dpt, layer_count);
-    float spread = layer_spread_px(k);
-    if (layer_count > 1)
-        spread = mix(spread, layer_spread_px(k + 1), interval_fraction(k, dpt, layer_count));
-    pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
-    spread_px[pixel] = spread;
+    if (all(lessThan(at, frame_size_px))) {
+        uint pixel = uint(at.y * frame_size_px.x + at.x);
+        float dpt = object_dpt(depth_in[pixel], vec2(at));
+        dpt = clamp(dpt, layer_dpt[0], layer_dpt[layer_count - 1]);
+        float place = layer_position(dpt);
+        int interval = position_interval(place, layer_count);
+        pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
+        position[pixel] = place;
+        atomicOr(group_used[interval / BITS_PER_WORD], 1u << uint(interval % BITS_PER_WORD));
+    }
+    barrier();  // all pixels of the group have noted theirs
+    int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
+    for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
+        if (group_used[word] != 0u) atomicOr(used[uint(first) + word], group_used[word]);
 }

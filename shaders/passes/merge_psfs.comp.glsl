@@ -1,23 +1,29 @@
 // Sums each kernel over the four pixels of a merged quad, so that a merged fragment
 // costs one look-up and loses no light.
-// In:  LAYERS, the kernel atlas (single kernels).   Out: the same (merged kernels).
-// Dispatch: x over texels of the largest merged kernel / THREADS, y = interval.
-// Twin: tests/numerical/test_renderer_passes.py (sums of reference.layer_kernels).
+// In:  KERNELS, the kernel atlas (single kernels), WORK.
+// Out: the same (merged kernels).
+// Dispatch: one group of THREADS texels per item of WORK.
+// Twin: tests/numerical/test_renderer_passes.py (sums of reference.kernel_pairs).
 
 layout(local_size_x = THREADS) in;
 
-layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
+layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
+layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
 layout(rgba32ui, binding = IMAGE_ATLAS) uniform uimage2D atlas;
 
 #include "common/atlas.glsl"
+#include "common/kernels.glsl"
+#include "common/work.glsl"
 
 void main() {
-    uvec4 place = layers[gl_WorkGroupID.y * uint(LAYER_WORDS)];
-    uvec4 look = layers[gl_WorkGroupID.y * uint(LAYER_WORDS) + 1u];
+    uint kernel;
+    int texel;
+    if (!take_work(kernel, texel)) return;
+    uvec4 place = kernel_place(kernel);
+    uvec4 look = kernel_look(kernel);
     float step_size = uintBitsToFloat(look.y) / WEIGHT_MAX;
     int width = 2 * int(place.w) + 1;
     int merged_width = width + 1;
-    int texel = int(gl_GlobalInvocationID.x);
     if (texel >= merged_width * merged_width) return;
     ivec2 at = ivec2(texel % merged_width, texel / merged_width);
     vec3 near = vec3(0.0);

@@ -1,5 +1,5 @@
 // Adds up the light that a tile's fragments send to each of its pixels.
-// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, TILE_COUNTS, TILE_OFFSETS, ENTRIES, LAYERS,
+// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, TILE_COUNTS, TILE_OFFSETS, ENTRIES, KERNELS,
 //      the kernel atlas, PIXELS (own colour where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
 // Dispatch: one group a tile of the band; a thread serves PIXELS_PER_THREAD pixels of a
@@ -19,9 +19,11 @@ layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 p
 layout(std430, binding = BINDING_TILE_COUNTS) readonly buffer Counts { uvec2 counts[]; };
 layout(std430, binding = BINDING_TILE_OFFSETS) readonly buffer Offsets { uint offsets[]; };
 layout(std430, binding = BINDING_ENTRIES) readonly buffer Entries { uint entries[]; };
-layout(std430, binding = BINDING_LAYERS) readonly buffer Layers { uvec4 layers[]; };
+layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_COLOR_OUT) writeonly buffer ColorOut { vec4 color_out[]; };
+
+#include "common/kernels.glsl"
 
 uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
@@ -40,12 +42,12 @@ void stage(uint slot, uint at) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
     int merged = (place.y & MERGED_BIT) != 0u ? 1 : 0;
-    int record = int(place.y & INTERVAL_MASK) * LAYER_WORDS;
+    uint kernel = place.y & KERNEL_MASK;
     int radius = int(place.w);
     int centre = radius * (2 * radius + 1 + merged) + radius;
-    uvec4 look = layers[record + 1];
+    uvec4 look = kernel_look(kernel);
     float scale = uintBitsToFloat(merged != 0 ? look.z : look.y) / WEIGHT_MAX;
-    int offset = int(merged != 0 ? layers[record].z : layers[record].y);
+    int offset = int(merged != 0 ? kernel_place(kernel).z : kernel_place(kernel).y);
     staged_color[at] = vec4(color.rgb, uintBitsToFloat(place.z));
     staged_place[at] = ivec4(place_origin_px(place), radius, merged);
     staged_kernel[at] = ivec2(offset + centre, floatBitsToInt(scale));

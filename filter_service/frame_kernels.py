@@ -1,0 +1,211 @@
+"""Which kernels a frame needs, and what each is blended from; CPU only.
+
+A frame's kernels are (image cell, layer interval) pairs, one for each that its pixels
+use.  A kernel holds both ends of its interval.  It is blended from node kernels, which
+are (field node, layer interval) pairs, and those from the cache.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import QUAD, RECIPE_TAPS, WEIGHT_MAX
+from filter_service.image_cells import ImageCells
+from filter_service.psf_store import FrameLayers, PsfStore, neighbours
+
+
+@dataclass(frozen=True)
+class NodeKernels:
+    """Kernels of field nodes, blended over pupil, accommodation and defocus.
+
+    Attributes
+    ----------
+    near, far : (n,)
+        Recipes of the interval's two ends.
+    radius_px, peak_ratio : (n,)
+        Of the interval: largest radius, and a bound on the weights.
+    recipes : (n_recipes, 3, 24), uint32
+        Per channel eight kernel offsets, eight radii, eight weights (float bits) that
+        turn steps of a cached kernel into its share of a layer.
+    recipe_spread_px : (n_recipes,)
+        Smallest spread over the channels; decides what may merge.
+    recipe_radius_px : (n_recipes,)
+    """
+
+    near: NDArray[np.int64]
+    far: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    peak_ratio: NDArray[np.float64]
+    recipes: NDArray[np.uint32]
+    recipe_spread_px: NDArray[np.float64]
+    recipe_radius_px: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FrameKernels:
+    """Kernels of a frame.
+
+    Attributes
+    ----------
+    cells, intervals : (n,)
+        Which pair a kernel serves.
+    parts : (n, 4)
+        Node kernels it is blended from.
+    weight_ratio : (n, 4)
+    radius_px : (n,)
+    peak_ratio : (n,)
+        Bound on the weights.
+    spread_px : (n, 2)
+        At both ends of the interval.
+    """
+
+    nodes: NodeKernels
+    cells: NDArray[np.int64]
+    intervals: NDArray[np.int64]
+    parts: NDArray[np.int64]
+    weight_ratio: NDArray[np.float64]
+    radius_px: NDArray[np.int64]
+    peak_ratio: NDArray[np.float64]
+    spread_px: NDArray[np.float64]
+
+    @property
+    def count(self) -> int:
+        """Number of kernels."""
+        return self.cells.size
+
+
+def interval_count(layers: FrameLayers) -> int:
+    """Intervals between layers; a single layer is its own."""
+    return max(len(layers.object_dpt) - 1, 1)
+
+
+def frame_kernels(
+    store: PsfStore,
+    layers: FrameLayers,
+    image: ImageCells,
+    used: NDArray[np.bool_],
+) -> FrameKernels:
+    """Plan the kernels of used (cell, interval) pairs.
+
+    Parameters
+    ----------
+    used : (n_cells, n_intervals)
+    """
+    cells, intervals = np.nonzero(used)
+    n_intervals = used.shape[1]
+    wanted = image.nodes[cells] * n_intervals + intervals[:, None]
+    # A node that weighs nothing is replaced by one that does.
+    weights = image.weight_ratio[cells]
+    heaviest = np.take_along_axis(wanted, weights.argmax(axis=1)[:, None], axis=1)
+    wanted = np.where(weights > 0.0, wanted, heaviest)
+    pairs, parts = np.unique(wanted, return_inverse=True)
+    parts = parts.reshape(wanted.shape)
+    nodes = _node_kernels(store, layers, *np.divmod(pairs, n_intervals))
+    spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
+    return FrameKernels(
+        nodes=nodes,
+        cells=cells,
+        intervals=intervals,
+        parts=parts,
+        weight_ratio=weights,
+        radius_px=nodes.radius_px[parts].max(axis=1),
+        peak_ratio=(nodes.peak_ratio[parts] * weights).sum(axis=1),
+        spread_px=(spread_px[parts] * weights[..., None]).sum(axis=1),
+    )
+
+
+def _node_kernels(
+    store: PsfStore, layers: FrameLayers, fields: NDArray, intervals: NDArray
+) -> NodeKernels:
+    n_layers = len(layers.object_dpt)
+    ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
+    wanted, recipe_of = np.unique(fields * n_layers + ends, return_inverse=True)
+    near, far = recipe_of.reshape(ends.shape)
+    recipe_fields, recipe_layers = np.divmod(wanted, n_layers)
+    psfs, weights = neighbours(
+        store,
+        layers.pupil_diameter_mm,
+        layers.corners,
+        recipe_fields,
+        layers.object_dpt[recipe_layers, None] + layers.at_infinity_dpt[recipe_fields],
+    )
+    own_px = np.where(weights > 0.0, store.radius_px[psfs], 0).max(axis=(1, 2))
+    own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
+    return NodeKernels(
+        near=near,
+        far=far,
+        radius_px=np.maximum(own_px[near], own_px[far]),
+        peak_ratio=np.maximum(own_peak[near], own_peak[far]),
+        recipes=_recipes(store, psfs, weights),
+        recipe_spread_px=(weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
+        recipe_radius_px=own_px,
+    )
+
+
+def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uint32]:
+    recipes = np.zeros((*psfs.shape[:2], 3, RECIPE_TAPS), dtype=np.uint32)
+    taps = psfs.shape[-1]
+    recipes[..., 0, :taps] = store.offsets[psfs]
+    recipes[..., 1, :taps] = store.radius_px[psfs]
+    per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
+    recipes[..., 2, :taps] = per_step.astype(np.float32).view(np.uint32)
+    return recipes.reshape(*psfs.shape[:2], 3 * RECIPE_TAPS)
+
+
+def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
+    """Make records (n, 2, 4) of node kernels for blend_psfs; and texels of all."""
+    sizes = (2 * nodes.radius_px + 1) ** 2
+    starts = np.cumsum(sizes) - sizes
+    table = np.zeros((nodes.near.size, 2, 4), dtype=np.uint32)
+    table[:, 0, 0] = nodes.near
+    table[:, 0, 1] = nodes.far
+    table[:, 0, 2] = starts
+    table[:, 0, 3] = nodes.radius_px
+    table[:, 1, 0] = nodes.peak_ratio.astype(np.float32).view(np.uint32)
+    return table, int(sizes.sum())
+
+
+def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
+    """Make records (n, 2, 4) of kernels for common/kernels.glsl; and texels of all.
+
+    Each is followed by its merged form: the kernel summed over a 2 x 2 quad.
+    """
+    widths = 2 * kernels.radius_px + 1
+    single, merged = widths**2, (widths + 1) ** 2
+    starts = np.concatenate([[0], np.cumsum(single + merged)])
+    scale = kernels.peak_ratio.astype(np.float32)
+    spread_px = kernels.spread_px.astype(np.float32)
+    table = np.zeros((kernels.count, 2, 4), dtype=np.uint32)
+    table[:, 0, 0] = spread_px[:, 0].view(np.uint32)
+    table[:, 0, 1] = starts[:-1]
+    table[:, 0, 2] = starts[:-1] + single
+    table[:, 0, 3] = kernels.radius_px
+    table[:, 1, 0] = spread_px[:, 1].copy().view(np.uint32)
+    table[:, 1, 1] = scale.view(np.uint32)
+    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
+    table[:, 1, 2] = merged_scale.view(np.uint32)
+    return table, int(starts[-1])
+
+
+def part_table(kernels: FrameKernels) -> NDArray[np.uint32]:
+    """Make records (n, 2, 4) for blend_cells: four node kernels and their weights."""
+    table = np.empty((kernels.count, 2, 4), dtype=np.uint32)
+    table[:, 0] = kernels.parts
+    table[:, 1] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
+    return table
+
+
+def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint32]:
+    """Kernel (n_cells, n_intervals) of a pair; 0 where no pixel uses it."""
+    index = np.zeros(shape, dtype=np.uint32)
+    index[kernels.cells, kernels.intervals] = np.arange(kernels.count)
+    return index
+
+
+def work_list(n_texels: NDArray[np.int64], threads: int) -> NDArray[np.uint32]:
+    """Work groups (n, 2) over kernels of different size: kernel, its first texel."""
+    groups = -(-n_texels // threads)
+    kernel = np.repeat(np.arange(groups.size), groups)
+    first = np.arange(kernel.size) - np.repeat(np.cumsum(groups) - groups, groups)
+    return np.stack([kernel, first * threads], axis=-1).astype(np.uint32)

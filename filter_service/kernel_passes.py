@@ -1,0 +1,147 @@
+"""The passes that make a frame's kernels from the cache; kept between frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import MAX_LAYERS, THREADS
+from filter_service.errors import GridTooLarge
+from filter_service.frame_kernels import (
+    FrameKernels,
+    frame_kernels,
+    interval_count,
+    kernel_table,
+    node_table,
+    pair_index,
+    part_table,
+    work_list,
+)
+from filter_service.gpu import Buffer, Gpu, Pages, StageTimer
+from filter_service.image_cells import ImageCells
+from filter_service.psf_store import FrameLayers, PsfStore
+
+MAX_GROUPS = 65535
+"""Work groups along one axis that every OpenGL 4.3 allows."""
+
+
+@dataclass(frozen=True)
+class KernelSet:
+    """Kernels on the GPU, in the context's atlas.
+
+    Attributes
+    ----------
+    kernels : FrameKernels
+    buffers : dict
+        KERNELS and KERNEL_OF.
+    """
+
+    kernels: FrameKernels
+    buffers: dict[str, Buffer]
+
+
+class KernelMaker:
+    """Makes the kernels that a frame uses; the last frame's serve if they can."""
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self._made_for: tuple | None = None
+        self._have: NDArray[np.bool_] | None = None
+        self._set: KernelSet | None = None
+
+    def kernels(
+        self,
+        store: PsfStore,
+        pages: Pages,
+        layers: FrameLayers,
+        image: ImageCells,
+        used: NDArray[np.bool_],
+        timer: StageTimer,
+    ) -> KernelSet:
+        """Return kernels for all used (cell, interval) pairs (n_cells, n_intervals)."""
+        key = (pages, layers, image)
+        if self._made_for is not None and all(
+            a is b for a, b in zip(self._made_for, key, strict=True)
+        ):
+            if not np.any(used & ~self._have):
+                return self._set
+        self._made_for = None  # stays so if what follows fails
+        with timer.wall("psf_plan_ms"):
+            kernels = frame_kernels(store, layers, image, used)
+        with timer.stage("psf_blend_ms"):
+            self._set = self._blend(kernels, pages, used.shape)
+        self._made_for, self._have = key, used
+        return self._set
+
+    def _blend(self, kernels: FrameKernels, pages: Pages, shape: tuple) -> KernelSet:
+        gpu = self._gpu
+        nodes, node_texels = node_table(kernels.nodes)
+        table, texels = kernel_table(kernels)
+        node_atlas = gpu.atlas("nodes", node_texels)
+        atlas = gpu.atlas("kernels", texels)
+        buffers = {
+            "NODES": gpu.upload("NODES", nodes),
+            "RECIPES": gpu.upload("RECIPES", kernels.nodes.recipes),
+            "KERNELS": gpu.upload("KERNELS", table),
+            "PARTS": gpu.upload("PARTS", part_table(kernels)),
+            "KERNEL_OF": gpu.upload("KERNEL_OF", pair_index(kernels, shape)),
+        }
+        node_sizes = (2 * kernels.nodes.radius_px + 1) ** 2
+        widths = 2 * kernels.radius_px + 1
+        self._run(
+            "blend_psfs",
+            node_sizes,
+            {name: buffers[name] for name in ("NODES", "RECIPES")},
+            images={"NODES": node_atlas},
+            textures={"STORE": pages},
+        )
+        self._run(
+            "blend_cells",
+            widths**2,
+            {name: buffers[name] for name in ("NODES", "PARTS", "KERNELS")},
+            images={"ATLAS": atlas},
+            textures={"NODES": node_atlas},
+        )
+        self._run(
+            "merge_psfs",
+            (widths + 1) ** 2,
+            {"KERNELS": buffers["KERNELS"]},
+            images={"ATLAS": atlas},
+        )
+        return KernelSet(
+            kernels, {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
+        )
+
+    def _run(self, name: str, n_texels: NDArray, buffers: dict, **bindings) -> None:
+        work = work_list(n_texels, THREADS)
+        columns = min(len(work), MAX_GROUPS)
+        self._gpu.dispatch(
+            name,
+            (columns, -(-len(work) // columns)),
+            buffers={**buffers, "WORK": self._gpu.upload("WORK", work)},
+            uniforms={"group_count": len(work)},
+            **bindings,
+        )
+
+
+def words_per_cell(layers: FrameLayers) -> int:
+    """32-bit words that note the used intervals of a cell.
+
+    Raises
+    ------
+    GridTooLarge
+        More layers than a frame may have.
+    """
+    if len(layers.object_dpt) > MAX_LAYERS:
+        raise GridTooLarge(
+            f"{len(layers.object_dpt)} layers between "
+            f"{layers.object_dpt[0]:g} and {layers.object_dpt[-1]:g} dpt",
+            allowed=f"{MAX_LAYERS} layers: a smaller pupil or fewer pixels per degree",
+        )
+    return -(-interval_count(layers) // 32)
+
+
+def used_pairs(words: NDArray[np.uint32], layers: FrameLayers) -> NDArray[np.bool_]:
+    """Return used pairs (n_cells, n_intervals) from words (n_cells, n_words)."""
+    bits = np.unpackbits(words.astype("<u4").view(np.uint8), axis=1, bitorder="little")
+    return bits[:, : interval_count(layers)].astype(bool)

@@ -1,0 +1,200 @@
+"""Off the axis: points of light against the exact PSF of their direction."""
+
+import numpy as np
+import pytest
+
+from estimator.profiles import parse_profile
+from estimator.psf import compute_psf_batch
+from filter_service.eye_model import prepare_eye
+from filter_service.field_directions import (
+    angles_deg,
+    field_deg,
+    gaze_rotation,
+    pixel_from_mrad,
+    unit_direction,
+)
+from filter_service.frame import View
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_store import channel_wavelengths_nm
+from filter_service.renderer import FilterRenderer
+from tests.numerical.synthetic import psnr_db, tangents, texture
+
+WIDTH, HEIGHT = 160, 120
+PUPIL_MM, FOCUS_DPT, OBJECT_M = 5.0, 0.5, 2.0
+
+
+def tangents_of(h_low, h_high, v_low, v_high):
+    low, high = np.tan(np.radians([[h_low, v_low], [h_high, v_high]]))
+    return low[0], high[0], high[1], low[1]
+
+
+class FieldBench:
+    """A traced eye before a camera, ready to render."""
+
+    def __init__(self, gpu, name, view_tangents, size=(WIDTH, HEIGHT), **settings):
+        self.spec = GridSpec.for_camera(
+            width_px=size[0],
+            height_px=size[1],
+            tangents=view_tangents,
+            pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+            focus_range_dpt=(FOCUS_DPT, FOCUS_DPT),
+            object_range_dpt=(0.0, 2.0),
+            **{"mode": "quality", "tolerance": "fine", **settings},
+        )
+        profile = parse_profile({"kind": "preset", "name": name})
+        self.eye, _ = prepare_eye(
+            profile,
+            self.spec,
+            eye_model="traced",
+        )
+        self.store = build_psf_store(self.eye, self.spec)
+        self.renderer = FilterRenderer(gpu)
+        self.handle = self.renderer.load(self.store)
+
+    def render(self, color, depth_m):
+        depth_m = np.broadcast_to(np.float32(depth_m), color.shape[:2])
+        view = View(color, depth_m.astype(np.float32), self.spec.camera.tangents)
+        return self.renderer.render(
+            view, self.handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT
+        )
+
+    def exact_kernels(self, x, y, distance_m, radius_px=None):
+        """PSFs (3 n) of the directions of n pixels, channel fastest."""
+        gaze_deg = self.spec.gaze_deg
+        h, v = field_deg(self.spec.camera, x + 0.5, y + 0.5, gaze_deg=gaze_deg)
+        h, v, distance_m = (np.repeat(np.ravel(a), 3) for a in (h, v, distance_m))
+        wavelengths_nm = np.tile(channel_wavelengths_nm(self.spec), h.size // 3)
+        state = {
+            "h_deg": h,
+            "v_deg": v,
+            "pupil_diameter_mm": PUPIL_MM,
+            "accommodation_dpt": self.eye.accommodation_dpt(FOCUS_DPT),
+            "wavelength_nm": wavelengths_nm,
+        }
+        total_dpt = self.eye.total_defocus_dpt(**state) + 1.0 / distance_m
+        found = self.eye.wavefronts(**state, total_defocus_dpt=total_dpt)
+        return compute_psf_batch(
+            found.zernike_um,
+            pupil_diameter_mm=found.circle_diameter_mm,
+            pupil_ellipse=found.pupil_ellipse,
+            wavelength_nm=wavelengths_nm,
+            pixel_from_mrad=pixel_from_mrad(self.spec.camera, h, v, gaze_deg=gaze_deg),
+            radius_px=radius_px,
+        )
+
+
+def radial_depth_m(spec, distance_m):
+    """Planar depth (height, width) of a sphere about the eye."""
+    camera = spec.camera
+    left, right, up, down = camera.tangents
+    x = left + (right - left) * (np.arange(camera.width_px) + 0.5) / camera.width_px
+    y = up + (down - up) * (np.arange(camera.height_px) + 0.5) / camera.height_px
+    return distance_m / np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+
+
+@pytest.mark.parametrize(
+    ("corner_deg", "gaze_deg"),
+    [
+        ((22, 32, 8, 15), (0, 0)),
+        ((-33, -23, -16, -9), (0, 0)),
+        ((2, 12, 4, 11), (-14, 9)),
+    ],
+)
+def test_points_of_light_become_the_psf_of_their_direction(gpu, corner_deg, gaze_deg):
+    bench = FieldBench(gpu, "keratoconus", tangents_of(*corner_deg), gaze_deg=gaze_deg)
+    depth_m = radial_depth_m(bench.spec, OBJECT_M)
+    for x, y in [(40, 30), (120, 35), (77, 88)]:
+        point = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        point[y, x] = 1.0
+        radius = 28
+        part = (slice(y - radius, y + radius + 1), slice(x - radius, x + radius + 1))
+        seen = bench.render(point, depth_m).color[part].astype(float)
+        psfs = bench.exact_kernels(np.array(x), np.array(y), OBJECT_M, radius)
+        exact = np.stack([psf.kernel for psf in psfs], axis=-1).astype(float)
+        # All eight orientations: only the right one is near.
+        errors = {
+            (turns, flip): np.linalg.norm(
+                seen - np.rot90(exact[:, ::flip], turns, axes=(0, 1))
+            )
+            for turns in range(4)
+            for flip in (1, -1)
+        }
+        right = errors.pop((0, 1))
+        assert right <= 0.4 * np.linalg.norm(exact)
+        assert right <= 0.5 * min(errors.values())
+
+
+def splat_exactly(bench, color, depth_m):
+    """Every pixel through the PSF of its own direction and distance; one surface."""
+    height, width = depth_m.shape
+    y, x = np.mgrid[0:height, 0:width]
+    camera = bench.spec.camera
+    left, right, up, down = camera.tangents
+    slope_x = left + (right - left) * (x + 0.5) / width
+    slope_y = up + (down - up) * (y + 0.5) / height
+    distance_m = depth_m * np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    psfs = bench.exact_kernels(x, y, distance_m)
+    margin = int(psfs.radius_px.max())
+    light = np.zeros((height + 2 * margin, width + 2 * margin, 3))
+    weight = np.zeros_like(light)
+    for n, psf in enumerate(psfs):
+        row, column, c = n // 3 // width + margin, n // 3 % width + margin, n % 3
+        r = psf.radius_px
+        part = (slice(row - r, row + r + 1), slice(column - r, column + r + 1), c)
+        light[part] += psf.kernel * color[row - margin, column - margin, c]
+        weight[part] += psf.kernel
+    inside = (slice(margin, -margin), slice(margin, -margin))
+    return light[inside] / weight[inside]
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, name):
+    width, height = 96, 72
+    bench = FieldBench(gpu, name, tangents(width, height, 40.0), size=(width, height))
+    color = texture(rng, height, width, cell_px=3)
+    # a floor that comes nearer: half a dioptre to two
+    depth_m = 1.0 / np.linspace(0.4, 1.6, height)[:, None] * np.ones((1, width))
+    truth = splat_exactly(bench, color, depth_m.astype(np.float32))
+    result = bench.render(color, depth_m)
+    assert psnr_db(result.color, truth) >= 46.0
+
+
+def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
+    spec = GridSpec.for_camera(
+        width_px=WIDTH,
+        height_px=HEIGHT,
+        tangents=tangents(WIDTH, HEIGHT, 90.0),
+        pupil_range_mm=(3.0, 3.0),
+        focus_range_dpt=(0.0, 0.0),
+        object_range_dpt=(0.0, 0.0),
+        mode="quality",
+        diffraction=False,
+        chromatic=False,
+    )
+    eye, _ = prepare_eye(
+        parse_profile({"kind": "prescription", "sphere_dpt": 0.0}),
+        spec,
+        eye_model="wavefront",
+    )
+    renderer = FilterRenderer(gpu)
+    handle = renderer.load(build_psf_store(eye, spec))
+    image = texture(rng, HEIGHT, WIDTH, cell_px=1)
+    view = View(
+        image, np.full(image.shape[:2], np.inf, np.float32), spec.camera.tangents
+    )
+    result = renderer.render(view, handle, pupil_diameter_mm=3.0, focus_dpt=0.0)
+    corner = (slice(0, 16), slice(0, 16))
+    assert psnr_db(result.color[corner], image[corner]) >= 60.0
+
+
+def test_gaze_turns_the_field_the_way_the_eye_turns():
+    spec = GridSpec.for_camera(
+        width_px=200, height_px=100, tangents=(-1.0, 1.0, 0.5, -0.5)
+    )
+    gaze_deg = (20.0, -10.0)
+    direction = gaze_rotation(gaze_deg) @ unit_direction(0.0, 0.0)
+    assert np.allclose(angles_deg(direction), gaze_deg)
+    tangent = direction[:2] / -direction[2]
+    x_px, y_px = 100 * (1 + tangent[0]), 50 * (1 - tangent[1] / 0.5)
+    assert np.allclose(field_deg(spec.camera, x_px, y_px, gaze_deg=gaze_deg), 0.0)
