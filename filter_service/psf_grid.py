@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.units import MRAD_PER_RAD, RGB_WAVELENGTHS_NM
+from filter_service.field_directions import field_range_deg, pixel_from_mrad
+from filter_service.wire_images import Camera
 
 PUPIL_RATIO = 1.16
 """Neighbouring pupil nodes differ by at most this factor (tests/benchmarks)."""
@@ -29,20 +31,41 @@ BASE_OBJECT_STEP_DPT = 0.25
 """The paper's object distances: 33 over 8 dpt."""
 
 
+MODES = ("on-axis", "quality", "dynamic")
+"""One kernel set for the whole image; or, over the visual field, the finer and the
+coarser grid (of the planner, or of the paper)."""
+
+PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
+"""Azimuth and elevation to both sides (released code)."""
+
+GRIDS = ("planned", "paper")
+TOLERANCES = ("loose", "normal", "fine")
+
+
 @dataclass(frozen=True)
 class GridSpec:
     """What a PSF cache is built for.
 
     Attributes
     ----------
-    pixel_pitch_mrad : (float, float)
-        Width and height of the pixel on the optical axis.
+    camera : Camera
+        Image size and tangents; the on-axis mode uses no more than its pixel pitch.
     pupil_range_mm, object_range_dpt, focus_range_dpt : (float, float)
         Entrance pupils, object distances and focus distances that frames may ask for.
     wavelengths_nm : (float, float, float)
         For red, green, blue.
     diffraction, chromatic : bool
         Off: geometrical optics; all channels at the reference wavelength.
+    mode : "on-axis", "quality" or "dynamic"
+        Whether PSFs follow the visual field, and over how fine a grid.
+    grid : "planned" or "paper"
+        Nodes where this eye needs them, or the paper's fixed ones (section 7.2).
+    tolerance : "loose", "normal" or "fine"
+        How much interpolation between planned nodes may cost.
+    gaze_deg : (h, v)
+        Where the eye looks within the camera's image.
+    memory_budget_mb : float
+        A larger plan is refused.
     max_blur_step_px : float
         Blur difference between neighbouring nodes.
     max_blur_radius_px : int
@@ -53,13 +76,18 @@ class GridSpec:
         0.999 at 74 dB, for kernels of twice and ten times the radius.
     """
 
-    pixel_pitch_mrad: tuple[float, float]
+    camera: Camera
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)
     object_range_dpt: tuple[float, float] = (0.0, 10.0)
     focus_range_dpt: tuple[float, float] = (0.0, 6.0)
     wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
     diffraction: bool = True
     chromatic: bool = True
+    mode: str = "on-axis"
+    grid: str = "planned"
+    tolerance: str = "normal"
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
+    memory_budget_mb: float = 2000.0
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
     kept_energy_ratio: float = 0.99
@@ -68,6 +96,15 @@ class GridSpec:
         _check_range("pupil_range_mm", self.pupil_range_mm, 0.5, 9.0)
         _check_range("object_range_dpt", self.object_range_dpt, 0.0, 100.0)
         _check_range("focus_range_dpt", self.focus_range_dpt, 0.0, 20.0)
+        for name, options in (
+            ("mode", MODES),
+            ("grid", GRIDS),
+            ("tolerance", TOLERANCES),
+        ):
+            if getattr(self, name) not in options:
+                raise ValueError(
+                    f"{name} {getattr(self, name)!r}: allowed are {', '.join(options)}"
+                )
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise ValueError(
@@ -78,17 +115,48 @@ class GridSpec:
     def for_camera(
         cls, *, width_px: int, height_px: int, tangents: tuple, **settings
     ) -> "GridSpec":
-        """Spec with the pixel pitch of a camera; other settings as given."""
-        return cls(
-            pixel_pitch_mrad=pixel_pitch_mrad(
-                width_px=width_px, height_px=height_px, tangents=tangents
-            ),
-            **settings,
+        """Spec for a camera given by its parts; other settings as given."""
+        return cls(camera=Camera(width_px, height_px, tuple(tangents)), **settings)
+
+    @property
+    def pixel_pitch_mrad(self) -> tuple[float, float]:
+        """Width and height of the pixel on the camera's axis."""
+        return pixel_pitch_mrad(
+            width_px=self.camera.width_px,
+            height_px=self.camera.height_px,
+            tangents=self.camera.tangents,
+        )
+
+    @property
+    def follows_field(self) -> bool:
+        """Whether PSFs differ over the visual field."""
+        return self.mode != "on-axis"
+
+    @property
+    def field_range_deg(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Field directions (h, v) from smallest to largest that PSFs are needed for."""
+        if not self.follows_field:
+            return (0.0, 0.0), (0.0, 0.0)
+        seen_deg = field_range_deg(self.camera, gaze_deg=self.gaze_deg)
+        if self.grid == "planned":
+            return seen_deg
+        return tuple(
+            (min(low, -reach), max(high, reach))
+            for (low, high), reach in zip(
+                seen_deg, PAPER_REACH_DEG[self.mode], strict=True
+            )
         )
 
     def blur_px_per_dpt(self, pupil_diameter_mm: float) -> float:
-        """Radius of the geometric blur disc per dioptre of defocus, px."""
+        """Radius of the geometric blur disc on axis per dioptre of defocus, px."""
         return pupil_diameter_mm / 2.0 / min(self.pixel_pitch_mrad)
+
+    def pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
+        """Local scale (..., 2, 2) of the image at field directions; on axis its own."""
+        if not self.follows_field:
+            axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
+            return np.broadcast_to(axis, (*np.shape(h_deg), 2, 2))
+        return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=self.gaze_deg)
 
 
 def _check_range(name: str, values: tuple, low: float, high: float) -> None:

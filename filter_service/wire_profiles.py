@@ -30,12 +30,18 @@ from filter_service.wire_images import (
 from filter_service.wire_text import clip, clip_notes, take_notes
 
 EYE_MODELS = ("traced", "wavefront")
+MODES = ("on-axis", "quality", "dynamic")
+GRIDS = ("planned", "paper")
+TOLERANCES = ("loose", "normal", "fine")
 
 
 @dataclass(frozen=True)
 class ProfileSettings:
-    """How the PSFs of a profile are computed."""
+    """How the PSFs of a profile are computed; PROTOCOL.md explains each."""
 
+    mode: str = "on-axis"
+    grid: str = "planned"
+    tolerance: str = "normal"
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)
     focus_range_dpt: tuple[float, float] = (0.0, 6.0)
     object_range_dpt: tuple[float, float] = (0.0, 10.0)
@@ -43,6 +49,11 @@ class ProfileSettings:
     chromatic: bool = True
     eye_model: str = "traced"
     age_years: float | None = None
+
+    @property
+    def follows_field(self) -> bool:
+        """Return whether PSFs differ over the visual field."""
+        return self.mode != "on-axis"
 
     def fields(self) -> dict[str, Any]:
         """Return the map that travels."""
@@ -81,14 +92,22 @@ class ProfileSettings:
             path="settings.age_years",
             default=None,
         )
-        eye_model = take_choice(
-            source,
-            "eye_model",
-            choices=EYE_MODELS,
-            path="settings.eye_model",
-            default=default.eye_model,
-        )
-        return cls(**ranges, **switches, eye_model=eye_model, age_years=age_years)
+        choices = {
+            name: take_choice(
+                source,
+                name,
+                choices=allowed,
+                path=f"settings.{name}",
+                default=getattr(default, name),
+            )
+            for name, allowed in (
+                ("mode", MODES),
+                ("grid", GRIDS),
+                ("tolerance", TOLERANCES),
+                ("eye_model", EYE_MODELS),
+            )
+        }
+        return cls(**choices, **ranges, **switches, age_years=age_years)
 
 
 @dataclass(frozen=True)
@@ -130,11 +149,15 @@ class ProfileRequest:
 
 @dataclass(frozen=True)
 class Accepted:
-    """A profile is well formed; ``is_building`` is false while no camera is known."""
+    """A profile is well formed; ``is_building`` is false while no camera is known.
+
+    ``n_cameras`` counts the cameras that it is being prepared for.
+    """
 
     profile_id: int
     generation: int
     is_building: bool
+    n_cameras: int = 1
 
     type_name: ClassVar[str] = "accepted"
 
@@ -150,6 +173,7 @@ class Accepted:
             profile_id=take_int(header, "profile_id", low=0, high=MAX_ID),
             generation=take_int(header, "generation", low=0, high=MAX_ID),
             is_building=take_bool(header, "is_building", default=True),
+            n_cameras=take_int(header, "n_cameras", low=0, high=1000, default=1),
         )
 
 
@@ -182,7 +206,11 @@ class Progress:
 
 @dataclass(frozen=True)
 class Ready:
-    """The PSFs of a profile are in place; frames are filtered with them from now on."""
+    """The PSFs of a profile are in place; frames are filtered with them from now on.
+
+    ``is_complete`` is false for a preview: good for what the last frame looked at, and
+    followed by another Ready.
+    """
 
     profile_id: int
     generation: int
@@ -191,6 +219,7 @@ class Ready:
     memory_mb: float
     pixel_pitch_mrad: tuple[float, float]
     notes: tuple[str, ...] = ()
+    is_complete: bool = True
 
     type_name: ClassVar[str] = "ready"
 
@@ -218,4 +247,5 @@ class Ready:
             memory_mb=take_float(header, "memory_mb", low=0, high=1e9),
             pixel_pitch_mrad=(pitch_x, pitch_y),
             notes=take_notes(header),
+            is_complete=take_bool(header, "is_complete", default=True),
         )

@@ -1,0 +1,175 @@
+"""Nodes of a PSF cache: plain arrays, with the search for a value's neighbours."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.units import REFERENCE_WAVELENGTH_NM
+from filter_service.constants import RGB
+from filter_service.psf_grid import GridSpec
+
+
+def channel_wavelengths_nm(spec: GridSpec) -> NDArray[np.float64]:
+    """Wavelengths (3,) of the channels; all the same without chromatic blur."""
+    return np.array(
+        spec.wavelengths_nm if spec.chromatic else (REFERENCE_WAVELENGTH_NM,) * RGB
+    )
+
+
+@dataclass(frozen=True)
+class RaggedNodes:
+    """Groups of nodes, each with its own number of ascending values.
+
+    Attributes
+    ----------
+    values : (n,)
+        All groups one after the other.
+    starts : (n_groups + 1,)
+        Where each group begins in `values`; the last entry is n.
+    """
+
+    values: NDArray[np.float64]
+    starts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, groups: list[NDArray[np.float64]]) -> "RaggedNodes":
+        """Join groups, each ascending and not empty."""
+        counts = [len(group) for group in groups]
+        if not counts or min(counts) < 1:
+            raise ValueError(f"groups of {counts} nodes: at least one node each")
+        if any((np.diff(group) <= 0.0).any() for group in groups):
+            raise ValueError("the values of a group must ascend")
+        return cls(
+            values=np.concatenate(groups).astype(np.float64),
+            starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        )
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Nodes (n_groups,) of each group."""
+        return np.diff(self.starts)
+
+    @property
+    def group_of_value(self) -> NDArray[np.int64]:
+        """Group (n,) of each value."""
+        return np.repeat(np.arange(len(self.starts) - 1), self.counts)
+
+    @cached_property
+    def _span(self) -> float:
+        return float(np.ptp(self.values)) + 1.0
+
+    @cached_property
+    def _keys(self) -> NDArray[np.float64]:
+        # Every group on a stretch of its own, so that one search serves all of them.
+        return self.values - self.values.min() + self._span * self.group_of_value
+
+    def bracket(
+        self, groups: ArrayLike, t: ArrayLike
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Neighbours of values within their groups, clipped to the groups' ends.
+
+        Parameters
+        ----------
+        groups : (...) int
+        t : (...)
+            Broadcast against each other.
+
+        Returns
+        -------
+        lower, upper : (...) int
+            Indices into `values`; the same node twice in a group of one.
+        fraction : (...)
+            Share of the upper node, 0 to 1.
+        """
+        groups, t = np.broadcast_arrays(np.asarray(groups), np.asarray(t, float))
+        first, last = self.starts[groups], self.starts[groups + 1] - 1
+        t = np.clip(t, self.values[first], self.values[last])
+        keys = t - self.values.min() + self._span * groups
+        upper = np.searchsorted(self._keys, keys)
+        upper = np.clip(upper, np.minimum(first + 1, last), last)
+        lower = np.maximum(upper - 1, first)
+        span = self.values[upper] - self.values[lower]
+        fraction = (t - self.values[lower]) / np.where(span > 0.0, span, 1.0)
+        return lower, upper, np.clip(fraction, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class PlanPrediction:
+    """What a plan will cost, and what its interpolation will.
+
+    Attributes
+    ----------
+    psf_count : int
+    memory_mb : float
+        Kernels, two bytes a texel.
+    build_s : float
+        On `core_count` processor cores.
+    core_count : int
+    interpolation_db : float
+        PSNR of an image filtered by interpolated PSFs against exact ones, over the
+        states that frames can ask for.
+    error_db_by_axis : dict
+        The same with one axis interpolated at a time: "defocus", "pupil",
+        "accommodation", "field".
+    """
+
+    psf_count: int
+    memory_mb: float
+    build_s: float
+    core_count: int
+    interpolation_db: float
+    error_db_by_axis: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CachePlan:
+    """Nodes of a cache, before anything is computed.
+
+    Attributes
+    ----------
+    h_deg, v_deg : (n_h,), (n_v,)
+        Field directions, ascending; a single (0, 0) on axis.
+    pupils_mm : (n_pupils,)
+    accommodations_dpt : (n_accommodations,)
+    defocus : RaggedNodes
+        Total defocus in dpt; groups in C order [v, h, pupil, accommodation].
+    channel_shift_dpt : (n_groups, 3)
+        Channel c of a node at t is the kernel of total defocus t + shift: zero, so that
+        a node is one defocus for all channels, but in the paper's grids, where it is
+        one object distance.
+    prediction : PlanPrediction
+    """
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    pupils_mm: NDArray[np.float64]
+    accommodations_dpt: NDArray[np.float64]
+    defocus: RaggedNodes
+    channel_shift_dpt: NDArray[np.float64]
+    prediction: PlanPrediction
+
+    @property
+    def group_shape(self) -> tuple[int, int, int, int]:
+        """Numbers of nodes (v, h, pupil, accommodation)."""
+        return (
+            len(self.v_deg),
+            len(self.h_deg),
+            len(self.pupils_mm),
+            len(self.accommodations_dpt),
+        )
+
+    @property
+    def psf_count(self) -> int:
+        """Kernels, one per node and channel."""
+        return RGB * len(self.defocus.values)
+
+
+def bracket_axis(
+    nodes: ArrayLike, value: ArrayLike
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbours of values (...) among ascending nodes; see `RaggedNodes.bracket`."""
+    nodes = np.asarray(nodes, np.float64)
+    only = RaggedNodes(values=nodes, starts=np.array([0, nodes.size]))
+    return only.bracket(0, value)

@@ -1,0 +1,104 @@
+"""What a planned cache costs: memory from predicted radii, time from a cost model."""
+
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.psf import ACCURACY
+from estimator.psf_fourier import plan_grids
+from estimator.psf_survey import PupilSurvey, needed_radius_px, survey_pupils
+from estimator.psf_switch import geometric_shares
+from filter_service.constants import RGB
+from filter_service.eye import Eye
+from filter_service.psf_grid import GridSpec
+from filter_service.psf_nodes import CachePlan, channel_wavelengths_nm
+from filter_service.psf_slopes import PupilStates, state_frames
+
+SAMPLES = 1536
+"""PSFs whose wavefronts are looked at."""
+
+BYTES_PER_TEXEL = 2
+
+COMPUTED_BEYOND = 0.2
+"""Light that trimming drops, over what a computed kernel lacks (`psf_build.py`)."""
+
+
+def predicted_cost(eye: Eye, spec: GridSpec, plan: CachePlan) -> dict:
+    """Fields of `PlanPrediction`: count, memory, time and cores."""
+    count = (RGB if spec.chromatic else 1) * len(plan.defocus.values)
+    states = sampled_states(spec, plan, SAMPLES)
+    survey = survey_pupils(state_frames(eye, spec, states))
+    kept_px = kernel_radius_px(spec, survey, share=1.0)
+    texels = float(np.mean((2.0 * kept_px + 1.0) ** 2))
+    cores = len(os.sched_getaffinity(0))
+    time_us = sum(
+        TERM_US[name] * float(np.mean(values))
+        for name, values in cost_terms(spec, survey).items()
+    )
+    return {
+        "psf_count": count,
+        "memory_mb": BYTES_PER_TEXEL * texels * count / 1e6,
+        "build_s": time_us * count / cores / 1e6,
+        "core_count": cores,
+    }
+
+
+def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
+    """States of a plan's PSFs: all of them, or so many spread evenly."""
+    channels = RGB if spec.chromatic else 1
+    count = channels * len(plan.defocus.values)
+    psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+    nodes, channel = psfs // channels, psfs % channels
+    groups = plan.defocus.group_of_value[nodes]
+    v, h, pupil, used = np.unravel_index(groups, plan.group_shape)
+    return PupilStates(
+        h_deg=plan.h_deg[h],
+        v_deg=plan.v_deg[v],
+        pupil_diameter_mm=plan.pupils_mm[pupil],
+        accommodation_dpt=plan.accommodations_dpt[used],
+        wavelength_nm=channel_wavelengths_nm(spec)[channel],
+        total_defocus_dpt=plan.defocus.values[nodes]
+        + plan.channel_shift_dpt[groups, channel],
+    )
+
+
+RAYS_PX2 = 1000.0
+"""Spot, px², that takes twice as long to trace as a point."""
+
+
+def kernel_radius_px(
+    spec: GridSpec, survey: PupilSurvey, *, share: float
+) -> NDArray[np.int64]:
+    """Radii (P,) that hold all but a share of the light that a cache may drop."""
+    if not spec.diffraction:
+        return np.ceil(survey.blur_radius_px + 0.21).astype(np.int64)
+    return needed_radius_px(
+        survey, lost_energy_ratio=share * (1.0 - spec.kept_energy_ratio)
+    )
+
+
+TERM_US = {"psf": 20.0, "wave": 0.0005, "rays": 60.0, "texels": 0.02}
+"""Processor time of what `cost_terms` counts."""
+
+
+def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.float64]]:
+    """What takes time in each PSF (P,): itself, transforms, traced spots and texels."""
+    radius_px = kernel_radius_px(spec, survey, share=COMPUTED_BEYOND)
+    count = survey.blur_radius_px.size
+    share = geometric_shares(survey) if spec.diffraction else np.ones(count)
+    samples = np.zeros(count)
+    chosen = share < 1.0
+    if chosen.any():
+        grids = plan_grids(
+            extent_px=survey.extent_px[chosen],
+            unit_px=survey.unit_px[chosen],
+            accuracy=ACCURACY["normal"],
+        )
+        samples[chosen] = grids.length_count.prod(axis=1)
+    return {
+        "psf": np.ones(count),
+        "wave": samples * np.log2(np.maximum(samples, 2.0)),
+        "rays": (share > 0.0) * (1.0 + survey.extent_px.prod(axis=1) / RAYS_PX2),
+        "texels": (2.0 * radius_px + 1.0) ** 2,
+    }

@@ -1,0 +1,302 @@
+"""Interpolated against exact kernels for the planner's tests and benchmarks.
+
+`sampled_errors` reads a plan as a frame does: four field nodes, two pupils, two
+accommodations and two nodes of defocus each, every kernel computed, none from a store.
+"""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from estimator.estimation import estimate_eye
+from estimator.profile_files import load_profile
+from estimator.psf import compute_psf_batch
+from estimator.traced_eye import TracedEye
+from filter_service.psf_grid import GridSpec, pupil_nodes_mm
+from filter_service.psf_nodes import bracket_axis, channel_wavelengths_nm
+from filter_service.psf_pack import pack_kernels
+from filter_service.psf_plan_paper import DISTANCES_DPT
+from filter_service.psf_plan_use import FIELD_OF_AXIS, sample_use
+from filter_service.psf_slopes import PupilStates
+
+SPECTRUM_SIDE_PX = 256
+
+COURTYARD_SPECTRUM = (
+    (0.025, 0.04, 0.063, 0.1, 0.16, 0.25, 0.4, 0.63, 1.0, 1.58, 2.5),
+    (70.0, 35.0, 15.3, 5.25, 2.04, 0.943, 0.269, 0.085, 0.0265, 0.00668, 0.00137),
+)
+"""Variance of a pixel per frequency (rad/px) in linear 720p frames of *Courtyard*, as
+`tests.benchmarks.plan_law` measures it; its mean over all frequencies is 0.037."""
+
+
+def spec_for(width_px=480, height_px=270, vertical_fov_deg=50.0, **settings):
+    up = math.tan(math.radians(vertical_fov_deg) / 2)
+    right = up * width_px / height_px
+    return GridSpec.for_camera(
+        width_px=width_px,
+        height_px=height_px,
+        tangents=(-right, right, up, -up),
+        **settings,
+    )
+
+
+def traced_eye(name, spec):
+    """The traced eye of a preset for all that a spec asks for."""
+    return _traced(
+        name,
+        tuple(pupil_nodes_mm(spec.pupil_range_mm)),
+        spec.focus_range_dpt,
+        spec.field_range_deg,
+        tuple(channel_wavelengths_nm(spec)),
+    )
+
+
+@cache
+def _estimated(name):
+    return estimate_eye(load_profile(name))
+
+
+@cache
+def _traced(name, pupils_mm, focus_range_dpt, field_range_deg, wavelengths_nm):
+    return TracedEye.trace(
+        _estimated(name),
+        pupil_diameters_mm=pupils_mm,
+        focus_range_dpt=focus_range_dpt,
+        wavelengths_nm=wavelengths_nm,
+        field_range_deg=field_range_deg,
+    )
+
+
+def isotropic_spectrum(side_px=SPECTRUM_SIDE_PX, table=COURTYARD_SPECTRUM):
+    """Spectrum (side, side) as `numpy.fft.fft2` orders it."""
+    along = 2.0 * math.pi * np.fft.fftfreq(side_px)
+    frequency = np.maximum(np.hypot(along[:, None], along), table[0][0])
+    return np.exp(np.interp(np.log(frequency), *np.log(table)))
+
+
+def image_error(kernel_difference, spectrum):
+    """Mean square of an image of that spectrum, filtered with a difference kernel."""
+    side = len(spectrum)
+    rows, columns = kernel_difference.shape
+    if max(rows, columns) > side:
+        raise ValueError(f"kernel of {rows} px: the spectrum has {side}")
+    padded = np.zeros((side, side))
+    padded[:rows, :columns] = kernel_difference
+    return float(np.mean(np.abs(np.fft.fft2(padded)) ** 2 * spectrum))
+
+
+def exact_kernels(eye, spec, states):
+    """Kernels of states (P,) as they are computed, untrimmed."""
+    found = eye.wavefronts(**vars(states))
+    return compute_psf_batch(
+        found.zernike_um,
+        pupil_diameter_mm=found.circle_diameter_mm,
+        pupil_ellipse=found.pupil_ellipse,
+        wavelength_nm=states.wavelength_nm,
+        pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
+        diffraction=spec.diffraction,
+        min_energy_ratio=1.0 - 0.2 * (1.0 - spec.kept_energy_ratio),
+        workers=2,
+    )
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """Nodes that states (P,) read, and their weights, corner by corner (P, 32)."""
+
+    states: PupilStates
+    weights: np.ndarray
+
+
+def _corners(eye, spec, plan, states, object_dpt, axes):
+    """Read all axes of a plan, or only some and the others exactly."""
+    count = states.h_deg.size
+
+    def ends(axis, nodes, values):
+        if axis not in axes:
+            return [(None, values, np.ones(count))]
+        lower, upper, share = bracket_axis(nodes, values)
+        return [(lower, nodes[lower], 1 - share), (upper, nodes[upper], share)]
+
+    v_ends, h_ends, pupil_ends, used_ends = (
+        ends(axis, nodes, vars(states)[FIELD_OF_AXIS[axis]])
+        for axis, nodes in (
+            ("v", plan.v_deg),
+            ("h", plan.h_deg),
+            ("pupil", plan.pupils_mm),
+            ("accommodation", plan.accommodations_dpt),
+        )
+    )
+    channel = np.argmin(
+        np.abs(channel_wavelengths_nm(spec) - states.wavelength_nm[:, None]), axis=1
+    )
+    found, weights = [], []
+    for v_index, v_deg, v_share in v_ends:
+        for h_index, h_deg, h_share in h_ends:
+            total_dpt = object_dpt + eye.total_defocus_dpt(
+                h_deg=h_deg,
+                v_deg=v_deg,
+                pupil_diameter_mm=states.pupil_diameter_mm,
+                accommodation_dpt=states.accommodation_dpt,
+                wavelength_nm=states.wavelength_nm,
+            )
+            for pupil_index, pupil_mm, pupil_share in pupil_ends:
+                for used_index, used_dpt, used_share in used_ends:
+                    at_dpt = total_dpt * states.pupil_diameter_mm / pupil_mm
+                    share = v_share * h_share * pupil_share * used_share
+                    columns = {
+                        "h_deg": h_deg,
+                        "v_deg": v_deg,
+                        "pupil_diameter_mm": pupil_mm,
+                        "accommodation_dpt": used_dpt,
+                        "wavelength_nm": states.wavelength_nm,
+                    }
+                    if "defocus" not in axes:
+                        found.append(columns | {"total_defocus_dpt": at_dpt})
+                        weights.append(share)
+                        continue
+                    group = np.ravel_multi_index(
+                        (v_index, h_index, pupil_index, used_index), plan.group_shape
+                    )
+                    shift_dpt = plan.channel_shift_dpt[group, channel]
+                    lower, upper, part = plan.defocus.bracket(group, at_dpt - shift_dpt)
+                    for index, t_share in ((lower, 1 - part), (upper, part)):
+                        node_dpt = plan.defocus.values[index] + shift_dpt
+                        found.append(columns | {"total_defocus_dpt": node_dpt})
+                        weights.append(share * t_share)
+    return _Corners(
+        PupilStates(
+            **{
+                name: np.stack([np.broadcast_to(c[name], count) for c in found], axis=1)
+                for name in found[0]
+            }
+        ),
+        np.stack(weights, axis=1),
+    )
+
+
+ALL_AXES = ("h", "v", "pupil", "accommodation", "defocus")
+
+
+def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=None):
+    """Mean square errors (count,) of images at random states, blended against exact.
+
+    Parameters
+    ----------
+    axes : tuple
+        Which axes are interpolated: with "defocus" all must be; the others alone or
+        together.
+    """
+    spectrum = isotropic_spectrum() if spectrum is None else spectrum
+    use = sample_use(eye, spec, 4096)
+    chosen = np.random.default_rng(seed).choice(4096, count, replace=False)
+    use = use.taken(chosen)
+    return state_errors(
+        eye, spec, plan, use.states, use.object_dpt, axes=axes, spectrum=spectrum
+    )
+
+
+def state_errors(
+    eye, spec, plan, states, object_dpt, *, axes=ALL_AXES, spectrum, stored=False
+):
+    """Mean square errors (P,) of images at given states, blended against exact.
+
+    ``stored``: blend kernels as a cache holds them, trimmed and in 16 bits.
+    """
+    corners = _corners(eye, spec, plan, states, object_dpt, axes)
+    kept = corners.weights > 1e-9
+    exact = exact_kernels(eye, spec, states)
+    blended = exact_kernels(
+        eye,
+        spec,
+        PupilStates(**{name: v[kept] for name, v in vars(corners.states).items()}),
+    )
+    kernels = _stored(spec, blended) if stored else [psf.kernel for psf in blended]
+    starts = np.concatenate([[0], np.cumsum(kept.sum(axis=1))])
+    return np.array(
+        [
+            image_error(
+                _difference(
+                    exact[k].kernel,
+                    kernels[starts[k] : starts[k + 1]],
+                    corners.weights[k][kept[k]],
+                ),
+                spectrum,
+            )
+            for k in range(len(exact))
+        ]
+    )
+
+
+def _difference(exact, kernels, weights):
+    side = max(kernel.shape[0] for kernel in (exact, *kernels))
+    difference = np.zeros((side, side))
+    for weight, kernel in zip((1.0, *-weights), (exact, *kernels), strict=True):
+        edge = (side - kernel.shape[0]) // 2
+        inner = slice(edge, side - edge)
+        difference[inner, inner] += weight * kernel / kernel.sum(dtype=np.float64)
+    return difference
+
+
+def _stored(spec, batch):
+    with ThreadPoolExecutor(2) as pool:
+        packed = pack_kernels(
+            batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool
+        )
+    kernels = []
+    for offset, radius in zip(packed.offsets, packed.radius_px, strict=True):
+        side = 2 * int(radius) + 1
+        weights = packed.weights[offset : offset + side * side]
+        kernels.append(weights.reshape(side, side).astype(float))
+    return kernels
+
+
+def node_errors(eye, spec, plan, *, count, seed=0):
+    """Errors (count,) at nodes, where only storage errs."""
+    return _grid_errors(eye, spec, plan, count, seed, share=0.0)
+
+
+def halfway_errors(eye, spec, plan, *, count, seed=0):
+    """Errors (count,) half-way between nodes of all axes at once."""
+    return _grid_errors(eye, spec, plan, count, seed, share=0.5)
+
+
+def _grid_errors(eye, spec, plan, count, seed, share):
+    rng = np.random.default_rng(seed)
+
+    def between(nodes):
+        if len(nodes) == 1:
+            return np.full(count, nodes[0])
+        lower = rng.integers(0, len(nodes) - 1, count)
+        return (1.0 - share) * nodes[lower] + share * nodes[lower + 1]
+
+    # A node of the defocus groups is one distance, in green, at all of the paper's.
+    n_distances = int(plan.defocus.counts[0])
+    object_dpt = between(np.linspace(*DISTANCES_DPT, n_distances))
+    wavelengths_nm = channel_wavelengths_nm(spec)
+    known = {
+        "h_deg": between(plan.h_deg),
+        "v_deg": between(plan.v_deg),
+        "pupil_diameter_mm": between(plan.pupils_mm),
+        "accommodation_dpt": between(plan.accommodations_dpt),
+        "wavelength_nm": wavelengths_nm[rng.integers(0, 3, count)],
+    }
+    states = PupilStates(
+        **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + object_dpt
+    )
+    return state_errors(
+        eye,
+        spec,
+        plan,
+        states,
+        object_dpt,
+        spectrum=isotropic_spectrum(),
+        stored=share == 0.0,
+    )
+
+
+def mean_db(errors):
+    return -10.0 * math.log10(float(np.mean(errors)))
