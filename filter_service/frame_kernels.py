@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import QUAD, RECIPE_TAPS, WEIGHT_MAX
 from filter_service.image_cells import ImageCells
+from filter_service.psf_pack import box_sizes, pack_reach
 from filter_service.psf_store import FrameLayers, PsfStore, neighbours
 
 
@@ -23,23 +24,25 @@ class NodeKernels:
     ----------
     near, far : (n,)
         Recipes of the interval's two ends.
-    radius_px, peak_ratio : (n,)
-        Of the interval: largest radius, and a bound on the weights.
+    reach_px : (n, 4)
+        Of the interval: left, right, up, down.
+    radius_px : (n,)
+    peak_ratio : (n,)
+        Bound on the weights of the interval.
     recipes : (n_recipes, 3, 24), uint32
-        Per channel eight kernel offsets, eight radii, eight weights (float bits) that
-        turn steps of a cached kernel into its share of a layer.
+        Per channel eight kernel offsets, eight reaches (a byte a side), eight weights
+        (float bits) that turn steps of a cached kernel into its share of a layer.
     recipe_spread_px : (n_recipes,)
         Smallest spread over the channels; decides what may merge.
-    recipe_radius_px : (n_recipes,)
     """
 
     near: NDArray[np.int64]
     far: NDArray[np.int64]
+    reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
     recipes: NDArray[np.uint32]
     recipe_spread_px: NDArray[np.float64]
-    recipe_radius_px: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class FrameKernels:
     parts : (n, 4)
         Node kernels it is blended from.
     weight_ratio : (n, 4)
+    reach_px : (n, 4)
+        Left, right, up, down.
     radius_px : (n,)
     peak_ratio : (n,)
         Bound on the weights.
@@ -65,6 +70,7 @@ class FrameKernels:
     intervals: NDArray[np.int64]
     parts: NDArray[np.int64]
     weight_ratio: NDArray[np.float64]
+    reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
     spread_px: NDArray[np.float64]
@@ -109,6 +115,7 @@ def frame_kernels(
         intervals=intervals,
         parts=parts,
         weight_ratio=weights,
+        reach_px=nodes.reach_px[parts].max(axis=1),
         radius_px=nodes.radius_px[parts].max(axis=1),
         peak_ratio=(nodes.peak_ratio[parts] * weights).sum(axis=1),
         spread_px=(spread_px[parts] * weights[..., None]).sum(axis=1),
@@ -130,16 +137,18 @@ def _node_kernels(
         recipe_fields,
         layers.object_dpt[recipe_layers, None] + layers.at_infinity_dpt[recipe_fields],
     )
-    own_px = np.where(weights > 0.0, store.radius_px[psfs], 0).max(axis=(1, 2))
+    taken = weights > 0.0
+    own_px = np.where(taken[..., None], store.reach_px[psfs], 0).max(axis=(1, 2))
+    own_radius_px = np.where(taken, store.radius_px[psfs], 0).max(axis=(1, 2))
     own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
     return NodeKernels(
         near=near,
         far=far,
-        radius_px=np.maximum(own_px[near], own_px[far]),
+        reach_px=np.maximum(own_px[near], own_px[far]),
+        radius_px=np.maximum(own_radius_px[near], own_radius_px[far]),
         peak_ratio=np.maximum(own_peak[near], own_peak[far]),
         recipes=_recipes(store, psfs, weights),
         recipe_spread_px=(weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
-        recipe_radius_px=own_px,
     )
 
 
@@ -147,7 +156,7 @@ def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uin
     recipes = np.zeros((*psfs.shape[:2], 3, RECIPE_TAPS), dtype=np.uint32)
     taps = psfs.shape[-1]
     recipes[..., 0, :taps] = store.offsets[psfs]
-    recipes[..., 1, :taps] = store.radius_px[psfs]
+    recipes[..., 1, :taps] = pack_reach(store.reach_px[psfs])
     per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
     recipes[..., 2, :taps] = per_step.astype(np.float32).view(np.uint32)
     return recipes.reshape(*psfs.shape[:2], 3 * RECIPE_TAPS)
@@ -155,13 +164,14 @@ def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uin
 
 def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
     """Make records (n, 2, 4) of node kernels for blend_psfs; and texels of all."""
-    sizes = (2 * nodes.radius_px + 1) ** 2
+    widths, heights = box_sizes(nodes.reach_px)
+    sizes = widths * heights
     starts = np.cumsum(sizes) - sizes
     table = np.zeros((nodes.near.size, 2, 4), dtype=np.uint32)
     table[:, 0, 0] = nodes.near
     table[:, 0, 1] = nodes.far
     table[:, 0, 2] = starts
-    table[:, 0, 3] = nodes.radius_px
+    table[:, 0, 3] = pack_reach(nodes.reach_px)
     table[:, 1, 0] = nodes.peak_ratio.astype(np.float32).view(np.uint32)
     return table, int(sizes.sum())
 
@@ -171,8 +181,8 @@ def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
 
     Each is followed by its merged form: the kernel summed over a 2 x 2 quad.
     """
-    widths = 2 * kernels.radius_px + 1
-    single, merged = widths**2, (widths + 1) ** 2
+    widths, heights = box_sizes(kernels.reach_px)
+    single, merged = widths * heights, (widths + 1) * (heights + 1)
     starts = np.concatenate([[0], np.cumsum(single + merged)])
     scale = kernels.peak_ratio.astype(np.float32)
     spread_px = kernels.spread_px.astype(np.float32)
@@ -180,11 +190,12 @@ def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
     table[:, 0, 0] = spread_px[:, 0].view(np.uint32)
     table[:, 0, 1] = starts[:-1]
     table[:, 0, 2] = starts[:-1] + single
-    table[:, 0, 3] = kernels.radius_px
+    table[:, 0, 3] = pack_reach(kernels.reach_px)
     table[:, 1, 0] = spread_px[:, 1].copy().view(np.uint32)
     table[:, 1, 1] = scale.view(np.uint32)
     merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
     table[:, 1, 2] = merged_scale.view(np.uint32)
+    table[:, 1, 3] = kernels.radius_px
     return table, int(starts[-1])
 
 

@@ -199,7 +199,7 @@ class FramePasses:
                 paper_order=int(self.paper_rule),
                 scan_px=self.scan,
             )
-        reach_px = int(kernels.kernels.radius_px.max()) + 1.5
+        reach_px = int(kernels.kernels.reach_px.max()) + 1.5
         self.search_blocks = min(
             group_count(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
         )

@@ -19,6 +19,7 @@ from filter_service.frame_kernels import (
 )
 from filter_service.gpu import Buffer, Gpu, Pages, StageTimer
 from filter_service.image_cells import ImageCells
+from filter_service.psf_pack import box_sizes
 from filter_service.psf_store import FrameLayers, PsfStore
 
 MAX_GROUPS = 65535
@@ -86,25 +87,25 @@ class KernelMaker:
             "PARTS": gpu.upload("PARTS", part_table(kernels)),
             "KERNEL_OF": gpu.upload("KERNEL_OF", pair_index(kernels, shape)),
         }
-        node_sizes = (2 * kernels.nodes.radius_px + 1) ** 2
-        widths = 2 * kernels.radius_px + 1
+        node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
+        widths, heights = box_sizes(kernels.reach_px)
         self._run(
             "blend_psfs",
-            node_sizes,
+            node_widths * node_heights,
             {name: buffers[name] for name in ("NODES", "RECIPES")},
             images={"NODES": node_atlas},
             textures={"STORE": pages},
         )
         self._run(
             "blend_cells",
-            widths**2,
+            widths * heights,
             {name: buffers[name] for name in ("NODES", "PARTS", "KERNELS")},
             images={"ATLAS": atlas},
             textures={"NODES": node_atlas},
         )
         self._run(
             "merge_psfs",
-            (widths + 1) ** 2,
+            (widths + 1) * (heights + 1),
             {"KERNELS": buffers["KERNELS"]},
             images={"ATLAS": atlas},
         )

@@ -169,6 +169,7 @@ def _store(
         plan=plan,
         kernels=joined("weights"),
         offsets=np.repeat(offsets, copies),
+        reach_px=np.repeat(joined("reach_px"), copies, axis=0),
         radius_px=np.repeat(joined("radius_px"), copies),
         blur_px=np.repeat(blur_px, copies),
         spread_px=np.repeat(joined("spread_px"), copies),

@@ -1,6 +1,8 @@
-"""Computed kernels to cached ones: rim trimmed, sixteen bits a weight.
+"""Computed kernels to cached ones: cut to their boxes, sixteen bits a weight.
 
-Loops over single kernels, so compiled; threads share a batch.
+Off axis a kernel is long and lies beside its centre: the box that holds its light has a
+third of the area of the disc about the centre.  Loops over single kernels, so compiled;
+threads share a batch.
 """
 
 import math
@@ -14,9 +16,17 @@ from numpy.typing import NDArray
 from estimator.psf import PsfBatch
 from filter_service.constants import WEIGHT_MAX
 
-MAX_CENTROID_SHIFT_PX = 0.005
-"""Trimming stops where it would move a kernel's centroid farther than this."""
+MAX_CENTROID_SHIFT_RATIO = 0.005
+"""Cutting may move a kernel's centroid by this share of its spread, and of a pixel for
+sharper ones: images then move by what costs 55 dB at most."""
 
+CUT_STEPS = 7
+"""Halvings of the light that may be cut, until the centroid stays; then none is."""
+
+MAX_REACH_PX = 255
+"""Four reaches share a word."""
+
+SIDES = 4
 PSFS_PER_TASK = 64
 
 
@@ -28,7 +38,11 @@ class PackedKernels:
     ----------
     weights : (n_texels,), uint16
         Rows downwards; in steps of the kernel's peak over WEIGHT_MAX.
-    offsets, radius_px : (P,)
+    offsets : (P,)
+    reach_px : (P, 4)
+        Columns to the left and right, rows up and down of the centre that are held.
+    radius_px : (P,)
+        All weights but zeros lie within dx² + dy² <= (R + 0.5)².
     peak_ratio : (P,)
         Largest weight.
     spread_px : (P,)
@@ -39,113 +53,176 @@ class PackedKernels:
 
     weights: NDArray[np.uint16]
     offsets: NDArray[np.int64]
+    reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
     spread_px: NDArray[np.float64]
     lost_energy_ratio: NDArray[np.float64]
 
 
+def box_sizes(reach_px: NDArray) -> tuple[NDArray, NDArray]:
+    """Widths and heights (...) of kernels with reaches (..., 4)."""
+    left, right, up, down = np.moveaxis(np.asarray(reach_px), -1, 0)
+    return left + right + 1, up + down + 1
+
+
+def pack_reach(reach_px: NDArray) -> NDArray[np.uint32]:
+    """Four reaches (..., 4) as the bytes of a word, left lowest."""
+    return (np.asarray(reach_px, np.uint32) << np.array([0, 8, 16, 24], np.uint32)).sum(
+        axis=-1, dtype=np.uint32
+    )
+
+
+def square_kernel(
+    weights: NDArray[np.uint16], offset: int, reach_px: NDArray, radius_px: int
+) -> NDArray[np.float64]:
+    """Kernel (2 R + 1, 2 R + 1) in its steps, about its centre."""
+    left, right, up, down = (int(r) for r in reach_px)
+    width, height = left + right + 1, up + down + 1
+    square = np.zeros((2 * radius_px + 1,) * 2)
+    square[
+        radius_px - up : radius_px + down + 1, radius_px - left : radius_px + right + 1
+    ] = weights[offset : offset + width * height].reshape(height, width)
+    return square
+
+
 def pack_kernels(
     batch: PsfBatch, *, kept_energy_ratio: float, pool: Executor
 ) -> PackedKernels:
-    """Trim and quantise a batch.
+    """Cut and quantise a batch.
 
     Parameters
     ----------
     kept_energy_ratio : float
-        Share of a kernel's light that its radius must hold.
+        Share of a kernel's light that its box must hold.
     """
     count = len(batch)
-    radius_px = np.empty(count, np.int64)
-    trimmed_ratio = np.empty(count)
+    reach_px = np.empty((count, SIDES), np.int64)
+    cut_ratio = np.empty(count)
     tasks = [slice(k, k + PSFS_PER_TASK) for k in range(0, count, PSFS_PER_TASK)]
 
     def shared(work, *arrays) -> None:
         list(pool.map(lambda part: work(*(a[part] for a in arrays)), tasks))
 
     shared(
-        lambda *parts: _trim_radii(batch.flat_kernels, kept_energy_ratio, *parts),
-        *(batch.offset_count, batch.radius_px, radius_px, trimmed_ratio),
+        lambda *parts: _cut(batch.flat_kernels, 1.0 - kept_energy_ratio, *parts),
+        *(batch.offset_count, batch.radius_px, reach_px, cut_ratio),
     )
-    sizes = (2 * radius_px + 1) ** 2
+    widths, heights = box_sizes(reach_px)
+    sizes = widths * heights
     offsets = np.cumsum(sizes) - sizes
     weights = np.empty(int(sizes.sum()), np.uint16)
+    radius_px = np.empty(count, np.int64)
     peak_ratio, spread_px = np.empty(count), np.empty(count)
     shared(
         lambda *parts: _quantise(batch.flat_kernels, weights, *parts),
-        *(batch.offset_count, batch.radius_px, offsets, radius_px),
-        *(peak_ratio, spread_px),
+        *(batch.offset_count, batch.radius_px, offsets, reach_px),
+        *(radius_px, peak_ratio, spread_px),
     )
     return PackedKernels(
         weights=weights,
         offsets=offsets,
+        reach_px=reach_px,
         radius_px=radius_px,
         peak_ratio=peak_ratio,
         spread_px=spread_px,
-        lost_energy_ratio=batch.lost_energy_ratio + trimmed_ratio,
+        lost_energy_ratio=batch.lost_energy_ratio + cut_ratio,
     )
 
 
 @njit(nogil=True, cache=True)
-def _trim_radii(kernels, kept_energy_ratio, starts, full_px, radius_px, trimmed_ratio):
-    """Smallest radii from which on the rule holds: light within, centroid unmoved."""
+def _cut(kernels, cut_ratio, starts, full_px, reach_px, removed_ratio):
+    """Reaches beyond which each side has its share of the light that may be cut."""
     for p in range(starts.size):
         full, start = full_px[p], starts[p]
-        light, moment_x, moment_y = np.zeros((3, full + 1))
-        for dy in range(-full, full + 1):
-            row = start + (dy + full) * (2 * full + 1) + full
-            for dx in range(-full, full + 1):
-                ring = math.ceil(math.hypot(dx, dy) - 0.5)
-                if ring <= full:
-                    value = kernels[row + dx]
-                    light[ring] += value
-                    moment_x[ring] += value * dx
-                    moment_y[ring] += value * dy
-        light, moment_x, moment_y = (
-            np.cumsum(light),
-            np.cumsum(moment_x),
-            np.cumsum(moment_y),
-        )
-        center_x, center_y = moment_x[full] / light[full], moment_y[full] / light[full]
-        radius = full
-        while radius > 0:
-            kept = max(light[radius - 1], 1e-12)
-            shift = math.hypot(
-                moment_x[radius - 1] / kept - center_x,
-                moment_y[radius - 1] / kept - center_y,
-            )
-            if kept < kept_energy_ratio * light[full] or shift > MAX_CENTROID_SHIFT_PX:
+        width = 2 * full + 1
+        kernel = kernels[start : start + width * width].reshape(width, width)
+        by_column, by_row = np.zeros(width), np.zeros(width)
+        squares = 0.0
+        for y in range(width):
+            for x in range(width):
+                value = float(kernel[y, x])
+                by_column[x] += value
+                by_row[y] += value
+                squares += value * value
+        total = by_row.sum()
+        spread = total / math.sqrt(math.pi * squares)
+        limit = MAX_CENTROID_SHIFT_RATIO * max(spread, 1.0)
+        side_ratio = cut_ratio / SIDES
+        for step in range(CUT_STEPS + 1):
+            if step == CUT_STEPS:
+                side_ratio = 0.0
+            left, right, shift_x = _ends(by_column, side_ratio * total, full)
+            up, down, shift_y = _ends(by_row, side_ratio * total, full)
+            if max(abs(shift_x), abs(shift_y)) <= limit:
                 break
-            radius -= 1
-        radius_px[p] = radius
-        trimmed_ratio[p] = 1.0 - light[radius] / light[full]
+            side_ratio /= 2.0
+        reach_px[p, 0], reach_px[p, 1] = left, right
+        reach_px[p, 2], reach_px[p, 3] = up, down
+        held = 0.0
+        for y in range(full - up, full + down + 1):
+            for x in range(full - left, full + right + 1):
+                held += kernel[y, x]
+        removed_ratio[p] = 1.0 - held / total
+
+
+@njit(nogil=True, cache=True)
+def _ends(light, allowed, full):
+    """Reach before and after the centre, and how far the centroid moves by the cut."""
+    first, cut = 0, 0.0
+    while first < full and cut + light[first] <= allowed:
+        cut += light[first]
+        first += 1
+    last, cut = light.size - 1, 0.0
+    while last > full and cut + light[last] <= allowed:
+        cut += light[last]
+        last -= 1
+    total, moment, held, held_moment = 0.0, 0.0, 0.0, 0.0
+    for i in range(light.size):
+        total += light[i]
+        moment += light[i] * (i - full)
+        if first <= i <= last:
+            held += light[i]
+            held_moment += light[i] * (i - full)
+    shift = held_moment / max(held, 1e-12) - moment / max(total, 1e-12)
+    return full - first, last - full, shift
 
 
 @njit(nogil=True, cache=True)
 def _quantise(
-    kernels, weights, starts, full_px, offsets, radius_px, peak_ratio, spread_px
+    kernels,
+    weights,
+    starts,
+    full_px,
+    offsets,
+    reach_px,
+    radius_px,
+    peak_ratio,
+    spread_px,
 ):
-    """Cut kernels to their discs, bring them to unit sum and to steps of their peak."""
+    """Bring what boxes hold to unit sum and to steps of its peak."""
     for p in range(starts.size):
-        full, radius = full_px[p], radius_px[p]
-        centre = starts[p] + full * (2 * full + 1) + full
+        full = full_px[p]
+        width = 2 * full + 1
+        kernel = kernels[starts[p] : starts[p] + width * width].reshape(width, width)
+        box = kernel[
+            full - reach_px[p, 2] : full + reach_px[p, 3] + 1,
+            full - reach_px[p, 0] : full + reach_px[p, 1] + 1,
+        ]
         total, squares, peak = 0.0, 0.0, 0.0
-        for dy in range(-radius, radius + 1):
-            row = centre + dy * (2 * full + 1)
-            for dx in range(-radius, radius + 1):
-                if math.ceil(math.hypot(dx, dy) - 0.5) <= radius:
-                    value = float(kernels[row + dx])
-                    total += value
-                    squares += value * value
-                    peak = max(peak, value)
-        to = offsets[p]
-        for dy in range(-radius, radius + 1):
-            row = centre + dy * (2 * full + 1)
-            for dx in range(-radius, radius + 1):
-                value = 0.0
-                if math.ceil(math.hypot(dx, dy) - 0.5) <= radius:
-                    value = float(kernels[row + dx])
-                weights[to] = np.uint16(value * (WEIGHT_MAX / peak) + 0.5)
+        for value in box.flat:
+            total += value
+            squares += float(value) * float(value)
+            peak = max(peak, float(value))
+        to, farthest = offsets[p], 0
+        for y in range(box.shape[0]):
+            for x in range(box.shape[1]):
+                weight = np.uint16(float(box[y, x]) * (WEIGHT_MAX / peak) + 0.5)
+                weights[to] = weight
                 to += 1
+                if weight > 0:
+                    dx, dy = x - reach_px[p, 0], y - reach_px[p, 2]
+                    farthest = max(farthest, dx * dx + dy * dy)
+        radius_px[p] = math.ceil(math.sqrt(farthest) - 0.5)
         peak_ratio[p] = peak / total
         spread_px[p] = total / math.sqrt(math.pi * squares)

@@ -29,8 +29,12 @@ class PsfStore:
     kernels : (n_texels,), uint16
         All kernels, rows downwards, one after the other; in steps of the kernel's peak
         over WEIGHT_MAX, which is finer than half floats and half of what floats take.
-    offsets, radius_px : (n_psfs,)
-        Where a kernel starts and its radius.
+    offsets : (n_psfs,)
+        Where a kernel starts.
+    reach_px : (n_psfs, 4)
+        Its columns to the left and right, its rows up and down of the centre.
+    radius_px : (n_psfs,)
+        It lies within dx² + dy² <= (R + 0.5)².
     blur_px : (n_psfs,)
         Geometric blur radius.
     spread_px : (n_psfs,)
@@ -45,6 +49,7 @@ class PsfStore:
     plan: CachePlan
     kernels: NDArray[np.uint16]
     offsets: NDArray[np.int64]
+    reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     blur_px: NDArray[np.float64]
     spread_px: NDArray[np.float64]

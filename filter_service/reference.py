@@ -18,6 +18,7 @@ from filter_service.frame_kernels import (
     interval_count,
 )
 from filter_service.image_cells import ImageCells, image_cells
+from filter_service.psf_pack import square_kernel
 from filter_service.psf_store import FrameLayers, PsfStore
 
 
@@ -43,23 +44,20 @@ def recipe_kernels(
     kernels = np.zeros((len(nodes.recipes), size, size, 3))
     for k, by_channel in enumerate(nodes.recipes):
         for channel, words in enumerate(by_channel):
-            offsets, radii, bits = words.reshape(3, -1)
+            offsets, reaches, bits = words.reshape(3, -1)
             weights = bits.view(np.float32)
-            for offset, own, weight in zip(offsets, radii, weights, strict=True):
+            for offset, own, weight in zip(offsets, reaches, weights, strict=True):
                 if weight > 0.0:
-                    width = 2 * int(own) + 1
-                    first = int(offset)
-                    cached = store.kernels[first : first + width * width]
-                    part = slice(radius_px - int(own), radius_px + int(own) + 1)
-                    kernels[k, part, part, channel] += float(weight) * cached.reshape(
-                        width, width
-                    ).astype(np.float64)
+                    reach_px = np.uint32(own).reshape(1).view(np.uint8)
+                    kernels[k, ..., channel] += float(weight) * square_kernel(
+                        store.kernels, int(offset), reach_px, radius_px
+                    )
     return kernels
 
 
 def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
     """Kernels (n, 2, size, size, 3) of a frame, at both ends of their intervals."""
-    radius = int(kernels.radius_px.max())
+    radius = int(kernels.reach_px.max())
     of_recipe = recipe_kernels(store, kernels.nodes, radius)
     nodes = kernels.nodes
     ends = np.stack([of_recipe[nodes.near], of_recipe[nodes.far]], axis=1)

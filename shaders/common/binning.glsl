@@ -29,7 +29,13 @@ int next_block(inout Walk walk) {
 }
 
 bool reaches_tile(uvec4 place, ivec2 tile) {
-    float reach = place_reach_px(place);
-    vec2 center = place_center_px(place);
-    return distance_squared_to_tile(center, tile * TILE_SIZE_PX) <= reach * reach;
+    Reach reach = unpack_reach(place.w);
+    ivec2 first = place_origin_px(place);
+    ivec2 last = first + ((place.y & MERGED_BIT) != 0u ? 1 : 0);
+    ivec2 tile_first = tile * TILE_SIZE_PX;
+    ivec2 tile_last = tile_first + TILE_SIZE_PX - 1;
+    if (any(lessThan(last + ivec2(reach.right, reach.down), tile_first))
+        || any(greaterThan(first - ivec2(reach.left, reach.up), tile_last))) return false;
+    float radius = place_reach_px(place);
+    return distance_squared_to_tile(vec2(first), tile_first) <= radius * radius;
 }

@@ -1,7 +1,7 @@
 // A fragment: one pixel or one merged 2 x 2 quad of the input, with its blur.
 // color.rgb is linear light; color.a the sort depth (smaller = nearer).
-// place: x | y << 16 (first pixel), kernel | flags, bits of the fraction of the kernel's
-// interval, kernel radius in px.
+// place: x | y << 16 (first pixel), kernel | flags, fraction of the kernel's interval in
+// 16 bits | radius of the kernel << 16, reach of the kernel (common/reach.glsl).
 
 struct Fragment {
     vec3 linear_rgb;
@@ -10,6 +10,7 @@ struct Fragment {
     uint kernel;
     float layer_fraction;
     int radius_px;
+    uint reach;
     bool is_merged;
     bool is_edge;
 };
@@ -19,21 +20,21 @@ uvec4 pack_place(Fragment fragment) {
     state |= fragment.is_merged ? MERGED_BIT : 0u;
     state |= fragment.is_edge ? EDGE_BIT : 0u;
     uint place = uint(fragment.origin_px.x) | (uint(fragment.origin_px.y) << PLACE_BITS);
-    return uvec4(place, state, floatBitsToUint(fragment.layer_fraction),
-                 uint(fragment.radius_px));
+    uint fraction = uint(fragment.layer_fraction * float(PLACE_MASK) + 0.5);
+    return uvec4(place, state, fraction | (uint(fragment.radius_px) << PLACE_BITS),
+                 fragment.reach);
 }
 
 ivec2 place_origin_px(uvec4 place) {
     return ivec2(place.x & PLACE_MASK, place.x >> PLACE_BITS);
 }
 
-// Centre of the fragment's area and the reach of its light from there.
-vec2 place_center_px(uvec4 place) {
-    float shift = (place.y & MERGED_BIT) != 0u ? 0.5 : 0.0;
-    return vec2(place_origin_px(place)) + shift;
+float place_fraction(uvec4 place) {
+    return float(place.z & PLACE_MASK) / float(PLACE_MASK);
 }
 
+// Largest distance at which the fragment lights a pixel, from its first pixel.
 float place_reach_px(uvec4 place) {
-    float corner = (place.y & MERGED_BIT) != 0u ? sqrt(0.5) : 0.0;
-    return float(place.w) + 0.5 + corner;
+    float merged = (place.y & MERGED_BIT) != 0u ? sqrt(2.0) : 0.0;
+    return float(place.z >> PLACE_BITS) + 0.5 + merged;
 }

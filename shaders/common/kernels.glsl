@@ -1,6 +1,7 @@
 // Kernels of this frame, each with both ends of its interval of layers.  Record k:
-//   (spread bits at the near end px, offset, merged offset, radius px),
-//   (spread bits at the far end px, scale bits, merged scale bits, 0).
+//   (spread bits at the near end px, offset, merged offset, reach),
+//   (spread bits at the far end px, scale bits, merged scale bits, radius px).
+// The kernel lies within its reach and within dx^2 + dy^2 <= (radius + 0.5)^2.
 // Needs a buffer `kernels` of uvec4 in scope.
 
 uvec4 kernel_place(uint kernel) { return kernels[kernel * uint(KERNEL_WORDS)]; }

@@ -17,13 +17,14 @@ layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 #include "common/atlas.glsl"
 #include "common/kernels.glsl"
 #include "common/work.glsl"
+#include "common/reach.glsl"
 
 void add_node(uint node, float weight, ivec2 at, inout vec3 near, inout vec3 far) {
     uvec4 place = nodes[node * uint(KERNEL_WORDS)];
-    int radius = int(place.w);
-    if (weight == 0.0 || abs(at.x) > radius || abs(at.y) > radius) return;
+    Reach reach = unpack_reach(place.w);
+    if (weight == 0.0 || !within(reach, at)) return;
     float scale = uintBitsToFloat(nodes[node * uint(KERNEL_WORDS) + 1u].x);
-    int texel = int(place.z) + (at.y + radius) * (2 * radius + 1) + at.x + radius;
+    int texel = int(place.z) + reach_texel(reach, at);
     uvec4 ends = texelFetch(node_atlas, atlas_position(texel), 0);
     near += weight * scale / WEIGHT_MAX * near_weights(ends);
     far += weight * scale / WEIGHT_MAX * far_weights(ends);
@@ -34,10 +35,9 @@ void main() {
     int texel;
     if (!take_work(kernel, texel)) return;
     uvec4 place = kernel_place(kernel);
-    int radius = int(place.w);
-    int width = 2 * radius + 1;
-    if (texel >= width * width) return;
-    ivec2 at = ivec2(texel % width, texel / width) - radius;
+    Reach reach = unpack_reach(place.w);
+    if (texel >= reach_width(reach) * reach_height(reach)) return;
+    ivec2 at = reach_offset(reach, texel);
     uvec4 node = parts[kernel * uint(KERNEL_WORDS)];
     vec4 weight = uintBitsToFloat(parts[kernel * uint(KERNEL_WORDS) + 1u]);
     vec3 near = vec3(0.0);

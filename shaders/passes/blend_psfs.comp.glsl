@@ -1,8 +1,8 @@
 // Blends cached PSFs into node kernels: field node, both ends of an interval of layers.
 // In:  the store (16-bit weights, a texture array addressed as one line), RECIPES (per
-//      layer and channel offsets, radii and weights of eight cached kernels: two pupils
+//      layer and channel offsets, reaches and weights of eight cached kernels: two pupils
 //      x two accommodations x two defocus nodes), NODES (records: near recipe, far
-//      recipe, offset, radius; scale bits), WORK.
+//      recipe, offset, reach; scale bits), WORK.
 // Out: the node atlas.
 // Dispatch: one group of THREADS texels per item of WORK.
 // Twin: reference.recipe_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
@@ -17,10 +17,12 @@ layout(rgba32ui, binding = IMAGE_NODES) writeonly uniform uimage2D node_atlas;
 
 #include "common/atlas.glsl"
 #include "common/work.glsl"
+#include "common/reach.glsl"
 
-float cached(uint offset, int radius, ivec2 at) {
-    if (abs(at.x) > radius || abs(at.y) > radius) return 0.0;
-    uint texel = offset + uint((at.y + radius) * (2 * radius + 1) + at.x + radius);
+float cached(uint offset, uint word, ivec2 at) {
+    Reach reach = unpack_reach(word);
+    if (!within(reach, at)) return 0.0;
+    uint texel = offset + uint(reach_texel(reach, at));
     ivec3 place = ivec3(texel & uint(STORE_SIDE - 1),
                         (texel >> uint(STORE_SIDE_BITS)) & uint(STORE_SIDE - 1),
                         texel >> uint(2 * STORE_SIDE_BITS));
@@ -32,11 +34,11 @@ float blended_half(uint recipe, uint half_index, ivec2 at) {
     vec4 weights = uintBitsToFloat(recipes[recipe + uint(RECIPE_WEIGHTS) + half_index]);
     if (all(equal(weights, vec4(0.0)))) return 0.0;
     uvec4 offsets = recipes[recipe + half_index];
-    uvec4 radii = recipes[recipe + 2u + half_index];
-    return weights.x * cached(offsets.x, int(radii.x), at)
-         + weights.y * cached(offsets.y, int(radii.y), at)
-         + weights.z * cached(offsets.z, int(radii.z), at)
-         + weights.w * cached(offsets.w, int(radii.w), at);
+    uvec4 reaches = recipes[recipe + 2u + half_index];
+    return weights.x * cached(offsets.x, reaches.x, at)
+         + weights.y * cached(offsets.y, reaches.y, at)
+         + weights.z * cached(offsets.z, reaches.z, at)
+         + weights.w * cached(offsets.w, reaches.w, at);
 }
 
 float blended(uint recipe, ivec2 at) {
@@ -55,10 +57,9 @@ void main() {
     if (!take_work(node, texel)) return;
     uvec4 place = nodes[node * uint(KERNEL_WORDS)];
     float scale = uintBitsToFloat(nodes[node * uint(KERNEL_WORDS) + 1u].x);
-    int radius = int(place.w);
-    int width = 2 * radius + 1;
-    if (texel >= width * width) return;
-    ivec2 at = ivec2(texel % width, texel / width) - radius;
+    Reach reach = unpack_reach(place.w);
+    if (texel >= reach_width(reach) * reach_height(reach)) return;
+    ivec2 at = reach_offset(reach, texel);
     uvec4 ends = pack_weights(recipe_weight(place.x, at), recipe_weight(place.y, at), scale);
     imageStore(node_atlas, atlas_position(int(place.z) + texel), ends);
 }

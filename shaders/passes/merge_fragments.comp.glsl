@@ -19,6 +19,7 @@ layout(std430, binding = BINDING_BLOCKS) writeonly buffer Blocks { uvec4 blocks[
 #include "common/layers.glsl"
 #include "common/cells.glsl"
 #include "common/kernels.glsl"
+#include "common/reach.glsl"
 #include "common/fragments.glsl"
 
 uniform ivec2 frame_size_px;
@@ -108,7 +109,7 @@ Fragment make_fragment(ivec2 at, vec4 pixel, float place, bool merged, bool edge
     float fraction;
     uint kernel = kernel_at(at, place, fraction);
     return Fragment(pixel.rgb, sort_depth(at, pixel.a), at, kernel, fraction,
-                    int(kernel_place(kernel).w), merged, edge);
+                    int(kernel_look(kernel).w), kernel_place(kernel).w, merged, edge);
 }
 
 void main() {

@@ -14,6 +14,7 @@ layout(rgba32ui, binding = IMAGE_ATLAS) uniform uimage2D atlas;
 #include "common/atlas.glsl"
 #include "common/kernels.glsl"
 #include "common/work.glsl"
+#include "common/reach.glsl"
 
 void main() {
     uint kernel;
@@ -22,18 +23,19 @@ void main() {
     uvec4 place = kernel_place(kernel);
     uvec4 look = kernel_look(kernel);
     float step_size = uintBitsToFloat(look.y) / WEIGHT_MAX;
-    int width = 2 * int(place.w) + 1;
-    int merged_width = width + 1;
-    if (texel >= merged_width * merged_width) return;
+    Reach reach = unpack_reach(place.w);
+    ivec2 size = ivec2(reach_width(reach), reach_height(reach));
+    int merged_width = size.x + 1;
+    if (texel >= merged_width * (size.y + 1)) return;
     ivec2 at = ivec2(texel % merged_width, texel / merged_width);
     vec3 near = vec3(0.0);
     vec3 far = vec3(0.0);
     for (int dy = 0; dy < 2; ++dy) {
         for (int dx = 0; dx < 2; ++dx) {
             ivec2 from = at - ivec2(dx, dy);
-            if (any(lessThan(from, ivec2(0))) || any(greaterThanEqual(from, ivec2(width))))
+            if (any(lessThan(from, ivec2(0))) || any(greaterThanEqual(from, size)))
                 continue;
-            int source = int(place.y) + from.y * width + from.x;
+            int source = int(place.y) + from.y * size.x + from.x;
             uvec4 single = imageLoad(atlas, atlas_position(source));
             near += near_weights(single) * step_size;
             far += far_weights(single) * step_size;

@@ -15,13 +15,28 @@ layout(std430, binding = BINDING_PSF_FIELD) writeonly buffer Field { vec4 field[
 
 uniform int first_record;
 
+const float cosine_terms[PSF_TURN_TERMS] = float[PSF_TURN_TERMS](PSF_COSINE_SERIES);
+const float sine_terms[PSF_TURN_TERMS] = float[PSF_TURN_TERMS](PSF_SINE_SERIES);
 const float edge_terms[PSF_EDGE_TERMS] = float[PSF_EDGE_TERMS](PSF_EDGE_SERIES);
+
+// Cosine and sine of turns within -0.5..0.5.
+void turned(vec2 turns, out vec2 cosine, out vec2 sine) {
+    vec2 square = turns * turns;
+    cosine = vec2(cosine_terms[PSF_TURN_TERMS - 1]);
+    sine = vec2(sine_terms[PSF_TURN_TERMS - 1]);
+    for (int k = PSF_TURN_TERMS - 2; k >= 0; --k) {
+        cosine = cosine_terms[k] + square * cosine;
+        sine = sine_terms[k] + square * sine;
+    }
+    sine *= turns;
+}
 
 // Low-passed step at `depth` samples inside the edge: a sine series, by Clenshaw's rule.
 vec2 smooth_step(vec2 depth) {
     vec2 inside = clamp(depth, -float(PSF_EDGE_HALF_WIDTH), float(PSF_EDGE_HALF_WIDTH));
-    vec2 angle = inside * PSF_EDGE_ANGLE;
-    vec2 twice = 2.0 * cos(angle);
+    vec2 cosine, sine;
+    turned(inside * PSF_EDGE_SLOPE, cosine, sine);
+    vec2 twice = 2.0 * cosine;
     vec2 newer = vec2(0.0);
     vec2 older = vec2(0.0);
     for (int m = PSF_EDGE_TERMS - 1; m >= 0; --m) {
@@ -29,7 +44,7 @@ vec2 smooth_step(vec2 depth) {
         older = newer;
         newer = next;
     }
-    return 0.5 + PSF_EDGE_SLOPE * inside + newer * sin(angle);
+    return 0.5 + PSF_EDGE_SLOPE * inside + newer * sine;
 }
 
 // Amplitude of the low-passed elliptical pupil in two rows; exact for a circle, right to
@@ -71,15 +86,16 @@ void main() {
         float x = (float(column) - middle.x) / half_samples.x;
         vec2 turns = row[PSF_TERMS - 1];
         for (int a = PSF_TERMS - 2; a >= 0; --a) turns = row[a] + x * turns;
-        vec2 angle = PSF_TURN * (turns - floor(turns + 0.5));
+        vec2 cosine, sine;
+        turned(turns - floor(turns + 0.5), cosine, sine);
         vec2 size = amplitude(x, y, shear, half_samples);
 #ifdef APODISED
         size.x *= exp(psf_log_amplitude(low, high, x, y.x));
         size.y *= exp(psf_log_amplitude(low, high, x, y.y));
 #endif
         size = column < grid.x ? size : vec2(0.0);
-        vec2 real = size * cos(angle);
-        vec2 imaginary = size * sin(angle);
+        vec2 real = size * cosine;
+        vec2 imaginary = size * sine;
         samples[r] = vec4(real.x, imaginary.x, real.y, imaginary.y);
     }
     vec4 result[FFT_LAST];

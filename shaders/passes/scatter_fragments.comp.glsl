@@ -4,6 +4,7 @@
 // Twin: reference.tile_lists.
 
 #include "common/tiles.glsl"
+#include "common/reach.glsl"
 #include "common/fragments.glsl"
 
 layout(local_size_x = GROUP_THREADS) in;

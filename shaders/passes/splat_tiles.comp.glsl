@@ -9,6 +9,7 @@
 //      front to back, w <- min(w, 1 - A), and plain sums where one surface fills the tile.
 // Twin: reference.splat.  Source: section 6.1; accumulation DESIGN 4.
 
+#include "common/reach.glsl"
 #include "common/fragments.glsl"
 #include "common/atlas.glsl"
 
@@ -35,22 +36,24 @@ const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 
 // Staged fragments: what the pixel loop needs, ready to use.
 shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
-shared ivec4 staged_place[THREADS];   // origin x, y, reach, 1 if merged
-shared ivec2 staged_kernel[THREADS];  // centre texel, scale bits
+shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
+shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, 1 if merged
 
 void stage(uint slot, uint at) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
     int merged = (place.y & MERGED_BIT) != 0u ? 1 : 0;
     uint kernel = place.y & KERNEL_MASK;
-    int radius = int(place.w);
-    int centre = radius * (2 * radius + 1 + merged) + radius;
+    Reach reach = unpack_reach(place.w);
     uvec4 look = kernel_look(kernel);
     float scale = uintBitsToFloat(merged != 0 ? look.z : look.y) / WEIGHT_MAX;
     int offset = int(merged != 0 ? kernel_place(kernel).z : kernel_place(kernel).y);
-    staged_color[at] = vec4(color.rgb, uintBitsToFloat(place.z));
-    staged_place[at] = ivec4(place_origin_px(place), radius, merged);
-    staged_kernel[at] = ivec2(offset + centre, floatBitsToInt(scale));
+    ivec2 origin = place_origin_px(place);
+    ivec2 first = origin - ivec2(reach.left, reach.up);
+    staged_color[at] = vec4(color.rgb, place_fraction(place));
+    staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + merged);
+    staged_kernel[at] = ivec4(offset, reach_width(reach) + merged, floatBitsToInt(scale),
+                              merged);
 }
 
 // Weight that remains under the accumulation rule.
@@ -88,24 +91,20 @@ void main() {
         barrier();  // the new batch is staged
         int staged = int(min(end - batch, uint(THREADS)));
         for (int i = 0; i < staged; ++i) {
-            ivec4 place = staged_place[i];
-            ivec2 kernel = staged_kernel[i];
+            ivec4 box = staged_box[i];
+            ivec4 kernel = staged_kernel[i];
             vec4 color = staged_color[i];
-            ivec2 offset = at - place.xy;
-            int reach = place.z;
-            int row = 2 * reach + 1 + place.w;
-            bool in_columns = offset.x >= -reach && offset.x <= reach + place.w;
-            int texel = kernel.x + offset.y * row + offset.x;
+            bool in_columns = at.x >= box.x && at.x <= box.z;
+            int texel = kernel.x + (at.y - box.y) * kernel.y + at.x - box.x;
             for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-                bool in_reach = in_columns && offset.y + p >= -reach
-                             && offset.y + p <= reach + place.w;
-                uvec4 pair = texelFetch(atlas, atlas_position(in_reach ? texel : 0), 0);
-                vec3 weight = mix(near_weights(pair), far_weights(pair), color.a);
-                weight *= in_reach ? intBitsToFloat(kernel.y) : 0.0;
-                weight = ruled_weight(weight, coverage[p], place.w != 0, ordered);
+                bool lit = in_columns && at.y + p >= box.y && at.y + p <= box.w;
+                uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
+                vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
+                weight *= lit ? intBitsToFloat(kernel.z) : 0.0;
+                weight = ruled_weight(weight, coverage[p], kernel.w != 0, ordered);
                 light[p] += weight * color.rgb;
                 coverage[p] += weight;
-                texel += row;
+                texel += kernel.y;
             }
         }
     }

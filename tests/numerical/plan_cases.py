@@ -17,7 +17,7 @@ from estimator.psf import compute_psf_batch
 from estimator.traced_eye import TracedEye
 from filter_service.psf_grid import GridSpec, pupil_nodes_mm
 from filter_service.psf_nodes import bracket_axis, channel_wavelengths_nm
-from filter_service.psf_pack import pack_kernels
+from filter_service.psf_pack import pack_kernels, square_kernel
 from filter_service.psf_plan_paper import DISTANCES_DPT
 from filter_service.psf_plan_use import FIELD_OF_AXIS, sample_use
 from filter_service.psf_slopes import PupilStates
@@ -246,12 +246,10 @@ def _stored(spec, batch):
         packed = pack_kernels(
             batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool
         )
-    kernels = []
-    for offset, radius in zip(packed.offsets, packed.radius_px, strict=True):
-        side = 2 * int(radius) + 1
-        weights = packed.weights[offset : offset + side * side]
-        kernels.append(weights.reshape(side, side).astype(float))
-    return kernels
+    return [
+        square_kernel(packed.weights, int(offset), reach_px, int(reach_px.max()))
+        for offset, reach_px in zip(packed.offsets, packed.reach_px, strict=True)
+    ]
 
 
 def node_errors(eye, spec, plan, *, count, seed=0):

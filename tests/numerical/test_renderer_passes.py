@@ -50,26 +50,27 @@ def tile_grid():
 
 
 def fragments(bench):
-    """Alive slots, their centres and reaches, as the merge pass packed them."""
+    """Alive slots, first pixels, reaches and radii, as the merge pass packed them."""
     columns, rows = tile_grid()
     n_tiles, slots = columns * rows, columns * rows * constants.THREADS
     counts = read(bench, "BLOCKS", (n_tiles, 4), np.uint32)[:, 0]
     place = read(bench, "FRAGMENT_PLACE", (slots, 4), np.uint32)
     alive = np.arange(slots) % constants.THREADS < np.repeat(counts, constants.THREADS)
     merged = (place[:, 1] & constants.MERGED_BIT) != 0
-    x = (place[:, 0] & constants.PLACE_MASK) + 0.5 * merged
-    y = (place[:, 0] >> constants.PLACE_BITS) + 0.5 * merged
-    reach = place[:, 3] + 0.5 + np.sqrt(0.5) * merged
-    return np.flatnonzero(alive), x, y, reach, merged
+    x = (place[:, 0] & constants.PLACE_MASK).astype(int)
+    y = (place[:, 0] >> constants.PLACE_BITS).astype(int)
+    reach = np.ascontiguousarray(place[:, 3]).view(np.uint8).reshape(-1, 4).astype(int)
+    radius = (place[:, 2] >> constants.PLACE_BITS).astype(int)
+    return np.flatnonzero(alive), x, y, reach, radius, merged
 
 
 def merged_twin(kernel):
     """Kernel summed over the four positions of a quad."""
-    size = kernel.shape[0] + 1
-    total = np.zeros((size, size, 3))
+    height, width = kernel.shape[:2]
+    total = np.zeros((height + 1, width + 1, 3))
     for dy in (0, 1):
         for dx in (0, 1):
-            total[dy : dy + size - 1, dx : dx + size - 1] += kernel
+            total[dy : dy + height, dx : dx + width] += kernel
     return total
 
 
@@ -101,18 +102,21 @@ def test_blended_kernels_equal_their_twin(gpu, rng, mode):
     largest = expected.shape[2] // 2
     assert kernels.count > (1 if mode == "on-axis" else 50)
     for k in range(0, kernels.count, max(kernels.count // 50, 1)):
-        radius = int(kernels.radius_px[k])
-        part = slice(largest - radius, largest + radius + 1)
+        to_left, to_right, to_top, to_bottom = kernels.reach_px[k]
+        part = (
+            slice(largest - to_top, largest + to_bottom + 1),
+            slice(largest - to_left, largest + to_right + 1),
+        )
         scale, merged_scale = table[k, 1, 1:3].view(np.float32) / constants.WEIGHT_MAX
-        width = 2 * radius + 1
-        singles = line[table[k, 0, 1] :][: width**2].reshape(width, width, 3)
-        quads = line[table[k, 0, 2] :][: (width + 1) ** 2]
-        quads = quads.reshape(width + 1, width + 1, 3)
+        height, width = to_top + to_bottom + 1, to_left + to_right + 1
+        singles = line[table[k, 0, 1] :][: height * width].reshape(height, width, 3)
+        quads = line[table[k, 0, 2] :][: (height + 1) * (width + 1)]
+        quads = quads.reshape(height + 1, width + 1, 3)
         # half a step of the kernel, of up to four node kernels, and float32 sums
         nodes = kernels.nodes.peak_ratio[kernels.parts[k]] / constants.WEIGHT_MAX
         rounding = 0.501 * (scale + float((nodes * kernels.weight_ratio[k]).sum()))
         for end, shift in enumerate((0, constants.WEIGHT_BITS)):
-            twin = expected[k, end, part, part]
+            twin = expected[k, end][part]
             single = ((singles >> shift) & constants.WEIGHT_MASK) * float(scale)
             merged = ((quads >> shift) & constants.WEIGHT_MASK) * float(merged_scale)
             assert np.abs(single - twin).max() <= rounding + 1e-7
@@ -138,14 +142,13 @@ def test_layers_are_no_farther_apart_than_the_blur_step(bench):
 
 def test_merging_keeps_every_pixel_once(bench, view):
     result = bench.render(view, pupil_diameter_mm=5.0)
-    alive, x, y, _, merged = fragments(bench)
+    alive, x, y, _, _, merged = fragments(bench)
     assert result.fragment_count == len(alive)
     assert merged[alive].sum() * 4 == result.merged_count > 0
     covered = np.zeros((101, 150), int)
     for slot in alive:
-        left, top = int(x[slot] - 0.5 * merged[slot]), int(y[slot] - 0.5 * merged[slot])
         edge = 2 if merged[slot] else 1
-        covered[top : top + edge, left : left + edge] += 1
+        covered[y[slot] : y[slot] + edge, x[slot] : x[slot] + edge] += 1
     assert np.all(covered == 1)
 
 
@@ -160,7 +163,7 @@ def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
 
 def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
     bench.render(view)
-    alive, x, y, reach, _ = fragments(bench)
+    alive, x, y, reach, radius, merged = fragments(bench)
     columns, rows = tile_grid()
     n_tiles, size = columns * rows, constants.TILE_SIZE_PX
     offsets = read(bench, "TILE_OFFSETS", (n_tiles + 1,), np.uint32)
@@ -173,7 +176,16 @@ def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
         left, top = (tile % columns) * size, (tile // columns) * size
         dx = np.clip(x[alive], left, left + size - 1) - x[alive]
         dy = np.clip(y[alive], top, top + size - 1) - y[alive]
-        expected = alive[dx**2 + dy**2 <= reach[alive] ** 2]
+        # the box of the kernel, and the disc that it lies in
+        far = radius[alive] + 0.5 + np.sqrt(2.0) * merged[alive]
+        to_left, to_right, to_top, to_bottom = reach[alive].T
+        lit = (
+            (x[alive] + to_right + merged[alive] >= left)
+            & (x[alive] - to_left <= left + size - 1)
+            & (y[alive] + to_bottom + merged[alive] >= top)
+            & (y[alive] - to_top <= top + size - 1)
+        )
+        expected = alive[lit & (dx**2 + dy**2 <= far**2)]
         listed = entries[offsets[tile] : offsets[tile + 1]]
         assert np.array_equal(np.sort(listed), expected)
         if counts[tile, 1]:
