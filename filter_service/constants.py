@@ -25,12 +25,14 @@ tiles need no order: at this slope the weights of a surface still sum to 1 withi
 and are normalised away."""
 
 MERGE_MIN_SPREAD_PX = 1.5
-"""Fragments whose kernels spread less than this stay single."""
+"""Fragments whose kernels spread less than this stay single; twice as much for each
+further level."""
 
 MERGE_CONTRAST = 0.03
 """Largest colour difference within a merged 2 x 2 quad is this times spread**1.5:
 the error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
-area), so the image error stays the same at every blur: 55 dB on textured scenes."""
+area), so the image error stays the same at every blur: 55 dB on textured scenes.  A
+square of the next level under twice the spread is the same picture, twice as large."""
 
 MERGE_CONTRAST_POWER = 1.5
 
@@ -50,7 +52,7 @@ MIN_BLUR_RANGE = 1.0e-12
 """Smallest depth range that is divided by."""
 
 QUAD = 4.0
-"""Pixels of a merged quad."""
+"""Fragments that merge into one of the next level."""
 
 SRGB_DECODE_KNEE = 0.04045
 SRGB_ENCODE_KNEE = 0.0031308
@@ -64,8 +66,9 @@ BYTE_MAX = 255.0
 PLACE_BITS = 16
 PLACE_MASK = 0xFFFF
 KERNEL_MASK = 0xFFFFFFF
-MERGED_BIT = 0x10000000
-EDGE_BIT = 0x20000000
+LEVEL_SHIFT = 28
+LEVEL_MASK = 3
+EDGE_BIT = 0x40000000
 """Packing of a fragment's position and state words (shaders/README.md)."""
 
 ATLAS_WIDTH_BITS = 12
@@ -86,8 +89,14 @@ STORE_SIDE = 1 << STORE_SIDE_BITS
 """Edge of a page of the cache, a texture array addressed as one line: no storage block
 could hold a cache over the whole field."""
 
-KERNEL_WORDS = 2
-"""uvec4 words of one kernel record."""
+KERNEL_WORDS = 3
+NODE_WORDS = 2
+"""uvec4 words of one record: of a frame's kernel; of a node kernel or its share."""
+
+MAX_LEVEL = 3
+NO_LEVEL = 0x7FFFFFFF
+"""Fragments merge to squares of up to 2**3 pixels, a block; the offset of a level that
+a kernel is too sharp for."""
 
 MAX_LAYERS = 2048
 """Layers of a frame; the note of what it uses is then 256 bytes of shared memory."""

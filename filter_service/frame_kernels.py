@@ -10,7 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import QUAD, RECIPE_TAPS, WEIGHT_MAX
+from filter_service.constants import (
+    KERNEL_WORDS,
+    MAX_LEVEL,
+    MERGE_MIN_SPREAD_PX,
+    NO_LEVEL,
+    NODE_WORDS,
+    RECIPE_TAPS,
+    WEIGHT_MAX,
+)
 from filter_service.image_cells import ImageCells
 from filter_service.psf_pack import box_sizes, pack_reach
 from filter_service.psf_store import FrameLayers, PsfStore, neighbours
@@ -167,7 +175,7 @@ def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
     widths, heights = box_sizes(nodes.reach_px)
     sizes = widths * heights
     starts = np.cumsum(sizes) - sizes
-    table = np.zeros((nodes.near.size, 2, 4), dtype=np.uint32)
+    table = np.zeros((nodes.near.size, NODE_WORDS, 4), dtype=np.uint32)
     table[:, 0, 0] = nodes.near
     table[:, 0, 1] = nodes.far
     table[:, 0, 2] = starts
@@ -176,32 +184,47 @@ def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
     return table, int(sizes.sum())
 
 
-def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
-    """Make records (n, 2, 4) of kernels for common/kernels.glsl; and texels of all.
+def kernel_levels(kernels: FrameKernels) -> NDArray[np.int64]:
+    """Merging level (n,) up to which a kernel is wide enough at both ends."""
+    steps = np.log2(
+        np.maximum(kernels.spread_px.max(axis=1), 1e-9) / MERGE_MIN_SPREAD_PX
+    )
+    return np.clip(np.floor(steps) + 1, 0, MAX_LEVEL).astype(np.int64)
 
-    Each is followed by its merged form: the kernel summed over a 2 x 2 quad.
-    """
+
+def level_sizes(kernels: FrameKernels, level: int) -> NDArray[np.int64]:
+    """Texels (n,) of the kernels of a level; 0 where there is none."""
     widths, heights = box_sizes(kernels.reach_px)
-    single, merged = widths * heights, (widths + 1) * (heights + 1)
-    starts = np.concatenate([[0], np.cumsum(single + merged)])
-    scale = kernels.peak_ratio.astype(np.float32)
+    extent = 2**level - 1
+    return np.where(
+        level <= kernel_levels(kernels), (widths + extent) * (heights + extent), 0
+    )
+
+
+def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
+    """Make records (n, 3, 4) of kernels for common/kernels.glsl; and texels of all.
+
+    Each is followed by its merged forms: the kernel summed over squares of pixels.
+    """
+    levels = np.arange(MAX_LEVEL + 1)
+    sizes = np.stack([level_sizes(kernels, int(level)) for level in levels], axis=-1)
+    starts = (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape)
+    scale = np.minimum(kernels.peak_ratio[:, None] * 4.0**levels, 1.0)
+    scale = scale.astype(np.float32)
+    scale[:, 0] = kernels.peak_ratio
     spread_px = kernels.spread_px.astype(np.float32)
-    table = np.zeros((kernels.count, 2, 4), dtype=np.uint32)
-    table[:, 0, 0] = spread_px[:, 0].view(np.uint32)
-    table[:, 0, 1] = starts[:-1]
-    table[:, 0, 2] = starts[:-1] + single
+    table = np.zeros((kernels.count, KERNEL_WORDS, 4), dtype=np.uint32)
+    table[:, 0, :2] = spread_px.view(np.uint32)
+    table[:, 0, 2] = kernels.radius_px
     table[:, 0, 3] = pack_reach(kernels.reach_px)
-    table[:, 1, 0] = spread_px[:, 1].copy().view(np.uint32)
-    table[:, 1, 1] = scale.view(np.uint32)
-    merged_scale = np.minimum(np.float32(QUAD) * scale, np.float32(1.0))
-    table[:, 1, 2] = merged_scale.view(np.uint32)
-    table[:, 1, 3] = kernels.radius_px
-    return table, int(starts[-1])
+    table[:, 1] = np.where(sizes > 0, starts, NO_LEVEL)
+    table[:, 2] = scale.view(np.uint32)
+    return table, int(sizes.sum())
 
 
 def part_table(kernels: FrameKernels) -> NDArray[np.uint32]:
     """Make records (n, 2, 4) for blend_cells: four node kernels and their weights."""
-    table = np.empty((kernels.count, 2, 4), dtype=np.uint32)
+    table = np.empty((kernels.count, NODE_WORDS, 4), dtype=np.uint32)
     table[:, 0] = kernels.parts
     table[:, 1] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
     return table

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import (
     BYTES_PER_WORD,
+    MAX_LEVEL,
     PAPER_SORT_KEY_BITS,
     RGB,
     SORT_KEY_BITS,
@@ -194,7 +195,7 @@ class FramePasses:
                 *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
                 **self._common,
                 blur_px_per_dpt=self.layers.blur_px_per_dpt,
-                merge_enabled=int(self.merge),
+                max_level=self._max_level,
                 white_level=self.white_level,
                 paper_order=int(self.paper_rule),
                 scan_px=self.scan,
@@ -339,21 +340,16 @@ class FramePasses:
             )
 
     @property
-    def _block_counts(self) -> NDArray[np.uint32]:
-        return self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)[
-            :, 0
-        ]
+    def _max_level(self) -> int:
+        """Level up to which fragments merge; the paper merges once."""
+        if not self.merge:
+            return 0
+        return 1 if self.paper_rule else MAX_LEVEL
 
-    @property
-    def fragment_count(self) -> int:
-        """Fragments after merging."""
-        return int(self._block_counts.sum())
-
-    @property
-    def merged_count(self) -> int:
-        """Pixels that went into merged fragments."""
-        singles_saved = self.pixel_count - self.fragment_count
-        return singles_saved * 4 // 3
+    def fragment_counts(self) -> tuple[int, int]:
+        """Fragments after merging, and pixels that went into merged ones."""
+        blocks = self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)
+        return int(blocks[:, 0].sum()), int(blocks[:, 3].sum())
 
 
 def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:

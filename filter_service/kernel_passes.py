@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import MAX_LAYERS, THREADS
+from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
 from filter_service.errors import GridTooLarge
 from filter_service.frame_kernels import (
     FrameKernels,
     frame_kernels,
     interval_count,
     kernel_table,
+    level_sizes,
     node_table,
     pair_index,
     part_table,
@@ -103,24 +104,36 @@ class KernelMaker:
             images={"ATLAS": atlas},
             textures={"NODES": node_atlas},
         )
-        self._run(
-            "merge_psfs",
-            (widths + 1) * (heights + 1),
-            {"KERNELS": buffers["KERNELS"]},
-            images={"ATLAS": atlas},
-        )
+        for level in range(1, MAX_LEVEL + 1):
+            self._run(
+                "merge_psfs",
+                level_sizes(kernels, level),
+                {"KERNELS": buffers["KERNELS"]},
+                images={"ATLAS": atlas},
+                uniforms={"level": level},
+            )
         return KernelSet(
             kernels, {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
         )
 
-    def _run(self, name: str, n_texels: NDArray, buffers: dict, **bindings) -> None:
+    def _run(
+        self,
+        name: str,
+        n_texels: NDArray,
+        buffers: dict,
+        *,
+        uniforms: dict | None = None,
+        **bindings,
+    ) -> None:
         work = work_list(n_texels, THREADS)
+        if not len(work):
+            return
         columns = min(len(work), MAX_GROUPS)
         self._gpu.dispatch(
             name,
             (columns, -(-len(work) // columns)),
             buffers={**buffers, "WORK": self._gpu.upload("WORK", work)},
-            uniforms={"group_count": len(work)},
+            uniforms={"group_count": len(work), **(uniforms or {})},
             **bindings,
         )
 

@@ -185,8 +185,7 @@ class FilterRenderer:
             )
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
             counts += (
-                passes.fragment_count,
-                passes.merged_count,
+                *passes.fragment_counts(),
                 passes.entry_count,
                 passes.kernel_count,
             )

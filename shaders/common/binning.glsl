@@ -31,7 +31,7 @@ int next_block(inout Walk walk) {
 bool reaches_tile(uvec4 place, ivec2 tile) {
     Reach reach = unpack_reach(place.w);
     ivec2 first = place_origin_px(place);
-    ivec2 last = first + ((place.y & MERGED_BIT) != 0u ? 1 : 0);
+    ivec2 last = first + place_extent_px(place);
     ivec2 tile_first = tile * TILE_SIZE_PX;
     ivec2 tile_last = tile_first + TILE_SIZE_PX - 1;
     if (any(lessThan(last + ivec2(reach.right, reach.down), tile_first))

@@ -1,7 +1,7 @@
-// A fragment: one pixel or one merged 2 x 2 quad of the input, with its blur.
+// A fragment: a pixel or a merged square of 2^level pixels of the input, with its blur.
 // color.rgb is linear light; color.a the sort depth (smaller = nearer).
-// place: x | y << 16 (first pixel), kernel | flags, fraction of the kernel's interval in
-// 16 bits | radius of the kernel << 16, reach of the kernel (common/reach.glsl).
+// place: x | y << 16 (first pixel), kernel | level | flag, fraction of the kernel's
+// interval in 16 bits | radius of the kernel << 16, reach of the kernel (common/reach.glsl).
 
 struct Fragment {
     vec3 linear_rgb;
@@ -11,13 +11,13 @@ struct Fragment {
     float layer_fraction;
     int radius_px;
     uint reach;
-    bool is_merged;
+    int level;
     bool is_edge;
 };
 
 uvec4 pack_place(Fragment fragment) {
     uint state = fragment.kernel;
-    state |= fragment.is_merged ? MERGED_BIT : 0u;
+    state |= uint(fragment.level) << LEVEL_SHIFT;
     state |= fragment.is_edge ? EDGE_BIT : 0u;
     uint place = uint(fragment.origin_px.x) | (uint(fragment.origin_px.y) << PLACE_BITS);
     uint fraction = uint(fragment.layer_fraction * float(PLACE_MASK) + 0.5);
@@ -33,8 +33,12 @@ float place_fraction(uvec4 place) {
     return float(place.z & PLACE_MASK) / float(PLACE_MASK);
 }
 
+int place_level(uvec4 place) { return int((place.y >> LEVEL_SHIFT) & LEVEL_MASK); }
+
+// Pixels of its square beyond the first, to the right and down.
+int place_extent_px(uvec4 place) { return (1 << place_level(place)) - 1; }
+
 // Largest distance at which the fragment lights a pixel, from its first pixel.
 float place_reach_px(uvec4 place) {
-    float merged = (place.y & MERGED_BIT) != 0u ? sqrt(2.0) : 0.0;
-    return float(place.z >> PLACE_BITS) + 0.5 + merged;
+    return float(place.z >> PLACE_BITS) + 0.5 + sqrt(2.0) * float(place_extent_px(place));
 }

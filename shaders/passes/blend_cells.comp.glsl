@@ -20,10 +20,10 @@ layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 #include "common/reach.glsl"
 
 void add_node(uint node, float weight, ivec2 at, inout vec3 near, inout vec3 far) {
-    uvec4 place = nodes[node * uint(KERNEL_WORDS)];
+    uvec4 place = nodes[node * uint(NODE_WORDS)];
     Reach reach = unpack_reach(place.w);
     if (weight == 0.0 || !within(reach, at)) return;
-    float scale = uintBitsToFloat(nodes[node * uint(KERNEL_WORDS) + 1u].x);
+    float scale = uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x);
     int texel = int(place.z) + reach_texel(reach, at);
     uvec4 ends = texelFetch(node_atlas, atlas_position(texel), 0);
     near += weight * scale / WEIGHT_MAX * near_weights(ends);
@@ -34,18 +34,17 @@ void main() {
     uint kernel;
     int texel;
     if (!take_work(kernel, texel)) return;
-    uvec4 place = kernel_place(kernel);
-    Reach reach = unpack_reach(place.w);
+    Reach reach = unpack_reach(kernel_reach(kernel));
     if (texel >= reach_width(reach) * reach_height(reach)) return;
     ivec2 at = reach_offset(reach, texel);
-    uvec4 node = parts[kernel * uint(KERNEL_WORDS)];
-    vec4 weight = uintBitsToFloat(parts[kernel * uint(KERNEL_WORDS) + 1u]);
+    uvec4 node = parts[kernel * uint(NODE_WORDS)];
+    vec4 weight = uintBitsToFloat(parts[kernel * uint(NODE_WORDS) + 1u]);
     vec3 near = vec3(0.0);
     vec3 far = vec3(0.0);
     add_node(node.x, weight.x, at, near, far);
     add_node(node.y, weight.y, at, near, far);
     add_node(node.z, weight.z, at, near, far);
     add_node(node.w, weight.w, at, near, far);
-    uvec4 ends = pack_weights(near, far, uintBitsToFloat(kernel_look(kernel).y));
-    imageStore(atlas, atlas_position(int(place.y) + texel), ends);
+    uvec4 ends = pack_weights(near, far, kernel_scale(kernel, 0));
+    imageStore(atlas, atlas_position(int(kernel_offset(kernel, 0)) + texel), ends);
 }

@@ -55,8 +55,8 @@ void main() {
     uint node;
     int texel;
     if (!take_work(node, texel)) return;
-    uvec4 place = nodes[node * uint(KERNEL_WORDS)];
-    float scale = uintBitsToFloat(nodes[node * uint(KERNEL_WORDS) + 1u].x);
+    uvec4 place = nodes[node * uint(NODE_WORDS)];
+    float scale = uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x);
     Reach reach = unpack_reach(place.w);
     if (texel >= reach_width(reach) * reach_height(reach)) return;
     ivec2 at = reach_offset(reach, texel);

@@ -1,7 +1,7 @@
-// Sums each kernel over the four pixels of a merged quad, so that a merged fragment
-// costs one look-up and loses no light.
-// In:  KERNELS, the kernel atlas (single kernels), WORK.
-// Out: the same (merged kernels).
+// Sums kernels over the squares of merged fragments, level by level, so that a merged
+// fragment costs one look-up and loses no light.
+// In:  KERNELS, the kernel atlas (level below), WORK.
+// Out: the same (this level).
 // Dispatch: one group of THREADS texels per item of WORK.
 // Twin: tests/numerical/test_renderer_passes.py (sums of reference.kernel_pairs).
 
@@ -16,31 +16,31 @@ layout(rgba32ui, binding = IMAGE_ATLAS) uniform uimage2D atlas;
 #include "common/work.glsl"
 #include "common/reach.glsl"
 
+uniform int level;
+
 void main() {
     uint kernel;
     int texel;
     if (!take_work(kernel, texel)) return;
-    uvec4 place = kernel_place(kernel);
-    uvec4 look = kernel_look(kernel);
-    float step_size = uintBitsToFloat(look.y) / WEIGHT_MAX;
-    Reach reach = unpack_reach(place.w);
-    ivec2 size = ivec2(reach_width(reach), reach_height(reach));
-    int merged_width = size.x + 1;
-    if (texel >= merged_width * (size.y + 1)) return;
-    ivec2 at = ivec2(texel % merged_width, texel / merged_width);
+    float step_size = kernel_scale(kernel, level - 1) / WEIGHT_MAX;
+    int half_side = 1 << (level - 1);
+    Reach reach = unpack_reach(kernel_reach(kernel));
+    ivec2 size = ivec2(reach_width(reach), reach_height(reach)) + half_side - 1;
+    int width = size.x + half_side;
+    if (texel >= width * (size.y + half_side)) return;
+    ivec2 at = ivec2(texel % width, texel / width);
     vec3 near = vec3(0.0);
     vec3 far = vec3(0.0);
     for (int dy = 0; dy < 2; ++dy) {
         for (int dx = 0; dx < 2; ++dx) {
-            ivec2 from = at - ivec2(dx, dy);
-            if (any(lessThan(from, ivec2(0))) || any(greaterThanEqual(from, size)))
-                continue;
-            int source = int(place.y) + from.y * size.x + from.x;
-            uvec4 single = imageLoad(atlas, atlas_position(source));
-            near += near_weights(single) * step_size;
-            far += far_weights(single) * step_size;
+            ivec2 from = at - half_side * ivec2(dx, dy);
+            if (any(lessThan(from, ivec2(0))) || any(greaterThanEqual(from, size))) continue;
+            int source = int(kernel_offset(kernel, level - 1)) + from.y * size.x + from.x;
+            uvec4 ends = imageLoad(atlas, atlas_position(source));
+            near += near_weights(ends) * step_size;
+            far += far_weights(ends) * step_size;
         }
     }
-    uvec4 packed_pair = pack_weights(near, far, uintBitsToFloat(look.z));
-    imageStore(atlas, atlas_position(int(place.z) + texel), packed_pair);
+    uvec4 ends = pack_weights(near, far, kernel_scale(kernel, level));
+    imageStore(atlas, atlas_position(int(kernel_offset(kernel, level)) + texel), ends);
 }

@@ -37,31 +37,30 @@ const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 // Staged fragments: what the pixel loop needs, ready to use.
 shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
 shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
-shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, 1 if merged
+shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, level
 
 void stage(uint slot, uint at) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
-    int merged = (place.y & MERGED_BIT) != 0u ? 1 : 0;
     uint kernel = place.y & KERNEL_MASK;
+    int level = place_level(place);
+    int extent = place_extent_px(place);
     Reach reach = unpack_reach(place.w);
-    uvec4 look = kernel_look(kernel);
-    float scale = uintBitsToFloat(merged != 0 ? look.z : look.y) / WEIGHT_MAX;
-    int offset = int(merged != 0 ? kernel_place(kernel).z : kernel_place(kernel).y);
+    float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
     ivec2 origin = place_origin_px(place);
     ivec2 first = origin - ivec2(reach.left, reach.up);
     staged_color[at] = vec4(color.rgb, place_fraction(place));
-    staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + merged);
-    staged_kernel[at] = ivec4(offset, reach_width(reach) + merged, floatBitsToInt(scale),
-                              merged);
+    staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + extent);
+    staged_kernel[at] = ivec4(kernel_offset(kernel, level), reach_width(reach) + extent,
+                              floatBitsToInt(scale), level);
 }
 
 // Weight that remains under the accumulation rule.
-vec3 ruled_weight(vec3 weight, vec3 coverage, bool merged, bool ordered) {
+vec3 ruled_weight(vec3 weight, vec3 coverage, int level, bool ordered) {
 #ifdef PAPER_RULE
-    if (merged) {
-        vec3 through = 1.0 - min(weight / QUAD, 1.0);
-        weight = 1.0 - through * through * through * through;
+    if (level > 0) {
+        float count = float(1 << (2 * level));
+        weight = 1.0 - pow(1.0 - min(weight / count, 1.0), vec3(count));
     }
     return weight * (1.0 - coverage);
 #else
@@ -101,7 +100,7 @@ void main() {
                 uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
                 vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
                 weight *= lit ? intBitsToFloat(kernel.z) : 0.0;
-                weight = ruled_weight(weight, coverage[p], kernel.w != 0, ordered);
+                weight = ruled_weight(weight, coverage[p], kernel.w, ordered);
                 light[p] += weight * color.rgb;
                 coverage[p] += weight;
                 texel += kernel.y;

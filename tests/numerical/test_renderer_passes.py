@@ -56,20 +56,20 @@ def fragments(bench):
     counts = read(bench, "BLOCKS", (n_tiles, 4), np.uint32)[:, 0]
     place = read(bench, "FRAGMENT_PLACE", (slots, 4), np.uint32)
     alive = np.arange(slots) % constants.THREADS < np.repeat(counts, constants.THREADS)
-    merged = (place[:, 1] & constants.MERGED_BIT) != 0
+    level = (place[:, 1] >> constants.LEVEL_SHIFT) & constants.LEVEL_MASK
     x = (place[:, 0] & constants.PLACE_MASK).astype(int)
     y = (place[:, 0] >> constants.PLACE_BITS).astype(int)
     reach = np.ascontiguousarray(place[:, 3]).view(np.uint8).reshape(-1, 4).astype(int)
     radius = (place[:, 2] >> constants.PLACE_BITS).astype(int)
-    return np.flatnonzero(alive), x, y, reach, radius, merged
+    return np.flatnonzero(alive), x, y, reach, radius, 2 ** level.astype(int)
 
 
-def merged_twin(kernel):
-    """Kernel summed over the four positions of a quad."""
+def merged_twin(kernel, edge):
+    """Kernel summed over the positions of a square."""
     height, width = kernel.shape[:2]
-    total = np.zeros((height + 1, width + 1, 3))
-    for dy in (0, 1):
-        for dx in (0, 1):
+    total = np.zeros((height + edge - 1, width + edge - 1, 3))
+    for dy in range(edge):
+        for dx in range(edge):
             total[dy : dy + height, dx : dx + width] += kernel
     return total
 
@@ -99,7 +99,7 @@ def test_blended_kernels_equal_their_twin(gpu, rng, mode):
     expected = reference.kernel_pairs(bench.store, kernels)
     table, _ = frame_kernels.kernel_table(kernels)
     line = atlas_line(gpu, "kernels")
-    largest = expected.shape[2] // 2
+    largest, levels = expected.shape[2] // 2, set()
     assert kernels.count > (1 if mode == "on-axis" else 50)
     for k in range(0, kernels.count, max(kernels.count // 50, 1)):
         to_left, to_right, to_top, to_bottom = kernels.reach_px[k]
@@ -107,21 +107,24 @@ def test_blended_kernels_equal_their_twin(gpu, rng, mode):
             slice(largest - to_top, largest + to_bottom + 1),
             slice(largest - to_left, largest + to_right + 1),
         )
-        scale, merged_scale = table[k, 1, 1:3].view(np.float32) / constants.WEIGHT_MAX
+        steps = table[k, 2].view(np.float32) / constants.WEIGHT_MAX
         height, width = to_top + to_bottom + 1, to_left + to_right + 1
-        singles = line[table[k, 0, 1] :][: height * width].reshape(height, width, 3)
-        quads = line[table[k, 0, 2] :][: (height + 1) * (width + 1)]
-        quads = quads.reshape(height + 1, width + 1, 3)
         # half a step of the kernel, of up to four node kernels, and float32 sums
         nodes = kernels.nodes.peak_ratio[kernels.parts[k]] / constants.WEIGHT_MAX
-        rounding = 0.501 * (scale + float((nodes * kernels.weight_ratio[k]).sum()))
-        for end, shift in enumerate((0, constants.WEIGHT_BITS)):
-            twin = expected[k, end][part]
-            single = ((singles >> shift) & constants.WEIGHT_MASK) * float(scale)
-            merged = ((quads >> shift) & constants.WEIGHT_MASK) * float(merged_scale)
-            assert np.abs(single - twin).max() <= rounding + 1e-7
-            limit = 4 * rounding + 0.501 * merged_scale + 1e-6
-            assert np.abs(merged - merged_twin(twin)).max() <= limit
+        rounding = 0.501 * float((nodes * kernels.weight_ratio[k]).sum())
+        for level, (offset, step) in enumerate(zip(table[k, 1], steps, strict=True)):
+            if offset == constants.NO_LEVEL:
+                break
+            edge = 2**level
+            shape = height + edge - 1, width + edge - 1, 3
+            found = line[offset:][: shape[0] * shape[1]].reshape(shape)
+            rounding = rounding * (4 if level else 1) + 0.501 * step
+            for end, shift in enumerate((0, constants.WEIGHT_BITS)):
+                made = ((found >> shift) & constants.WEIGHT_MASK) * float(step)
+                twin = merged_twin(expected[k, end][part], edge)
+                assert np.abs(made - twin).max() <= rounding + 1e-6
+                levels.add(level)
+    assert len(levels) >= 2
 
 
 def test_layers_are_no_farther_apart_than_the_blur_step(bench):
@@ -142,12 +145,13 @@ def test_layers_are_no_farther_apart_than_the_blur_step(bench):
 
 def test_merging_keeps_every_pixel_once(bench, view):
     result = bench.render(view, pupil_diameter_mm=5.0)
-    alive, x, y, _, _, merged = fragments(bench)
+    alive, x, y, _, _, edges = fragments(bench)
     assert result.fragment_count == len(alive)
-    assert merged[alive].sum() * 4 == result.merged_count > 0
+    assert np.square(edges[alive])[edges[alive] > 1].sum() == result.merged_count
+    assert {1, 2, 4} <= set(edges[alive])
     covered = np.zeros((101, 150), int)
     for slot in alive:
-        edge = 2 if merged[slot] else 1
+        edge = edges[slot]
         covered[y[slot] : y[slot] + edge, x[slot] : x[slot] + edge] += 1
     assert np.all(covered == 1)
 
@@ -163,7 +167,7 @@ def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
 
 def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
     bench.render(view)
-    alive, x, y, reach, radius, merged = fragments(bench)
+    alive, x, y, reach, radius, edges = fragments(bench)
     columns, rows = tile_grid()
     n_tiles, size = columns * rows, constants.TILE_SIZE_PX
     offsets = read(bench, "TILE_OFFSETS", (n_tiles + 1,), np.uint32)
@@ -177,12 +181,13 @@ def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
         dx = np.clip(x[alive], left, left + size - 1) - x[alive]
         dy = np.clip(y[alive], top, top + size - 1) - y[alive]
         # the box of the kernel, and the disc that it lies in
-        far = radius[alive] + 0.5 + np.sqrt(2.0) * merged[alive]
+        extent = edges[alive] - 1
+        far = radius[alive] + 0.5 + np.sqrt(2.0) * extent
         to_left, to_right, to_top, to_bottom = reach[alive].T
         lit = (
-            (x[alive] + to_right + merged[alive] >= left)
+            (x[alive] + to_right + extent >= left)
             & (x[alive] - to_left <= left + size - 1)
-            & (y[alive] + to_bottom + merged[alive] >= top)
+            & (y[alive] + to_bottom + extent >= top)
             & (y[alive] - to_top <= top + size - 1)
         )
         expected = alive[lit & (dx**2 + dy**2 <= far**2)]
