@@ -135,7 +135,7 @@ class FilterClient:
         *,
         settings: Mapping[str, Any] | None = None,
         views: Sequence[Camera | RgbdView] = (),
-        wait: bool = True,
+        wait: bool | str = True,
         on_progress: Callable[[Progress], None] | None = None,
         timeout_s: float = 120.0,
     ) -> Ready | Accepted:
@@ -151,9 +151,10 @@ class FilterClient:
             The cameras to prepare for.  Without them the service prepares for those
             of the last frame; before any frame there is nothing to prepare, and
             Accepted is returned with ``is_building`` false.
-        wait : bool
-            Return only when the profile is ready; otherwise as soon as it is accepted
-            (`poll` then hands out Progress and Ready).
+        wait : bool or "first"
+            Return when everything is in place; or with "first" as soon as frames can be
+            seen through the new eye, maybe by a preview; or with False as soon as the
+            profile is accepted.  `poll` hands out each Progress and Ready that follows.
         on_progress : callable, optional
             Called with each Progress while waiting.
 
@@ -162,6 +163,8 @@ class FilterClient:
         UnknownProfile, GridTooLarge, BuildFailed, WorkerCrashed, ServiceTimeout
             After any of them the eye that was in use before stays in use.
         """
+        if wait not in (True, False, "first"):
+            raise ValueError(f"wait is {wait!r}; allowed: True, False or 'first'")
         cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
         request = ProfileRequest(
             self._next_profile_id,
@@ -184,13 +187,13 @@ class FilterClient:
     def _await_profile(
         self,
         request: ProfileRequest,
-        wait: bool,
+        wait: bool | str,
         on_progress: Callable[[Progress], None] | None,
         timeout_s: float,
     ) -> Ready | Accepted:
         profile_id = request.profile_id
         deadline_s = time.monotonic() + timeout_s
-        n_ready = 0
+        n_awaited = n_ready = 0
         while True:
             for event in self._link.take_events(
                 lambda e: getattr(e, "profile_id", None) == profile_id
@@ -199,12 +202,14 @@ class FilterClient:
                     raise event.exception()
                 if isinstance(event, Progress) and on_progress is not None:
                     on_progress(event)
-                if isinstance(event, Ready):
-                    n_ready += 1
-                    if n_ready >= len(_distinct_pitches(request.cameras)):
+                if isinstance(event, Accepted):
+                    n_awaited = event.n_cameras
+                    if not (wait and event.is_building):
                         return event
-                if isinstance(event, Accepted) and not (wait and event.is_building):
-                    return event
+                if isinstance(event, Ready):
+                    n_ready += event.is_complete
+                    if n_ready >= n_awaited or wait == "first":
+                        return event
             self._link.pump_before(deadline_s, f"profile {profile_id} to become ready")
 
     # Frames
@@ -371,16 +376,3 @@ class FilterClient:
             lambda: bool(self._link.pongs), limit_s, "an answer to ping"
         )
         return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]
-
-
-def _distinct_pitches(cameras: Sequence[Camera]) -> set[tuple[float, float]]:
-    """Return the pixel pitches that the service builds for, one Ready each."""
-    pitches: list[tuple[float, float]] = []
-    for camera in cameras:
-        pitch = camera.pixel_pitch_mrad
-        if not any(
-            all(abs(a / b - 1) <= 1e-3 for a, b in zip(pitch, known, strict=True))
-            for known in pitches
-        ):
-            pitches.append(pitch)
-    return set(pitches)

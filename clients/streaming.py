@@ -237,5 +237,5 @@ class _ChangeWatch:
         elif getattr(event, "profile_id", None) == self._accepted.profile_id:
             if isinstance(event, Progress):
                 self._on_progress(event.fraction, event.stage)
-            elif isinstance(event, Ready):
+            elif isinstance(event, Ready) and event.is_complete:
                 self.ready = event

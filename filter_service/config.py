@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from filter_service.build_job import BuildLimits
 from filter_service.messages import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
 MB = 2**20
+
+
+def default_cache_dir() -> str:
+    """Return where finished PSFs are kept if nothing else is said."""
+    own = os.environ.get("OCUFILTER_CACHE_DIR")
+    if own is not None:
+        return own
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return str(Path(base) / "ocufilter")
 
 
 @dataclass(frozen=True)
@@ -34,11 +45,18 @@ class ServiceConfig:
         Limits of one message; published in ``welcome``.
     max_blur_radius_px : int
         A profile that needs a wider kernel is refused.
+    max_store_mb : int
+        A profile that needs more memory for its PSFs is refused.
     max_cameras : int
-        Pixel pitches that one session keeps prepared.
+        Cameras that one session keeps prepared.
+    store_cache_dir : str
+        Where finished PSFs are kept for the next time; ``""`` keeps none.  By default
+        ``$OCUFILTER_CACHE_DIR``, or ``ocufilter`` in ``$XDG_CACHE_HOME`` or ~/.cache.
+    store_cache_max_mb : int
+        What that folder may hold; those unused for longest go.
     build_niceness : int
-        Added to the niceness of the process that computes PSFs, so that the render
-        loop wins where cores are few.
+        Of what is computed after a profile's first PSFs, so that the render loop wins
+        where cores are few.
     cancel_grace_s : float
         A build that does not stop within this time is stopped by force.
     alive_interval_s : float
@@ -57,8 +75,11 @@ class ServiceConfig:
     max_part_mb: int = 100
     max_profile_kb: int = 1024
     max_blur_radius_px: int = 255
+    max_store_mb: int = 2000
     max_cameras: int = 4
-    build_niceness: int = 10
+    store_cache_dir: str = default_cache_dir()
+    store_cache_max_mb: int = 2000
+    build_niceness: int = 5
     cancel_grace_s: float = 3.0
     alive_interval_s: float = 5.0
     ready_file: Path | None = None
@@ -83,6 +104,16 @@ class ServiceConfig:
         )
 
     @property
+    def build_limits(self) -> BuildLimits:
+        """Return what every build has to keep to."""
+        return BuildLimits(
+            max_blur_radius_px=self.max_blur_radius_px,
+            max_store_mb=self.max_store_mb,
+            store_cache_dir=self.store_cache_dir,
+            store_cache_max_mb=self.store_cache_max_mb,
+        )
+
+    @property
     def max_message_part_bytes(self) -> int:
         """Return the size beyond which libzmq cuts a client off."""
         limits = self.limits
@@ -98,7 +129,9 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_part_mb": (1, 2047),
     "max_profile_kb": (1, 1024),
     "max_blur_radius_px": (1, 255),
+    "max_store_mb": (1, 1_000_000),
     "max_cameras": (1, 16),
+    "store_cache_max_mb": (1, 1_000_000),
     "build_niceness": (0, 19),
     "cancel_grace_s": (0.05, 600.0),
     "alive_interval_s": (0.05, 600.0),

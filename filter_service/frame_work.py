@@ -99,5 +99,6 @@ def _result(
         total_ms=total_ms,
         stage_times_ms=stages_ms,
         notes=tuple(notes),
+        is_complete=plan.is_complete,
         colors=tuple(view.color for view in rendered),
     )

@@ -8,17 +8,14 @@ says what the messages mean.
 from __future__ import annotations
 
 import logging
-import signal
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from filter_service.build_job import Build
 from filter_service.config import ServiceConfig
 from filter_service.errors import FilterError, NoSession, TooManySessions
-from filter_service.eye_builds import EyeBuilds, free_retired
+from filter_service.eye_builds import EyeBuilds
 from filter_service.frame_work import filter_frame
 from filter_service.mailbox import Mailbox, Outcome
 from filter_service.messages import (
@@ -47,6 +44,8 @@ from filter_service.worker_handle import WorkerHandle
 MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep the loop from rendering
 MAX_UNSENT_RESULTS = 4  # large replies a client has not taken; bounds memory
 MARK_SENT_S = 0.03  # less than most frames take to filter
+LOAD_RANGE_S = (0.004, 0.03)  # for copying a new store to the GPU between two frames
+LOAD_SHARE = 0.5  # of a frame's time: the stream is never late by a whole frame
 IDLE_WAIT_S = 1.0
 ATTENTION_WAIT_S = 0.1
 
@@ -59,9 +58,9 @@ class FilterServer:
     Parameters
     ----------
     config : ServiceConfig
-    renderer : FilterRenderer, or another with its ``load`` and ``render``
-    build : callable
-        Makes a BuiltStore of a BuildJob, in the worker process.
+    renderer : FilterRenderer, or another with its ``load_steps`` and ``render``
+    worker : WorkerHandle
+        Started, or to be started; the server closes it.
     check_profile : callable
         ``check_profile(body, settings)`` raises a FilterError for a wrong profile.
     gl_renderer : str
@@ -73,7 +72,7 @@ class FilterServer:
         config: ServiceConfig,
         *,
         renderer: Any,
-        build: Build,
+        worker: WorkerHandle,
         check_profile: Callable[[dict, Any], object],
         gl_renderer: str,
     ) -> None:
@@ -85,6 +84,7 @@ class FilterServer:
         self._next_session_id = 1
         self._n_rendered = 0
         self._n_dropped = 0
+        self._frame_s = 0.0  # what the last frame took to filter
         self._next_alive_s = time.monotonic() + config.alive_interval_s
         self._is_stopping = False
         self._mailbox = Mailbox(config.bind, config.max_message_part_bytes)
@@ -92,13 +92,13 @@ class FilterServer:
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_writer.setblocking(False)
         self._wake_reader.setblocking(False)
-        self._worker = WorkerHandle(build, config.build_niceness, config.cancel_grace_s)
+        self._worker = worker
         self._builds = EyeBuilds(
             self._worker,
             renderer=renderer,
             check_profile=check_profile,
             send=self._send,
-            max_blur_radius_px=config.max_blur_radius_px,
+            limits=config.build_limits,
         )
 
     # The loop
@@ -133,10 +133,14 @@ class FilterServer:
         self._mailbox.wait(self._wait_s())
         self._take_in_messages()
         self._filter_one_frame()
-        self._builds.advance(self._sessions.values())
+        low_s, high_s = LOAD_RANGE_S
+        load_s = min(max(LOAD_SHARE * self._frame_s, low_s), high_s)
+        self._builds.advance(self._sessions.values(), load_s=load_s)
         self._probe_clients()
 
     def _wait_s(self) -> float:
+        if self._builds.is_loading:
+            return 0.0
         if any(session.waiting for session in self._sessions.values()):
             return 0.0
         if self._worker.needs_attention_soon:
@@ -276,7 +280,7 @@ class FilterServer:
             return
         self._builds.cancel(session)
         session.end()
-        free_retired(session)
+        self._builds.free_retired(session)
         why = "" if outcome is None else f": the client is {outcome.value}"
         log.info("session %d ends%s", session.session_id, why)
 
@@ -310,11 +314,13 @@ class FilterServer:
             reply = ErrorReply.from_exception(error, frame_id=frame_id)
             self._answer_frame(session, reply)
             return
-        free_retired(session)
+        self._builds.free_retired(session)
         if plan is None:
             self._answer_frame(session, Dropped(frame_id, "preparing"))
         else:
+            started_s = time.monotonic()
             reply = filter_frame(self._renderer, waiting, plan)
+            self._frame_s = time.monotonic() - started_s
             self._answer_frame(session, reply)
 
     def _is_slow_consumer(self, session: Session) -> bool:
@@ -329,67 +335,3 @@ class FilterServer:
             time.sleep(0.001)
             session.unsent = [item for item in session.unsent if not item.done]
         return len(session.unsent) >= MAX_UNSENT_RESULTS
-
-
-def serve(
-    config: ServiceConfig,
-    *,
-    renderer: Any,
-    build: Build,
-    check_profile: Callable[[dict, Any], object],
-    gl_renderer: str = "unknown",
-) -> None:
-    """Serve until SIGINT or SIGTERM; prints one line when ready.
-
-    Must run in the main thread of a process that owns the renderer's GL context.
-    """
-    server = FilterServer(
-        config,
-        renderer=renderer,
-        build=build,
-        check_profile=check_profile,
-        gl_renderer=gl_renderer,
-    )
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: server.stop())
-        signal.set_wakeup_fd(server.wake_file_descriptor, warn_on_full_buffer=False)
-    try:
-        _announce(config, server.endpoint)
-        server.run()
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.set_wakeup_fd(-1)
-        if config.ready_file is not None:
-            config.ready_file.unlink(missing_ok=True)
-
-
-def _announce(config: ServiceConfig, endpoint: str) -> None:
-    """Say that the service is ready; the file appears complete or not at all."""
-    if config.ready_file is not None:
-        unfinished = config.ready_file.with_suffix(".unfinished")
-        unfinished.write_text(endpoint + "\n", encoding="utf-8")
-        unfinished.replace(config.ready_file)
-    print(f"ocufilter: serving on {endpoint}", flush=True)
-
-
-def run(config: ServiceConfig) -> None:
-    """Serve with the real renderer and the real PSFs."""
-    from filter_service.gpu import Gpu
-    from filter_service.profile_build import build, check_profile
-    from filter_service.renderer import FilterRenderer
-    from filter_service.threads import require_safe_threading_layer
-
-    require_safe_threading_layer()
-    logging.basicConfig(level=logging.INFO, format="ocufilter: %(message)s")
-    gpu = Gpu()
-    try:
-        serve(
-            config,
-            renderer=FilterRenderer(gpu),
-            build=build,
-            check_profile=check_profile,
-            gl_renderer=gpu.info["renderer"],
-        )
-    finally:
-        gpu.close()

@@ -127,6 +127,7 @@ class Result:
     total_ms: float
     stage_times_ms: dict[str, float]
     notes: tuple[str, ...] = ()
+    is_complete: bool = True
     colors: tuple[NDArray[Any], ...] = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"
@@ -169,6 +170,7 @@ class Result:
                 for name, value in stages.items()
             },
             notes=take_notes(header),
+            is_complete=take_bool(header, "is_complete", default=True),
             colors=tuple(
                 image_from_part(
                     part,

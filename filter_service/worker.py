@@ -1,29 +1,34 @@
-"""The worker process: computes PSF stores and sends them back over a pipe.
+"""The worker process: computes PSF stores and hands them to the service.
 
 A process, not a thread: OpenGL calls hold the interpreter lock of the render loop.
 
 Parent to worker: ``("build", ticket, job)``, ``("cancel", ticket)``.  Worker to parent:
-``("ready",)``, ``("progress", ticket, fraction, stage)``, ``("failed", ticket, code,
-message, field, allowed)``, and ``("result", ticket, head, sizes)`` followed by the
-arrays in chunks.  Chunks, because the render loop takes a few milliseconds' worth at a
-time and never waits for 100 MB.  The pipe joins two processes of ours, so it may carry
-pickles; nothing from outside does.
+``("ready",)``, ``("progress", ticket, fraction, stage)``; for each store that a build
+yields ``("result", ticket, head, sizes)`` and then the descriptor of a file in memory
+with the arrays; at the end ``("finished", ticket)`` or ``("failed", ticket, code,
+message, field, allowed)``.  The render loop maps the file: over the pipe 100 MB would
+take it 0.2 s.  The pipe joins two processes of ours, so it may carry pickles; nothing
+from outside does.
 """
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import pickle
 import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import send_handle
 from typing import Any
 
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
+from filter_service.shared_buffers import write_shared
 
-CHUNK_BYTES = 64 * 1024  # what a socket pair holds, so a chunk is rarely waited for
 PROGRESS_INTERVAL_S = 0.1
 
 log = logging.getLogger("ocufilter.worker")
@@ -33,37 +38,64 @@ class ParentGone(Exception):
     """The service has ended; so does the worker."""
 
 
-def worker_main(pipe: Connection, build: Callable[..., Any], niceness: int) -> None:
+def worker_main(pipe: Connection, build_name: str, niceness: int) -> None:
     """Build what is asked for until the pipe closes; the process's entry point."""
     # Ctrl-C goes to the whole group; the service ends the worker in its own time.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(niceness)
     logging.basicConfig(level=logging.INFO, format="ocufilter worker: %(message)s")
     try:
+        module, _, function = build_name.partition(":")
+        build = getattr(importlib.import_module(module), function)
         pipe.send(("ready",))
         while True:
             message = pipe.recv()
             if message[0] == "build":
-                _build_one(pipe, build, ticket=message[1], job=message[2])
+                _build_one(pipe, build, niceness, ticket=message[1], job=message[2])
     except (EOFError, OSError, ParentGone):
         return
 
 
 def _build_one(
-    pipe: Connection, build: Callable[..., Any], *, ticket: int, job: object
+    pipe: Connection,
+    build: Callable[..., Iterator[Any]],
+    niceness: int,
+    *,
+    ticket: int,
+    job: object,
 ) -> None:
     try:
-        built = build(
+        stores = build(
             job,
             progress=_throttled_progress(pipe, ticket),
             cancelled=lambda: _is_cancelled(pipe, ticket),
         )
+        # Somebody waits for the first; what follows makes room for the frames.
+        _send_result(pipe, ticket, next(stores))
+        _run_nicely(niceness, lambda: _send_all(pipe, ticket, stores))
     except ParentGone:
         raise
     except Exception as error:
         _send_failure(pipe, ticket, error)
         return
-    _send_result(pipe, ticket, built)
+    pipe.send(("finished", ticket))
+
+
+def _run_nicely(niceness: int, work: Callable[[], None]) -> None:
+    """Run something in a thread with a niceness of its own, as Linux has it.
+
+    Threads that it starts have it too.  For the process it could not be taken back.
+    """
+
+    def yield_to_others() -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+
+    with ThreadPoolExecutor(1, initializer=yield_to_others) as pool:
+        pool.submit(work).result()
+
+
+def _send_all(pipe: Connection, ticket: int, stores: Iterator[Any]) -> None:
+    for built in stores:
+        _send_result(pipe, ticket, built)
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
@@ -105,7 +137,9 @@ def _send_result(pipe: Connection, ticket: int, built: object) -> None:
     buffers: list[pickle.PickleBuffer] = []
     head = pickle.dumps(built, protocol=5, buffer_callback=buffers.append)
     arrays = [buffer.raw() for buffer in buffers]
-    pipe.send(("result", ticket, head, [array.nbytes for array in arrays]))
-    for array in arrays:
-        for start in range(0, array.nbytes, CHUNK_BYTES):
-            pipe.send_bytes(array[start : start + CHUNK_BYTES])
+    descriptor = write_shared(arrays)
+    try:
+        pipe.send(("result", ticket, head, [array.nbytes for array in arrays]))
+        send_handle(pipe, descriptor, os.getppid())
+    finally:
+        os.close(descriptor)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import pickle
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from filter_service.errors import (
     BuildCancelled,
@@ -22,6 +20,7 @@ from filter_service.errors import (
     WorkerCrashed,
     error_from_code,
 )
+from filter_service.shared_buffers import map_shared
 from filter_service.worker import worker_main
 
 RECEIVE_BUDGET_S = 0.004  # the render loop's time for one call of poll
@@ -42,7 +41,7 @@ class BuildProgress:
 
 @dataclass(frozen=True)
 class BuildDone:
-    """What a build made."""
+    """What a build made; more may follow, as ``built`` says."""
 
     ticket: int
     built: Any
@@ -59,26 +58,25 @@ class BuildError:
 BuildEvent = BuildProgress | BuildDone | BuildError
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Incoming:
-    """A result of which the chunks are still arriving."""
+    """A result of which the arrays are still to come."""
 
     ticket: int
     head: bytes
-    arrays: list[NDArray[np.uint8]]
-    index: int = 0
-    offset: int = 0
+    sizes: list[int]
 
-    @property
-    def is_complete(self) -> bool:
-        while self.index < len(self.arrays) and (
-            self.offset >= self.arrays[self.index].nbytes
-        ):
-            self.index, self.offset = self.index + 1, 0
-        return self.index == len(self.arrays)
-
-    def receive_chunk(self, pipe: Connection) -> None:
-        self.offset += pipe.recv_bytes_into(self.arrays[self.index], self.offset)
+    def received(self, pipe: Connection) -> BuildDone:
+        """Take the descriptor of the arrays' file, which waits in the pipe."""
+        try:
+            descriptor = recv_handle(pipe)
+        except RuntimeError as error:  # what it says of a pipe that ends
+            raise EOFError from error
+        try:
+            buffers = map_shared(descriptor, self.sizes)
+        finally:
+            os.close(descriptor)
+        return BuildDone(self.ticket, pickle.loads(self.head, buffers=buffers))
 
 
 @dataclass
@@ -87,14 +85,17 @@ class WorkerHandle:
 
     Parameters
     ----------
-    build : callable
-        ``build(job, *, progress, cancelled)``, found by its name in the new process.
+    build : str
+        ``module:function`` of ``build(job, *, progress, cancelled)``, which yields what
+        it has built, a preview maybe before the whole.  A name, because to import the
+        function here would keep the new process waiting.
     niceness : int
+        Of what a build does after the first store that it yields.
     cancel_grace_s : float
         A cancelled build that goes on longer is ended with its process.
     """
 
-    build: Callable[..., Any]
+    build: str
     niceness: int = 10
     cancel_grace_s: float = 3.0
     n_restarts: int = 0
@@ -109,7 +110,9 @@ class WorkerHandle:
     _incoming: _Incoming | None = None
 
     def start(self) -> None:
-        """Start the process; it gets ready on its own time."""
+        """Start the process, if there is none; it gets ready on its own time."""
+        if self._process is not None:
+            return
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
         self._process = spawn.Process(
@@ -186,8 +189,8 @@ class WorkerHandle:
 
     def _receive(self, events: list[BuildEvent]) -> None:
         if self._incoming is not None:
-            self._incoming.receive_chunk(self._pipe)
-            self._finish_incoming(events)
+            incoming, self._incoming = self._incoming, None
+            events.append(incoming.received(self._pipe))
             return
         message = self._pipe.recv()
         kind = message[0]
@@ -201,19 +204,9 @@ class WorkerHandle:
             self._end_running()
             events.append(BuildError(ticket, error))
         elif kind == "result":
-            ticket, head, sizes = message[1:]
-            arrays = [np.empty(size, dtype=np.uint8) for size in sizes]
-            self._incoming = _Incoming(ticket, head, arrays)
-            self._finish_incoming(events)
-
-    def _finish_incoming(self, events: list[BuildEvent]) -> None:
-        incoming = self._incoming
-        if not incoming.is_complete:
-            return
-        self._incoming = None
-        self._end_running()
-        built = pickle.loads(incoming.head, buffers=incoming.arrays)
-        events.append(BuildDone(incoming.ticket, built))
+            self._incoming = _Incoming(*message[1:])
+        elif kind == "finished":
+            self._end_running()
 
     def _end_running(self) -> None:
         self._running = None

@@ -7,6 +7,9 @@ import zlib
 # two cores are what the project plans for; must be set before numba is imported
 os.environ.setdefault("NUMBA_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
 
+# a service that a test starts leaves the user's folder of stores alone
+os.environ["OCUFILTER_CACHE_DIR"] = ""
+
 import numpy as np
 import pytest
 

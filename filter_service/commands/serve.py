@@ -30,9 +30,9 @@ def serve(
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
-    from filter_service import server
+    from filter_service import serving
     from filter_service.config import load_config
 
     if config is not None and not config.is_file():
         raise ValueError(f"--config '{config}': no such file")
-    server.run(load_config(config, bind=bind, ready_file=ready_file))
+    serving.run(load_config(config, bind=bind, ready_file=ready_file))

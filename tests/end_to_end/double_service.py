@@ -5,8 +5,9 @@ import logging
 from pathlib import Path
 
 from filter_service.config import load_config
-from filter_service.server import serve
-from tests.end_to_end.doubles import RendererDouble, build, check_profile
+from filter_service.serving import serve
+from filter_service.worker_handle import WorkerHandle
+from tests.end_to_end.doubles import RendererDouble, check_profile
 
 
 def main():
@@ -15,10 +16,12 @@ def main():
     parser.add_argument("--filter-ms", type=float, default=0.0)
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
+    config = load_config(arguments.config)
+    build = "tests.end_to_end.doubles:build"
     serve(
-        load_config(arguments.config),
+        config,
         renderer=RendererDouble(arguments.filter_ms),
-        build=build,
+        worker=WorkerHandle(build, config.build_niceness, config.cancel_grace_s),
         check_profile=check_profile,
         gl_renderer="numpy double",
     )

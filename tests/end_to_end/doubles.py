@@ -12,14 +12,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from filter_service.build_job import BuiltStore
+from filter_service.camera_match import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
-from filter_service.session import is_same_pitch
+from filter_service.messages import Camera
+
+SLICE_BYTES = 4 * 2**20
 
 
 @dataclass
 class StoreDouble:
     mark: int
-    pixel_pitch_mrad: tuple[float, float]
+    camera: Camera
+    follows_field: bool
     ballast: np.ndarray
     n_released: int = 0
 
@@ -44,9 +48,13 @@ class RendererDouble:
     def __init__(self, filter_ms: float):
         self.filter_ms = filter_ms
 
-    def load(self, store: StoreDouble) -> StoreDouble:
-        assert store.ballast.sum() == store.ballast.size * store.mark
-        return store
+    def load_steps(self, store: StoreDouble):
+        """Read the ballast in slices, as a copy to a GPU would."""
+        for first in range(0, store.ballast.size, SLICE_BYTES):
+            part = store.ballast[first : first + SLICE_BYTES]
+            assert (part == store.mark).all()
+            yield None
+        yield store
 
     def render(
         self,
@@ -61,10 +69,11 @@ class RendererDouble:
     ):
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape
-        left, right, up, down = view.tangents
-        pitch = (1000 * (right - left) / width_px, 1000 * (up - down) / height_px)
-        if not is_same_pitch(pitch, handle.pixel_pitch_mrad):
-            raise CameraMismatch(f"pitch {pitch}", field="tangents")
+        camera = Camera(width_px, height_px, view.tangents)
+        if not is_same_camera(
+            handle.camera, camera, follows_field=handle.follows_field
+        ):
+            raise CameraMismatch(f"{camera}", field="tangents")
         if pupil_diameter_mm == 8.75:
             raise ArithmeticError("the double breaks at 8.75 mm")
         start_s = time.perf_counter()
@@ -104,19 +113,35 @@ def check_profile(body, settings):
 
 
 def build(job, *, progress, cancelled):
-    """Take ``build_s``; ``crash``, ``deaf``, ``fail`` in the body do what they say."""
+    """Take ``build_s``; ``crash``, ``deaf``, ``fail`` in the body do what they say.
+
+    With ``preview_mark`` there is a preview of that mark after ``preview_s``; its first
+    note says which pupil it is for.
+    """
     body = job.body
-    start_s = time.monotonic()
-    build_s = body.get("build_s", 0.0)
     if body.get("crash"):
         os.kill(os.getpid(), signal.SIGKILL)
+    if "preview_mark" in body:
+        _work(body.get("preview_s", 0.0), body, progress, cancelled)
+        looked_at = job.look_at and f"{job.look_at.pupil_diameter_mm:g} mm"
+        yield _store(job, body["preview_mark"], str(looked_at), is_complete=False)
     if body.get("fail"):
         raise ValueError("the double was told to fail")
+    _work(body.get("build_s", 0.0), body, progress, cancelled)
+    yield _store(job, body["mark"], "a double", is_complete=True)
+
+
+def _work(build_s, body, progress, cancelled):
+    start_s = time.monotonic()
     while (elapsed_s := time.monotonic() - start_s) < build_s:
         progress(elapsed_s / build_s, "waiting")
         if cancelled() and not body.get("deaf"):
             raise BuildCancelled("cancelled")
         time.sleep(0.005)
-    ballast = np.full(int(body.get("ballast_mb", 0.1) * 1e6), body["mark"], np.uint8)
-    store = StoreDouble(body["mark"], job.pixel_pitch_mrad, ballast)
-    return BuiltStore(store, 1000 * build_s, 1, ballast.nbytes / 1e6, ("a double",))
+
+
+def _store(job, mark, note, *, is_complete):
+    ballast = np.full(int(job.body.get("ballast_mb", 0.1) * 1e6), mark, np.uint8)
+    store = StoreDouble(mark, job.camera, job.settings.follows_field, ballast)
+    build_ms = 1000 * job.body.get("build_s", 0.0)
+    return BuiltStore(store, build_ms, 1, ballast.nbytes / 1e6, (note,), is_complete)

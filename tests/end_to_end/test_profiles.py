@@ -1,6 +1,7 @@
 """Profile changes while frames stream: no gap, no mix, every failure said."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -226,3 +227,86 @@ def test_old_eyes_are_freed(client):
         memory_mb.append(client.ping()[1].memory_mb)
     # After the first few there are always the new one, the old one and one arriving.
     assert max(memory_mb[4:]) - min(memory_mb[4:]) < 45.0, memory_mb
+
+
+def test_a_preview_shows_the_new_eye_at_once_and_the_whole_follows(client):
+    view = make_view()
+    client.set_profile(double(11), views=[view])
+    client.filter(view, **SEE)
+    ready = client.set_profile(
+        double(22, preview_mark=21, preview_s=0.1, build_s=0.5), wait="first"
+    )
+    assert not ready.is_complete
+    assert ready.notes == ("4 mm",), "the preview is for the last frame's pupil"
+    events = stream(
+        client,
+        view,
+        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 22,
+    )
+    frames = [(t, e) for t, e in events if isinstance(e, FilteredFrame)]
+    assert [e.is_complete for _, e in events if isinstance(e, Ready)] == [True]
+    marks = [mark_of(e) for _, e in frames]
+    assert marks == sorted(marks)
+    assert marks.count(21) > 10, "the preview did not serve"
+    for _, event in frames:
+        assert event.header.is_complete == (mark_of(event) != 21)
+        assert event.header.generation == ready.generation
+    assert np.diff([t for t, _ in frames]).max() < 0.3
+
+
+def test_set_profile_waits_for_the_whole_unless_told_otherwise(client):
+    view = make_view()
+    body = double(32, preview_mark=31, build_s=0.1)
+    ready = client.set_profile(body, views=[view])
+    assert ready.is_complete
+    assert mark_of(client.filter(view, **SEE)) == 32
+    with pytest.raises(ValueError, match="'first'"):
+        client.set_profile(body, wait="last")
+
+
+def test_a_newer_profile_stops_a_build_between_preview_and_whole(client):
+    view = make_view()
+    client.set_profile(double(41), views=[view])
+    client.filter(view, **SEE)
+    slow = client.set_profile(double(43, preview_mark=42, build_s=60.0), wait="first")
+    assert mark_of(client.filter(view, **SEE)) == 42
+    accepted = client.set_profile(double(44, build_s=0.3), wait=False)
+    events = stream(
+        client,
+        view,
+        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 44,
+    )
+    frames = [e for _, e in events if isinstance(e, FilteredFrame)]
+    assert {mark_of(e) for e in frames} == {42, 44}
+    assert accepted.generation == slow.generation + 1
+    (cancelled,) = [e for _, e in events if isinstance(e, ErrorReply)]
+    assert (cancelled.code, cancelled.profile_id) == (
+        "build_cancelled",
+        slow.profile_id,
+    )
+
+
+def test_a_profile_that_fails_after_its_preview_leaves_the_old_eye(client):
+    view = make_view()
+    client.set_profile(double(51), views=[view])
+    client.filter(view, **SEE)
+    with pytest.raises(errors.BuildFailed, match="told to fail"):
+        client.set_profile(double(53, preview_mark=52, fail=True))
+    assert mark_of(client.filter(view, **SEE)) == 51
+
+
+def test_over_the_field_a_shifted_camera_is_prepared_for_anew(client):
+    first = make_view()
+    left, right, up, down = first.tangents
+    second = replace(first, tangents=(left + 0.1, right + 0.1, up, down))
+    for settings, reasons in (({}, set()), ({"mode": "dynamic"}, {"preparing"})):
+        body = double(61, build_s=0.05)
+        client.set_profile(body, settings=settings, views=[first])
+        client.filter(first, **SEE)
+        client.submit(second, **SEE)
+        events = stream(client, second, until=lambda e: isinstance(e, FilteredFrame))
+        assert {e.reason for _, e in events if isinstance(e, Dropped)} == reasons
+    with pytest.raises(errors.BadMessage) as caught:
+        client.set_profile(double(61), settings={"mode": "sideways"}, views=[first])
+    assert caught.value.field == "settings.mode"
+    assert "dynamic" in caught.value.allowed

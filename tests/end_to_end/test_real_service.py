@@ -109,7 +109,14 @@ def test_a_wrong_profile_is_named_by_field(real_client):
 def test_a_blur_beyond_the_cap_is_an_error_and_not_a_wrong_image(real_client):
     telescope = Camera(2000, 10, (-0.05, 0.05, 0.00025, -0.00025))
     with pytest.raises(errors.GridTooLarge, match="255"):
+        real_client.set_profile(MYOPIA, settings=NARROW, views=[telescope])
+
+
+def test_a_plan_beyond_the_memory_budget_is_refused_with_the_numbers(real_client):
+    telescope = Camera(2000, 10, (-0.05, 0.05, 0.00025, -0.00025))
+    with pytest.raises(errors.GridTooLarge, match=r"MB for \d+ PSFs") as caught:
         real_client.set_profile(MYOPIA, views=[telescope])
+    assert caught.value.allowed == "2000 MB"
 
 
 def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_client):

@@ -2,14 +2,16 @@
 
 import pytest
 
+from filter_service.build_job import LookAt
 from filter_service.errors import BuildFailed, CreditExceeded, NoProfile
-from filter_service.messages import Camera, Frame, ProfileRequest, ViewHeader
-from filter_service.session import (
-    Session,
-    WaitingFrame,
-    distinct_pitches,
-    is_same_pitch,
+from filter_service.messages import (
+    Camera,
+    Frame,
+    ProfileRequest,
+    ProfileSettings,
+    ViewHeader,
 )
+from filter_service.session import PreparedStore, Session, WaitingFrame
 
 SMALL = Camera(100, 100, (-0.5, 0.5, 0.5, -0.5))  # 10 mrad
 LARGE = Camera(200, 200, (-0.5, 0.5, 0.5, -0.5))  # 5 mrad
@@ -44,17 +46,9 @@ def build_all(session):
     stores = []
     while (following := session.next_build()) is not None:
         stores.append(Store())
-        session.finish_build(*following, stores[-1])
+        eye, camera = following
+        session.put_in_place(eye, PreparedStore(camera, stores[-1]))
     return stores
-
-
-def test_pitches_within_a_thousandth_share_a_store():
-    assert is_same_pitch((5.0, 5.0), (5.004, 4.996))
-    assert not is_same_pitch((5.0, 5.0), (5.0, 5.006))
-    assert distinct_pitches([(5.0, 5.0), (5.001, 5.0), (4.0, 5.0)]) == [
-        (5.0, 5.0),
-        (4.0, 5.0),
-    ]
 
 
 def test_credit_counts_unanswered_frames_and_the_newest_waits():
@@ -92,7 +86,7 @@ def test_a_new_camera_is_wanted_while_the_old_eye_serves_the_old_one():
     session.add_profile(request(1, SMALL))
     build_all(session)
     assert session.plan(frame_of(LARGE)) is None
-    assert session.next_build()[1] == LARGE.pixel_pitch_mrad
+    assert session.next_build()[1] == LARGE
     assert session.plan(frame_of(SMALL)) is not None
     build_all(session)
     assert session.plan(frame_of(SMALL, LARGE)) is not None
@@ -148,3 +142,91 @@ def test_the_end_frees_all_stores():
     stores = build_all(session)
     session.end()
     assert session.retired == stores
+
+
+def preview_of(session):
+    """Put a preview of the next build in place; return its store."""
+    eye, camera = session.next_build()
+    store = Store()
+    session.put_in_place(eye, PreparedStore(camera, store, is_complete=False))
+    return store
+
+
+def test_a_preview_serves_until_the_whole_replaces_it_and_only_then_the_old_eye_goes():
+    session = make_session()
+    session.add_profile(request(1, SMALL))
+    (old_store,) = build_all(session)
+    new = session.add_profile(request(2))
+    preview = preview_of(session)
+    plan = session.plan(frame_of(SMALL))
+    assert (plan.eye, plan.stores, plan.is_complete) == (new, (preview,), False)
+    assert session.next_build() == (new, SMALL), "the whole is still to be built"
+    assert session.retired == []
+    (whole,) = build_all(session)
+    assert session.retired == [preview]
+    plan = session.plan(frame_of(SMALL))
+    assert (plan.eye, plan.stores, plan.is_complete) == (new, (whole,), True)
+    assert session.retired == [preview, old_store]
+
+
+def test_a_profile_that_fails_after_its_preview_gives_way_to_the_old_one():
+    session = make_session()
+    old = session.add_profile(request(1, SMALL))
+    build_all(session)
+    session.add_profile(request(2))
+    preview = preview_of(session)
+    assert session.plan(frame_of(SMALL)).stores == (preview,)
+    session.fail_build(*session.next_build(), BuildFailed("no"))
+    assert session.plan(frame_of(SMALL)).eye is old
+    assert session.retired == [preview]
+
+
+def test_a_preview_without_an_old_eye_stays_when_the_whole_fails():
+    session = make_session()
+    session.add_profile(request(1, SMALL))
+    preview = preview_of(session)
+    session.fail_build(*session.next_build(), BuildFailed("no"))
+    assert session.plan(frame_of(SMALL)).stores == (preview,)
+    assert session.next_build() is None
+    assert session.unfinished_eye() is None
+
+
+def test_a_newer_profile_finds_the_preview_in_use_and_no_ending_said():
+    session = make_session()
+    session.add_profile(request(1, SMALL))
+    build_all(session)
+    second = session.add_profile(request(2))
+    preview = preview_of(session)
+    session.plan(frame_of(SMALL))
+    assert session.unfinished_eye() is second
+    third = session.add_profile(request(3))
+    plan = session.plan(frame_of(SMALL))
+    assert (plan.eye, plan.stores) == (second, (preview,))
+    assert session.eyes == [third, second]
+    build_all(session)
+    assert session.plan(frame_of(SMALL)).eye is third
+    assert session.unfinished_eye() is None
+
+
+def test_the_second_view_of_a_pair_needs_its_own_store_over_the_field_only():
+    left = Camera(100, 100, (-0.6, 0.4, 0.5, -0.5))
+    right = Camera(100, 100, (-0.4, 0.6, 0.5, -0.5))
+    for settings, cameras in (
+        (ProfileSettings(), (left,)),
+        (ProfileSettings(mode="quality"), (left, right)),
+    ):
+        session = make_session()
+        eye = session.add_profile(
+            ProfileRequest(1, {}, settings, cameras=(left, right))
+        )
+        assert eye.wanted == cameras
+        build_all(session)
+        assert session.plan(frame_of(left, right)) is not None
+
+
+def test_what_the_last_frame_looked_at_is_remembered():
+    session = make_session()
+    session.add_profile(request(1, SMALL))
+    assert session.look_at is None
+    session.plan(frame_of(SMALL))
+    assert session.look_at == LookAt(4.0, 0.0)

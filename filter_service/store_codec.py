@@ -1,0 +1,126 @@
+"""Our own objects as JSON and plain arrays, and back, without running anybody's code.
+
+Covers what a PSF store is made of: classes of this project whose state is numbers,
+texts, arrays, lists, dicts and other such classes.  A file of these can at worst hold
+wrong numbers, where a pickle could hold a program.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PACKAGES = ("estimator.", "filter_service.")
+"""Only classes of these are written or made."""
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+class NotStorable(TypeError):
+    """An object holds something that is no data."""
+
+
+def pack(value: object) -> tuple[Any, dict[str, NDArray]]:
+    """Return the JSON tree of an object and its arrays by name.
+
+    Raises
+    ------
+    NotStorable
+        Says where in the object the thing is that cannot be written.
+    """
+    arrays: dict[str, NDArray] = {}
+    return _packed(value, "", arrays, {}), arrays
+
+
+def unpack(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
+    """Return the object of a tree; its arrays are those given, not copies.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError, AttributeError, ImportError
+        The tree is not one that `pack` has made here.
+    """
+    if isinstance(tree, _PLAIN):
+        return tree
+    if isinstance(tree, list):
+        return [unpack(item, arrays) for item in tree]
+    ((kind, content),) = tree.items()
+    if kind == "array":
+        return arrays[content]
+    if kind == "tuple":
+        return tuple(unpack(item, arrays) for item in content)
+    if kind == "map":
+        return {key: unpack(item, arrays) for key, item in content}
+    name, state = content
+    if kind != "object":
+        raise ValueError(f"{kind!r} is no kind of data")
+    made = object.__new__(_class_of(name))
+    for field, item in state.items():
+        object.__setattr__(made, field, unpack(item, arrays))
+    return made
+
+
+def _packed(
+    value: object, path: str, arrays: dict[str, NDArray], known: dict[int, str]
+) -> Any:
+    if isinstance(value, np.ndarray):
+        return {"array": _array_name(value, path, arrays, known)}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, _PLAIN):
+        return value
+    if isinstance(value, list | tuple):
+        items = [
+            _packed(item, f"{path}.{i}", arrays, known) for i, item in enumerate(value)
+        ]
+        return items if type(value) is list else {"tuple": items}
+    if type(value) is dict:
+        return {
+            "map": [
+                [key, _packed(item, f"{path}.{key}", arrays, known)]
+                for key, item in value.items()
+                if _is_key(key, path)
+            ]
+        }
+    name = f"{type(value).__module__}:{type(value).__qualname__}"
+    if not name.startswith(PACKAGES) or not hasattr(value, "__dict__"):
+        raise NotStorable(f"{path or 'it'} is {value!r}: no data")
+    state = {
+        field: _packed(item, f"{path}.{field}", arrays, known)
+        for field, item in vars(value).items()
+    }
+    return {"object": [name, state]}
+
+
+def _is_key(key: object, path: str) -> bool:
+    if not isinstance(key, str | int):
+        raise NotStorable(f"{path} has the key {key!r}: no text or number")
+    return True
+
+
+def _array_name(
+    array: NDArray, path: str, arrays: dict[str, NDArray], known: dict[int, str]
+) -> str:
+    """Return under which name an array is kept; the same one only once."""
+    if array.dtype.hasobject:
+        raise NotStorable(f"{path} is an array of objects")
+    if id(array) not in known:
+        known[id(array)] = path.removeprefix(".") or "value"
+        arrays[known[id(array)]] = array
+    return known[id(array)]
+
+
+def _class_of(name: str) -> type:
+    if not name.startswith(PACKAGES):
+        raise ValueError(f"{name!r} is no class of this project")
+    module, _, path = name.partition(":")
+    found: Any = importlib.import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part)
+    if not isinstance(found, type) or found.__module__ != module:
+        raise ValueError(f"{name!r} is no class of this project")
+    return found

@@ -1,0 +1,42 @@
+"""A store on its way to the GPU, a slice at a time, so that frames go on meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+
+class Upload:
+    """One store that is being loaded.
+
+    Parameters
+    ----------
+    steps : iterator
+        Of the renderer's ``load_steps``: None after each slice, in the end the loaded
+        store.
+    """
+
+    def __init__(self, steps: Iterator[Any]) -> None:
+        self._steps = steps
+        self.loaded: Any | None = None
+
+    def advance(self, deadline_s: float) -> bool:
+        """Copy slices until the time is over, one at least; return whether it is done.
+
+        Parameters
+        ----------
+        deadline_s : float
+            Of ``time.monotonic()``.
+        """
+        while self.loaded is None:
+            self.loaded = next(self._steps)
+            if time.monotonic() >= deadline_s:
+                break
+        return self.loaded is not None
+
+    def give_up(self) -> None:
+        """Free what has been copied."""
+        self._steps.close()
+        if self.loaded is not None:
+            self.loaded.release()

@@ -1,0 +1,69 @@
+"""`ocufilter filter --plan`: what would be computed, said before anything is."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.source_tree import ROOT
+
+WIDTH_PX, HEIGHT_PX = 64, 48
+
+
+@pytest.fixture
+def arguments(tmp_path, rng):
+    np.save(tmp_path / "color.npy", rng.random((HEIGHT_PX, WIDTH_PX, 3), np.float32))
+    near_m = np.linspace(0.5, 4.0, WIDTH_PX, dtype=np.float32)
+    np.save(tmp_path / "depth.npy", np.tile(near_m, (HEIGHT_PX, 1)))
+    files = {name: str(tmp_path / f"{name}.npy") for name in ("color", "depth", "out")}
+    return [
+        *("filter", "--color", files["color"], "--depth", files["depth"]),
+        *("--fov-deg", "50", "--profile", "emmetropia", "--out", files["out"]),
+        *("--eye-model", "traced", "--pupil-mm", "5"),
+    ]
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "filter_service", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_the_plan_is_said_and_nothing_is_written(arguments, tmp_path):
+    finished = run(*arguments, "--mode", "dynamic", "--plan")
+    assert finished.returncode == 0, finished.stderr
+    assert "azimuths: -" in finished.stdout
+    assert "interpolation at" in finished.stdout
+    assert not (tmp_path / "out.npy").exists()
+
+
+def test_the_plan_as_json_follows_mode_tolerance_and_gaze(arguments):
+    plans = [
+        run(*arguments, "--mode", "quality", "--plan", "--json", *more)
+        for more in (
+            [],
+            ["--tolerance", "fine"],
+            ["--gaze-h-deg", "10"],
+            ["--grid", "paper"],
+        )
+    ]
+    normal, fine, aside, paper = (json.loads(p.stdout) for p in plans)
+    assert fine["psf_count"] > normal["psf_count"] > 0
+    assert fine["interpolation_db"] > normal["interpolation_db"] + 3.0
+    assert normal["h_deg"][0] == pytest.approx(-normal["h_deg"][-1])
+    assert aside["h_deg"][-1] < normal["h_deg"][-1] - 5.0
+    assert (paper["psf_count"], len(paper["h_deg"])) == (17577, 31)
+    assert set(normal["error_db_by_axis"]) == {"h", "v", "defocus"}
+
+
+def test_a_gaze_out_of_range_is_refused(arguments):
+    finished = run(*arguments, "--gaze-v-deg", "75", "--plan")
+    assert finished.returncode == 2
+    assert "--gaze-v-deg" in finished.stderr
+    assert finished.stderr.count("\n") == 1

@@ -1,0 +1,292 @@
+"""Stores on disk: they come back as they were, or not at all, whatever happens."""
+
+import json
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.profiles import parse_profile
+from filter_service import store_cache, store_codec, store_file
+from filter_service.errors import BuildCancelled
+from filter_service.messages import Camera
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.store_cache import StoreCache, Stored, store_key
+
+PROFILE = parse_profile({"kind": "prescription", "sphere_dpt": -1.0})
+CAMERA = Camera(96, 54, (-0.5, 0.5, 0.28, -0.28))
+SPEC = GridSpec(
+    CAMERA,
+    pupil_range_mm=(4.0, 4.0),
+    focus_range_dpt=(0.0, 0.0),
+    object_range_dpt=(0.0, 1.0),
+)
+
+
+def nothing():
+    """Stand for a build that is not cancelled."""
+
+
+def key_of(number):
+    return f"{number:032x}"
+
+
+def is_same(first, second):
+    """Compare two packed objects, arrays by value."""
+    (tree, arrays), (other_tree, other_arrays) = map(store_codec.pack, (first, second))
+    return (
+        json.dumps(tree) == json.dumps(other_tree)  # where nan is nan
+        and arrays.keys() == other_arrays.keys()
+        and all(
+            array.dtype == other_arrays[name].dtype
+            and np.array_equal(array, other_arrays[name], equal_nan=True)
+            for name, array in arrays.items()
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def stored():
+    eye = MeasuredWavefront.from_profile(PROFILE)
+    return Stored(build_psf_store(eye, SPEC), ("a note",))
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return StoreCache(str(tmp_path / "stores"), max_mb=100)
+
+
+@pytest.fixture
+def path(cache, stored):
+    cache.save(key_of(1), stored)
+    return cache._path(key_of(1))
+
+
+def test_a_store_comes_back_whole_and_its_eye_answers_the_same(cache, stored, path):
+    again = cache.load(key_of(1), go_on=nothing)
+    assert is_same(again, stored)
+    assert again.store.spec == stored.store.spec
+    assert again.notes == ("a note",)
+    state = {"pupil_diameter_mm": 4.0, "accommodation_dpt": 0.0, "wavelength_nm": 550.0}
+    assert again.store.eye.total_defocus_dpt(**state) == pytest.approx(
+        stored.store.eye.total_defocus_dpt(**state), abs=0
+    )
+    assert cache.load(key_of(2), go_on=nothing) is None
+
+
+def test_the_folder_is_for_its_owner_only_and_holds_no_pickle(path):
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+    assert path.stat().st_mode & 0o077 == 0
+    assert path.read_bytes().startswith(store_file.MAGIC)
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("kept_ratio", [0.0, 0.0001, 0.5, 0.999])
+def test_a_truncated_file_is_removed_with_a_word(cache, path, caplog, kept_ratio):
+    with path.open("r+b") as file:
+        file.truncate(int(kept_ratio * path.stat().st_size))
+    with caplog.at_level(logging.WARNING):
+        assert cache.load(key_of(1), go_on=nothing) is None
+    assert not path.exists()
+    assert path.name in caplog.text
+
+
+@pytest.mark.parametrize("at_ratio", [0.0, 0.0003, 0.3, 0.9])
+def test_a_changed_file_is_removed(cache, path, at_ratio):
+    with path.open("r+b") as file:
+        file.seek(int(at_ratio * path.stat().st_size))
+        was = file.read(1)
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([was[0] ^ 0x40]))
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert not path.exists()
+
+
+def test_a_file_cannot_name_other_code_than_ours(cache, path, stored, monkeypatch):
+    real = store_codec.pack
+
+    def forged(value):
+        tree, arrays = real(value)
+        tree["object"][0] = "subprocess:Popen"
+        return tree, arrays
+
+    monkeypatch.setattr(store_file, "pack", forged)
+    cache.save(key_of(1), stored)
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert not path.exists()
+
+
+def _write_until_killed(folder, started):
+    """Write a file of which the arrays never end."""
+
+    @dataclass
+    class Endless:
+        memory_mb: float = 1.0
+
+    def pack(value):
+        return {}, {"kernels": np.zeros(2**22, np.uint8)}
+
+    def blocks(arrays):
+        while True:
+            started.set()
+            yield memoryview(arrays["kernels"])[: 2**16]
+            time.sleep(0.001)
+
+    store_file.pack, store_file._blocks = pack, blocks
+    StoreCache(folder, max_mb=100).save(key_of(3), Stored(Endless(), ()))
+
+
+def test_a_crash_while_writing_leaves_nothing_that_is_read(cache, tmp_path, stored):
+    context = multiprocessing.get_context("spawn")
+    started = context.Event()
+    folder = tmp_path / "stores"
+    writer = context.Process(target=_write_until_killed, args=(str(folder), started))
+    writer.start()
+    assert started.wait(30.0)
+    os.kill(writer.pid, signal.SIGKILL)
+    writer.join(10.0)
+    (left,) = folder.iterdir()
+    assert left.suffix == store_file.UNFINISHED
+    assert cache.load(key_of(3), go_on=nothing) is None
+    os.utime(left, (time.time() - 2 * store_cache.ABANDONED_S,) * 2)
+    cache.save(key_of(4), stored)
+    assert [p.name for p in folder.iterdir()] == [f"{key_of(4)}.psfs"]
+
+
+def test_a_cancelled_load_stops_and_leaves_the_file(cache, path):
+    def cancel():
+        raise BuildCancelled("a newer profile took over")
+
+    with pytest.raises(BuildCancelled):
+        cache.load(key_of(1), go_on=cancel)
+    assert path.exists()
+
+
+def test_a_full_folder_loses_what_was_used_longest_ago(tmp_path, stored):
+    size_mb = 1e-6 * store_file.write_file(tmp_path / "one.psfs", stored)
+    cache = StoreCache(str(tmp_path / "stores"), max_mb=3.5 * size_mb)
+    for number in range(3):
+        cache.save(key_of(number), stored)
+        os.utime(cache._path(key_of(number)), (1000 + number,) * 2)
+    cache.load(key_of(0), go_on=nothing)
+    cache.save(key_of(3), stored)
+    there = {p.stem for p in cache._folder.iterdir()}
+    assert there == {key_of(0), key_of(2), key_of(3)}
+    StoreCache(str(tmp_path / "none"), max_mb=1e-6).save(key_of(0), stored)
+    assert not (tmp_path / "none").exists()
+
+
+def test_without_a_folder_nothing_is_kept(stored, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cache = StoreCache("", max_mb=100)
+    cache.save(key_of(1), stored)
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_costs_a_log_line(tmp_path, stored, caplog):
+    taken = tmp_path / "taken"
+    taken.write_text("a file")
+    StoreCache(str(taken), max_mb=100).save(key_of(1), stored)
+    assert "cannot be kept" in caplog.text
+
+
+def _save_and_load(folder, seed, failures):
+    """Save and load a few keys at random, in a folder that is always too small."""
+    rng = np.random.default_rng(seed)
+    values = {n: np.full(50_000, n, np.uint16) for n in range(6)}
+
+    @dataclass
+    class Small:
+        memory_mb: float = 0.1
+
+    cache = StoreCache(folder, max_mb=0.35)
+    real = store_codec.pack
+    for _ in range(60):
+        n = int(rng.integers(6))
+        store_file.pack = lambda value, n=n: real({"n": n, "kernels": values[n]})
+        found = cache.load(key_of(n), go_on=nothing)
+        if found is None:
+            cache.save(key_of(n), Stored(Small(), ()))
+        elif found["n"] != n or not (found["kernels"] == n).all():
+            failures.put(f"{n}: {found}")
+
+
+def test_two_processes_share_a_folder(tmp_path, caplog):
+    context = multiprocessing.get_context("spawn")
+    failures = context.SimpleQueue()
+    folder = str(tmp_path / "stores")
+    processes = [
+        context.Process(target=_save_and_load, args=(folder, seed, failures))
+        for seed in range(2)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(30.0)
+    assert [process.exitcode for process in processes] == [0, 0]
+    assert failures.empty()
+    assert all(p.suffix == ".psfs" for p in (tmp_path / "stores").iterdir())
+
+
+def test_the_key_tells_apart_what_changes_a_store():
+    def key(profile=PROFILE, spec=SPEC, eye_model="traced"):
+        return store_key(profile, spec, eye_model=eye_model)
+
+    same_again = parse_profile({"sphere_dpt": -1, "kind": "prescription"})
+    assert key(profile=same_again) == key()
+    shifted = replace(SPEC, camera=Camera(96, 54, (-0.4, 0.6, 0.28, -0.28)))
+    assert key(spec=shifted) == key(), "on axis a store knows the pixel size only"
+    field = replace(SPEC, mode="dynamic")
+    others = [
+        key(profile=parse_profile({"kind": "prescription", "sphere_dpt": -1.25})),
+        key(eye_model="wavefront"),
+        key(spec=replace(SPEC, tolerance="fine")),
+        key(spec=replace(SPEC, pupil_range_mm=(4.0, 4.5))),
+        key(spec=field),
+        key(spec=replace(field, camera=shifted.camera)),
+        key(spec=replace(field, gaze_deg=(1.0, 0.0))),
+    ]
+    assert len({key(), *others}) == 1 + len(others)
+
+
+def test_other_code_means_other_keys(monkeypatch):
+    before = store_key(PROFILE, SPEC, eye_model="traced")
+    monkeypatch.setattr(store_cache, "code_version", lambda: "another")
+    assert store_key(PROFILE, SPEC, eye_model="traced") != before
+
+
+def test_the_code_version_follows_every_file(tmp_path, monkeypatch):
+    versions = set()
+    for package in ("estimator", "filter_service"):
+        (tmp_path / package).mkdir()
+        source = tmp_path / package / "__init__.py"
+        source.write_text("")
+        module = getattr(store_cache, package)
+        monkeypatch.setattr(module, "__file__", str(source))
+    shader = tmp_path / "shaders" / "passes" / "psf_sum.comp.glsl"
+    shader.parent.mkdir(parents=True)
+    for path in (
+        tmp_path / "estimator" / "presets.json",
+        tmp_path / "filter_service" / "psf_build.py",
+        shader,
+    ):
+        versions.add(store_cache.code_version.__wrapped__())
+        path.write_text("changed")
+        versions.add(store_cache.code_version.__wrapped__())
+    assert len(versions) == 4
+
+
+def test_what_is_no_data_is_not_stored(cache, stored, caplog):
+    strange = Stored(replace(stored.store, methods={"by": print}), ())
+    cache.save(key_of(1), strange)
+    assert "methods" in caplog.text
+    assert not cache._path(key_of(1)).exists()
+    assert list(cache._folder.iterdir()) == []
