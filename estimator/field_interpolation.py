@@ -128,7 +128,9 @@ class FieldInterpolation:
         self.passes = bool(is_open[:, :, 0].all())
         self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
         self.all_open = bool(is_open.all())
-        self._values = values
+        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), in one piece: it is
+        # multiplied at every call.
+        self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
 
     @staticmethod
     def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
@@ -167,11 +169,16 @@ class FieldInterpolation:
         ValueError
             A wavelength that is not among the traced ones.
         """
-        channel = self._channels(wavelength_nm)
+        channels, channel = np.unique(
+            self._channels(wavelength_nm), return_inverse=True
+        )
         first, field = distinct_rows(h_deg, v_deg)
-        over_field = self._over_field(h_deg[first], v_deg[first])
         used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
         lower, share = self._pupil_shares(pupil_diameter_mm)
+        # Only what is asked for: few calls need all wavelengths and pupils.
+        pupils = slice(int(lower.min()), int(lower.max()) + 2)
+        lower = lower - pupils.start
+        over_field = self._over_field(h_deg[first], v_deg[first], channels, pupils)
         found = np.empty((h_deg.size, N_TERMS + N_RIM))
         for start in range(0, h_deg.size, _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -190,12 +197,14 @@ class FieldInterpolation:
         rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
         return found[:, :N_TERMS], rim_mm
 
-    def _over_field(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
-        """Values (n, n_wavelengths, n_pupils, n_accommodations, 33) at fields (n,)."""
+    def _over_field(
+        self, h_deg: NDArray, v_deg: NDArray, channels: NDArray, pupils: slice
+    ) -> NDArray[np.float64]:
+        """Values (n, n_channels, n_pupils, n_accommodations, 33) at fields (n,)."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         weights = (over_h[:, :, None] * over_v[:, None, :]).reshape(h_deg.size, -1)
-        values = np.moveaxis(self._values, 4, 2)
+        values = self._values[:, :, channels, pupils]
         found = weights @ values.reshape(weights.shape[1], -1)
         return found.reshape(h_deg.size, *values.shape[2:])
 

@@ -5,6 +5,7 @@ import sys
 import typer
 from typer.exceptions import Abort, TyperException
 
+from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.commands.console import CommandFailed
 from filter_service.commands.doctor import doctor
 from filter_service.commands.estimate import estimate
