@@ -44,10 +44,13 @@ __all__ = [
     "EnzOutsideDomain",
     "Psf",
     "PsfBatch",
+    "PsfPlan",
     "PsfTooLarge",
     "compute_psf_batch",
     "compute_psfs",
     "disc_mask",
+    "finished_batch",
+    "plan_psfs",
 ]
 
 METHODS = ("auto", "fourier", "geometric", "enz", "enz_unchecked")
@@ -108,6 +111,23 @@ class PsfBatch:
         )
 
 
+@dataclass(frozen=True)
+class PsfPlan:
+    """What is known of P kernels before one is computed.
+
+    Attributes
+    ----------
+    survey : PupilSurvey
+    radius_px : (P,) int64
+    geometric_ratio : (P,)
+        Share of ray optics in each.
+    """
+
+    survey: PupilSurvey
+    radius_px: NDArray[np.int64]
+    geometric_ratio: NDArray[np.float64]
+
+
 def _choose_radii(
     survey: PupilSurvey,
     *,
@@ -134,10 +154,14 @@ def _choose_radii(
     return radii
 
 
-def _batch(
-    survey: PupilSurvey, output: KernelBuffer, diffraction: bool, method: str
+def finished_batch(
+    survey: PupilSurvey,
+    output: KernelBuffer,
+    diffraction: bool,
+    method: str,
+    first: int = 0,
 ) -> PsfBatch:
-    """Refuse dark kernels, and say what each lost.
+    """Refuse dark kernels, and say what each lost; ``first`` is the call's number of 0.
 
     The light outside is known in closed form while it is little; a kernel's own sum
     carries the method's energy error of a few 1e-3.
@@ -146,8 +170,8 @@ def _batch(
     if dark.size:
         p = int(dark[0])
         raise ValueError(
-            f"PSF {p} has no light within {output.radius_px[p]} px of the chief ray; "
-            f"its blur radius is {survey.blur_radius_px[p]:.1f} px"
+            f"PSF {first + p} has no light within {output.radius_px[p]} px of the "
+            f"chief ray; its blur radius is {survey.blur_radius_px[p]:.1f} px"
         )
     lost = 1.0 - output.total_ratio
     if diffraction:
@@ -162,6 +186,57 @@ def _batch(
         geometric_ratio=output.geometric_ratio,
         wave_method=method if method.startswith("enz") else "fourier",
     )
+
+
+def plan_psfs(
+    zernike_um: ArrayLike,
+    *,
+    pupil_diameter_mm: ArrayLike,
+    wavelength_nm: ArrayLike,
+    pixel_pitch_mrad: ArrayLike | None = None,
+    pixel_from_mrad: ArrayLike | None = None,
+    pupil_ellipse: ArrayLike | None = None,
+    stiles_crawford: StilesCrawford | None = None,
+    radius_px: int | None = None,
+    method: str = "auto",
+    diffraction: bool = True,
+    max_radius_px: int = 255,
+    min_energy_ratio: float = MIN_ENERGY_RATIO,
+) -> PsfPlan:
+    """Check the arguments of `compute_psf_batch`; survey, radii and methods of all."""
+    zernike_um = checked_zernike_um(zernike_um)
+    count = zernike_um.shape[0]
+    checked_choice("method", method, METHODS)
+    if not 0.0 < min_energy_ratio < 1.0:
+        raise ValueError(f"min_energy_ratio {min_energy_ratio}: must be in (0, 1)")
+    if method != "auto" and method != "geometric" and not diffraction:
+        raise ValueError(f"method {method!r} includes diffraction: use 'geometric'")
+    circle_mm = checked_positive("pupil_diameter_mm", pupil_diameter_mm, count) / 2.0
+    wavelength_nm = checked_positive("wavelength_nm", wavelength_nm, count)
+    survey = survey_pupils(
+        pupil_frames(
+            wavefront_polynomial(zernike_um),
+            circle_radius_mm=circle_mm,
+            wavelength_nm=wavelength_nm,
+            pixel_from_mrad=checked_scale(pixel_pitch_mrad, pixel_from_mrad, count),
+            pupil_ellipse=checked_ellipse(pupil_ellipse, circle_mm),
+            apodisation=(
+                stiles_crawford.amplitude(wavelength_nm) if stiles_crawford else None
+            ),
+        )
+    )
+    radii = _choose_radii(
+        survey,
+        radius_px=radius_px,
+        diffraction=diffraction,
+        max_radius_px=max_radius_px,
+        min_energy_ratio=min_energy_ratio,
+    )
+    if method == "auto" and diffraction:
+        shares = geometric_shares(survey)
+    else:
+        shares = np.full(count, 1.0 if method in ("auto", "geometric") else 0.0)
+    return PsfPlan(survey=survey, radius_px=radii, geometric_ratio=shares)
 
 
 def compute_psf_batch(
@@ -240,46 +315,29 @@ def compute_psf_batch(
     Pupil point u (mm, x to the person's right, y up) sends light to theta = grad W
     (mrad): PSF(theta) = |int exp(2 pi i (W - theta.u) / lambda) du|².
     """
-    zernike_um = checked_zernike_um(zernike_um)
-    count = zernike_um.shape[0]
-    checked_choice("method", method, METHODS)
     checked_choice("accuracy", accuracy, ACCURACY)
-    if not 0.0 < min_energy_ratio < 1.0:
-        raise ValueError(f"min_energy_ratio {min_energy_ratio}: must be in (0, 1)")
-    if method != "auto" and method != "geometric" and not diffraction:
-        raise ValueError(f"method {method!r} includes diffraction: use 'geometric'")
-    circle_mm = checked_positive("pupil_diameter_mm", pupil_diameter_mm, count) / 2.0
-    wavelength_nm = checked_positive("wavelength_nm", wavelength_nm, count)
-    survey = survey_pupils(
-        pupil_frames(
-            wavefront_polynomial(zernike_um),
-            circle_radius_mm=circle_mm,
-            wavelength_nm=wavelength_nm,
-            pixel_from_mrad=checked_scale(pixel_pitch_mrad, pixel_from_mrad, count),
-            pupil_ellipse=checked_ellipse(pupil_ellipse, circle_mm),
-            apodisation=(
-                stiles_crawford.amplitude(wavelength_nm) if stiles_crawford else None
-            ),
-        )
-    )
-    radii = _choose_radii(
-        survey,
+    plan = plan_psfs(
+        zernike_um,
+        pupil_diameter_mm=pupil_diameter_mm,
+        wavelength_nm=wavelength_nm,
+        pixel_pitch_mrad=pixel_pitch_mrad,
+        pixel_from_mrad=pixel_from_mrad,
+        pupil_ellipse=pupil_ellipse,
+        stiles_crawford=stiles_crawford,
         radius_px=radius_px,
+        method=method,
         diffraction=diffraction,
         max_radius_px=max_radius_px,
         min_energy_ratio=min_energy_ratio,
     )
-    if method == "auto" and diffraction:
-        shares = geometric_shares(survey)
-    else:
-        shares = np.full(count, 1.0 if method in ("auto", "geometric") else 0.0)
-    output = empty_buffer(radii, shares)
+    shares = plan.geometric_ratio
+    output = empty_buffer(plan.radius_px, shares)
     with ThreadPoolExecutor(workers or len(os.sched_getaffinity(0))) as pool:
         common = {"output": output, "pool": pool}
         if method.startswith("enz"):
             enz_kernels(
-                survey,
-                np.arange(count),
+                plan.survey,
+                np.arange(shares.size),
                 degree=enz_degree,
                 is_checked=method == "enz",
                 accuracy=ACCURACY["fine"],
@@ -287,9 +345,9 @@ def compute_psf_batch(
             )
         else:
             wave, rays = np.flatnonzero(shares < 1.0), np.flatnonzero(shares > 0.0)
-            fourier_kernels(survey, wave, accuracy=ACCURACY[accuracy], **common)
-            geometric_kernels(survey, rays, diffraction=diffraction, **common)
-    return _batch(survey, output, diffraction, method)
+            fourier_kernels(plan.survey, wave, accuracy=ACCURACY[accuracy], **common)
+            geometric_kernels(plan.survey, rays, diffraction=diffraction, **common)
+    return finished_batch(plan.survey, output, diffraction, method)
 
 
 def compute_psfs(zernike_um: ArrayLike, **options) -> list[Psf]:

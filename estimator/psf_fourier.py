@@ -100,13 +100,16 @@ def plan_grids(
     extent_px: NDArray[np.float64],
     unit_px: NDArray[np.float64],
     accuracy: FourierAccuracy,
+    lengths: NDArray[np.int64] = _FAST_LENGTHS,
 ) -> FourierPlan:
     """Smallest grids whose windows hold the spots (M, 2) and their margins.
+
+    ``lengths``: FFTs to choose from, ascending.
 
     Raises
     ------
     ValueError
-        No FFT up to `MAX_LENGTH` holds the window.
+        None of them holds the window.
     """
     margin_px = np.maximum(accuracy.margin * unit_px, MARGIN_PX)
     window_px = extent_px + 2.0 * margin_px
@@ -116,12 +119,12 @@ def plan_grids(
     )
     while True:
         wanted = window_px * samples_per_px
-        if wanted.size and wanted.max() > MAX_LENGTH:
+        if wanted.size and wanted.max() > lengths[-1]:
             raise ValueError(
                 f"wave PSF needs an FFT of {wanted.max():.0f} samples; at most "
-                f"{MAX_LENGTH} are allowed: use the geometric method"
+                f"{lengths[-1]} are allowed: use the geometric method"
             )
-        length = _FAST_LENGTHS[np.searchsorted(_FAST_LENGTHS, wanted)]
+        length = lengths[np.searchsorted(lengths, wanted)]
         pupil = length / (samples_per_px * unit_px)
         too_wide = pupil + 2 * EDGE_HALF_WIDTH > length
         if not too_wide.any():
@@ -130,7 +133,7 @@ def plan_grids(
 
 
 @lru_cache(maxsize=1)
-def _edge_response() -> NDArray[np.float32]:
+def edge_response() -> NDArray[np.float32]:
     """Response of a Kaiser-windowed sinc to a step, at 1/256 sample.
 
     Half width 8, beta 3.75: light from the pupil's edge is kept up to 0.43 of the
@@ -252,7 +255,7 @@ class _Work:
             EXPONENTS[:, 1],
             (self.plan.pupil_samples[part], size),
             self.center_px[part],
-            _edge_response(),
+            edge_response(),
             field,
         )
         # In place; the rows below the pupil are zero and stay so.

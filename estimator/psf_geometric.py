@@ -27,7 +27,7 @@ _PART = 32
 
 
 @lru_cache(maxsize=1)
-def _fresnel_table() -> NDArray[np.float64]:
+def fresnel_table() -> NDArray[np.float64]:
     """Integral from the dark side of (1/2)[(1/2+C)² + (1/2+S)²] less the step."""
     fine = 16
     v = np.linspace(-FRESNEL_LIMIT, FRESNEL_LIMIT, fine * _FRESNEL_STEPS + 1)
@@ -79,7 +79,7 @@ def geometric_kernels(
             (survey.edge_slope_px[part], survey.edge_light_um[part], extent_px[part]),
             (
                 frames.wavelength_nm[part] / 1000.0,
-                _fresnel_table(),
+                fresnel_table(),
                 FRESNEL_LIMIT,
                 diffraction,
             ),

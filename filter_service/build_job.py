@@ -26,6 +26,7 @@ class BuildLimits:
 
     max_blur_radius_px: int = 255
     max_store_mb: int = 2000
+    psf_engine: str = "auto"
     store_cache_dir: str = ""
     store_cache_max_mb: int = 2000
 

@@ -14,6 +14,7 @@ from filter_service.messages import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
 MB = 2**20
+PSF_ENGINES = ("auto", "cpu", "gpu")
 
 
 def default_cache_dir() -> str:
@@ -47,6 +48,8 @@ class ServiceConfig:
         A profile that needs a wider kernel is refused.
     max_store_mb : int
         A profile that needs more memory for its PSFs is refused.
+    psf_engine : "auto", "cpu" or "gpu"
+        What computes PSFs; "auto" is the GPU unless a processor imitates it.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
@@ -76,6 +79,7 @@ class ServiceConfig:
     max_profile_kb: int = 1024
     max_blur_radius_px: int = 255
     max_store_mb: int = 2000
+    psf_engine: str = "auto"
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
     store_cache_max_mb: int = 2000
@@ -87,6 +91,10 @@ class ServiceConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot work, naming the setting."""
         _check_bind(self.bind, self.allow_remote)
+        if self.psf_engine not in PSF_ENGINES:
+            raise ValueError(
+                f"psf_engine is {self.psf_engine!r}; allowed: {', '.join(PSF_ENGINES)}"
+            )
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
@@ -109,6 +117,7 @@ class ServiceConfig:
         return BuildLimits(
             max_blur_radius_px=self.max_blur_radius_px,
             max_store_mb=self.max_store_mb,
+            psf_engine=self.psf_engine,
             store_cache_dir=self.store_cache_dir,
             store_cache_max_mb=self.store_cache_max_mb,
         )

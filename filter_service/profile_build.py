@@ -19,6 +19,7 @@ from filter_service.eye_model import ABERRATION_SHARE, prepare_eye
 from filter_service.messages import ProfileSettings
 from filter_service.preview import is_worthwhile, preview_spec
 from filter_service.psf_build import build_psf_store
+from filter_service.psf_engine import psf_engine
 from filter_service.psf_grid import GridSpec
 from filter_service.psf_plan import PlanTooLarge, plan_cache
 from filter_service.store_cache import StoreCache, Stored, store_key
@@ -135,6 +136,7 @@ def _built(
         progress(done + (1.0 - done) * part, stage)
 
     go_on()
+    engine = psf_engine(job.limits.psf_engine)
     # Over the field, planning the whole takes longer than a preview.
     plan = None if spec.follows_field else plan_cache(eye, spec)
     first_spec = preview_spec(spec, job.look_at)
@@ -146,6 +148,7 @@ def _built(
             eye,
             first_spec,
             plan=first_plan,
+            engine=engine,
             progress=lambda part, stage: progress(done, PREVIEW_STAGE),
             cancelled=cancelled,
         )
@@ -153,6 +156,8 @@ def _built(
     report(0.0, "plan")
     plan = plan or plan_cache(eye, spec)
     go_on()
-    store = build_psf_store(eye, spec, plan=plan, progress=report, cancelled=cancelled)
+    store = build_psf_store(
+        eye, spec, plan=plan, engine=engine, progress=report, cancelled=cancelled
+    )
     yield result(store, notes, is_complete=True)
     cache.save_aside(key, Stored(store, notes))

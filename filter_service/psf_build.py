@@ -1,4 +1,4 @@
-"""Builds the PSF cache of an eye for a camera: CPU only, no GL, cancellable."""
+"""Builds the PSF cache of an eye for a camera, in chunks, cancellable."""
 
 import os
 import time
@@ -12,20 +12,18 @@ from numpy.typing import NDArray
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import EyeProfile
-from estimator.psf import PsfBatch, compute_psf_batch
+from estimator.psf import PsfBatch
 from filter_service.constants import RGB
 from filter_service.errors import BuildCancelled
 from filter_service.eye import Eye
+from filter_service.psf_engine import CPU, PsfEngine
 from filter_service.psf_grid import GridSpec
 from filter_service.psf_pack import PackedKernels, pack_kernels
 from filter_service.psf_plan import CachePlan, plan_cache
-from filter_service.psf_store import PsfStore, channel_wavelengths_nm
+from filter_service.psf_store import PsfStore
 
 COMPUTED_BEYOND = 0.2
 """Kernels are computed out to this share of the light that trimming will drop."""
-
-CHUNK = 768
-"""PSFs between two looks at progress and cancellation."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,7 @@ def build_psf_store(
     spec: GridSpec,
     *,
     plan: CachePlan | None = None,
+    engine: PsfEngine = CPU,
     progress: Callable[[float, str], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> PsfStore:
@@ -60,6 +59,7 @@ def build_psf_store(
         A profile is used as the measured wavefront.
     plan : CachePlan, optional
         Nodes other than those that `psf_plan.plan_cache` chooses.
+    engine : PsfEngine
     progress : callable, optional
         Called with a fraction 0..1 and a stage.
     cancelled : callable, optional
@@ -82,17 +82,18 @@ def build_psf_store(
     methods: Counter[str] = Counter()
     packed, blur_px = [], []
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for first in range(0, count, CHUNK):
+        for first in range(0, count, engine.batch_count):
             if cancelled is not None and cancelled():
                 raise BuildCancelled("a newer profile took over")
-            batch = _computed(eye, spec, requests.part(slice(first, first + CHUNK)))
+            end = first + engine.batch_count
+            batch = _computed(engine, eye, spec, requests.part(slice(first, end)))
             packed.append(
                 pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool)
             )
             blur_px.append(batch.blur_radius_px)
             methods += _methods(batch)
             if progress is not None:
-                progress(min(1.0, (first + CHUNK) / count), "psfs")
+                progress(min(1.0, end / count), "psfs")
     build_ms = 1e3 * (time.perf_counter() - started_s)
     return _store(spec, eye, plan, packed, np.concatenate(blur_px), methods, build_ms)
 
@@ -106,7 +107,7 @@ def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
         )
     )
     of_group = np.repeat(np.arange(h_deg.size), np.diff(plan.defocus.starts))
-    wavelengths_nm = np.array(channel_wavelengths_nm(spec)[:channels])
+    wavelengths_nm = np.array(spec.channel_wavelengths_nm[:channels])
 
     def each(values: NDArray) -> NDArray[np.float64]:
         return np.repeat(values, channels)
@@ -117,14 +118,16 @@ def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
         v_deg=each(v_deg[of_group]),
         pupil_diameter_mm=each(pupils_mm[of_group]),
         accommodation_dpt=each(used_dpt[of_group]),
-        total_defocus_dpt=(plan.defocus.values[:, None] + shift_dpt).ravel(),
+        total_defocus_dpt=(plan.defocus.values_dpt[:, None] + shift_dpt).ravel(),
         wavelength_nm=np.tile(wavelengths_nm, of_group.size),
     )
 
 
-def _computed(eye: Eye, spec: GridSpec, states: dict[str, NDArray]) -> PsfBatch:
+def _computed(
+    engine: PsfEngine, eye: Eye, spec: GridSpec, states: dict[str, NDArray]
+) -> PsfBatch:
     found = eye.wavefronts(**states)
-    return compute_psf_batch(
+    return engine.compute(
         found.zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
