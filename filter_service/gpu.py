@@ -190,6 +190,11 @@ class Gpu:
 
     # ----- programs
 
+    @property
+    def program_count(self) -> int:
+        """Passes compiled so far, each variant by itself."""
+        return len(self._programs)
+
     def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
         key = (name, *sorted(defines.items()))

@@ -77,13 +77,16 @@ def _run_beside(worker: WorkerHandle, config: ServiceConfig) -> None:
     from filter_service.profile_build import check_profile
     from filter_service.renderer import FilterRenderer
     from filter_service.threads import require_safe_threading_layer
+    from filter_service.warm_up import warm_up
 
     require_safe_threading_layer()
     gpu = Gpu()
     try:
+        renderer = FilterRenderer(gpu)
+        warm_up(renderer)
         serve(
             config,
-            renderer=FilterRenderer(gpu),
+            renderer=renderer,
             worker=worker,
             check_profile=check_profile,
             gl_renderer=gpu.info["renderer"],

@@ -1,0 +1,27 @@
+"""After warming up, frames meet no shader that is not compiled."""
+
+from filter_service.gpu import Gpu
+from filter_service.renderer import FilterRenderer
+from filter_service.warm_up import warm_up
+from tests.numerical.synthetic import Bench, texture
+
+
+def test_no_program_is_compiled_by_the_first_frames(rng):
+    gpu = Gpu()
+    warm_up(FilterRenderer(gpu))
+    compiled = gpu.program_count
+    bench = Bench(
+        gpu,
+        {"kind": "preset", "name": "myopia"},
+        width_px=96,
+        height_px=64,
+        vertical_fov_deg=20.0,
+        mode="dynamic",
+        pupil_range_mm=(4.0, 5.0),
+    )
+    view = bench.view(texture(rng, 64, 96), 1.0)
+    for accumulation in ("coverage", "paper"):
+        for output in ("srgb8", "linear"):
+            bench.render(view, accumulation=accumulation, output=output)
+    assert gpu.program_count == compiled
+    gpu.close()
