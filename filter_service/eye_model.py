@@ -9,7 +9,6 @@ from estimator.traced_eye import MAX_PUPIL_MM, TracedEye
 from filter_service.errors import BuildCancelled
 from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, pupil_nodes_mm
-from filter_service.psf_store import channel_wavelengths_nm
 from filter_service.wire_profiles import EYE_MODELS
 
 ESTIMATION_SHARE = 0.1
@@ -63,7 +62,7 @@ def prepare_eye(
         estimated,
         pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
         focus_range_dpt=spec.focus_range_dpt,
-        wavelengths_nm=channel_wavelengths_nm(spec),
+        wavelengths_nm=spec.channel_wavelengths_nm,
         field_range_deg=spec.field_range_deg,
         progress=lambda done: report(
             ESTIMATION_SHARE + (ABERRATION_SHARE - ESTIMATION_SHARE) * done,

@@ -185,7 +185,7 @@ def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
 
 
 def kernel_levels(kernels: FrameKernels) -> NDArray[np.int64]:
-    """Merging level (n,) up to which a kernel is wide enough at both ends."""
+    """Return the merging level (n,) for which a kernel is wide enough at one end."""
     steps = np.log2(
         np.maximum(kernels.spread_px.max(axis=1), 1e-9) / MERGE_MIN_SPREAD_PX
     )

@@ -19,8 +19,8 @@ from filter_service.psf_plan import CachePlan
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 """Largest edge of a cell on the camera's axis.  One kernel set for a cell of 4 degrees
-costs 52 to 55 dB against cells of half of that, of 2 degrees 59 to 62 dB (5 mm, 640x360,
-emmetropia and keratoconus); a quarter as many kernels are made."""
+costs 52 to 55 dB against cells of half of that, of 2 degrees 59 to 62 dB (5 mm,
+640x360, emmetropia and keratoconus); a quarter as many kernels are made."""
 
 MIN_CELL_PX = 8
 MAX_CELL_PX = 256

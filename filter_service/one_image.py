@@ -13,6 +13,8 @@ from filter_service.frame import View, fill_missing_depth, object_dpt
 from filter_service.gpu import Gpu
 from filter_service.psf_build import build_psf_store
 from filter_service.psf_grid import GridSpec
+from filter_service.psf_nodes import CachePlan
+from filter_service.psf_plan import plan_cache
 from filter_service.renderer import FilterRenderer, Rendered
 
 NEAREST_OBJECT_DPT = 20.0
@@ -34,6 +36,10 @@ class ImageSettings:
     merge: bool = True
     output: str = "linear"
     eye_model: str = "wavefront"
+    mode: str = "on-axis"
+    grid: str = "planned"
+    tolerance: str = "normal"
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class FilteredImage:
     rendered: Rendered
     eye_notes: tuple[str, ...]
     grid: GridSpec
+    plan: CachePlan
     gl_renderer: str
     build_ms: float
     start_ms: float
@@ -69,6 +76,39 @@ def object_range_dpt(view: View) -> tuple[float, float]:
     return min(low_dpt, NEAREST_OBJECT_DPT), min(high_dpt, NEAREST_OBJECT_DPT)
 
 
+def grid_spec(view: View, settings: ImageSettings) -> GridSpec:
+    """Return what the PSFs of one view must cover."""
+    pupil_mm, focus_dpt = settings.pupil_diameter_mm, settings.focus_dpt
+    return GridSpec.for_camera(
+        width_px=view.width_px,
+        height_px=view.height_px,
+        tangents=view.tangents,
+        pupil_range_mm=(pupil_mm, pupil_mm),
+        object_range_dpt=object_range_dpt(view),
+        focus_range_dpt=(focus_dpt, focus_dpt),
+        diffraction=settings.diffraction,
+        chromatic=settings.chromatic,
+        mode=settings.mode,
+        grid=settings.grid,
+        tolerance=settings.tolerance,
+        gaze_deg=settings.gaze_deg,
+        kept_energy_ratio=KEPT_ENERGY_RATIO,
+    )
+
+
+def plan_one_image(view: View, eye: EyeProfile, settings: ImageSettings) -> CachePlan:
+    """Decide which PSFs one view needs, and compute none.
+
+    Raises
+    ------
+    ValueError
+        A setting out of range; a plan beyond the memory budget.
+    """
+    grid = grid_spec(view, settings)
+    prepared, _ = prepare_eye(eye, grid, eye_model=settings.eye_model)
+    return plan_cache(prepared, grid)
+
+
 def filter_one_image(
     view: View,
     eye: EyeProfile,
@@ -81,22 +121,12 @@ def filter_one_image(
     Raises
     ------
     ValueError
-        A setting out of range, or a blur too large for the image.
+        A setting out of range, a blur too large for the image, or a plan beyond the
+        memory budget.
     RenderError
         The GPU part failed.
     """
-    pupil_mm, focus_dpt = settings.pupil_diameter_mm, settings.focus_dpt
-    grid = GridSpec.for_camera(
-        width_px=view.width_px,
-        height_px=view.height_px,
-        tangents=view.tangents,
-        pupil_range_mm=(pupil_mm, pupil_mm),
-        object_range_dpt=object_range_dpt(view),
-        focus_range_dpt=(focus_dpt, focus_dpt),
-        diffraction=settings.diffraction,
-        chromatic=settings.chromatic,
-        kept_energy_ratio=KEPT_ENERGY_RATIO,
-    )
+    grid = grid_spec(view, settings)
     clock_s = [time.perf_counter()]
     prepared, eye_notes = prepare_eye(eye, grid, eye_model=settings.eye_model)
     store = build_psf_store(prepared, grid, progress=progress)
@@ -108,8 +138,8 @@ def filter_one_image(
     rendered = renderer.render(
         view,
         handle,
-        pupil_diameter_mm=pupil_mm,
-        focus_dpt=focus_dpt,
+        pupil_diameter_mm=settings.pupil_diameter_mm,
+        focus_dpt=settings.focus_dpt,
         accumulation=settings.accumulation,
         merge=settings.merge,
         output=settings.output,
@@ -120,6 +150,7 @@ def filter_one_image(
         rendered=rendered,
         eye_notes=eye_notes,
         grid=grid,
+        plan=store.plan,
         gl_renderer=gpu.info["renderer"],
         build_ms=float(build_ms),
         start_ms=float(start_ms),

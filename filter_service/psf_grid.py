@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.units import MRAD_PER_RAD, RGB_WAVELENGTHS_NM
+from estimator.units import (
+    MRAD_PER_RAD,
+    REFERENCE_WAVELENGTH_NM,
+    RGB_WAVELENGTHS_NM,
+)
 from filter_service.field_directions import field_range_deg, pixel_from_mrad
 from filter_service.wire_images import Camera
 
@@ -146,6 +150,13 @@ class GridSpec:
                 seen_deg, PAPER_REACH_DEG[self.mode], strict=True
             )
         )
+
+    @property
+    def channel_wavelengths_nm(self) -> NDArray[np.float64]:
+        """Wavelengths (3,) of the channels; all the same without chromatic blur."""
+        if not self.chromatic:
+            return np.full(len(self.wavelengths_nm), REFERENCE_WAVELENGTH_NM)
+        return np.array(self.wavelengths_nm)
 
     def blur_px_per_dpt(self, pupil_diameter_mm: float) -> float:
         """Radius of the geometric blur disc on axis per dioptre of defocus, px."""

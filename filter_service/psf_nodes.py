@@ -6,31 +6,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.units import REFERENCE_WAVELENGTH_NM
-from filter_service.constants import RGB
-from filter_service.psf_grid import GridSpec
-
-
-def channel_wavelengths_nm(spec: GridSpec) -> NDArray[np.float64]:
-    """Wavelengths (3,) of the channels; all the same without chromatic blur."""
-    return np.array(
-        spec.wavelengths_nm if spec.chromatic else (REFERENCE_WAVELENGTH_NM,) * RGB
-    )
-
 
 @dataclass(frozen=True)
 class RaggedNodes:
-    """Groups of nodes, each with its own number of ascending values.
+    """Groups of nodes of total defocus, each with its own number of them.
 
     Attributes
     ----------
-    values : (n,)
-        All groups one after the other.
+    values_dpt : (n,)
+        All groups one after the other, ascending in each.
     starts : (n_groups + 1,)
-        Where each group begins in `values`; the last entry is n.
+        Where each group begins in `values_dpt`; the last entry is n.
     """
 
-    values: NDArray[np.float64]
+    values_dpt: NDArray[np.float64]
     starts: NDArray[np.int64]
 
     @classmethod
@@ -42,7 +31,7 @@ class RaggedNodes:
         if any((np.diff(group) <= 0.0).any() for group in groups):
             raise ValueError("the values of a group must ascend")
         return cls(
-            values=np.concatenate(groups).astype(np.float64),
+            values_dpt=np.concatenate(groups).astype(np.float64),
             starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         )
 
@@ -52,18 +41,18 @@ class RaggedNodes:
         return np.diff(self.starts)
 
     @property
-    def group_of_value(self) -> NDArray[np.int64]:
-        """Group (n,) of each value."""
+    def group_of_node(self) -> NDArray[np.int64]:
+        """Group (n,) of each node."""
         return np.repeat(np.arange(len(self.starts) - 1), self.counts)
 
     @cached_property
     def _span(self) -> float:
-        return float(np.ptp(self.values)) + 1.0
+        return float(np.ptp(self.values_dpt)) + 1.0
 
     @cached_property
     def _keys(self) -> NDArray[np.float64]:
         # Every group on a stretch of its own, so that one search serves all of them.
-        return self.values - self.values.min() + self._span * self.group_of_value
+        return self.values_dpt - self.values_dpt.min() + self._span * self.group_of_node
 
     def bracket(
         self, groups: ArrayLike, t: ArrayLike
@@ -79,19 +68,19 @@ class RaggedNodes:
         Returns
         -------
         lower, upper : (...) int
-            Indices into `values`; the same node twice in a group of one.
+            Indices into `values_dpt`; the same node twice in a group of one.
         fraction : (...)
             Share of the upper node, 0 to 1.
         """
         groups, t = np.broadcast_arrays(np.asarray(groups), np.asarray(t, float))
         first, last = self.starts[groups], self.starts[groups + 1] - 1
-        t = np.clip(t, self.values[first], self.values[last])
-        keys = t - self.values.min() + self._span * groups
+        t = np.clip(t, self.values_dpt[first], self.values_dpt[last])
+        keys = t - self.values_dpt.min() + self._span * groups
         upper = np.searchsorted(self._keys, keys)
         upper = np.clip(upper, np.minimum(first + 1, last), last)
         lower = np.maximum(upper - 1, first)
-        span = self.values[upper] - self.values[lower]
-        fraction = (t - self.values[lower]) / np.where(span > 0.0, span, 1.0)
+        span = self.values_dpt[upper] - self.values_dpt[lower]
+        fraction = (t - self.values_dpt[lower]) / np.where(span > 0.0, span, 1.0)
         return lower, upper, np.clip(fraction, 0.0, 1.0)
 
 
@@ -160,16 +149,15 @@ class CachePlan:
             len(self.accommodations_dpt),
         )
 
-    @property
-    def psf_count(self) -> int:
-        """Kernels, one per node and channel."""
-        return RGB * len(self.defocus.values)
-
 
 def bracket_axis(
     nodes: ArrayLike, value: ArrayLike
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Neighbours of values (...) among ascending nodes; see `RaggedNodes.bracket`."""
     nodes = np.asarray(nodes, np.float64)
-    only = RaggedNodes(values=nodes, starts=np.array([0, nodes.size]))
-    return only.bracket(0, value)
+    last = nodes.size - 1
+    value = np.clip(np.asarray(value, np.float64), nodes[0], nodes[-1])
+    upper = np.clip(np.searchsorted(nodes, value), min(1, last), last)
+    lower = np.maximum(upper - 1, 0)
+    span = nodes[upper] - nodes[lower]
+    return lower, upper, (value - nodes[lower]) / np.where(span > 0.0, span, 1.0)

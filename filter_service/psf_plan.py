@@ -21,12 +21,11 @@ from filter_service.psf_nodes import (
     CachePlan,
     PlanPrediction,
     RaggedNodes,
-    channel_wavelengths_nm,
 )
 from filter_service.psf_plan_cost import predicted_cost
 from filter_service.psf_plan_law import combined_error, equal_share, psnr_db
 from filter_service.psf_plan_nodes import axis_nodes, defocus_groups, target_error
-from filter_service.psf_plan_paper import paper_axes, paper_defocus
+from filter_service.psf_plan_paper import GREEN, paper_axes, paper_defocus
 from filter_service.psf_plan_use import (
     AXES,
     Use,
@@ -46,10 +45,8 @@ __all__ = [
     "unchecked_plan",
 ]
 
-USE_SAMPLES = 128
+USE_SAMPLES = 96
 """States at which errors are predicted."""
-
-GREEN = 1
 
 
 class PlanTooLarge(ValueError):
@@ -63,9 +60,8 @@ class PlanTooLarge(ValueError):
 
     def __init__(self, spec: GridSpec, prediction: PlanPrediction, advice: str):
         super().__init__(
-            f"the planned cache needs {prediction.memory_mb:.0f} MB for "
-            f"{prediction.psf_count} PSFs; allowed are {spec.memory_budget_mb:.0f} MB: "
-            f"{advice}"
+            f"the planned PSFs need {_needs(prediction)}; memory_budget_mb allows "
+            f"{_mb(spec.memory_budget_mb)}: {advice}"
         )
         self.prediction = prediction
         self.budget_mb = spec.memory_budget_mb
@@ -94,15 +90,26 @@ def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
     return plan
 
 
-def unchecked_plan(eye: Eye, spec: GridSpec) -> CachePlan:
-    """Plan like `plan_cache`, however large."""
+def unchecked_plan(
+    eye: Eye, spec: GridSpec, *, target_db: float | None = None
+) -> CachePlan:
+    """Plan like `plan_cache`, however large.
+
+    Parameters
+    ----------
+    target_db : float, optional
+        What interpolation may cost; the spec's tolerance says where it is None.
+    """
+    allowed_error = target_error(spec)
+    if target_db is not None:
+        allowed_error = 10.0 ** (-target_db / 10.0)
     use = sample_use(eye, spec, USE_SAMPLES)
     if spec.grid == "paper":
         axes = _Axes(*paper_axes(eye, spec))
         defocus, shift_dpt = paper_defocus(eye, spec, tuple(vars(axes).values()))
     else:
         if spec.follows_field:
-            axes, left = _field_axes(use)
+            axes, left = _field_axes(use, allowed_error)
             defocus = _field_defocus(eye, spec, axes, left)
         else:
             axes = _central_axes(eye, spec)
@@ -145,7 +152,7 @@ def _central_axes(eye: Eye, spec: GridSpec) -> _Axes:
     )
 
 
-def _field_axes(use: Use) -> tuple[_Axes, float]:
+def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
     """Nodes but those of defocus, and the mean square error left to defocus.
 
     Axes with few nodes meet their share with some to spare; it goes to the others.
@@ -165,11 +172,11 @@ def _field_axes(use: Use) -> tuple[_Axes, float]:
             nodes[axis] = np.array([range_[0]])
             continue
         share = equal_share(
-            target_error(spec), spent=spent, count=1 + len(open_) - len(spent)
+            allowed_error, spent=spent, count=1 + len(open_) - len(spent)
         )
-        nodes[axis] = axis_nodes(use, axis, range_, allowed_error=share)
-        spent.append(axis_error(use, axis, nodes[axis]))
-    left = equal_share(target_error(spec), spent=spent, count=1)
+        nodes[axis], error = axis_nodes(use, axis, range_, allowed_error=share)
+        spent.append(error)
+    left = equal_share(allowed_error, spent=spent, count=1)
     return _Axes(*(nodes[axis] for axis in AXES[:-1])), left
 
 
@@ -200,7 +207,7 @@ def _field_defocus(
         v_deg=axes.v_deg[:, None, None, None],
         pupil_diameter_mm=axes.pupils_mm[:, None],
         accommodation_dpt=axes.accommodations_dpt,
-        wavelength_nm=channel_wavelengths_nm(spec)[GREEN],
+        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
         total_defocus_dpt=0.0,
     )
     return defocus_groups(
@@ -227,7 +234,7 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
         v_deg=axes.v_deg[:, None, None, None, None],
         pupil_diameter_mm=axes.pupils_mm[:, None, None],
         accommodation_dpt=axes.accommodations_dpt[:, None],
-        wavelength_nm=channel_wavelengths_nm(spec),
+        wavelength_nm=spec.channel_wavelengths_nm,
     )
     lows, highs = at_infinity_dpt.min(axis=-1), at_infinity_dpt.max(axis=-1)
     used_dpt = axes.accommodations_dpt
@@ -256,8 +263,16 @@ def _advice(eye: Eye, spec: GridSpec) -> str:
     for words, smaller in _smaller_specs(spec):
         found = unchecked_plan(eye, smaller).prediction
         if found.memory_mb <= spec.memory_budget_mb:
-            return f"{words} needs {found.memory_mb:.0f} MB for {found.psf_count} PSFs"
-    return f"{words} still needs {found.memory_mb:.0f} MB; use a smaller image"
+            return f"{words} needs {_needs(found)}"
+    return f"even {words} needs {_needs(found)}; use a smaller image"
+
+
+def _needs(prediction: PlanPrediction) -> str:
+    return f"{_mb(prediction.memory_mb)} for {prediction.psf_count} PSFs"
+
+
+def _mb(memory_mb: float) -> str:
+    return f"{memory_mb:.0f} MB" if memory_mb >= 10.0 else f"{memory_mb:.2g} MB"
 
 
 def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
@@ -267,7 +282,7 @@ def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
     def step(text: str, **settings) -> None:
         words.append(text)
         steps.append(
-            (" with ".join(words), replace(steps[-1][1] if steps else spec, **settings))
+            (" and ".join(words), replace(steps[-1][1] if steps else spec, **settings))
         )
 
     if spec.grid == "paper":

@@ -99,7 +99,10 @@ def blend_error(
     blur_px2 = _blur_px2(spot_covariance(exact_px), difference_px2, unit_px)
     half_way = 4.0 * share_ratio * (1.0 - share_ratio)
     doubled = DOUBLING * half_way * difference_px2 / blur_px2**BLUR_EXPONENT
-    aside_square = ASIDE**2 * aside_px2 * blur_px2 ** (1.0 - 2.0 * BLUR_EXPONENT)
+    # A miss larger than the blur counts less and less: an image has no more contrast.
+    aside_square = (
+        ASIDE**2 * aside_px2 * (blur_px2 + aside_px2) ** (1.0 - 2.0 * BLUR_EXPONENT)
+    )
     return doubled**2 + aside_square
 
 

@@ -45,11 +45,17 @@ def target_error(spec: GridSpec) -> float:
 
 def axis_nodes(
     use: Use, axis: str, range_: tuple[float, float], *, allowed_error: float
-) -> NDArray[np.float64]:
-    """Nodes (n,) of one axis from end to end of its range, for a mean square error."""
+) -> tuple[NDArray[np.float64], float]:
+    """Nodes (n,) of one axis from end to end of its range, and their error.
+
+    Parameters
+    ----------
+    range_ : (low, high)
+        Not a point.
+    allowed_error : float
+        Mean square error that as few nodes as possible must meet.
+    """
     low, high = range_
-    if high - low < 1e-9:
-        return np.array([low])
     ladder = np.linspace(low, high, _LADDER)
     needed = _needed_over_ladder(use, axis, ladder, allowed_error)
     count = 1 + min(max(1, math.floor(0.8 * needed[-1])), MAX_NODES - 1)
@@ -57,7 +63,7 @@ def axis_nodes(
         nodes = np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
         error = axis_error(use, axis, nodes)
         if error <= allowed_error or count >= MAX_NODES:
-            return nodes
+            return nodes, error
         # The error falls as the fourth power of the intervals, a little slower where
         # rays do not move in proportion; do not overshoot.
         grown = (count - 1) * (error / allowed_error) ** 0.25

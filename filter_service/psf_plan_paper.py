@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from filter_service.eye import Eye
 from filter_service.psf_grid import PAPER_REACH_DEG, GridSpec
-from filter_service.psf_nodes import RaggedNodes, channel_wavelengths_nm
+from filter_service.psf_nodes import RaggedNodes
 
 ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
 DISTANCE_COUNTS = {"on-axis": 33, "quality": 9, "dynamic": 9}
@@ -66,7 +66,7 @@ def paper_defocus(
         v_deg=v_deg[:, None, None, None, None],
         pupil_diameter_mm=pupils_mm[:, None, None],
         accommodation_dpt=used_dpt[:, None],
-        wavelength_nm=channel_wavelengths_nm(spec),
+        wavelength_nm=spec.channel_wavelengths_nm,
     ).reshape(-1, 3)
     green_dpt = at_infinity_dpt[:, GREEN, None]
     count = DISTANCE_COUNTS[spec.mode]

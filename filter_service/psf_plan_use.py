@@ -11,7 +11,6 @@ from filter_service.psf_grid import GridSpec
 from filter_service.psf_nodes import (
     CachePlan,
     bracket_axis,
-    channel_wavelengths_nm,
 )
 from filter_service.psf_plan_law import AXIS_FACTOR, blend_error
 from filter_service.psf_slopes import PupilStates, slopes_px, state_frames
@@ -99,7 +98,7 @@ def sample_use(eye: Eye, spec: GridSpec, count: int) -> Use:
         np.clip(focused_dpt, low_dpt, high_dpt),
         low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
     )
-    wavelengths_nm = channel_wavelengths_nm(spec)
+    wavelengths_nm = spec.channel_wavelengths_nm
     known = {
         "h_deg": h_deg,
         "v_deg": v_deg,
@@ -140,11 +139,11 @@ def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
 def defocus_error(use: Use, plan: CachePlan) -> float:
     """Mean square error of the states when defocus is interpolated within its groups.
 
-    Each state reads the group of its next lower field, pupil and accommodation.
+    Each state reads the group of its nearest field, pupil and accommodation.
     """
     states = use.states
     corner = [
-        bracket_axis(nodes, values)[0]
+        np.abs(nodes - values[:, None]).argmin(axis=1)
         for nodes, values in (
             (plan.v_deg, states.v_deg),
             (plan.h_deg, states.h_deg),
@@ -160,7 +159,7 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
     )
     own_dpt = use.object_dpt - states.total_defocus_dpt + _at_infinity_dpt(use, node)
     channel = np.argmin(
-        np.abs(channel_wavelengths_nm(use.spec) - states.wavelength_nm[:, None]), axis=1
+        np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
     shift_dpt = plan.channel_shift_dpt[groups, channel]
     scale = states.pupil_diameter_mm / plan.pupils_mm[corner[2]]
@@ -169,7 +168,7 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
     columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
     columns["total_defocus_dpt"] = np.concatenate(
         [
-            (plan.defocus.values[index] + shift_dpt) / scale - own_dpt
+            (plan.defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
             for index in (lower, upper)
         ]
     )

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.units import REFERENCE_WAVELENGTH_NM
 from filter_service.constants import RGB
 from filter_service.eye import Eye
 from filter_service.psf_grid import GridSpec, layer_distances_dpt
@@ -95,11 +94,6 @@ class FrameLayers:
     notes: tuple[str, ...]
 
 
-def channel_wavelengths_nm(spec: GridSpec) -> tuple[float, ...]:
-    """Wavelengths of the three channels; all the same without chromatic blur."""
-    return spec.wavelengths_nm if spec.chromatic else (REFERENCE_WAVELENGTH_NM,) * RGB
-
-
 def channel_defocus_dpt(
     eye: Eye,
     spec: GridSpec,
@@ -115,7 +109,7 @@ def channel_defocus_dpt(
         v_deg=np.asarray(v_deg, float)[:, None],
         pupil_diameter_mm=pupil_diameter_mm,
         accommodation_dpt=accommodation_dpt,
-        wavelength_nm=np.array(channel_wavelengths_nm(spec)),
+        wavelength_nm=spec.channel_wavelengths_nm,
     )
 
 

@@ -13,6 +13,7 @@ from filter_service.commands.console import (
     progress_bar,
     say,
 )
+from filter_service.commands.plan_text import plan_summary, say_plan
 
 if TYPE_CHECKING:
     from estimator.profiles import EyeProfile
@@ -22,12 +23,30 @@ if TYPE_CHECKING:
 PUPIL_LIMITS_MM = (0.5, 9.0)
 FOCUS_LIMITS_DPT = (0.0, 20.0)
 FOV_LIMITS_DEG = (1.0, 150.0)
+GAZE_LIMITS_DEG = (-60.0, 60.0)
 
 
 class Mode(StrEnum):
     """Which directions have a PSF of their own."""
 
     ON_AXIS = "on-axis"
+    QUALITY = "quality"
+    DYNAMIC = "dynamic"
+
+
+class Grid(StrEnum):
+    """Where the PSFs between which others are blended lie."""
+
+    PLANNED = "planned"
+    PAPER = "paper"
+
+
+class Tolerance(StrEnum):
+    """What blending between planned PSFs may cost."""
+
+    LOOSE = "loose"
+    NORMAL = "normal"
+    FINE = "fine"
 
 
 class Accumulation(StrEnum):
@@ -85,8 +104,24 @@ def filter_image(
         float, typer.Option(help="Focus distance, dpt; 0 is infinity.")
     ] = 0.0,
     mode: Annotated[
-        Mode, typer.Option(help="on-axis: one direction for the whole image.")
+        Mode,
+        typer.Option(
+            help="on-axis: one direction for the whole image; quality and dynamic: "
+            "PSFs that follow the visual field, over a finer and a coarser grid."
+        ),
     ] = Mode.ON_AXIS,
+    grid: Annotated[
+        Grid,
+        typer.Option(help="planned: PSFs where this eye needs them; paper: its grid."),
+    ] = Grid.PLANNED,
+    tolerance: Annotated[
+        Tolerance,
+        typer.Option(help="Interpolation of a planned grid at about 40, 46 or 52 dB."),
+    ] = Tolerance.NORMAL,
+    gaze_h_deg: Annotated[
+        float, typer.Option(help="Gaze from the image's axis to the right, deg.")
+    ] = 0.0,
+    gaze_v_deg: Annotated[float, typer.Option(help="The same upwards, deg.")] = 0.0,
     accumulation: Annotated[
         Accumulation,
         typer.Option(help="coverage conserves light; paper is the published rule."),
@@ -114,6 +149,10 @@ def filter_image(
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
     ] = False,
+    plan: Annotated[
+        bool,
+        typer.Option("--plan", help="Say which PSFs would be computed, and stop."),
+    ] = False,
     json_output: Json = False,
 ) -> None:
     """Filter one image with depth through one eye; no server is needed.
@@ -124,6 +163,8 @@ def filter_image(
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
     check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
+    check_range("--gaze-h-deg", gaze_h_deg, GAZE_LIMITS_DEG)
+    check_range("--gaze-v-deg", gaze_v_deg, GAZE_LIMITS_DEG)
 
     from estimator.profile_files import load_profile
     from filter_service import image_files, one_image
@@ -147,7 +188,14 @@ def filter_image(
         merge=not no_merge,
         output="linear" if linear else "srgb8",
         eye_model=eye_model.value,
+        mode=mode.value,
+        grid=grid.value,
+        tolerance=tolerance.value,
+        gaze_deg=(gaze_h_deg, gaze_v_deg),
     )
+    if plan:
+        say_plan(one_image.plan_one_image(view, eye, settings), json_output=json_output)
+        return
     with progress_bar("PSFs", quiet=json_output) as progress:
         filtered = one_image.filter_one_image(view, eye, settings, progress=progress)
     image_files.write_image(out, filtered.rendered.color)
@@ -202,6 +250,7 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "render_ms": filtered.render_ms,
         "stage_times_ms": dict(rendered.stage_times_ms),
         "gl_renderer": filtered.gl_renderer,
+        "plan": plan_summary(filtered.plan),
         "notes": [*filtered.eye_notes, *rendered.notes],
     }
 

@@ -19,15 +19,19 @@ class Bench(StrEnum):
     """Benchmarks by what they time."""
 
     ESTIMATE = "estimate"
+    PLAN = "plan"
     PSF = "psf"
     RENDER = "render"
+    SWITCH = "switch"
     ROUNDTRIP = "roundtrip"
 
 
 BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
+    Bench.PLAN: "tests.benchmarks.bench_plan",
     Bench.PSF: "tests.benchmarks.bench_psf",
     Bench.RENDER: "tests.benchmarks.bench_render",
+    Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ROUNDTRIP: "clients.latency",
 }
 

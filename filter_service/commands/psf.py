@@ -1,17 +1,32 @@
 """`ocufilter psf`: one point-spread function of one eye, as an array or a picture."""
 
 import math
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from filter_service.commands.console import Json, check_range, print_json, say
+from filter_service.commands.console import (
+    CommandFailed,
+    Json,
+    check_range,
+    print_json,
+    say,
+)
+from filter_service.commands.wavefront import (
+    FIELD_LIMITS_DEG,
+    ellipse_facts,
+    explicit_body,
+    load_surfaces,
+)
 
 if TYPE_CHECKING:
-    from estimator.measured_wavefront import WavefrontState
+    import numpy as np
+
     from estimator.psf_types import Psf
+    from estimator.stiles_crawford import StilesCrawford
 
 PUPIL_LIMITS_MM = (0.5, 9.0)
 DISTANCE_LIMITS_DPT = (0.0, 20.0)
@@ -29,12 +44,29 @@ class Method(StrEnum):
     AUTO = "auto"
     FOURIER = "fourier"
     GEOMETRIC = "geometric"
+    ENZ = "enz"
+
+
+@dataclass(frozen=True)
+class _State:
+    """Wavefront of the eye in the state and direction asked for."""
+
+    name: str
+    zernike_um: "np.ndarray"
+    zernike_radius_mm: float
+    pupil_diameter_mm: float
+    ellipse: dict | None
+    eye_side: str | None
+    notes: tuple[str, ...]
 
 
 def psf(
-    profile: Annotated[
+    eye: Annotated[
         str,
-        typer.Argument(help="A preset name, or a .json, .abp or .csv profile."),
+        typer.Argument(
+            help="A preset name, a .json, .abp or .csv profile, or a .json with "
+            "surfaces or the 45 parameters."
+        ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -46,63 +78,164 @@ def psf(
         float, typer.Option(help="Distance of the point, dpt; 0 is infinity.")
     ] = 0.0,
     focus_dpt: Annotated[
-        float, typer.Option(help="Distance focused at, dpt; 0 is infinity.")
-    ] = 0.0,
+        float | None,
+        typer.Option(help="Distance focused at, dpt; infinity if not given."),
+    ] = None,
+    h_deg: Annotated[float, typer.Option(help="Source to the right, deg.")] = 0.0,
+    v_deg: Annotated[float, typer.Option(help="Source above, deg.")] = 0.0,
     method: Annotated[
-        Method, typer.Option(help="auto takes the one valid for this wavefront.")
+        Method,
+        typer.Option(
+            help="auto takes the one valid for this wavefront; enz refuses where its "
+            "series does not hold."
+        ),
     ] = Method.AUTO,
+    stiles_crawford: Annotated[
+        bool,
+        typer.Option("--stiles-crawford", help="Cones see the pupil's rim dimmer."),
+    ] = False,
     json_output: Json = False,
 ) -> None:
-    """Compute one PSF on axis, integrated over pixels.
+    """Compute one PSF, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downwards), with
-    the chief ray in its centre and unit sum.
+    the chief ray in its centre and unit sum.  On axis a measured wavefront is taken
+    as it is; off axis the eye is estimated and ray-traced, with its elliptical pupil.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
-    --pixel-arcmin 1 -o psf.png
+    --pixel-arcmin 1 --h-deg 20 -o psf.png
     """
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
     check_range("--pixel-arcmin", pixel_arcmin, PIXEL_LIMITS_ARCMIN)
     check_range("--object-dpt", object_dpt, DISTANCE_LIMITS_DPT)
-    check_range("--focus-dpt", focus_dpt, DISTANCE_LIMITS_DPT)
+    if focus_dpt is not None:
+        check_range("--focus-dpt", focus_dpt, DISTANCE_LIMITS_DPT)
+    check_range("--h-deg", h_deg, FIELD_LIMITS_DEG)
+    check_range("--v-deg", v_deg, FIELD_LIMITS_DEG)
 
-    from estimator.measured_wavefront import MeasuredWavefront
-    from estimator.profile_files import load_profile
-    from estimator.psf import compute_psfs
-    from estimator.units import MRAD_PER_RAD
     from filter_service.image_files import check_output
 
     check_output(out, (".npy", ".png"))
-    eye = load_profile(profile)
-    state = MeasuredWavefront.from_profile(eye).state(
-        pupil_diameter_mm=pupil_mm,
-        object_dpt=object_dpt,
-        focus_dpt=focus_dpt,
+    is_traced = h_deg != 0.0 or v_deg != 0.0 or explicit_body(eye) is not None
+    view = {
+        "pupil_diameter_mm": pupil_mm,
+        "object_dpt": object_dpt,
+        "wavelength_nm": wavelength_nm,
+    }
+    if is_traced:
+        state = _traced(eye, focus_dpt, h_deg=h_deg, v_deg=v_deg, **view)
+    else:
+        state = _measured(eye, focus_dpt, **view)
+    computed, predicted_db = _compute(
+        state,
         wavelength_nm=wavelength_nm,
-    )
-    computed = compute_psfs(
-        state.zernike_um[None, :],
-        pupil_diameter_mm=state.pupil_diameter_mm,
-        wavelength_nm=wavelength_nm,
-        pixel_pitch_mrad=MRAD_PER_RAD * math.radians(pixel_arcmin / ARCMIN_PER_DEG),
+        pixel_arcmin=pixel_arcmin,
         method=method.value,
-        max_radius_px=MAX_RADIUS_PX,
-    )[0]
+        stiles_crawford=_apodisation(state) if stiles_crawford else None,
+    )
     _write(out, computed, pixel_arcmin=pixel_arcmin)
-    summary = {"out": str(out), "profile": eye.name} | _facts(computed, state)
-    summary |= {"wavelength_nm": wavelength_nm, "pixel_arcmin": pixel_arcmin}
+    summary = {
+        "out": str(out),
+        "profile": state.name,
+        **_facts(computed, state),
+        "predicted_psnr_db": predicted_db,
+        "stiles_crawford": stiles_crawford,
+        "wavelength_nm": wavelength_nm,
+        "pixel_arcmin": pixel_arcmin,
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+    }
     if json_output:
         print_json(summary)
     else:
         _report(summary)
 
 
-def _facts(computed: "Psf", state: "WavefrontState") -> dict:
+def _measured(source: str, focus_dpt: float | None, **view) -> _State:
+    from estimator.measured_wavefront import MeasuredWavefront
+    from estimator.profile_files import load_profile
+
+    profile = load_profile(source)
+    found = MeasuredWavefront.from_profile(profile).state(
+        focus_dpt=focus_dpt or 0.0, **view
+    )
+    return _State(
+        name=profile.name,
+        zernike_um=found.zernike_um,
+        zernike_radius_mm=found.pupil_diameter_mm / 2.0,
+        pupil_diameter_mm=found.pupil_diameter_mm,
+        ellipse=None,
+        eye_side=profile.eye_side,
+        notes=tuple(found.notes),
+    )
+
+
+def _traced(source: str, focus_dpt: float | None, **view) -> _State:
+    from estimator.profile_files import load_profile
+    from estimator.wavefront import wavefront_aberrations
+
+    is_explicit = explicit_body(source) is not None
+    if focus_dpt is None and not is_explicit:
+        focus_dpt = 0.0
+    name, surfaces, notes = load_surfaces(source, focus_dpt)
+    found = wavefront_aberrations(surfaces, **view)
+    if not found.rms_residual_um >= 0.0:
+        raise CommandFailed(
+            f"{name}, h {view['h_deg']:g} v {view['v_deg']:g} deg: "
+            + ("; ".join(found.notes) or "too little of the pupil to fit")
+        )
+    return _State(
+        name=name,
+        zernike_um=found.zernike_um,
+        zernike_radius_mm=found.zernike_radius_mm,
+        pupil_diameter_mm=view["pupil_diameter_mm"],
+        ellipse=ellipse_facts(found.pupil_ellipse),
+        eye_side=None if is_explicit else load_profile(source).eye_side,
+        notes=(*notes, *found.notes),
+    )
+
+
+def _apodisation(state: _State) -> "StilesCrawford":
+    from estimator.stiles_crawford import EYE_SIDES, StilesCrawford
+
+    if state.eye_side in EYE_SIDES:
+        return StilesCrawford.of_eye(state.eye_side)
+    return StilesCrawford()
+
+
+def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", float]:
+    """Return the PSF, and the PSNR that images filtered with it should exceed."""
+    from estimator.psf import compute_psfs, plan_psfs
+    from estimator.psf_switch import predicted_least_psnr_db
+    from estimator.units import MRAD_PER_RAD
+
+    options |= {
+        "pupil_diameter_mm": 2.0 * state.zernike_radius_mm,
+        "pixel_pitch_mrad": MRAD_PER_RAD * math.radians(pixel_arcmin / ARCMIN_PER_DEG),
+        "method": method,
+        "max_radius_px": MAX_RADIUS_PX,
+    }
+    if state.ellipse is not None:
+        names = ("centre_x_mm", "centre_y_mm", "semi_major_mm", "semi_minor_mm")
+        options["pupil_ellipse"] = [
+            *(state.ellipse[name] for name in names),
+            math.radians(state.ellipse["major_axis_deg"]),
+        ]
+    wavefront = state.zernike_um[None, :]
+    computed = compute_psfs(wavefront, **options)[0]
+    plan = plan_psfs(wavefront, **options)
+    predicted_db = predicted_least_psnr_db(plan.survey, plan.geometric_ratio)
+    return computed, float(predicted_db[0])
+
+
+def _facts(computed: "Psf", state: _State) -> dict:
     from filter_service.psf_picture import half_light_radius_px
 
     return {
         "pupil_diameter_mm": state.pupil_diameter_mm,
+        "zernike_radius_mm": state.zernike_radius_mm,
+        "pupil_ellipse": state.ellipse,
         "method": computed.method,
         "radius_px": int(computed.radius_px),
         "blur_radius_px": float(computed.blur_radius_px),
@@ -134,5 +267,6 @@ def _report(summary: dict) -> None:
         f"{summary['pupil_diameter_mm']:g} mm, {summary['wavelength_nm']:g} nm; radius "
         f"{summary['radius_px']} px ({summary['radius_px'] * arcmin:.3g} arcmin), half "
         f"of the light within {summary['half_light_radius_px'] * arcmin:.3g} arcmin, "
-        f"{summary['lost_energy_ratio']:.2g} of it outside"
+        f"{summary['lost_energy_ratio']:.2g} of it outside; images filtered with it "
+        f"should be right to {summary['predicted_psnr_db']:.0f} dB"
     )

@@ -17,7 +17,7 @@ from filter_service.commands.console import (
 
 if TYPE_CHECKING:
     from estimator.surfaces import EyeSurfaces
-    from estimator.wavefront import Aberrations
+    from estimator.wavefront import Aberrations, PupilEllipse
 
 PUPIL_LIMITS_MM = (0.05, 12.0)
 WAVELENGTH_LIMITS_NM = (365.0, 1014.0)
@@ -73,7 +73,7 @@ def wavefront(
 
     from estimator.wavefront import wavefront_aberrations
 
-    name, surfaces, notes = _load(eye, focus_dpt)
+    name, surfaces, notes = load_surfaces(eye, focus_dpt)
     found = wavefront_aberrations(
         surfaces,
         wavelength_nm=wavelength_nm,
@@ -122,7 +122,7 @@ def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt
     check_range("--object-dpt", object_dpt, OBJECT_LIMITS_DPT)
 
 
-def _explicit_body(source: str) -> dict | None:
+def explicit_body(source: str) -> dict | None:
     """Content of a JSON file that gives surfaces; None for any other source."""
     from estimator.explicit_eye import is_explicit_eye
 
@@ -136,11 +136,11 @@ def _explicit_body(source: str) -> dict | None:
     return body if is_explicit_eye(body) else None
 
 
-def _load(
+def load_surfaces(
     source: str, focus_dpt: float | None
 ) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
     """Name, surfaces and notes of what the user named."""
-    body = _explicit_body(source)
+    body = explicit_body(source)
     if body is not None:
         from estimator.explicit_eye import parse_explicit_eye
 
@@ -167,21 +167,25 @@ def _load(
     return profile.name, focused.surfaces, (*notes, *focused.notes)
 
 
+def ellipse_facts(ellipse: "PupilEllipse") -> dict:
+    """Pupil of a traced wavefront, as the JSON output has it."""
+    return {
+        "centre_x_mm": ellipse.centre_x_mm,
+        "centre_y_mm": ellipse.centre_y_mm,
+        "semi_major_mm": ellipse.semi_major_mm,
+        "semi_minor_mm": ellipse.semi_minor_mm,
+        "major_axis_deg": ellipse.major_axis_deg,
+        "ratio": ellipse.axis_ratio,
+    }
+
+
 def _facts(found: "Aberrations") -> dict:
     from estimator.raytrace import STATUS_WORDS
 
-    ellipse = found.pupil_ellipse
     return {
         "zernike_um": found.zernike_um.tolist(),
         "zernike_radius_mm": found.zernike_radius_mm,
-        "pupil_ellipse": {
-            "centre_x_mm": ellipse.centre_x_mm,
-            "centre_y_mm": ellipse.centre_y_mm,
-            "semi_major_mm": ellipse.semi_major_mm,
-            "semi_minor_mm": ellipse.semi_minor_mm,
-            "major_axis_deg": ellipse.major_axis_deg,
-            "ratio": ellipse.axis_ratio,
-        },
+        "pupil_ellipse": ellipse_facts(found.pupil_ellipse),
         "rms_residual_um": found.rms_residual_um,
         "stop_diameter_mm": found.stop_diameter_mm,
         "open_ratio": found.open_ratio,

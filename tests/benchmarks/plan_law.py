@@ -150,7 +150,8 @@ def fit(data, errors):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
-    parts = 8 if parser.parse_args().quick else 60
+    is_quick = parser.parse_args().quick
+    parts = 8 if is_quick else 60
     frame = scene_view("courtyard", width_px=1280, height_px=720)
     spectrum = frame_spectrum(srgb_to_linear(frame.color))
     rng = np.random.default_rng(0)
@@ -217,7 +218,8 @@ def main():
     }
     for key, value in report.items():
         print(f"{key}: {value}")
-    write_report("plan_law", report)
+    if not is_quick:
+        write_report("plan_law", report)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from estimator.profile_files import load_profile
 from estimator.psf import compute_psf_batch
 from estimator.traced_eye import TracedEye
 from filter_service.psf_grid import GridSpec, pupil_nodes_mm
-from filter_service.psf_nodes import bracket_axis, channel_wavelengths_nm
+from filter_service.psf_nodes import bracket_axis
 from filter_service.psf_pack import pack_kernels, square_kernel
 from filter_service.psf_plan_paper import DISTANCES_DPT
 from filter_service.psf_plan_use import FIELD_OF_AXIS, sample_use
@@ -50,7 +50,7 @@ def traced_eye(name, spec):
         tuple(pupil_nodes_mm(spec.pupil_range_mm)),
         spec.focus_range_dpt,
         spec.field_range_deg,
-        tuple(channel_wavelengths_nm(spec)),
+        tuple(spec.channel_wavelengths_nm),
     )
 
 
@@ -70,6 +70,7 @@ def _traced(name, pupils_mm, focus_range_dpt, field_range_deg, wavelengths_nm):
     )
 
 
+@cache
 def isotropic_spectrum(side_px=SPECTRUM_SIDE_PX, table=COURTYARD_SPECTRUM):
     """Spectrum (side, side) as `numpy.fft.fft2` orders it."""
     along = 2.0 * math.pi * np.fft.fftfreq(side_px)
@@ -77,10 +78,17 @@ def isotropic_spectrum(side_px=SPECTRUM_SIDE_PX, table=COURTYARD_SPECTRUM):
     return np.exp(np.interp(np.log(frequency), *np.log(table)))
 
 
-def image_error(kernel_difference, spectrum):
-    """Mean square of an image of that spectrum, filtered with a difference kernel."""
-    side = len(spectrum)
+def image_error(kernel_difference, spectrum=None):
+    """Mean square of an image of that spectrum, filtered with a difference kernel.
+
+    Where it is None, `isotropic_spectrum` as large as the kernel needs.
+    """
     rows, columns = kernel_difference.shape
+    if spectrum is None:
+        spectrum = isotropic_spectrum(
+            SPECTRUM_SIDE_PX * 2 ** math.ceil(math.log2(max(rows / 200.0, 1.0)))
+        )
+    side = len(spectrum)
     if max(rows, columns) > side:
         raise ValueError(f"kernel of {rows} px: the spectrum has {side}")
     padded = np.zeros((side, side))
@@ -131,7 +139,7 @@ def _corners(eye, spec, plan, states, object_dpt, axes):
         )
     )
     channel = np.argmin(
-        np.abs(channel_wavelengths_nm(spec) - states.wavelength_nm[:, None]), axis=1
+        np.abs(spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
     found, weights = [], []
     for v_index, v_deg, v_share in v_ends:
@@ -164,7 +172,7 @@ def _corners(eye, spec, plan, states, object_dpt, axes):
                     shift_dpt = plan.channel_shift_dpt[group, channel]
                     lower, upper, part = plan.defocus.bracket(group, at_dpt - shift_dpt)
                     for index, t_share in ((lower, 1 - part), (upper, part)):
-                        node_dpt = plan.defocus.values[index] + shift_dpt
+                        node_dpt = plan.defocus.values_dpt[index] + shift_dpt
                         found.append(columns | {"total_defocus_dpt": node_dpt})
                         weights.append(share * t_share)
     return _Corners(
@@ -190,7 +198,6 @@ def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=No
         Which axes are interpolated: with "defocus" all must be; the others alone or
         together.
     """
-    spectrum = isotropic_spectrum() if spectrum is None else spectrum
     use = sample_use(eye, spec, 4096)
     chosen = np.random.default_rng(seed).choice(4096, count, replace=False)
     use = use.taken(chosen)
@@ -274,7 +281,7 @@ def _grid_errors(eye, spec, plan, count, seed, share):
     # A node of the defocus groups is one distance, in green, at all of the paper's.
     n_distances = int(plan.defocus.counts[0])
     object_dpt = between(np.linspace(*DISTANCES_DPT, n_distances))
-    wavelengths_nm = channel_wavelengths_nm(spec)
+    wavelengths_nm = spec.channel_wavelengths_nm
     known = {
         "h_deg": between(plan.h_deg),
         "v_deg": between(plan.v_deg),
@@ -291,7 +298,7 @@ def _grid_errors(eye, spec, plan, count, seed, share):
         plan,
         states,
         object_dpt,
-        spectrum=isotropic_spectrum(),
+        spectrum=None,
         stored=share == 0.0,
     )
 

@@ -16,7 +16,6 @@ from filter_service.field_directions import (
 from filter_service.frame import View
 from filter_service.psf_build import build_psf_store
 from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import channel_wavelengths_nm
 from filter_service.renderer import FilterRenderer
 from tests.numerical.synthetic import psnr_db, tangents, texture
 
@@ -64,7 +63,7 @@ class FieldBench:
         gaze_deg = self.spec.gaze_deg
         h, v = field_deg(self.spec.camera, x + 0.5, y + 0.5, gaze_deg=gaze_deg)
         h, v, distance_m = (np.repeat(np.ravel(a), 3) for a in (h, v, distance_m))
-        wavelengths_nm = np.tile(channel_wavelengths_nm(self.spec), h.size // 3)
+        wavelengths_nm = np.tile(self.spec.channel_wavelengths_nm, h.size // 3)
         state = {
             "h_deg": h,
             "v_deg": v,

@@ -1,0 +1,60 @@
+"""A plan of PSFs in words and as JSON."""
+
+from typing import TYPE_CHECKING
+
+from filter_service.commands.console import print_json, say
+
+if TYPE_CHECKING:
+    from filter_service.psf_nodes import CachePlan
+
+AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
+
+
+def plan_summary(plan: "CachePlan") -> dict:
+    """Nodes and prediction, ready for JSON."""
+    predicted = plan.prediction
+    return {
+        "h_deg": plan.h_deg.tolist(),
+        "v_deg": plan.v_deg.tolist(),
+        "pupils_mm": plan.pupils_mm.tolist(),
+        "accommodations_dpt": plan.accommodations_dpt.tolist(),
+        "defocus_range_dpt": [
+            float(plan.defocus.values_dpt.min()),
+            float(plan.defocus.values_dpt.max()),
+        ],
+        "defocus_counts": [
+            int(plan.defocus.counts.min()),
+            int(plan.defocus.counts.max()),
+        ],
+        **vars(predicted),
+    }
+
+
+def say_plan(plan: "CachePlan", *, json_output: bool) -> None:
+    """Print a plan."""
+    summary = plan_summary(plan)
+    if json_output:
+        print_json(summary)
+        return
+    low_dpt, high_dpt = summary["defocus_range_dpt"]
+    fewest, most = summary["defocus_counts"]
+    defocus_words = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    say(_axis("azimuths", summary["h_deg"], "deg"))
+    say(_axis("elevations", summary["v_deg"], "deg"))
+    say(_axis("pupils", summary["pupils_mm"], "mm"))
+    say(_axis("accommodations", summary["accommodations_dpt"], "dpt"))
+    say(f"{defocus_words} defoci from {low_dpt:.2f} to {high_dpt:.2f} dpt at each")
+    parts = ", ".join(
+        f"{AXIS_WORDS.get(axis, axis)} {db:.0f}"
+        for axis, db in summary["error_db_by_axis"].items()
+    )
+    say(
+        f"{summary['psf_count']} PSFs, {summary['memory_mb']:.1f} MB, "
+        f"{summary['build_s']:.1f} s on {summary['core_count']} cores; "
+        f"interpolation at {summary['interpolation_db']:.0f} dB ({parts})"
+    )
+
+
+def _axis(name: str, values: list[float], unit: str) -> str:
+    shown = ", ".join(f"{round(value, 2) + 0.0:g}" for value in values)
+    return f"{len(values)} {name}: {shown} {unit}"

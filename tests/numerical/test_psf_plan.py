@@ -1,0 +1,307 @@
+"""The planner: what it covers, what it predicts, and what blending really costs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.profile_files import load_profile
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import defocus_nodes_dpt, pupil_nodes_mm
+from filter_service.psf_nodes import (
+    RaggedNodes,
+    bracket_axis,
+)
+from filter_service.psf_plan import PlanTooLarge, plan_cache, unchecked_plan
+from filter_service.psf_plan_law import (
+    allowed_difference_px,
+    blend_error,
+    combined_error,
+    equal_share,
+)
+from filter_service.psf_plan_nodes import TOLERANCE_DB
+from filter_service.psf_plan_use import sample_use
+from tests.numerical.plan_cases import (
+    mean_db,
+    node_errors,
+    sampled_errors,
+    spec_for,
+    traced_eye,
+)
+
+FACTOR_TWO_DB = 20.0 * math.log10(2.0)
+ONE_STATE = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (0.5, 0.5)}
+GAZE_CAMERA = {"tangents": (-0.5, 1.1, 0.7, -0.4)}
+
+
+def measured_eye(name):
+    return MeasuredWavefront.from_profile(load_profile(name))
+
+
+# ----- nodes and their neighbours
+
+
+def test_brackets_are_those_of_each_group():
+    rng = np.random.default_rng(1)
+    groups = [np.sort(rng.normal(0, 3, n)) for n in (1, 2, 7, 30)]
+    nodes = RaggedNodes.of(groups)
+    group = rng.integers(0, 4, 500)
+    t = rng.normal(0, 5, 500)
+    lower, upper, share = nodes.bracket(group, t)
+    values = (1 - share) * nodes.values_dpt[lower] + share * nodes.values_dpt[upper]
+    clipped = [
+        np.clip(x, groups[g][0], groups[g][-1]) for g, x in zip(group, t, strict=True)
+    ]
+    np.testing.assert_allclose(values, clipped, atol=1e-9)
+    assert np.all(nodes.group_of_node[lower] == group)
+    assert np.all(nodes.group_of_node[upper] == group)
+    assert np.all((upper - lower == 1) | (nodes.counts[group] == 1))
+
+
+@pytest.mark.parametrize("groups", [[], [np.zeros(0)], [np.array([1.0, 1.0])]])
+def test_groups_that_are_no_nodes_are_refused(groups):
+    with pytest.raises(ValueError, match=r"at least one node|ascend"):
+        RaggedNodes.of(groups)
+
+
+# ----- on axis
+
+
+def expected_defocus(eye, spec):
+    """Nodes on axis, by the rule in words: what frames read, pupil by pupil."""
+    pupils_mm = pupil_nodes_mm([eye.usable_pupil_mm(p) for p in spec.pupil_range_mm])
+    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
+    groups = []
+    for i, pupil_mm in enumerate(pupils_mm):
+        for j in range(len(used_dpt)):
+            ends = []
+            for other_mm in pupils_mm[max(i - 1, 0) : i + 2]:
+                read_dpt = (
+                    used_dpt[max(j - 1, 0) : j + 2]
+                    if len(used_dpt) > 1
+                    else [eye.accommodation_dpt(f) for f in spec.focus_range_dpt]
+                )
+                at_infinity_dpt = eye.total_defocus_dpt(
+                    pupil_diameter_mm=other_mm,
+                    accommodation_dpt=np.array(read_dpt)[:, None],
+                    wavelength_nm=spec.channel_wavelengths_nm,
+                )
+                for d in spec.object_range_dpt:
+                    ends.append((at_infinity_dpt + d) * other_mm / pupil_mm)
+            groups.append(
+                defocus_nodes_dpt(
+                    min(float(e.min()) for e in ends),
+                    max(float(e.max()) for e in ends),
+                    blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
+                    max_blur_step_px=spec.max_blur_step_px,
+                )
+            )
+    return groups
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "myopia", "keratoconus"])
+@pytest.mark.parametrize("model", ["wavefront", "traced"])
+def test_on_axis_nodes_follow_the_blur_alone(name, model):
+    spec = spec_for()
+    eye = measured_eye(name) if model == "wavefront" else traced_eye(name, spec)
+    plan = plan_cache(eye, spec)
+    expected = expected_defocus(eye, spec)
+    assert plan.group_shape[:2] == (1, 1)
+    np.testing.assert_array_equal(plan.defocus.counts, [len(g) for g in expected])
+    np.testing.assert_allclose(
+        plan.defocus.values_dpt, np.concatenate(expected), atol=1e-12
+    )
+
+
+# ----- whatever frames read is there
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "settings"),
+    [
+        ("emmetropia", "traced", {"mode": "on-axis"}),
+        ("keratoconus", "traced", {"mode": "dynamic"}),
+        ("emmetropia", "traced", {"mode": "dynamic", "gaze_deg": (12.0, -8.0)}),
+        ("emmetropia", "wavefront", {"mode": "dynamic"}),
+    ],
+)
+def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings):
+    spec = spec_for(**settings)
+    eye = measured_eye(name) if model == "wavefront" else traced_eye(name, spec)
+    plan = plan_cache(eye, spec)
+    use = sample_use(eye, spec, 400)
+    states = use.states
+    for v in bracket_axis(plan.v_deg, states.v_deg)[:2]:
+        for h in bracket_axis(plan.h_deg, states.h_deg)[:2]:
+            total_dpt = use.object_dpt + eye.total_defocus_dpt(
+                h_deg=plan.h_deg[h],
+                v_deg=plan.v_deg[v],
+                pupil_diameter_mm=states.pupil_diameter_mm,
+                accommodation_dpt=states.accommodation_dpt,
+                wavelength_nm=states.wavelength_nm,
+            )
+            for i in bracket_axis(plan.pupils_mm, states.pupil_diameter_mm)[:2]:
+                for j in bracket_axis(
+                    plan.accommodations_dpt, states.accommodation_dpt
+                )[:2]:
+                    group = np.ravel_multi_index((v, h, i, j), plan.group_shape)
+                    read = total_dpt * states.pupil_diameter_mm / plan.pupils_mm[i]
+                    low = plan.defocus.values_dpt[plan.defocus.starts[group]]
+                    high = plan.defocus.values_dpt[plan.defocus.starts[group + 1] - 1]
+                    # Pupils and accommodations between nodes bend their defocus.
+                    assert np.all(read > low - 0.02)
+                    assert np.all(read < high + 0.02)
+
+
+def test_field_nodes_span_the_image_where_the_eye_looks_aside():
+    spec = replace(spec_for(mode="dynamic"), gaze_deg=(15.0, 5.0))
+    camera = replace(spec.camera, **GAZE_CAMERA)
+    spec = replace(spec, camera=camera, **ONE_STATE)
+    plan = plan_cache(traced_eye("emmetropia", spec), spec)
+    (h_low, h_high), (v_low, v_high) = spec.field_range_deg
+    assert (plan.h_deg[0], plan.h_deg[-1]) == pytest.approx((h_low, h_high))
+    assert (plan.v_deg[0], plan.v_deg[-1]) == pytest.approx((v_low, v_high))
+    assert h_low < -35.0 and 25.0 < h_high < 40.0  # 26.6 and 47.7 deg less the gaze
+
+
+# ----- tolerance, prediction and measurement
+
+
+def test_finer_tolerances_take_more_psfs_and_err_less_as_predicted():
+    counts, measured_db = [], []
+    for tolerance in ("loose", "normal", "fine"):
+        spec = spec_for(mode="dynamic", tolerance=tolerance)
+        eye = traced_eye("emmetropia", spec)
+        plan = plan_cache(eye, spec)
+        counts.append(plan.prediction.psf_count)
+        measured_db.append(mean_db(sampled_errors(eye, spec, plan, count=64)))
+        assert plan.prediction.psf_count == 3 * len(plan.defocus.values_dpt)
+        assert plan.prediction.interpolation_db > TOLERANCE_DB[tolerance] - 0.5
+        difference_db = measured_db[-1] - plan.prediction.interpolation_db
+        assert abs(difference_db) < FACTOR_TWO_DB
+    assert counts == sorted(set(counts))
+    assert np.all(np.diff(measured_db) > 3.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("keratoconus", {"mode": "quality", "width_px": 1280, "height_px": 720}),
+        ("post_lasik", {"mode": "dynamic"}),
+        ("myopia", {"mode": "dynamic", "vertical_fov_deg": 20.0}),
+        ("emmetropia", {"mode": "quality", "grid": "paper", **ONE_STATE}),
+        ("astigmatism", {"mode": "dynamic", "model": "wavefront"}),
+    ],
+)
+def test_errors_are_predicted_within_a_factor_of_two(name, settings):
+    settings = dict(settings)
+    model = settings.pop("model", "traced")
+    spec = spec_for(**settings)
+    eye = measured_eye(name) if model == "wavefront" else traced_eye(name, spec)
+    plan = plan_cache(eye, spec)
+    measured_db = mean_db(sampled_errors(eye, spec, plan, count=64, seed=3))
+    assert abs(measured_db - plan.prediction.interpolation_db) < FACTOR_TWO_DB
+
+
+def test_memory_is_predicted_for_the_cache_that_is_built():
+    spec = spec_for(mode="quality", tolerance="loose", **ONE_STATE)
+    eye = traced_eye("keratoconus", spec)
+    store = build_psf_store(eye, spec)
+    predicted = store.plan.prediction
+    assert store.psf_count == predicted.psf_count
+    assert predicted.memory_mb == pytest.approx(store.memory_mb, rel=0.2)
+    assert predicted.build_s > 0.0
+
+
+def test_the_law_is_zero_for_equal_psfs_and_inverts():
+    rng = np.random.default_rng(0)
+    slopes = rng.normal(0, 2, (5, 80, 2))
+    half, unit = np.full(5, 0.5), np.full(5, 0.1)
+    same = blend_error(slopes, slopes, slopes, share_ratio=half, unit_px=unit)
+    np.testing.assert_array_equal(same, 0.0)
+    covariance = np.array([[4.0, 4.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    allowed_px = allowed_difference_px(
+        covariance, unit_px=np.full(3, 0.1), half_way_error=3e-3
+    )
+    assert allowed_px[0] > allowed_px[1] > allowed_px[2] > 0.0
+    shares = [1e-6, 3e-6]
+    more = equal_share(2e-5, spent=shares, count=3)
+    assert combined_error([*shares, more, more, more]) == pytest.approx(2e-5)
+
+
+# ----- the paper's grids
+
+
+@pytest.mark.parametrize(("mode", "count"), [("quality", 17577), ("dynamic", 201825)])
+def test_the_papers_grids_have_its_psf_counts(mode, count):
+    ranges = {"pupil_range_mm": (2.0, 6.0), "focus_range_dpt": (0.125, 4.125)}
+    spec = spec_for(mode=mode, grid="paper", **ranges)
+    eye = traced_eye("emmetropia", spec)
+    plan = unchecked_plan(eye, spec)
+    assert plan.prediction.psf_count == count
+    assert plan.h_deg[0] == -45.0
+    if mode == "quality":  # at a node of all axes nothing is blended: storage alone
+        assert mean_db(node_errors(eye, spec, plan, count=24)) > 60.0
+
+
+# ----- too large, and degenerate
+
+
+def test_a_plan_beyond_its_budget_is_refused_with_one_that_fits():
+    spec = spec_for(mode="dynamic", tolerance="normal", **ONE_STATE)
+    eye = traced_eye("emmetropia", spec)
+    needed, smaller = (
+        unchecked_plan(eye, replace(spec, tolerance=tolerance)).prediction
+        for tolerance in ("normal", "loose")
+    )
+    budget_mb = 0.5 * (needed.memory_mb + smaller.memory_mb)
+    with pytest.raises(PlanTooLarge) as refused:
+        plan_cache(eye, replace(spec, memory_budget_mb=budget_mb))
+    assert refused.value.prediction == needed
+    assert refused.value.budget_mb == budget_mb
+    text = str(refused.value)
+    assert f"need {needed.memory_mb:.2g} MB for {needed.psf_count} PSFs" in text
+    smaller_words = f"{smaller.memory_mb:.2g} MB for {smaller.psf_count} PSFs"
+    assert f'tolerance "loose" needs {smaller_words}' in text
+    fitting = replace(spec, memory_budget_mb=budget_mb, tolerance="loose")
+    assert plan_cache(eye, fitting).prediction == smaller
+
+
+def test_where_nothing_fits_the_refusal_says_so():
+    spec = spec_for(memory_budget_mb=0.001)
+    with pytest.raises(PlanTooLarge, match=r"even .* needs"):
+        plan_cache(measured_eye("myopia"), spec)
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape"),
+    [
+        ({**ONE_STATE, "object_range_dpt": (1.0, 1.0)}, (None, None, 1, 1)),
+        (
+            {"width_px": 40, "height_px": 23, "vertical_fov_deg": 1.0},
+            (2, 2, None, None),
+        ),
+        ({"width_px": 1, "height_px": 1, "vertical_fov_deg": 4.0}, (2, 2, None, None)),
+        ({"width_px": 40, "height_px": 600}, (None, None, None, None)),
+        ({"chromatic": False, "diffraction": False}, (None, None, None, None)),
+    ],
+)
+@pytest.mark.parametrize("model", ["wavefront", "traced"])
+def test_degenerate_ranges_are_planned(settings, shape, model):
+    settings = {"mode": "dynamic", "tolerance": "loose", **settings}
+    spec = spec_for(**settings)
+    eye = (
+        measured_eye("myopia")
+        if model == "wavefront"
+        else traced_eye("emmetropia", spec)
+    )
+    plan = plan_cache(eye, spec)
+    for found, expected in zip(plan.group_shape, shape, strict=True):
+        assert found == expected if expected else found >= 1
+    channels = 3 if spec.chromatic else 1
+    assert plan.prediction.psf_count == channels * len(plan.defocus.values_dpt)
+    assert len(plan.defocus.starts) == 1 + math.prod(plan.group_shape)
+    assert plan.prediction.memory_mb > 0.0
+    assert plan.prediction.interpolation_db > 39.0
