@@ -17,8 +17,8 @@ from estimator.psf_arguments import checked_scale
 from estimator.stiles_crawford import StilesCrawford
 from estimator.zernike import EXPONENTS, wavefront_polynomial, zernike_gradient
 
-ROWS_AT_A_TIME = 1 << 24
-"""Field values held at a time (256 MiB): rows of pixels are done in such parts."""
+VALUES_AT_A_TIME = 1 << 24
+"""Field values held at a time (256 MiB): columns of pixels are done in such parts."""
 
 
 @dataclass(frozen=True)
@@ -315,15 +315,14 @@ def reference_kernel(
         for b in swing
     )
     kernel = np.empty((pixels.size, pixels.size))
-    rows = max(1, ROWS_AT_A_TIME // (node_y.size * pixels.size * node_x.size))
-    for first in range(0, pixels.size, rows):
-        part = slice(first, first + rows)
-        y_px = pixels[part, None] + node_y / 2.0
-        field = _field(
-            pupil, pixels, y_px.ravel(), node_x / 2.0, refine, workers
-        ).reshape(*y_px.shape, node_x.size, pixels.size)
+    y_px = (pixels[:, None] + node_y / 2.0).ravel()
+    columns = max(1, VALUES_AT_A_TIME // (y_px.size * node_x.size))
+    for first in range(0, pixels.size, columns):
+        part = slice(first, first + columns)
+        field = _field(pupil, pixels[part], y_px, node_x / 2.0, refine, workers)
+        field = field.reshape(pixels.size, node_y.size, *field.shape[1:])
         intensity = field.real**2 + field.imag**2
-        kernel[part] = np.einsum(
+        kernel[:, part] = np.einsum(
             "g,h,pghq->pq", weight_y / 2.0, weight_x / 2.0, intensity, optimize=True
         )
     area = math.pi * abs(float(np.linalg.det(pupil.image_matrix)))

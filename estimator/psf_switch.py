@@ -26,6 +26,10 @@ CROSS_FADE_DB = 0.5
 """Above the first the engines are mixed, from their sum on only rays are traced.  The
 fade is narrow, for a mixed kernel costs both; what it bridges is below 50 dB anyway."""
 
+WAVE_DB = 54.0
+"""PSNR that images filtered by the wave method, or the ENZ series where it holds,
+exceed."""
+
 _N_PLANE = 3
 """Piston and tilts."""
 
@@ -53,3 +57,10 @@ def geometric_shares(survey: PupilSurvey) -> NDArray[np.float64]:
     """Share (P,) of ray optics in each kernel: 0 wave, 1 rays, between them a fade."""
     above = (predicted_psnr_db(survey) - GEOMETRIC_FROM_DB) / CROSS_FADE_DB
     return np.clip(above, 0.0, 1.0)
+
+
+def predicted_least_psnr_db(
+    survey: PupilSurvey, geometric_ratio: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """PSNR (P,) that images filtered with these kernels should exceed."""
+    return np.where(geometric_ratio > 0.0, predicted_psnr_db(survey), WAVE_DB)

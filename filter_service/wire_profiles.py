@@ -39,7 +39,7 @@ TOLERANCES = ("loose", "normal", "fine")
 class ProfileSettings:
     """How the PSFs of a profile are computed; PROTOCOL.md explains each."""
 
-    mode: str = "on-axis"
+    mode: str = "dynamic"
     grid: str = "planned"
     tolerance: str = "normal"
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)

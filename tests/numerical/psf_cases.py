@@ -4,7 +4,10 @@ No tests here.  The wavefronts and where they come from: tests/data/psf_cases.js
 psf_field_cases.json for traced eyes over the visual field.
 """
 
+import hashlib
 import json
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +15,12 @@ import numpy as np
 import scipy.fft
 from PIL import Image, ImageDraw, ImageFont
 
+from estimator import psf_reference
 from estimator.pinhole import pixel_from_mrad
+from estimator.psf import plan_psfs
+from estimator.psf_arguments import checked_scale
 from estimator.psf_reference import reference_kernel
+from estimator.psf_survey import RADIUS_LIMIT_PX
 from estimator.psf_types import disc_mask
 from estimator.zernike import index_from_nm, remove_central_tilt, rescale_pupil
 
@@ -27,6 +34,7 @@ FIELD_CASES = json.loads(
 EYE_NAMES = tuple(FIELD_CASES["eyes"])
 ECCENTRICITIES_DEG = {(0, 0): 0, (16, 12): 20, (33, 24): 40}
 DENSITIES_MRAD = CASES["pixel_pitch_mrad"]
+KEPT_REFERENCES = Path(__file__).parents[2] / "out" / "psf_references"
 PUPILS_MM = tuple(CASES["pupil_diameters_mm"])
 
 
@@ -125,6 +133,64 @@ def truth(
     )
 
 
+@dataclass(frozen=True)
+class Window:
+    """Square of pixels about a spot: the spot and the Airy rings around it.
+
+    ``centre_px``: x right, y up, whole pixels from the chief ray.
+    """
+
+    centre_px: tuple[int, int]
+    radius_px: int
+
+    @classmethod
+    def of_spot(cls, zernike_um: np.ndarray, options: dict) -> "Window":
+        """Off axis the chief ray is not the middle of the spot."""
+        survey = plan_psfs(
+            zernike_um[None], max_radius_px=RADIUS_LIMIT_PX, **options
+        ).survey
+        middle = (survey.slope_low_px[0] + survey.slope_high_px[0]) / 2.0
+        x, y = np.rint(middle).astype(int).tolist()
+        half_px = float(survey.extent_px.max()) / 2.0
+        return cls((x, y), compared_radius_px(half_px + 0.5))
+
+    def cut(self, psf) -> np.ndarray:
+        """Shares of the whole light in the window of a PSF, float64."""
+        x, y = self.centre_px
+        room = max(0, max(abs(x), abs(y)) + self.radius_px - psf.radius_px)
+        kernel = psf.kernel.astype(np.float64) * (1.0 - psf.lost_energy_ratio)
+        kernel, middle = np.pad(kernel, room), psf.radius_px + room
+        rows = slice(middle - y - self.radius_px, middle - y + self.radius_px + 1)
+        return kernel[rows, middle + x - self.radius_px :][:, : 2 * self.radius_px + 1]
+
+    def reference(self, zernike_um: np.ndarray, options: dict) -> np.ndarray:
+        """Reference in the window, which whole pixels of tilt bring to the middle."""
+        jacobian = checked_scale(
+            options.get("pixel_pitch_mrad"), options.get("pixel_from_mrad"), 1
+        )[0]
+        shift_mrad = np.linalg.solve(jacobian, self.centre_px)
+        zernike_um = np.array(zernike_um)
+        # W = 2 C(1,1) x + 2 C(1,-1) y on the unit circle.
+        zernike_um[[2, 1]] -= shift_mrad * options["pupil_diameter_mm"] / 4.0
+        return reference_kernel(zernike_um, radius_px=self.radius_px, **options)
+
+    def kept_reference(self, zernike_um: np.ndarray, options: dict) -> np.ndarray:
+        """Return the reference, computed once and kept under out/."""
+        source = Path(psf_reference.__file__).read_bytes()
+        digest = hashlib.sha256(source + repr(self).encode())
+        for part in (zernike_um, *(options[name] for name in sorted(options))):
+            digest.update(np.asarray(part, np.float64).tobytes())
+        path = KEPT_REFERENCES / f"{digest.hexdigest()[:24]}.npy"
+        if path.is_file():
+            return np.load(path)
+        kernel = self.reference(zernike_um, options)
+        KEPT_REFERENCES.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}.npy")
+        np.save(part, kernel)
+        part.replace(path)
+        return kernel
+
+
 def physical_kernel(psf, radius_px: int) -> np.ndarray:
     """Shares of the whole light in the middle (2r+1)² of a PSF, float64."""
     kernel = psf.kernel.astype(np.float64) * (1.0 - psf.lost_energy_ratio)
@@ -182,11 +248,31 @@ def make_test_image(size_px: int = 512) -> np.ndarray:
 
 def filter_psnr_db(image: np.ndarray, kernel: np.ndarray, reference: np.ndarray):
     """PSNR (peak 1) between the image filtered with each kernel, both at unit sum."""
-    difference = kernel / kernel.sum() - reference / reference.sum()
-    size = scipy.fft.next_fast_len(image.shape[0] + difference.shape[0])
+    return filter_psnrs_db(image, kernel, reference, is_srgb=False)[0]
+
+
+def filter_psnrs_db(image, kernel, reference, *, is_srgb=True) -> tuple[float, float]:
+    """PSNR in linear light, and after sRGB encoding (nan if not asked for)."""
+    kernels = (kernel / kernel.sum(), reference / reference.sum())
+    size = scipy.fft.next_fast_len(image.shape[0] + kernel.shape[0])
     spectrum = scipy.fft.rfft2(image, (size, size))
-    spectrum *= scipy.fft.rfft2(difference, (size, size))
-    error = scipy.fft.irfft2(spectrum, (size, size))
-    half = difference.shape[0] // 2
-    inside = error[half : half + image.shape[0], half : half + image.shape[1]]
-    return float(-10.0 * np.log10(np.mean(inside**2)))
+    half = kernel.shape[0] // 2
+
+    def filtered(part):
+        part = scipy.fft.irfft2(spectrum * scipy.fft.rfft2(part, (size, size)))
+        return part[half : half + image.shape[0], half : half + image.shape[1]]
+
+    def psnr_db(error):
+        return float(-10.0 * np.log10(max(np.mean(error**2), 1e-30)))
+
+    linear_db = psnr_db(filtered(kernels[0] - kernels[1]))
+    if not is_srgb:
+        return linear_db, math.nan
+    seen, true = (encode_srgb(filtered(k)) for k in kernels)
+    return linear_db, psnr_db(seen - true)
+
+
+def encode_srgb(light: np.ndarray) -> np.ndarray:
+    light = np.clip(light, 0.0, 1.0)
+    bright = 1.055 * np.maximum(light, 1e-9) ** (1.0 / 2.4) - 0.055
+    return np.where(light <= 0.0031308, 12.92 * light, bright)

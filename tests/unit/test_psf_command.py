@@ -1,0 +1,98 @@
+"""`ocufilter psf` off axis, by every method, to JSON; and its refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from filter_service.__main__ import _exit_code
+from tests.unit.test_wavefront_command import eye_file
+
+VIEW = ["--pupil-mm", "3", "--wavelength-nm", "549", "--pixel-arcmin", "2"]
+
+__all__ = ["eye_file"]  # a fixture
+
+
+@pytest.fixture
+def psf(capsys, tmp_path):
+    """Facts and kernel of a successful call."""
+
+    def call(*arguments):
+        out = tmp_path / "psf.npy"
+        words = ["psf", *map(str, arguments), *VIEW, "-o", str(out), "--json"]
+        assert _exit_code(words) == 0
+        return json.loads(capsys.readouterr().out), np.load(out)
+
+    return call
+
+
+@pytest.fixture
+def refusal(capsys, tmp_path):
+    """Error line of a refused call."""
+
+    def call(*arguments):
+        words = ["psf", *arguments, *VIEW, "-o", str(tmp_path / "psf.npy")]
+        assert _exit_code(words) == 2
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1
+        return err
+
+    return call
+
+
+def test_methods_agree_on_axis_and_are_named(psf):
+    """Emmetropia lies in the domain of all but ray optics."""
+    auto, kernel = psf("emmetropia")
+    assert auto["method"] == "fourier"
+    assert auto["pupil_ellipse"] is None
+    assert auto["predicted_psnr_db"] == 54.0
+    for method in ("fourier", "enz"):
+        facts, other = psf("emmetropia", "--method", method)
+        assert facts["method"] == method
+        np.testing.assert_allclose(other, kernel, atol=1e-2 * kernel.max())
+    facts, _ = psf("emmetropia", "--method", "geometric")
+    assert facts["method"] == "geometric"
+    assert facts["predicted_psnr_db"] < 50.0
+
+
+def test_off_axis_the_eye_is_traced_through_its_elliptical_pupil(psf):
+    on_axis, _ = psf("emmetropia")
+    facts, kernel = psf("emmetropia", "--h-deg", 30, "--v-deg", 5)
+    assert facts["pupil_ellipse"]["ratio"] == pytest.approx(0.88, abs=0.03)
+    assert facts["h_deg"] == 30
+    assert facts["blur_radius_px"] > 3.0 * on_axis["blur_radius_px"]
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+    dimmer, other = psf("emmetropia", "--h-deg", 30, "--v-deg", 5, "--stiles-crawford")
+    assert dimmer["stiles_crawford"] and not facts["stiles_crawford"]
+    # The rim of the spot is the rim of the pupil: with it dimmed the spot is smaller.
+    assert 0.5 * _spread_px(kernel) < _spread_px(other) < 0.99 * _spread_px(kernel)
+
+
+def _spread_px(kernel):
+    """Mean distance of the light from its centre."""
+    offset = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
+    x, y = kernel.sum(0) @ offset, kernel.sum(1) @ offset
+    return float((kernel * np.hypot(offset - x, offset[:, None] - y)).sum())
+
+
+def test_surfaces_are_traced_too(eye_file, psf):
+    facts, _ = psf(eye_file, "--v-deg", -20)
+    assert facts["pupil_ellipse"]["ratio"] == pytest.approx(0.94, abs=0.03)
+    assert facts["notes"] == []
+
+
+def test_enz_refuses_what_its_series_does_not_hold(refusal):
+    assert "outside the domain" in refusal(
+        "keratoconus", "--method", "enz", *["--h-deg", "40"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--h-deg", "80"), ("--v-deg", "-76"), ("--focus-dpt", "-1")]
+)
+def test_views_out_of_range_are_refused(refusal, option, value):
+    assert option in refusal("emmetropia", option, value)
+
+
+def test_surfaces_do_not_accommodate(eye_file, refusal):
+    assert "does not accommodate" in refusal(str(eye_file), "--focus-dpt", "2")
