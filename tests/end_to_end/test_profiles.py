@@ -299,9 +299,9 @@ def test_over_the_field_a_shifted_camera_is_prepared_for_anew(client):
     first = make_view()
     left, right, up, down = first.tangents
     second = replace(first, tangents=(left + 0.1, right + 0.1, up, down))
-    for settings, reasons in (({}, set()), ({"mode": "dynamic"}, {"preparing"})):
+    for mode, reasons in (("on-axis", set()), ("dynamic", {"preparing"})):
         body = double(61, build_s=0.05)
-        client.set_profile(body, settings=settings, views=[first])
+        client.set_profile(body, settings={"mode": mode}, views=[first])
         client.filter(first, **SEE)
         client.submit(second, **SEE)
         events = stream(client, second, until=lambda e: isinstance(e, FilteredFrame))
