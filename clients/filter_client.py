@@ -195,22 +195,26 @@ class FilterClient:
         deadline_s = time.monotonic() + timeout_s
         n_awaited = n_ready = 0
         while True:
-            for event in self._link.take_events(
+            # One at a time: what came with the last one awaited is for the caller.
+            event = self._link.take_event(
                 lambda e: getattr(e, "profile_id", None) == profile_id
-            ):
-                if isinstance(event, ErrorReply):
-                    raise event.exception()
-                if isinstance(event, Progress) and on_progress is not None:
-                    on_progress(event)
-                if isinstance(event, Accepted):
-                    n_awaited = event.n_cameras
-                    if not (wait and event.is_building):
-                        return event
-                if isinstance(event, Ready):
-                    n_ready += event.is_complete
-                    if n_ready >= n_awaited or wait == "first":
-                        return event
-            self._link.pump_before(deadline_s, f"profile {profile_id} to become ready")
+            )
+            if event is None:
+                self._link.pump_before(
+                    deadline_s, f"profile {profile_id} to become ready"
+                )
+            if isinstance(event, ErrorReply):
+                raise event.exception()
+            if isinstance(event, Progress) and on_progress is not None:
+                on_progress(event)
+            if isinstance(event, Accepted):
+                n_awaited = event.n_cameras
+                if not (wait and event.is_building):
+                    return event
+            if isinstance(event, Ready):
+                n_ready += event.is_complete
+                if n_ready >= n_awaited or wait == "first":
+                    return event
 
     # Frames
 
@@ -257,11 +261,11 @@ class FilterClient:
         self, frame_id: int, deadline_s: float
     ) -> FilteredFrame | Dropped | ErrorReply:
         while True:
-            answers = self._link.take_events(
+            answer = self._link.take_event(
                 lambda e: getattr(e, "frame_id", None) == frame_id
             )
-            if answers:
-                return answers[0]
+            if answer is not None:
+                return answer
             self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
 
     def _await_ready(self, deadline_s: float) -> None:
@@ -269,13 +273,14 @@ class FilterClient:
         profile = self._link.profile
         profile_id = None if profile is None else profile.profile_id
         while True:
-            for event in self._link.take_events(
+            event = self._link.take_event(
                 lambda e: (
                     isinstance(e, Ready | ErrorReply) and e.profile_id == profile_id
                 )
-            ):
-                if isinstance(event, ErrorReply):
-                    raise event.exception()
+            )
+            if isinstance(event, ErrorReply):
+                raise event.exception()
+            if event is not None:
                 return
             self._link.pump_before(deadline_s, "the eye to be prepared for this camera")
 
@@ -353,7 +358,7 @@ class FilterClient:
             if remaining_s <= 0:
                 break
             self._link.pump(remaining_s)
-        return self._link.take_events(lambda event: True)
+        return self._link.take_events()
 
     @property
     def n_unanswered(self) -> int:

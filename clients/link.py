@@ -121,10 +121,15 @@ class ServiceLink:
         self.pending = outgoing
         self.pump(0.0)
 
-    def take_events(self, is_wanted: Callable[[Event], bool]) -> list[Event]:
-        """Return and forget the events that are wanted, oldest first."""
-        wanted = [event for event in self._events if is_wanted(event)]
-        self._events = [event for event in self._events if not is_wanted(event)]
+    def take_events(self) -> list[Event]:
+        """Return and forget all events, oldest first."""
+        taken, self._events = self._events, []
+        return taken
+
+    def take_event(self, is_wanted: Callable[[Event], bool]) -> Event | None:
+        """Return and forget the oldest event that is wanted, if any."""
+        wanted = next((event for event in self._events if is_wanted(event)), None)
+        self._events = [event for event in self._events if event is not wanted]
         return wanted
 
     @property

@@ -310,3 +310,18 @@ def test_over_the_field_a_shifted_camera_is_prepared_for_anew(client):
         client.set_profile(double(61), settings={"mode": "sideways"}, views=[first])
     assert caught.value.field == "settings.mode"
     assert "dynamic" in caught.value.allowed
+
+
+def test_what_comes_with_the_acceptance_is_not_lost(client):
+    """A quick build is ready before the client has looked at its acceptance."""
+    view = make_view()
+    first = client.set_profile(double(62), views=[view])
+    together = [
+        Accepted(first.profile_id + 1, first.generation + 1, True, 1),
+        replace(first, profile_id=first.profile_id + 1),
+    ]
+    link = client._link
+    link.say = lambda parts: link._events.extend(together)
+    accepted = client.set_profile(double(63), views=[view], wait=False)
+    assert accepted == together[0]
+    assert client.poll(0.0) == together[1:]

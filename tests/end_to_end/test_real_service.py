@@ -115,9 +115,7 @@ def test_a_blur_beyond_the_cap_is_an_error_and_not_a_wrong_image(real_client):
 def test_a_plan_beyond_the_memory_budget_is_refused_with_the_numbers(real_client):
     telescope = Camera(2000, 10, (-0.05, 0.05, 0.00025, -0.00025))
     with pytest.raises(errors.GridTooLarge, match=r"MB for \d+ PSFs") as caught:
-        real_client.set_profile(
-            MYOPIA, settings={"mode": "on-axis"}, views=[telescope]
-        )
+        real_client.set_profile(MYOPIA, settings={"mode": "on-axis"}, views=[telescope])
     assert caught.value.allowed == "2000 MB"
 
 
