@@ -6,6 +6,10 @@ TILE_SIZE_PX = 8
 THREADS = TILE_SIZE_PX * TILE_SIZE_PX
 """Threads of a tile's work group, and fragment slots of a block."""
 
+QUADS_ACROSS = TILE_SIZE_PX // 2
+QUADS = QUADS_ACROSS * QUADS_ACROSS
+"""Quads of pixels in a block, and along one side of it."""
+
 SCAN_THREADS = 256
 """Threads of the single group that sums the tile counts."""
 

@@ -4,11 +4,11 @@
 // In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval).
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
 //      reach bits, has an edge, pixels merged).
-// Dispatch: one group a block, one thread a pixel.
+// Dispatch: one group a block, one thread a quad of pixels.
 // Twin: tests/numerical/test_renderer_passes.py.  Source: section 6.3 (merging of tiled
 // splatting), there one level.
 
-layout(local_size_x = TILE_SIZE_PX, local_size_y = TILE_SIZE_PX) in;
+layout(local_size_x = QUADS) in;
 
 layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) readonly buffer Position { float position[]; };
@@ -36,13 +36,13 @@ shared uint alive[2];             // bit per thread: it keeps a fragment
 shared uint largest_reach_bits;   // reach is positive, so its bits order like it
 shared uint block_has_edge;
 shared uint block_merged_count;
-// What the thread's pixel, later the merged square that starts there, is made of.
-shared int level_of[THREADS];     // -1: belongs to a square that starts elsewhere
-shared vec4 mean[THREADS];        // linear RGB, dpt
-shared vec4 low[THREADS];
-shared vec4 high[THREADS];
-shared vec4 depth[THREADS];       // position: mean, nearest, farthest; least spread px
-shared uint edge_of[THREADS];
+// The merged square that starts at a thread's quad.
+shared int level_of[QUADS];       // 0: single pixels; -1: the quad is part of another square
+shared vec4 mean[QUADS];          // linear RGB, dpt
+shared vec4 low[QUADS];
+shared vec4 high[QUADS];
+shared vec4 positions[QUADS];     // in layers: mean, nearest, farthest; least spread px
+shared uint edge_of[QUADS];
 
 uint pixel_index(ivec2 at) { return uint(at.y * frame_size_px.x + at.x); }
 
@@ -69,24 +69,12 @@ uint kernel_at(ivec2 at, float place, out float fraction) {
     return kernel_of[cell_of(at) * interval_count(layer_count) + interval];
 }
 
-void note_pixel(ivec2 at, uint thread) {
-    vec4 pixel = pixels[pixel_index(at)];
-    float place = position[pixel_index(at)];
-    float fraction;
-    uint kernel = kernel_at(at, place, fraction);
-    mean[thread] = pixel;
-    low[thread] = pixel;
-    high[thread] = pixel;
-    depth[thread] = vec4(place, place, place, kernel_spread_px(kernel, fraction));
-    edge_of[thread] = is_edge_pixel(at, pixel.a) ? 1u : 0u;
-}
-
 // Whether a square of four of the level below may be one fragment.  Seen from a blur of
 // half the size, a square of the next level looks the same: so does its error.
 bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
+    float spread = place.w / float(1 << (level - 1));
     vec3 contrast = most.rgb - least.rgb;
     float largest = max(contrast.r, max(contrast.g, contrast.b));
-    float spread = place.w / float(1 << (level - 1));
     float fraction;
     uint kernel = kernel_at(at, place.x, fraction);
     // Neighbouring intervals at most: the kernel of the mean is then one of theirs.
@@ -97,28 +85,65 @@ bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
         && kernel_has_level(kernel, level);
 }
 
-void try_merging(ivec2 at, uint thread, int level) {
-    int half_side = 1 << (level - 1);
-    if (any(notEqual(at & (2 * half_side - 1), ivec2(0)))) return;
-    uvec4 members = thread + uint(half_side) * uvec4(0u, 1u, TILE_SIZE_PX, TILE_SIZE_PX + 1);
-    for (int i = 0; i < int(QUAD); ++i)
-        if (level_of[members[i]] != level - 1) return;
-    vec4 least = min(min(low[members.x], low[members.y]), min(low[members.z], low[members.w]));
-    vec4 most = max(max(high[members.x], high[members.y]),
-                    max(high[members.z], high[members.w]));
-    vec4 a = depth[members.x], b = depth[members.y], c = depth[members.z], d = depth[members.w];
-    vec4 place = vec4((a.x + b.x + c.x + d.x) / QUAD, min(min(a.y, b.y), min(c.y, d.y)),
-                      max(max(a.z, b.z), max(c.z, d.z)), min(min(a.w, b.w), min(c.w, d.w)));
+// Position of a pixel, three times, and the spread of its kernel.
+vec4 pixel_place(ivec2 at) {
+    float place = position[pixel_index(at)];
+    float fraction;
+    uint kernel = kernel_at(at, place, fraction);
+    return vec4(place, place, place, kernel_spread_px(kernel, fraction));
+}
+
+// Adds a member to the sum, the extremes and the places of a square.
+void take_in(vec4 value, vec4 least, vec4 most, vec4 place, bool is_first, inout vec4 sum,
+             inout vec4 all_least, inout vec4 all_most, inout vec4 all_places) {
+    sum = is_first ? value : sum + value;
+    all_least = is_first ? least : min(all_least, least);
+    all_most = is_first ? most : max(all_most, most);
+    all_places = is_first ? place
+               : vec4(all_places.x + place.x, min(all_places.y, place.y),
+                      max(all_places.z, place.z), min(all_places.w, place.w));
+}
+
+void keep_square(uint quad, int level, vec4 sum, vec4 least, vec4 most, vec4 place, uint edge) {
+    mean[quad] = sum / QUAD;
+    low[quad] = least;
+    high[quad] = most;
+    positions[quad] = place;
+    edge_of[quad] = edge;
+    level_of[quad] = level;
+}
+
+// Merges the thread's own quad, if all its pixels exist and are alike.
+void merge_pixels(ivec2 at, uint quad, uint edges) {
+    level_of[quad] = 0;
+    if (max_level == 0 || !inside(at + 1)) return;
+    vec4 sum, least, most, place;
+    for (int i = 0; i < int(QUAD); ++i) {
+        ivec2 member = at + ivec2(i & 1, i >> 1);
+        vec4 value = pixels[pixel_index(member)];
+        take_in(value, value, value, pixel_place(member), i == 0, sum, least, most, place);
+    }
+    place.x /= QUAD;
+    if (is_similar(at, 1, least, most, place))
+        keep_square(quad, 1, sum, least, most, place, edges != 0u ? 1u : 0u);
+}
+
+// Merges four squares of the level below, the first of which starts at this quad.
+void merge_squares(ivec2 at, uint quad, int level) {
+    uint side = 1u << uint(level - 2);
+    uint edge = 0u;
+    vec4 sum, least, most, place;
+    uvec4 members = quad + side * uvec4(0u, 1u, QUADS_ACROSS, QUADS_ACROSS + 1);
+    for (int i = 0; i < int(QUAD); ++i) {
+        uint m = members[i];
+        if (level_of[m] != level - 1) return;
+        take_in(mean[m], low[m], high[m], positions[m], i == 0, sum, least, most, place);
+        edge |= edge_of[m];
+    }
+    place.x /= QUAD;
     if (!is_similar(at, level, least, most, place)) return;
-    mean[thread] = (mean[members.x] + mean[members.y] + mean[members.z] + mean[members.w])
-                 / QUAD;
-    low[thread] = least;
-    high[thread] = most;
-    depth[thread] = place;
-    edge_of[thread] = edge_of[members.x] | edge_of[members.y] | edge_of[members.z]
-                    | edge_of[members.w];
     for (int i = 1; i < int(QUAD); ++i) level_of[members[i]] = -1;
-    level_of[thread] = level;
+    keep_square(quad, level, sum, least, most, place, edge);
 }
 
 // Smaller is nearer.
@@ -129,57 +154,84 @@ float sort_depth(ivec2 at, float dpt) {
     return distance_m + PAPER_TIE_BREAK_M * scan;
 }
 
-Fragment make_fragment(ivec2 at, uint thread) {
+Fragment make_fragment(ivec2 at, vec4 value, float place, int level, bool edge) {
     float fraction;
-    uint kernel = kernel_at(at, depth[thread].x, fraction);
-    return Fragment(mean[thread].rgb, sort_depth(at, mean[thread].a), at, kernel, fraction,
-                    kernel_radius_px(kernel), kernel_reach(kernel), level_of[thread],
-                    edge_of[thread] != 0u);
+    uint kernel = kernel_at(at, place, fraction);
+    return Fragment(value.rgb, sort_depth(at, value.a), at, kernel, fraction,
+                    kernel_radius_px(kernel), kernel_reach(kernel), level, edge);
+}
+
+// Bit of a pixel within the words of `alive`.
+uint pixel_bit(ivec2 local) {
+    return uint(local.y * TILE_SIZE_PX + local.x);
+}
+
+void note_survivor(uint bit, bool edge) {
+    atomicOr(alive[bit / uint(BITS_PER_WORD)], 1u << (bit % uint(BITS_PER_WORD)));
+    if (edge) block_has_edge = 1u;
+}
+
+void write_fragment(uint block, uint bit, Fragment fragment) {
+    uint word = bit / uint(BITS_PER_WORD);
+    uint before = bitCount(alive[word] & ((1u << (bit % uint(BITS_PER_WORD))) - 1u));
+    if (word == 1u) before += bitCount(alive[0]);
+    uint slot = block * uint(THREADS) + before;
+    uvec4 place = pack_place(fragment);
+    colors[slot] = vec4(fragment.linear_rgb, fragment.sort_depth);
+    places[slot] = place;
+    atomicMax(largest_reach_bits, floatBitsToUint(place_reach_px(place)));
 }
 
 void main() {
-    uint thread = gl_LocalInvocationIndex;
+    uint quad = gl_LocalInvocationIndex;
     uint block = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-    if (thread == 0u) {
+    if (quad == 0u) {
         alive[0] = 0u;
         alive[1] = 0u;
         largest_reach_bits = 0u;
         block_has_edge = 0u;
         block_merged_count = 0u;
     }
-    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    bool exists = inside(at);
-    level_of[thread] = exists ? 0 : -1;
-    if (exists) note_pixel(at, thread);
-    barrier();  // counters are clear and every pixel is noted before anyone looks
-    for (int level = 1; level <= max_level; ++level) {
-        try_merging(at, thread, level);
+    ivec2 local = 2 * ivec2(quad % uint(QUADS_ACROSS), quad / uint(QUADS_ACROSS));
+    ivec2 at = ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX + local;
+    uint edges = 0u;  // a bit for each of the quad's pixels
+    for (int i = 0; i < int(QUAD); ++i) {
+        ivec2 member = at + ivec2(i & 1, i >> 1);
+        if (inside(member) && is_edge_pixel(member, pixels[pixel_index(member)].a))
+            edges |= 1u << uint(i);
+    }
+    merge_pixels(at, quad, edges);
+    barrier();  // counters are clear and all quads are decided before anyone looks
+    for (int level = 2; level <= max_level; ++level) {
+        if (all(equal(local & ((1 << level) - 1), ivec2(0)))) merge_squares(at, quad, level);
         barrier();  // the level is whole before the next looks at it
     }
-    bool keeps = level_of[thread] >= 0;
-    uint word = thread / uint(BITS_PER_WORD);
-    uint bit = thread % uint(BITS_PER_WORD);
-    Fragment fragment;
-    uvec4 place = uvec4(0u);
-    if (keeps) {
-        fragment = make_fragment(at, thread);
-        place = pack_place(fragment);
-        atomicOr(alive[word], 1u << bit);
-        atomicMax(largest_reach_bits, floatBitsToUint(place_reach_px(place)));
-        if (fragment.is_edge) atomicOr(block_has_edge, 1u);
-        if (fragment.level > 0)
-            atomicAdd(block_merged_count, 1u << uint(2 * fragment.level));
+    int level = level_of[quad];
+    if (level > 0) {
+        note_survivor(pixel_bit(local), edge_of[quad] != 0u);
+        atomicAdd(block_merged_count, 1u << uint(2 * level));
+    }
+    for (int i = 0; i < int(QUAD); ++i) {
+        ivec2 step = ivec2(i & 1, i >> 1);
+        if (level == 0 && inside(at + step))
+            note_survivor(pixel_bit(local + step), (edges & (1u << uint(i))) != 0u);
     }
     barrier();  // every survivor is counted before slots are given out
 
-    if (keeps) {
-        uint before = bitCount(alive[word] & ((1u << bit) - 1u));
-        if (word == 1u) before += bitCount(alive[0]);
-        uint slot = block * uint(THREADS) + before;
-        colors[slot] = vec4(fragment.linear_rgb, fragment.sort_depth);
-        places[slot] = place;
+    if (level > 0)
+        write_fragment(block, pixel_bit(local),
+                       make_fragment(at, mean[quad], positions[quad].x, level,
+                                     edge_of[quad] != 0u));
+    for (int i = 0; i < int(QUAD); ++i) {
+        ivec2 step = ivec2(i & 1, i >> 1);
+        uint pixel = pixel_index(at + step);
+        if (level == 0 && inside(at + step))
+            write_fragment(block, pixel_bit(local + step),
+                           make_fragment(at + step, pixels[pixel], position[pixel], 0,
+                                         (edges & (1u << uint(i))) != 0u));
     }
-    if (thread == 0u) {
+    barrier();  // the largest reach is known
+    if (quad == 0u) {
         uint count = bitCount(alive[0]) + bitCount(alive[1]);
         blocks[block] = uvec4(count, largest_reach_bits, block_has_edge, block_merged_count);
     }

@@ -58,9 +58,10 @@ void stage(uint slot, uint at) {
 // Weight that remains under the accumulation rule.
 vec3 ruled_weight(vec3 weight, vec3 coverage, int level, bool ordered) {
 #ifdef PAPER_RULE
-    if (level > 0) {
-        float count = float(1 << (2 * level));
-        weight = 1.0 - pow(1.0 - min(weight / count, 1.0), vec3(count));
+    if (level > 0) {  // the paper merges once: four pixels
+        vec3 through = 1.0 - min(weight / QUAD, 1.0);
+        through *= through;
+        weight = 1.0 - through * through;
     }
     return weight * (1.0 - coverage);
 #else
