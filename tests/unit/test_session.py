@@ -212,7 +212,7 @@ def test_the_second_view_of_a_pair_needs_its_own_store_over_the_field_only():
     left = Camera(100, 100, (-0.6, 0.4, 0.5, -0.5))
     right = Camera(100, 100, (-0.4, 0.6, 0.5, -0.5))
     for settings, cameras in (
-        (ProfileSettings(), (left,)),
+        (ProfileSettings(mode="on-axis"), (left,)),
         (ProfileSettings(mode="quality"), (left, right)),
     ):
         session = make_session()
