@@ -18,8 +18,8 @@ EYES = (
         "Emmetropia: no error",
         {
             "courtyard": (
-                "Sign, lamps and arches are sharp;",
-                "leaves and cup, close by, are a little soft.",
+                "Sharp where it looks; the sides of the view,",
+                "and leaves and cup close by, are softer.",
             ),
             "primitives": (
                 "It looks at the letter: that is sharp.",
