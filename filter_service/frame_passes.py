@@ -94,6 +94,7 @@ class FramePasses:
         self.white_level = white_level
         self.entry_count = 0
         self.kernel_count = 0
+        self.kernel_texel_count = 0
 
     def _reserve(self, **n_bytes: int) -> None:
         for name, size in n_bytes.items():
@@ -182,6 +183,7 @@ class FramePasses:
         slots = self.tile_count * THREADS
         self.buffers.update(kernels.buffers)
         self.kernel_count = kernels.kernels.count
+        self.kernel_texel_count = kernels.texel_count
         self._reserve(
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,

@@ -34,11 +34,14 @@ class KernelSet:
     Attributes
     ----------
     kernels : FrameKernels
+    texel_count : int
+        Of all kernels, at all levels.
     buffers : dict
         KERNELS and KERNEL_OF.
     """
 
     kernels: FrameKernels
+    texel_count: int
     buffers: dict[str, Buffer]
 
 
@@ -112,9 +115,8 @@ class KernelMaker:
                 images={"ATLAS": atlas},
                 uniforms={"level": level},
             )
-        return KernelSet(
-            kernels, {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
-        )
+        kept = {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
+        return KernelSet(kernels, texels, kept)
 
     def _run(
         self,

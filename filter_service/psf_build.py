@@ -5,7 +5,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +19,11 @@ from filter_service.psf_engine import CPU, PsfEngine
 from filter_service.psf_grid import GridSpec
 from filter_service.psf_pack import PackedKernels, pack_kernels
 from filter_service.psf_plan import CachePlan, plan_cache
+from filter_service.psf_slopes import PupilStates
 from filter_service.psf_store import PsfStore
 
 COMPUTED_BEYOND = 0.2
 """Kernels are computed out to this share of the light that trimming will drop."""
-
-
-@dataclass(frozen=True)
-class _Requests:
-    """States (n,) whose PSFs make up a cache, channel fastest."""
-
-    h_deg: NDArray[np.float64]
-    v_deg: NDArray[np.float64]
-    pupil_diameter_mm: NDArray[np.float64]
-    accommodation_dpt: NDArray[np.float64]
-    total_defocus_dpt: NDArray[np.float64]
-    wavelength_nm: NDArray[np.float64]
-
-    def part(self, chosen: slice) -> dict[str, NDArray]:
-        """Arguments of `Eye.wavefronts` for some of them."""
-        return {name: values[chosen] for name, values in vars(self).items()}
 
 
 def build_psf_store(
@@ -77,8 +61,8 @@ def build_psf_store(
         eye = MeasuredWavefront.from_profile(eye)
     plan = plan or plan_cache(eye, spec)
     channels = RGB if spec.chromatic else 1
-    requests = _requests(spec, plan, channels)
-    count = requests.h_deg.size
+    states = _states(spec, plan, channels)
+    count = states.h_deg.size
     methods: Counter[str] = Counter()
     packed, blur_px = [], []
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -86,7 +70,7 @@ def build_psf_store(
             if cancelled is not None and cancelled():
                 raise BuildCancelled("a newer profile took over")
             end = first + engine.batch_count
-            batch = _computed(engine, eye, spec, requests.part(slice(first, end)))
+            batch = _computed(engine, eye, spec, states.taken(slice(first, end)))
             packed.append(
                 pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool)
             )
@@ -98,7 +82,8 @@ def build_psf_store(
     return _store(spec, eye, plan, packed, np.concatenate(blur_px), methods, build_ms)
 
 
-def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
+def _states(spec: GridSpec, plan: CachePlan, channels: int) -> PupilStates:
+    """States whose PSFs make up a cache, channel fastest."""
     v_deg, h_deg, pupils_mm, used_dpt = (
         axis.ravel()
         for axis in np.meshgrid(
@@ -113,7 +98,7 @@ def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
         return np.repeat(values, channels)
 
     shift_dpt = plan.channel_shift_dpt[of_group, :channels]
-    return _Requests(
+    return PupilStates(
         h_deg=each(h_deg[of_group]),
         v_deg=each(v_deg[of_group]),
         pupil_diameter_mm=each(pupils_mm[of_group]),
@@ -124,15 +109,15 @@ def _requests(spec: GridSpec, plan: CachePlan, channels: int) -> _Requests:
 
 
 def _computed(
-    engine: PsfEngine, eye: Eye, spec: GridSpec, states: dict[str, NDArray]
+    engine: PsfEngine, eye: Eye, spec: GridSpec, states: PupilStates
 ) -> PsfBatch:
-    found = eye.wavefronts(**states)
+    found = eye.wavefronts(**vars(states))
     return engine.compute(
         found.zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
-        wavelength_nm=states["wavelength_nm"],
-        pixel_from_mrad=spec.pixel_from_mrad(states["h_deg"], states["v_deg"]),
+        wavelength_nm=states.wavelength_nm,
+        pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.diffraction,
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),

@@ -34,7 +34,7 @@ class PupilStates:
         arrays = np.broadcast_arrays(*(np.asarray(v, float) for v in values.values()))
         return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
 
-    def taken(self, index: NDArray[np.int64]) -> "PupilStates":
+    def taken(self, index: NDArray[np.int64] | slice) -> "PupilStates":
         """Return some of the states, in any order."""
         return PupilStates(**{name: v[index] for name, v in vars(self).items()})
 

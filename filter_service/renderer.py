@@ -61,9 +61,11 @@ class Rendered:
         colour was not finite (taken as black).
     pupil_diameter_mm, focus_dpt : float
         As used.
-    fragment_count, merged_count, entry_count, kernel_count : int
-        Fragments, pixels merged into some, tile list entries, and kernels made; rows
-        that two strips of a very large frame share count twice.
+    fragment_count, merged_count, entry_count : int
+        Fragments, pixels merged into some, and tile list entries; rows that two strips
+        of a very large frame share count twice.
+    kernel_count, kernel_texel_count : int
+        Kernels in use, and texels of all their levels.
     """
 
     color: NDArray
@@ -77,6 +79,7 @@ class Rendered:
     merged_count: int
     entry_count: int
     kernel_count: int
+    kernel_texel_count: int
     layer_count: int
     notes: list[str]
 
@@ -164,7 +167,7 @@ class FilterRenderer:
             whole = replace(view, color=color, depth_m=depth.depth_m)
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
-        counts = np.zeros(4, dtype=np.int64)
+        counts = np.zeros(5, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
@@ -188,6 +191,7 @@ class FilterRenderer:
                 *passes.fragment_counts(),
                 passes.entry_count,
                 passes.kernel_count,
+                passes.kernel_texel_count,
             )
         self._gpu.check("render")
         notes = list(layers.notes)
@@ -207,6 +211,7 @@ class FilterRenderer:
             merged_count=int(counts[1]),
             entry_count=int(counts[2]),
             kernel_count=int(counts[3]),
+            kernel_texel_count=int(counts[4]),
             layer_count=len(layers.object_dpt),
             notes=notes,
         )

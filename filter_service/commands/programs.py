@@ -21,6 +21,8 @@ class Bench(StrEnum):
     ESTIMATE = "estimate"
     PLAN = "plan"
     PSF = "psf"
+    BUILD = "build"
+    LAYERS = "layers"
     RENDER = "render"
     SWITCH = "switch"
     ROUNDTRIP = "roundtrip"
@@ -30,6 +32,8 @@ BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
     Bench.PLAN: "tests.benchmarks.bench_plan",
     Bench.PSF: "tests.benchmarks.bench_psf",
+    Bench.BUILD: "tests.benchmarks.bench_psf_build",
+    Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ROUNDTRIP: "clients.latency",

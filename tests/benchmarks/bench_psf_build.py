@@ -137,7 +137,7 @@ def _times_s(build, part: Slice, repeats: int) -> tuple[list[float], float]:
 def _rows(method, case, setting, n, times_s, errors) -> list[Row]:
     return [
         Row(
-            bench="psf_build",
+            bench="build",
             method=method,
             case=case,
             setting=setting,
@@ -215,7 +215,7 @@ def whole_set_rows(gpu: Gpu, image, eye: str = "emmetropia") -> list[Row]:
 
 
 def main() -> None:
-    """Print rows and rates, and write tests/benchmarks/results/psf_build.json."""
+    """Print rows and rates, and write tests/benchmarks/results/build.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one slice, only auto")
     parser.add_argument("--whole", action="store_true", help="the whole set as well")
