@@ -1,0 +1,235 @@
+"""All methods of `bench_field` on one footing: a view and a state in, an image out."""
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from filter_service.frame import View, fill_missing_depth, object_dpt
+from filter_service.gpu import Gpu
+from filter_service.psf_build import build_psf_store
+from filter_service.psf_grid import GridSpec
+from filter_service.renderer import FilterRenderer
+from tests.benchmarks.baseline_types import Filtered
+from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
+from tests.benchmarks.paper_baselines import (
+    paper_dynamic,
+    paper_on_axis,
+    paper_quality,
+    predecessor,
+)
+from tests.numerical.plan_cases import traced_eye
+
+PUPIL_RANGE_MM = (2.0, 7.0)
+FOCUS_RANGE_DPT = (0.0, 3.0)
+PAPER_RANGES = {"pupil_range_mm": (2.0, 6.0), "focus_range_dpt": (0.125, 4.125)}
+
+DISTANCE_STEP_DPT = 0.25
+"""Ranges of object distances are rounded up to this."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What a frame asks of the eye."""
+
+    pupil_mm: float
+    focus_dpt: float
+
+    def __str__(self) -> str:
+        return f"{self.pupil_mm:.2f} mm {self.focus_dpt:.2f} dpt"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to filter a view.
+
+    Attributes
+    ----------
+    name : str
+    on_axis : bool
+        Which reference it aims at: one PSF per distance, or the whole visual field.
+    any_state : bool
+        Whether pupil and focus may be anything without a new preparation.
+    """
+
+    name: str
+    on_axis: bool
+    any_state: bool
+
+    def states(self, fixed: State, others: list[State]) -> list[State]:
+        """States that it is measured in."""
+        return [fixed, *others] if self.any_state else [fixed]
+
+
+class EyeBench:
+    """One eye before one camera: states for references, and stores for the renderer."""
+
+    def __init__(self, gpu: Gpu, name: str, views: list[View]):
+        self._gpu, self._name = gpu, name
+        self._camera = {
+            "width_px": views[0].width_px,
+            "height_px": views[0].height_px,
+            "tangents": views[0].tangents,
+        }
+        nearest_dpt = max(
+            object_dpt(view, fill_missing_depth(view.depth_m)[0]).max()
+            for view in views
+        )
+        steps = np.ceil(nearest_dpt / DISTANCE_STEP_DPT)
+        self._object_range_dpt = (0.0, float(DISTANCE_STEP_DPT * steps))
+        self._stores = {}
+
+    def spec(self, mode: str, **settings) -> GridSpec:
+        """Spec for this camera and these depths."""
+        settings = {"object_range_dpt": self._object_range_dpt, **settings}
+        return GridSpec.for_camera(**self._camera, mode=mode, **settings)
+
+    def exact_state(self, state: State, *, on_axis: bool) -> EyeState:
+        """Eye traced for this very pupil and focus."""
+        spec = self.spec(
+            "on-axis" if on_axis else "quality",
+            pupil_range_mm=(state.pupil_mm,) * 2,
+            focus_range_dpt=(state.focus_dpt,) * 2,
+        )
+        eye = traced_eye(self._name, spec)
+        return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
+
+    def grid_state(self, state: State) -> EyeState:
+        """Eye traced as far as the paper's grids reach, in angle, pupil and focus."""
+        spec = self.spec("quality", grid="paper", **PAPER_RANGES)
+        eye = traced_eye(self._name, spec)
+        return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
+
+    def store(self, method: "Ours", state: State):
+        """Store of a method of ours, on the GPU, and how long it took to build."""
+        settings = method.settings(state)
+        key = (method.name, *settings.values())
+        if key not in self._stores:
+            spec = self.spec(**settings)
+            eye = traced_eye(self._name, spec)
+            start_s = time.perf_counter()
+            store = build_psf_store(eye, spec)
+            build_ms = 1e3 * (time.perf_counter() - start_s)
+            self._stores[key] = (self.renderer.load(store), build_ms)
+        return self._stores[key]
+
+    @cached_property
+    def renderer(self) -> FilterRenderer:
+        """Shared by all stores."""
+        return FilterRenderer(self._gpu)
+
+    def release(self) -> None:
+        """Free the stores on the GPU."""
+        for handle, _ in self._stores.values():
+            handle.release()
+        self._stores.clear()
+
+
+@dataclass(frozen=True)
+class Ours(Method):
+    """The renderer, with a store for the fixed state or for all states."""
+
+    mode: str = "dynamic"
+    grid: str = "planned"
+    accumulation: str = "coverage"
+
+    def settings(self, state: State) -> dict:
+        """Settings of its store."""
+        ranges = {"pupil_range_mm": PUPIL_RANGE_MM, "focus_range_dpt": FOCUS_RANGE_DPT}
+        if self.grid == "paper":
+            ranges = PAPER_RANGES
+        elif not self.any_state:
+            ranges = {
+                "pupil_range_mm": (state.pupil_mm,) * 2,
+                "focus_range_dpt": (state.focus_dpt,) * 2,
+            }
+        return {"mode": self.mode, "grid": self.grid, **ranges}
+
+    def run(self, bench: EyeBench, view: View, state: State, repeats: int) -> list:
+        """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
+        handle, build_ms = bench.store(self, state)
+        results = []
+        for _ in range(1 + repeats):
+            start_s = time.perf_counter()
+            rendered = bench.renderer.render(
+                view,
+                handle,
+                pupil_diameter_mm=state.pupil_mm,
+                focus_dpt=state.focus_dpt,
+                accumulation=self.accumulation,
+            )
+            results.append(
+                Filtered(
+                    color=rendered.color,
+                    prepare_ms=build_ms,
+                    render_ms=1e3 * (time.perf_counter() - start_s),
+                    memory_mb=handle.store.memory_mb,
+                    psf_count=handle.store.psf_count,
+                )
+            )
+        return results[1:]
+
+
+@dataclass(frozen=True)
+class Baseline(Method):
+    """A function of `layered_baselines` or `paper_baselines`."""
+
+    function: object = None
+    options: tuple = ()
+    needs_whole_grid: bool = False
+
+    def run(self, bench: EyeBench, view: View, state: State, repeats: int) -> list:
+        """Filter once: preparation and frame are timed apart, and take long."""
+        del repeats
+        if self.needs_whole_grid:
+            at = bench.grid_state(state)
+        else:
+            at = bench.exact_state(state, on_axis=self.on_axis)
+        return [self.function(view, at, **dict(self.options))]
+
+
+PAPER_RULE = (("paper_rule", True),)
+
+OURS = (
+    Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
+    Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
+    Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
+    Ours("ours dynamic", on_axis=False, any_state=True),
+    Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
+)
+ON_AXIS_BASELINES = (
+    Baseline("Barsky", True, False, barsky),
+    Baseline("predecessor", True, False, predecessor),
+    Baseline("paper on-axis", True, False, paper_on_axis),
+    Baseline("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
+)
+FIELD_BASELINES = (
+    Baseline("Celaya", False, False, celaya),
+    Baseline("Gonzalez", False, False, gonzalez),
+    Baseline("paper quality", False, False, paper_quality, (), True),
+    Baseline("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
+    Baseline("paper dynamic", False, True, paper_dynamic, (), True),
+)
+METHODS = (*OURS, *ON_AXIS_BASELINES, *FIELD_BASELINES)
+
+
+def warmed_up(gpu: Gpu, view: View) -> None:
+    """Run every baseline once on a corner of a view, so that all is compiled."""
+    left, right, up, down = view.tangents
+    share = (48 / view.width_px, 32 / view.height_px)
+    corner = replace(
+        view,
+        color=view.color[:32, :48].copy(),
+        depth_m=view.depth_m[:32, :48].copy(),
+        tangents=(
+            left,
+            left + (right - left) * share[0],
+            up,
+            up + (down - up) * share[1],
+        ),
+    )
+    bench = EyeBench(gpu, "emmetropia", [corner])
+    for method in (*ON_AXIS_BASELINES, *FIELD_BASELINES[:3]):
+        method.run(bench, corner, State(3.0, 0.5), 1)

@@ -1,0 +1,321 @@
+"""The paper's renderer and its predecessor's on the processor: splats from textures.
+
+What is compared is how PSFs are laid out and interpolated: every source is splat near
+to far as in the dense reference, with coverage accumulation, or with the paper's own
+rule.  Tiles and merging only save time, so they are left out: the time of these rows
+is that of a scatter over all cores, and `tap_count` says how many samples the layout
+reads.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from filter_service.frame import View
+from filter_service.psf_nodes import bracket_axis
+from tests.benchmarks.baseline_types import Filtered, Stopwatch
+from tests.benchmarks.dense_reference import (
+    BAND_ROWS,
+    EyeState,
+    Sources,
+    linear_color,
+    normalised,
+    view_sources,
+)
+from tests.benchmarks.paper_layout import (
+    BYTES_PER_TEXEL,
+    DYNAMIC,
+    ON_AXIS,
+    QUALITY,
+    PaperGrid,
+    PaperTexture,
+    paper_texture,
+)
+from tests.benchmarks.resized_psfs import full_radius_px, resized
+
+PREDECESSOR_TAPS = 6
+ON_AXIS_TAPS = 1
+OFF_AXIS_TAPS = 4
+
+DYNAMIC_PUPILS_MM = np.arange(2.0, 7.0)
+DYNAMIC_FOCI_DPT = 0.125 + np.arange(5.0)
+
+
+def predecessor(
+    view: View,
+    state: EyeState,
+    *,
+    grid: PaperGrid = ON_AXIS,
+    paper_rule: bool = False,
+) -> Filtered:
+    """Stack of every PSF at every blur radius: six samples a chromatic value.
+
+    Each channel has its own blur radius, interpolated over distance, and reads the two
+    neighbouring distances there; the texture unit blends two whole radii.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, 6.1, on its predecessor (reference 49 there): N_d (R + 1)
+    layers, Table 6.
+    """
+    watch = Stopwatch()
+    cut = grid.precomputed(state)
+    radius = full_radius_px(cut.radius_px) + 1
+    psfs = resized(cut, np.zeros(cut.sides.size), np.full(cut.sides.size, radius))
+    radii_px = cut.radius_px.reshape(-1, 3)
+    stack = _padded_stack(psfs.flat_kernels, psfs.starts, radius)
+    prepare_ms = watch.lap_ms()
+    sources = view_sources(view, state.spec)
+    lower, upper, part = bracket_axis(grid.distance_dpt, sources.distance_dpt)
+    part = part[:, None]
+    own_px = (1.0 - part) * radii_px[lower] + part * radii_px[upper]
+    whole = np.minimum(own_px.astype(np.int64), radius - 1)
+    above = own_px - whole
+    layers, weights = [], []
+    for node, share in ((lower, 1.0 - part), (upper, part)):
+        for step, scale in ((0, 1.0 - above), (1, above)):
+            layers.append(node[:, None] * (radius + 1) + whole + step)
+            weights.append(share * scale)
+    color, evaluations = _splat(
+        view,
+        sources,
+        stack,
+        np.stack(layers, axis=-1),
+        np.stack(weights, axis=-1),
+        np.ceil(own_px.max(axis=1) - 1e-9),
+        paper_rule,
+    )
+    return Filtered(
+        color=color,
+        prepare_ms=prepare_ms,
+        render_ms=watch.lap_ms(),
+        memory_mb=len(stack) * stack.shape[2] ** 2 * BYTES_PER_TEXEL / 1e6,
+        psf_count=cut.sides.size,
+        tap_count=PREDECESSOR_TAPS * evaluations,
+    )
+
+
+def paper_on_axis(view: View, state: EyeState, *, paper_rule: bool = False) -> Filtered:
+    """Layers by distance with transitional ones between: one sample (Eq. 8, 6.1-6.2).
+
+    33 distances; pupil and focus are the frame's, not between nodes.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, sections 6.1 and 6.2.
+    """
+    return _from_texture(view, state, ON_AXIS, ON_AXIS_TAPS, paper_rule)
+
+
+def paper_quality(
+    view: View,
+    state: EyeState,
+    *,
+    grid: PaperGrid = QUALITY,
+    paper_rule: bool = False,
+) -> Filtered:
+    """Blocks of layers by direction, 31 x 21 x 9 and transitional ones: four samples.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, section 6.3 (Eqs. 9 to 13, s = 1, p = 1/2) and 7.2.2.
+    """
+    return _from_texture(view, state, grid, OFF_AXIS_TAPS, paper_rule)
+
+
+def paper_dynamic(
+    view: View,
+    state: EyeState,
+    *,
+    grid: PaperGrid = DYNAMIC,
+    paper_rule: bool = False,
+) -> Filtered:
+    """Blocks of 23 x 13 x 9 PSFs without transitional layers, blended over the state.
+
+    Textures of the two neighbouring pupils (2 to 6 mm) and foci (0.125 to 4.125 dpt)
+    are blended texel by texel; the memory is that of all 25 and of the blend.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, sections 6.4 and 7.2.2.
+    """
+    watch = Stopwatch()
+    corners = []
+    for pupil_mm, pupil_share in _ends(DYNAMIC_PUPILS_MM, state.pupil_diameter_mm):
+        for focus_dpt, focus_share in _ends(DYNAMIC_FOCI_DPT, state.focus_dpt):
+            if pupil_share * focus_share > 0.0:
+                at = replace(state, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+                texture = paper_texture(at, grid)
+                corners.append((pupil_share * focus_share, texture))
+    side = max(texture.weights.shape[2] for _, texture in corners)
+    first = corners[0][1]
+    prepare_ms = watch.lap_ms()
+    blended = np.zeros((*first.weights.shape[:2], side, side), np.float32)
+    for share, texture in corners:
+        edge = (side - texture.weights.shape[2]) // 2
+        inner = slice(edge, side - edge)
+        blended[:, :, inner, inner] += np.float32(share) * texture.weights
+    radius_px = np.max([texture.radius_px for _, texture in corners], axis=0)
+    texture = replace(first, weights=blended, radius_px=radius_px)
+    states = DYNAMIC_PUPILS_MM.size * DYNAMIC_FOCI_DPT.size
+    color, evaluations = _splat_texture(view, state, texture, paper_rule)
+    return Filtered(
+        color=color,
+        prepare_ms=prepare_ms,
+        render_ms=watch.lap_ms(),
+        memory_mb=(states + 1) * texture.memory_mb,
+        psf_count=states * texture.psf_count,
+        tap_count=OFF_AXIS_TAPS * evaluations,
+    )
+
+
+def _from_texture(view, state, grid, taps, paper_rule) -> Filtered:
+    watch = Stopwatch()
+    texture = paper_texture(state, grid)
+    prepare_ms = watch.lap_ms()
+    color, evaluations = _splat_texture(view, state, texture, paper_rule)
+    return Filtered(
+        color=color,
+        prepare_ms=prepare_ms,
+        render_ms=watch.lap_ms(),
+        memory_mb=texture.memory_mb,
+        psf_count=texture.psf_count,
+        tap_count=taps * evaluations,
+    )
+
+
+def _ends(nodes: NDArray, value: float) -> list[tuple[float, float]]:
+    lower, upper, share = bracket_axis(nodes, value)
+    ends = [(float(nodes[lower]), 1.0 - float(share))]
+    return [*ends, (float(nodes[upper]), float(share))] if share > 0.0 else ends
+
+
+def _splat_texture(
+    view: View, state: EyeState, texture: PaperTexture, paper_rule: bool
+) -> tuple[NDArray, int]:
+    """Splat every pixel with two layers of each of the blocks around its direction."""
+    sources = view_sources(view, state.spec)
+    ends = [
+        axis.position(values)
+        for axis, values in (
+            (texture.v, sources.v_deg),
+            (texture.h, sources.h_deg),
+            (texture.distance, sources.distance_dpt),
+        )
+    ]
+    counts = (texture.v.count, texture.h.count, texture.distance.count)
+    layers, weights = [], []
+    for corner in np.ndindex(2, 2, 2):
+        index = [
+            np.minimum(lower + step, count - 1)
+            for (lower, _), step, count in zip(ends, corner, counts, strict=True)
+        ]
+        share = 1.0
+        for (_, part), step in zip(ends, corner, strict=True):
+            share = share * (part if step else 1.0 - part)
+        if np.any(share > 0.0):
+            layers.append(np.ravel_multi_index(index, counts))
+            weights.append(share)
+    layers, weights = np.stack(layers, axis=-1), np.stack(weights, axis=-1)
+    used_px = np.where(weights > 0.0, texture.radius_px[layers], 0.0)
+    return _splat(
+        view,
+        sources,
+        texture.weights,
+        np.repeat(layers[:, None], 3, axis=1),
+        np.repeat(weights[:, None], 3, axis=1),
+        np.ceil(used_px.max(axis=1) - 1e-9),
+        paper_rule,
+    )
+
+
+def _splat(
+    view: View,
+    sources: Sources,
+    texture: NDArray,
+    layers: NDArray,
+    weights: NDArray,
+    radius_px: NDArray,
+    paper_rule: bool,
+) -> tuple[NDArray, int]:
+    """Splat sources near to far; image, and how many PSF values were made."""
+    order = sources.near_first()
+    light = np.zeros((3, view.height_px, view.width_px))
+    coverage = np.zeros_like(light)
+    radius_px = np.minimum(radius_px.astype(np.int64), texture.shape[2] // 2)
+    evaluations = np.zeros(-(-view.height_px // BAND_ROWS), np.int64)
+    _add_layers(
+        *np.divmod(order, view.width_px),
+        sources.color[order],
+        layers[order],
+        weights[order].astype(np.float32),
+        radius_px[order],
+        texture,
+        paper_rule,
+        light,
+        coverage,
+        evaluations,
+    )
+    picture = normalised(light, coverage, linear_color(view))
+    return picture, int(evaluations.sum())
+
+
+def _padded_stack(flat, starts, radius) -> NDArray[np.float32]:
+    """Texture [distance * (R + 1) + radius, channel] of all PSFs at all radii."""
+    n_distances = starts.size // 3
+    stack = np.zeros((n_distances * (radius + 1), 3, 2 * radius + 1, 2 * radius + 1))
+    stack = stack.astype(np.float32)
+    for p, start in enumerate(starts):
+        for r in range(radius + 1):
+            side = 2 * r + 1
+            inner = slice(radius - r, radius + r + 1)
+            stack[p // 3 * (radius + 1) + r, p % 3, inner, inner] = flat[
+                start : start + side * side
+            ].reshape(side, side)
+            start += side * side
+    return stack
+
+
+@njit(parallel=True, cache=True)
+def _add_layers(
+    rows,
+    columns,
+    color,
+    layers,
+    shares,
+    radius_px,
+    texture,
+    paper_rule,
+    light,
+    coverage,
+    evaluations,
+):
+    height, width = light.shape[1:]
+    full = texture.shape[2] // 2
+    n_taps = layers.shape[2]
+    for band in prange(-(-height // BAND_ROWS)):
+        top = band * BAND_ROWS
+        bottom = min(height, top + BAND_ROWS)
+        line = np.empty(width, np.float32)
+        for n in range(rows.size):
+            y, x, r = rows[n], columns[n], radius_px[n]
+            left, right = max(0, x - r), min(width, x + r + 1)
+            for to_y in range(max(top, y - r), min(bottom, y + r + 1)):
+                evaluations[band] += right - left
+                for c in range(3):
+                    line[: right - left] = 0.0
+                    for tap in range(n_taps):
+                        share = shares[n, c, tap]
+                        if share == 0.0:
+                            continue
+                        psf = texture[layers[n, c, tap], c, to_y - y + full]
+                        for k in range(right - left):
+                            line[k] += share * psf[left + k - x + full]
+                    for k in range(right - left):
+                        weight = np.float64(line[k])
+                        room = 1.0 - coverage[c, to_y, left + k]
+                        weight = weight * room if paper_rule else min(weight, room)
+                        light[c, to_y, left + k] += weight * color[n, c]
+                        coverage[c, to_y, left + k] += weight

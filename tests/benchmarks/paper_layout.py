@@ -1,0 +1,262 @@
+"""The paper's PSF textures, and the predecessor's, as arrays.
+
+A texture is [layer, channel, row, column]: every layer padded to the same 2R+1 square,
+R being the largest radius of all, with the PSF in its middle.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.resized_psfs import (
+    ResizedPsfs,
+    cut_psfs,
+    full_radius_px,
+    resized,
+    squares_below,
+)
+
+BYTES_PER_TEXEL = 4
+"""R11F_G11F_B10F, the released code's format; here weights are 32-bit floats."""
+
+
+@dataclass(frozen=True)
+class PaperGrid:
+    """Axes of precomputed PSFs, and how many layers may go between them.
+
+    Attributes
+    ----------
+    h_deg, v_deg, distance_dpt : (n,)
+        Uniform and ascending.
+    reduction : (s, p) or None
+        Of Eq. 13; without it Eqs. 8 to 12 hold as they are, and ``(100, 100)`` leaves
+        no transitional layers.
+    """
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    distance_dpt: NDArray[np.float64]
+    reduction: tuple[float, float] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of nodes (v, h, distance)."""
+        return self.v_deg.size, self.h_deg.size, self.distance_dpt.size
+
+    def precomputed(self, state: EyeState):
+        """Cut PSFs of the nodes in C order [v, h, distance, channel]."""
+        v_deg, h_deg, distance_dpt = np.meshgrid(
+            self.v_deg, self.h_deg, self.distance_dpt, indexing="ij"
+        )
+        return cut_psfs(state, h_deg, v_deg, distance_dpt)
+
+
+def paper_distances_dpt(count: int) -> NDArray[np.float64]:
+    """Object distances of the released code."""
+    return np.linspace(0.125, 8.125, count)
+
+
+ON_AXIS = PaperGrid(np.zeros(1), np.zeros(1), paper_distances_dpt(33))
+QUALITY = PaperGrid(
+    np.linspace(-45.0, 45.0, 31),
+    np.linspace(-25.0, 25.0, 21),
+    paper_distances_dpt(9),
+    reduction=(1.0, 0.5),
+)
+DYNAMIC = PaperGrid(
+    np.linspace(-45.0, 45.0, 23),
+    np.linspace(-24.0, 24.0, 13),
+    paper_distances_dpt(9),
+    reduction=(100.0, 100.0),
+)
+
+
+@dataclass(frozen=True)
+class LayerAxis:
+    """Layers along one axis: nodes and what goes between them.
+
+    Attributes
+    ----------
+    nodes : (n,)
+    first_layer : (n,)
+        Layer of a node.
+    base, fraction : (n_layers,)
+        Interval of a layer, and where in it.
+    """
+
+    nodes: NDArray[np.float64]
+    first_layer: NDArray[np.int64]
+    base: NDArray[np.int64]
+    fraction: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, nodes: NDArray, intervals: NDArray) -> "LayerAxis":
+        """Nodes and the numbers (n - 1,) of steps between them."""
+        first = np.concatenate([[0], np.cumsum(intervals)]).astype(np.int64)
+        base = np.repeat(np.arange(nodes.size - 1), intervals)
+        fraction = (np.arange(base.size) - first[base]) / np.asarray(intervals)[base]
+        last = max(nodes.size - 2, 0), float(nodes.size > 1)
+        return cls(nodes, first, np.append(base, last[0]), np.append(fraction, last[1]))
+
+    @property
+    def count(self) -> int:
+        """Number of layers."""
+        return self.base.size
+
+    def position(self, values: NDArray) -> tuple[NDArray, NDArray]:
+        """Layer below values (n,), and the share of the one above it."""
+        exact = np.interp(values, self.nodes, self.first_layer)
+        lower = np.minimum(exact.astype(np.int64), max(self.count - 2, 0))
+        return lower, exact - lower
+
+
+@dataclass(frozen=True)
+class PaperTexture:
+    """Layers of PSFs by direction and distance.
+
+    Attributes
+    ----------
+    weights : (n_v * n_h * n_d, 3, 2R+1, 2R+1) float32
+    radius_px : (n_layers,)
+        Of the largest channel of each layer.
+    v, h, distance : LayerAxis
+    psf_count : int
+    """
+
+    weights: NDArray[np.float32]
+    radius_px: NDArray[np.float64]
+    v: LayerAxis
+    h: LayerAxis
+    distance: LayerAxis
+    psf_count: int
+
+    @property
+    def memory_mb(self) -> float:
+        """Size of the published format."""
+        return self.weights.size // 3 * BYTES_PER_TEXEL / 1e6
+
+
+def interval_count(
+    radius_px: NDArray, axis: int, reduction: tuple[float, float] | None
+) -> NDArray[np.int64]:
+    """Steps (n - 1,) between the nodes of an axis: transitional layers and one.
+
+    Eqs. 8 to 12: the largest change of radius anywhere in the interval, rounded up.
+    Eq. 13 divides it by (s L)^p, as released: never below one, rounded down.
+    """
+    change_px = np.abs(np.diff(radius_px, axis=axis))
+    others = tuple(a for a in range(radius_px.ndim) if a != axis)
+    steps = np.maximum(np.ceil(change_px.max(axis=others) - 1e-9), 1.0)
+    if reduction is not None:
+        s, p = reduction
+        shrink = np.exp(np.minimum(p * np.log(np.maximum(steps * s, 1.0)), 700.0))
+        steps = np.maximum(np.floor(steps / shrink), 1.0)
+    return steps.astype(np.int64)
+
+
+def paper_texture(state: EyeState, grid: PaperGrid) -> PaperTexture:
+    """Build the texture of one pupil and focus (paper sections 6.1 to 6.3).
+
+    A layer's PSF is, per channel, interpolated over distance and direction at equal
+    radius, for the whole radii below and above the interpolated radius, and between
+    those two.
+    """
+    cut = grid.precomputed(state)
+    radii = cut.radius_px.reshape(*grid.shape, 3)
+    largest = radii.max(axis=-1)
+    axes = [
+        LayerAxis.of(nodes, interval_count(largest, a, grid.reduction))
+        for a, nodes in enumerate((grid.v_deg, grid.h_deg, grid.distance_dpt))
+    ]
+    first_px, last_px = _neighbour_radii(radii)
+    psfs = resized(cut, first_px.ravel(), last_px.ravel())
+    shape = tuple(axis.count for axis in axes)
+    radius = full_radius_px(radii)
+    weights = np.zeros((math.prod(shape), 3, 2 * radius + 1, 2 * radius + 1), "f4")
+    layer_radius_px = np.empty(math.prod(shape))
+    bases = [axis.base for axis in axes]
+    fractions = [axis.fraction for axis in axes]
+    _fill_layers(
+        *bases, *fractions, radii, *_parts(psfs, radii.shape), weights, layer_radius_px
+    )
+    return PaperTexture(weights, layer_radius_px, *axes, psf_count=cut.sides.size)
+
+
+def _parts(psfs: ResizedPsfs, shape: tuple) -> tuple[NDArray, NDArray, NDArray]:
+    return psfs.flat_kernels, psfs.starts.reshape(shape), psfs.first_px.reshape(shape)
+
+
+def _neighbour_radii(radii: NDArray) -> tuple[NDArray, NDArray]:
+    """Whole radii that layers beside a node can need."""
+    low, high = np.floor(radii + 1e-9), np.floor(radii + 1e-9) + 1
+    for axis in range(3):
+        padding = [(1, 1) if a == axis else (0, 0) for a in range(4)]
+        low = np.pad(low, padding, mode="edge")
+        high = np.pad(high, padding, mode="edge")
+        size = radii.shape[axis]
+        around = [range(k, k + size) for k in range(3)]
+        low = np.min([low.take(r, axis) for r in around], axis=0)
+        high = np.max([high.take(r, axis) for r in around], axis=0)
+    return low.astype(np.int64), high.astype(np.int64)
+
+
+@njit(parallel=True, cache=True)
+def _fill_layers(
+    base_v,
+    base_h,
+    base_d,
+    part_v,
+    part_h,
+    part_d,
+    radii,
+    kernels,
+    starts,
+    first_px,
+    weights,
+    layer_radius_px,
+):
+    n_v, n_h, n_d = radii.shape[:3]
+    full = weights.shape[2] // 2
+    for block in prange(base_v.size * base_h.size):
+        iv, ih = block // base_h.size, block % base_h.size
+        for iz in range(base_d.size):
+            layer = block * base_d.size + iz
+            largest = 0.0
+            for c in range(3):
+                radius = 0.0
+                for corner in range(8):
+                    v = min(base_v[iv] + (corner >> 2), n_v - 1)
+                    h = min(base_h[ih] + (corner >> 1 & 1), n_h - 1)
+                    d = min(base_d[iz] + (corner & 1), n_d - 1)
+                    share = part_v[iv] if corner >> 2 else 1.0 - part_v[iv]
+                    share *= part_h[ih] if corner >> 1 & 1 else 1.0 - part_h[ih]
+                    share *= part_d[iz] if corner & 1 else 1.0 - part_d[iz]
+                    radius += share * radii[v, h, d, c]
+                largest = max(largest, radius)
+                whole = int(radius + 1e-9)
+                above = radius - whole if radius - whole > 1e-6 else 0.0
+                for corner in range(8):
+                    v = min(base_v[iv] + (corner >> 2), n_v - 1)
+                    h = min(base_h[ih] + (corner >> 1 & 1), n_h - 1)
+                    d = min(base_d[iz] + (corner & 1), n_d - 1)
+                    share = part_v[iv] if corner >> 2 else 1.0 - part_v[iv]
+                    share *= part_h[ih] if corner >> 1 & 1 else 1.0 - part_h[ih]
+                    share *= part_d[iz] if corner & 1 else 1.0 - part_d[iz]
+                    if share == 0.0:
+                        continue
+                    for step in range(2):
+                        scale = share * (above if step else 1.0 - above)
+                        if scale == 0.0:
+                            continue
+                        r = whole + step
+                        at = starts[v, h, d, c]
+                        at += squares_below(r) - squares_below(first_px[v, h, d, c])
+                        for y in range(full - r, full + r + 1):
+                            for x in range(full - r, full + r + 1):
+                                weights[layer, c, y, x] += scale * kernels[at]
+                                at += 1
+            layer_radius_px[layer] = largest

@@ -1,0 +1,317 @@
+"""The renderer's references and baselines against plain loops and convolutions."""
+
+import numpy as np
+import pytest
+from scipy.signal import fftconvolve
+
+from filter_service.frame import View
+from filter_service.psf_grid import GridSpec
+from tests.benchmarks.dense_reference import EyeState, dense_reference, view_sources
+from tests.benchmarks.image_measures import ciede2000, measures, ssim
+from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
+from tests.benchmarks.paper_baselines import (
+    paper_dynamic,
+    paper_on_axis,
+    paper_quality,
+    predecessor,
+)
+from tests.benchmarks.paper_layout import (
+    ON_AXIS,
+    LayerAxis,
+    PaperGrid,
+    interval_count,
+    paper_texture,
+)
+from tests.numerical.plan_cases import traced_eye
+from tests.numerical.synthetic import psnr_db, tangents, texture
+from tests.numerical.test_renderer_field import (
+    FOCUS_DPT,
+    PUPIL_MM,
+    FieldBench,
+    splat_exactly,
+    tangents_of,
+)
+
+WIDTH, HEIGHT = 56, 42
+
+
+class ExactBench(FieldBench):
+    """The renderer's bench without a renderer: `exact_kernels` alone."""
+
+    def __init__(self, state):
+        self.spec, self.eye = state.spec, state.eye
+
+
+def eye_state(
+    name, view_tangents, mode="quality", size=(WIDTH, HEIGHT), focus_dpt=FOCUS_DPT
+):
+    spec = GridSpec.for_camera(
+        width_px=size[0],
+        height_px=size[1],
+        tangents=view_tangents,
+        pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+        focus_range_dpt=(focus_dpt, focus_dpt),
+        mode=mode,
+    )
+    return EyeState(traced_eye(name, spec), spec, PUPIL_MM, focus_dpt)
+
+
+def radial_view(state, color, distance_dpt):
+    shape = color.shape[:2]
+    distance_m = 1.0 / np.broadcast_to(np.asarray(distance_dpt, float), shape)
+    return View(
+        color.astype(np.float32),
+        distance_m.astype(np.float32),
+        state.spec.camera.tangents,
+        "radial",
+    )
+
+
+def off_axis():
+    """Small kernels of strong coma, off both axes."""
+    return eye_state("keratoconus", tangents_of(10, 22, 5, 14))
+
+
+def on_axis():
+    narrow = tangents(WIDTH, HEIGHT, 9.0)
+    return eye_state("keratoconus", narrow, mode="on-axis")
+
+
+def test_one_surface_equals_the_splat_of_every_pixel(rng):
+    state = off_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    slope_x, slope_y = np.meshgrid(
+        np.linspace(-1.0, 1.0, WIDTH), np.linspace(-1.0, 1.0, HEIGHT)
+    )
+    for distance_dpt in (1.0, 0.9 + 0.05 * slope_x + 0.03 * slope_y):
+        view = radial_view(state, color, distance_dpt)
+        sources = view_sources(view, state.spec)
+        planar_m = 1.0 / sources.distance_dpt.reshape(HEIGHT, WIDTH)
+        left, right, up, down = state.spec.camera.tangents
+        x = left + (right - left) * (np.arange(WIDTH) + 0.5) / WIDTH
+        y = up + (down - up) * (np.arange(HEIGHT) + 0.5) / HEIGHT
+        planar_m = planar_m / np.sqrt(1.0 + x[None] ** 2 + y[:, None] ** 2)
+        truth = splat_exactly(ExactBench(state), color, planar_m)
+        mean, seen = (
+            dense_reference(view, state, bins=False, accumulation=rule, kept=False)
+            for rule in ("sum", "coverage")
+        )
+        assert np.allclose(mean, truth, atol=2e-6)
+        # Coverage stops at one, the plain splat does not: where PSFs change this fast,
+        # sums are a few per cent off one.
+        assert psnr_db(seen, truth) >= 54.0
+
+
+def gathered(state, view, rule):
+    """Sorted gather of every pixel in plain loops."""
+    sources = view_sources(view, state.spec)
+    psfs = state.exact_psfs(sources.h_deg, sources.v_deg, sources.distance_dpt)
+    height, width = view.depth_m.shape
+    out = np.empty((height, width, 3))
+    order = np.argsort(-sources.distance_dpt, kind="stable")
+    weights = np.zeros((height * width, 3, height, width))
+    for n in range(height * width):
+        y, x = divmod(n, width)
+        for c in range(3):
+            kernel = psfs[3 * n + c].kernel
+            r = kernel.shape[0] // 2
+            wide = np.zeros((height + 2 * r, width + 2 * r))
+            wide[y : y + 2 * r + 1, x : x + 2 * r + 1] = kernel
+            weights[n, c] = wide[r : r + height, r : r + width]
+    for y, x, c in np.ndindex(height, width, 3):
+        light, coverage = 0.0, 0.0
+        for n in order:
+            weight = float(weights[n, c, y, x])
+            room = 1.0 - coverage
+            weight = weight * room if rule == "paper" else min(weight, room)
+            light += weight * sources.color[n, c]
+            coverage += weight
+        out[y, x, c] = light / coverage
+    return out
+
+
+@pytest.mark.parametrize("rule", ["coverage", "paper"])
+def test_surfaces_in_front_of_each_other_equal_a_sorted_gather(rng, rule):
+    size = (20, 14)
+    state = eye_state("emmetropia", tangents_of(10, 14, 5, 8), size=size)
+    color = rng.random((size[1], size[0], 3))
+    distance_dpt = rng.choice([0.25, 0.5, 1.5, 2.0], size=color.shape[:2])
+    view = radial_view(state, color, distance_dpt)
+    seen = dense_reference(view, state, bins=False, accumulation=rule, kept=False)
+    assert np.allclose(seen, gathered(state, view, rule), atol=1e-6)
+
+
+def test_a_near_plane_hides_the_blur_of_a_far_one():
+    narrow = tangents(WIDTH, HEIGHT, 2.0)
+    state = eye_state("emmetropia", narrow, mode="on-axis", focus_dpt=2.5)
+    bright = np.zeros((HEIGHT, WIDTH, 3))
+    bright[:, WIDTH // 2 :] = 1.0
+    is_dark = np.arange(WIDTH)[None] < WIDTH // 2
+    # The dark side is in focus; the bright one 2.5 dpt behind or before it.
+    hidden, spilt = (
+        dense_reference(
+            radial_view(state, bright, np.where(is_dark, 2.5, bright_dpt)),
+            state,
+            bins=False,
+            kept=False,
+        )
+        for bright_dpt in (0.01, 5.0)
+    )
+    psfs = state.exact_psfs(np.zeros(2), np.zeros(2), np.array([0.01, 5.0]))
+    assert psfs.blur_radius_px.min() >= 5.0
+    # green, in focus; away from the borders, beyond which nothing covers
+    beside = (slice(12, -12), WIDTH // 2 - 4, 1)
+    assert hidden[beside].max() <= 0.01
+    assert spilt[beside].min() >= 0.05
+
+
+def test_bins_cost_little(rng):
+    state = off_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    view = radial_view(state, color, np.linspace(0.4, 1.4, WIDTH)[None])
+    exact, in_bins = (
+        dense_reference(view, state, bins=bins, kept=False) for bins in (False, True)
+    )
+    assert 55.0 <= psnr_db(in_bins, exact) <= 120.0
+
+
+def convolved(color, kernels):
+    """Plain convolution, divided by what a white image gives."""
+    planes = []
+    for c, kernel in enumerate(kernels):
+        white = fftconvolve(np.ones(color.shape[:2]), kernel, mode="same")
+        planes.append(fftconvolve(color[..., c], kernel, mode="same") / white)
+    return np.stack(planes, axis=-1)
+
+
+PLANE_DPT = 1.125
+
+
+@pytest.mark.parametrize("method", [barsky, celaya, gonzalez])
+def test_layers_of_one_plane_are_a_convolution(rng, method):
+    state = on_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    view = radial_view(state, color, PLANE_DPT)
+    psfs = state.exact_psfs(np.zeros(1), np.zeros(1), np.array([PLANE_DPT]))
+    plain = convolved(color, [psf.kernel.astype(float) for psf in psfs])
+    assert np.allclose(method(view, state).color, plain, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", [predecessor, paper_on_axis])
+def test_textures_of_one_plane_are_a_convolution(rng, method):
+    state = on_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    view = radial_view(state, color, PLANE_DPT)
+    made = paper_texture(state, ON_AXIS)
+    layer = int(made.distance.position(np.array([PLANE_DPT]))[0][0])
+    node = int(np.flatnonzero(np.isclose(ON_AXIS.distance_dpt, PLANE_DPT))[0])
+    assert layer == made.distance.first_layer[node]
+    kernels = made.weights[layer].astype(float)
+    assert np.allclose(kernels.sum(axis=(1, 2)), 1.0, atol=1e-5)
+    seen = method(view, state)
+    assert np.allclose(seen.color, convolved(color, kernels), atol=2e-5)
+    psfs = state.exact_psfs(np.zeros(1), np.zeros(1), np.array([PLANE_DPT]))
+    exact = convolved(color, [psf.kernel.astype(float) for psf in psfs])
+    assert psnr_db(seen.color, exact) >= 45.0
+    assert seen.tap_count > 0
+
+
+def test_off_axis_baselines_turn_kernels_the_right_way(rng):
+    state = off_axis()
+    color = texture(rng, HEIGHT, WIDTH, cell_px=2)
+    view = radial_view(state, color, PLANE_DPT)
+    exact = dense_reference(view, state, bins=False, kept=False)
+    assert psnr_db(gonzalez(view, state, grid=(5, 5, 1)).color, exact) >= 47.0
+    assert psnr_db(celaya(view, state, grid=(5, 5, 1)).color, exact) >= 47.0
+    grid = PaperGrid(
+        np.linspace(10.0, 22.0, 6),
+        np.linspace(*state.spec.field_range_deg[1], 6),
+        np.linspace(0.125, 2.125, 3),
+        reduction=(1.0, 0.5),
+    )
+    assert psnr_db(paper_quality(view, state, grid=grid).color, exact) >= 45.0
+
+
+def test_textures_blend_over_pupil_and_focus(rng):
+    spec = GridSpec.for_camera(
+        width_px=WIDTH,
+        height_px=HEIGHT,
+        tangents=tangents_of(10, 13, 5, 7.25),
+        pupil_range_mm=(4.0, 5.0),
+        focus_range_dpt=(0.125, 1.125),
+        mode="quality",
+    )
+    eye = traced_eye("emmetropia", spec)
+    grid = PaperGrid(
+        np.linspace(*spec.field_range_deg[0], 3),
+        np.linspace(*spec.field_range_deg[1], 3),
+        np.linspace(0.125, 2.125, 3),
+        reduction=(100.0, 100.0),
+    )
+    at_nodes = EyeState(eye, spec, 5.0, 1.125)
+    view = radial_view(at_nodes, texture(rng, HEIGHT, WIDTH), 0.125)
+    blended = paper_dynamic(view, at_nodes, grid=grid)
+    alone = paper_quality(view, at_nodes, grid=grid)
+    assert np.allclose(blended.color, alone.color, atol=1e-6)
+    between = EyeState(eye, spec, 4.5, 0.625)
+    exact = dense_reference(view, between, bins=False, kept=False)
+    seen = paper_dynamic(view, between, grid=grid).color
+    # coarse on purpose: half-way on every axis
+    assert psnr_db(seen, exact) >= 37.0
+    assert psnr_db(seen, exact) >= psnr_db(alone.color, exact) + 6.0
+
+
+def test_slices_of_a_slope_have_no_seams(rng):
+    state = on_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    view = radial_view(state, color, np.linspace(0.4, 1.4, WIDTH)[None])
+    exact = dense_reference(view, state, bins=False, kept=False)
+    with_objects = barsky(view, state, slice_count=5).color
+    without = barsky(view, state, slice_count=5, finds_objects=False).color
+    assert psnr_db(with_objects, exact) >= psnr_db(without, exact) + 2.0
+
+
+def test_objects_end_at_steps_of_depth():
+    distance_dpt = np.full((6, 8), 1.0) + 0.01 * np.arange(8)
+    distance_dpt[1:4, 2:5] = 2.0
+    labels = depth_objects(distance_dpt)
+    assert np.unique(labels).size == 2
+    assert np.array_equal(labels == labels[2, 3], distance_dpt == 2.0)
+
+
+def test_transitional_layers_follow_the_equations():
+    radius_px = np.array([1.0, 1.4, 5.7, 2.5])
+    # Eq. 8: ceil of the change, less one, between; one step more than layers.
+    assert interval_count(radius_px, 0, None).tolist() == [1, 5, 4]
+    assert interval_count(radius_px, 0, (1.0, 0.5)).tolist() == [1, 2, 2]
+    assert interval_count(radius_px, 0, (100.0, 100.0)).tolist() == [1, 1, 1]
+    # Eqs. 9 to 11: the largest over the other axes.
+    field = np.stack([radius_px, radius_px[::-1]], axis=1)
+    assert interval_count(field, 0, None).tolist() == [4, 5, 4]
+    axis = LayerAxis.of(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1, 5, 4]))
+    assert axis.count == 11
+    lower, share = axis.position(np.array([-1.0, 0.5, 1.3, 3.0]))
+    assert (lower + share).tolist() == pytest.approx([0.0, 0.5, 2.5, 10.0])
+    assert np.allclose(
+        axis.base + axis.fraction,
+        np.interp(np.arange(11), axis.first_layer, np.arange(4)),
+    )
+
+
+def test_colour_difference_and_ssim_know_published_values(rng):
+    # Sharma, Wu & Dalal 2005, table 1, pairs 1, 7, 13, 17 and 25
+    pairs = [
+        ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
+        ((50.0, 0.0, 0.0), (50.0, -1.0, 2.0), 2.3669),
+        ((50.0, -0.0010, 2.4900), (50.0, 0.0009, -2.4900), 4.8045),
+        ((50.0, 2.5, 0.0), (73.0, 25.0, -18.0), 27.1492),
+        ((60.2574, -34.0099, 36.2677), (60.4626, -34.1751, 39.4387), 1.2644),
+    ]
+    first, second, wanted = (np.array(values) for values in zip(*pairs, strict=True))
+    assert np.allclose(ciede2000(first, second), wanted, atol=1e-4)
+    image = rng.random((20, 30, 3))
+    same = measures(image, image)
+    assert same.ssim_ratio == pytest.approx(1.0)
+    assert same.mean_delta_e == pytest.approx(0.0, abs=1e-6)
+    assert measures(image + 0.1, image).psnr_db == pytest.approx(20.0)
+    assert ssim(1.0 - image, image) < 0.0
