@@ -18,9 +18,10 @@ from filter_service.psf_nodes import bracket_axis
 from filter_service.psf_plan import CachePlan
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
-"""Largest edge of a cell on the camera's axis.  One kernel set for a cell of 4 degrees
-costs 52 to 55 dB against cells of half of that, of 2 degrees 59 to 62 dB (5 mm,
-640x360, emmetropia and keratoconus); a quarter as many kernels are made."""
+"""Largest edge of a cell on the camera's axis.  One kernel set a cell is what limits
+frames off the axis: at 640x360 cells of 16 px (2.4 degrees) cost 52 to 55 dB against
+cells of 8 px; at 320x180 and the finest field nodes, cells of 8 px (2.3 degrees) leave
+49 dB against the exact PSF of every pixel (bench_field), and 4 px would leave 54 dB."""
 
 MIN_CELL_PX = 8
 MAX_CELL_PX = 256

@@ -12,8 +12,8 @@ from filter_service.psf_gpu import gpu_psf_batch
 
 CPU_BATCH = 768
 GPU_BATCH = 8192
-"""PSFs computed between two looks at progress and cancellation: 0.1 s of two cores; and
-enough at once to fill a GPU."""
+"""PSFs computed between two looks at progress and cancellation: about 0.05 s of two
+cores; the GPU's number is a guess, for none was at hand."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from filter_service.constants import WEIGHT_MAX
 
 MAX_CENTROID_SHIFT_RATIO = 0.005
 """Cutting may move a kernel's centroid by this share of its spread, and of a pixel for
-sharper ones: images then move by what costs 55 dB at most."""
+sharper ones; `GridSpec.kept_energy_ratio` states what cutting costs in all."""
 
 CUT_STEPS = 7
 """Halvings of the light that may be cut, until the centroid stays; then none is."""

@@ -5,7 +5,7 @@
 // Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
 //      cell and interval).
 // Dispatch: one thread a pixel, 8 x 8 groups; a group lies in one cell.
-// Twin: reference.used_pairs.  Source: section 6.1; radial depth as DESIGN 3.
+// Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
 #include "common/color.glsl"
 

@@ -2,7 +2,7 @@
 // In:  FRAGMENT_PLACE, BLOCKS.   Out: TILE_COUNTS (count, order matters).
 // Dispatch: one group of GROUP_THREADS a tile: 8 on a software renderer, whose vectors
 //      then all have work, THREADS on hardware.
-// Twin: reference.tile_lists.
+// Twin: tests/numerical/test_renderer_passes.py (lists by comparing all pairs).
 
 #include "common/tiles.glsl"
 #include "common/reach.glsl"

@@ -2,7 +2,7 @@
 // In:  TILE_COUNTS.   Out: TILE_OFFSETS (tile_count + 1; the last is the total, the next
 // word the total as float bits, by which a caller notices a 32-bit overflow).
 // Dispatch: one group.
-// Twin: reference.scan_tiles (numpy.cumsum).
+// Twin: tests/numerical/test_renderer_passes.py (numpy.cumsum).
 
 layout(local_size_x = SCAN_THREADS) in;
 

@@ -1,7 +1,7 @@
 // Writes each tile's list of fragment slots, in the order of the walk.
 // In:  FRAGMENT_PLACE, BLOCKS, TILE_OFFSETS.   Out: ENTRIES.
 // Dispatch: one group of GROUP_THREADS a tile of the band.
-// Twin: reference.tile_lists.
+// Twin: tests/numerical/test_renderer_passes.py (lists by comparing all pairs).
 
 #include "common/tiles.glsl"
 #include "common/reach.glsl"

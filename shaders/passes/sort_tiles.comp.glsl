@@ -4,7 +4,7 @@
 // In:  FRAGMENT_COLOR (sort depth in a), TILE_COUNTS, TILE_OFFSETS.
 // In/Out: ENTRIES; ENTRIES_SPARE is scratch of the same size.
 // Dispatch: one group of GROUP_THREADS a tile of the band.  KEY_BITS: SORT_KEY_BITS or PAPER_SORT_KEY_BITS.
-// Twin: reference.sort_tiles (numpy stable argsort).
+// Twin: tests/numerical/test_renderer_passes.py (order of the listed depths).
 
 layout(local_size_x = GROUP_THREADS) in;
 

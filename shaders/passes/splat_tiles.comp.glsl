@@ -7,7 +7,7 @@
 //      one vector of threads; 1 on hardware).
 // Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage:
 //      front to back, w <- min(w, 1 - A), and plain sums where one surface fills the tile.
-// Twin: reference.splat.  Source: section 6.1; accumulation DESIGN 4.
+// Twin: reference.gather.  Source: section 6.1; accumulation DESIGN 4.
 
 #include "common/reach.glsl"
 #include "common/fragments.glsl"

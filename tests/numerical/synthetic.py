@@ -9,7 +9,7 @@ from estimator.profiles import parse_profile
 from filter_service.frame import View
 from filter_service.psf_build import build_psf_store
 from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import frame_layers
+from filter_service.psf_store import frame_layers, neighbours
 from filter_service.renderer import FilterRenderer
 
 
@@ -59,3 +59,16 @@ class Bench:
     def layers(self, **options):
         options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0, **options}
         return frame_layers(self.store, **options)
+
+    def blur_px(self, **options):
+        """Blur radius (n_layers, 3) of a frame's layers, on axis."""
+        layers = self.layers(**options)
+        total_dpt = layers.object_dpt[:, None] + layers.at_infinity_dpt[0]
+        psfs, weights = neighbours(
+            self.store,
+            layers.pupil_diameter_mm,
+            layers.corners,
+            np.zeros(len(total_dpt), int),
+            total_dpt,
+        )
+        return (self.store.blur_px[psfs] * weights).sum(axis=-1)

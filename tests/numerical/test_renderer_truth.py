@@ -207,7 +207,7 @@ def test_slanted_plane_is_the_normalised_gather(gpu, rng):
             weight[:, first:last, c] += spread[1][:, part]
     truth = light / weight
     inside = (slice(24, -24), slice(32, -32))
-    assert px_per_dpt * (6.0 + 0.5) >= 1.0  # blurred throughout
+    assert bench.blur_px().max(axis=1).min() >= 1.0
     assert psnr_db(result.color[inside], truth[inside]) >= 50.0
 
 

@@ -1,5 +1,6 @@
 """Numbers live in Python; shader passes name them."""
 
+import importlib
 import re
 
 import pytest
@@ -77,3 +78,18 @@ def test_all_shaders_are_core_glsl_without_vendor_extensions():
 )
 def test_the_scanner_finds_every_literal(text, expected):
     assert literals(text) == expected
+
+
+TWIN = re.compile(r"Twin: ([\w./]+\w)")
+
+
+@pytest.mark.parametrize("path", PASSES, ids=lambda path: path.stem)
+def test_the_twin_that_a_pass_names_exists(path):
+    place = TWIN.search(path.read_text(encoding="utf-8"))[1]
+    if place.startswith("tests/"):
+        assert (ROOT / place).is_file()
+        return
+    module, _, name = place.rpartition(".")
+    if module == "reference":
+        module = "filter_service.reference"
+    assert hasattr(importlib.import_module(module), name)
