@@ -127,6 +127,9 @@ BYTE_BITS = 8
 BYTE_MASK = 0xFF
 RGB = 3
 
+PSF_ENGINES = ("auto", "cpu", "gpu")
+"""What may compute PSFs: by measure, compiled loops, or compute shaders."""
+
 BINDINGS = {
     "BINDING_COLOR_IN": 0,
     "BINDING_DEPTH_IN": 1,

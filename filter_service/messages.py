@@ -1,8 +1,8 @@
 """The wire types of protocol version 1, and how they become message parts and back.
 
 This is the only module (with `errors`) that clients import.  The types live in
-`wire_requests`, `wire_profiles` and `wire_replies`, images and cameras in
-`wire_images`, the checks of single fields in `wire_checks`.  PROTOCOL.md is the
+`wire.requests`, `wire.profiles` and `wire.replies`, images and cameras in
+`wire.images`, the checks of single fields in `wire.checks`.  PROTOCOL.md is the
 authority.
 
 A message is a list of parts: ``[header, part, part, ...]``.  Nothing here touches a
@@ -18,13 +18,13 @@ from typing import Any
 import msgpack
 
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
-from filter_service.wire_checks import (
+from filter_service.wire.checks import (
     MAX_HEADER_BYTES,
     MAX_ID,
     show,
     unpack_header,
 )
-from filter_service.wire_images import (
+from filter_service.wire.images import (
     DEPTH_KINDS,
     LINEAR,
     SRGB8,
@@ -35,14 +35,14 @@ from filter_service.wire_images import (
     ViewHeader,
     ViewImages,
 )
-from filter_service.wire_profiles import (
+from filter_service.wire.profiles import (
     Accepted,
     ProfileRequest,
     ProfileSettings,
     Progress,
     Ready,
 )
-from filter_service.wire_replies import (
+from filter_service.wire.replies import (
     Alive,
     Dropped,
     ErrorReply,
@@ -52,7 +52,7 @@ from filter_service.wire_replies import (
     Welcome,
     check_output,
 )
-from filter_service.wire_requests import (
+from filter_service.wire.requests import (
     ACCUMULATIONS,
     Bye,
     Frame,

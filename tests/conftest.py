@@ -40,7 +40,7 @@ def rng(request):
 @pytest.fixture(scope="session")
 def gpu(pytestconfig):
     """The one OpenGL context of the test run; a test leaves it without errors."""
-    from filter_service.gpu import Gpu
+    from filter_service.gl.gpu import Gpu
 
     pytestconfig.stash[SESSION_GPU] = Gpu()
     return pytestconfig.stash[SESSION_GPU]

@@ -10,7 +10,7 @@ def doctor(json_output: Json = False) -> None:
 
     ocufilter doctor --json
     """
-    from filter_service.doctor import examine
+    from filter_service.commands.doctor_checks import examine
 
     report = examine()
     if json_output:

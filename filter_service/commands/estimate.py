@@ -50,7 +50,7 @@ def estimate(
 
     from estimator.estimation import estimate_eye
     from estimator.profile_files import load_profile
-    from filter_service.image_files import check_output
+    from filter_service.commands.image_files import check_output
 
     if plot is not None:
         check_output(plot, (".png",))

@@ -17,8 +17,8 @@ from filter_service.commands.plan_text import plan_summary, say_plan
 
 if TYPE_CHECKING:
     from estimator.profiles import EyeProfile
-    from filter_service.frame import View
-    from filter_service.one_image import FilteredImage
+    from filter_service.commands.one_image import FilteredImage
+    from filter_service.rendering.frame import View
 
 PUPIL_LIMITS_MM = (0.5, 9.0)
 FOCUS_LIMITS_DPT = (0.0, 20.0)
@@ -167,7 +167,7 @@ def filter_image(
     check_range("--gaze-v-deg", gaze_v_deg, GAZE_LIMITS_DEG)
 
     from estimator.profile_files import load_profile
-    from filter_service import image_files, one_image
+    from filter_service.commands import image_files, one_image
 
     image_files.check_output(out)
     eye = load_profile(profile)
@@ -214,9 +214,9 @@ def _read_view(
     depth_kind: str,
     depth_scale: float | None,
 ) -> "View":
-    from filter_service.frame import View
-    from filter_service.image_files import read_color, read_depth
-    from filter_service.one_image import symmetric_tangents
+    from filter_service.commands.image_files import read_color, read_depth
+    from filter_service.commands.one_image import symmetric_tangents
+    from filter_service.rendering.frame import View
 
     color = read_color(color_path)
     depth_m = read_depth(depth_path, depth_scale=depth_scale)

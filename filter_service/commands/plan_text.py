@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from filter_service.commands.console import print_json, say
 
 if TYPE_CHECKING:
-    from filter_service.psf_nodes import CachePlan
+    from filter_service.planning.nodes import CachePlan
 
 AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 

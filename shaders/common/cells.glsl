@@ -1,4 +1,4 @@
-// The image in square cells, each with kernels of its own (filter_service/image_cells.py).
+// The image in square cells, each with kernels of its own (filter_service/rendering/image_cells.py).
 // cell_px is 0 where one cell is the whole image.
 
 uniform int cell_px;

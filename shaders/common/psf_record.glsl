@@ -1,4 +1,4 @@
-// One PSF on its way through the passes `psf_*`; psf_records.py writes it.  Pupil
+// One PSF on its way through the passes `psf_*`; psfs/gpu_build_records.py writes it.  Pupil
 // coordinates x, y in -1..1 over the bounding box, pixels x right, y up, as
 // estimator/psf_pupil.py has them.
 

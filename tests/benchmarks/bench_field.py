@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service.gpu import Gpu
+from filter_service.gl.gpu import Gpu
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.field_methods import (
     FOCUS_RANGE_DPT,

@@ -19,11 +19,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from estimator.psf_survey import survey_pupils
-from filter_service.psf_nodes import CachePlan
-from filter_service.psf_pack import pack_kernels
-from filter_service.psf_plan import unchecked_plan
-from filter_service.psf_plan_cost import cost_terms, sampled_states
-from filter_service.psf_slopes import state_frames
+from filter_service.planning.cost import cost_terms, sampled_states
+from filter_service.planning.nodes import CachePlan
+from filter_service.planning.plan import unchecked_plan
+from filter_service.planning.slopes import state_frames
+from filter_service.psfs.pack import pack_kernels
 from tests.benchmarks.harness import (
     Row,
     print_rows,

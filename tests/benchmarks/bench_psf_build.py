@@ -17,9 +17,9 @@ import numpy as np
 
 from estimator.psf import compute_psf_batch, plan_psfs
 from estimator.psf_reference import reference_kernel
-from filter_service.gpu import Gpu
-from filter_service.psf_gpu import gpu_psf_batch, gpu_psfs
-from filter_service.psf_records import kernel_starts, plan_rays, plan_waves
+from filter_service.gl.gpu import Gpu
+from filter_service.psfs.gpu_build import gpu_psf_batch, gpu_psfs
+from filter_service.psfs.gpu_build_records import kernel_starts, plan_rays, plan_waves
 from tests.benchmarks.harness import (
     Row,
     machine_info,

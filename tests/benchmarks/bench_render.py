@@ -12,12 +12,12 @@ import time
 import numpy as np
 
 from estimator.profiles import parse_profile
-from filter_service import reference
-from filter_service.gpu import Gpu
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import frame_layers
-from filter_service.renderer import FilterRenderer
+from filter_service.gl.gpu import Gpu
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering import reference
+from filter_service.rendering.renderer import FilterRenderer
 from tests.benchmarks.harness import (
     Row,
     machine_info,

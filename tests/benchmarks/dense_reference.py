@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from estimator.psf import PsfBatch, compute_psf_batch
 from filter_service.constants import MIN_COVERAGE
-from filter_service.eye import Eye
-from filter_service.field_directions import field_deg
-from filter_service.frame import View, fill_missing_depth, object_dpt
-from filter_service.psf_grid import GridSpec
-from filter_service.reference import linear_from_srgb
+from filter_service.planning.eye import Eye
+from filter_service.planning.field_directions import field_deg
+from filter_service.planning.grid import GridSpec
+from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.reference import linear_from_srgb
 
 ANGLE_BIN_DEG = 0.2
 DISTANCE_BIN_DPT = 0.005

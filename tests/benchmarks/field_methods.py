@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from filter_service.frame import View, fill_missing_depth, object_dpt
-from filter_service.gpu import Gpu
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.renderer import FilterRenderer
+from filter_service.gl.gpu import Gpu
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.renderer import FilterRenderer
 from tests.benchmarks.baseline_types import Filtered
 from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from filter_service.reference import srgb_from_linear
+from filter_service.rendering.reference import srgb_from_linear
 
 DIFFERENCE_GAIN = 16.0
 """Of linear light: a difference of 1/16 is white."""

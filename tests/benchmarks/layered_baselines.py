@@ -20,8 +20,8 @@ from scipy.sparse.csgraph import connected_components
 
 from estimator.psf import PsfBatch
 from filter_service.constants import MIN_COVERAGE
-from filter_service.frame import View
-from filter_service.psf_nodes import bracket_axis
+from filter_service.planning.nodes import bracket_axis
+from filter_service.rendering.frame import View
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import (
     EyeState,

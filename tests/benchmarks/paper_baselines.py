@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from filter_service.frame import View
-from filter_service.psf_nodes import bracket_axis
+from filter_service.planning.nodes import bracket_axis
+from filter_service.rendering.frame import View
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import (
     BAND_ROWS,

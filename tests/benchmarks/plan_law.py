@@ -1,4 +1,4 @@
-"""Fits the law of `psf_plan_law.py`: what blending two PSFs costs an image.
+"""Fits the law of `planning/error_law.py`: what blending two PSFs costs an image.
 
     python -m tests.benchmarks.plan_law [--quick]
 
@@ -13,9 +13,9 @@ import math
 import numpy as np
 from scipy.optimize import least_squares
 
-from filter_service import psf_plan_law as law
-from filter_service.psf_plan_use import moved, sample_use
-from filter_service.psf_slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning import error_law as law
+from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.use import moved, sample_use
 from tests.benchmarks.harness import commit_id, machine_info, write_report
 from tests.numerical.plan_cases import (
     exact_kernels,

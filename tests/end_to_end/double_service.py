@@ -4,9 +4,9 @@ import argparse
 import logging
 from pathlib import Path
 
-from filter_service.config import load_config
-from filter_service.serving import serve
-from filter_service.worker_handle import WorkerHandle
+from filter_service.service.config import load_config
+from filter_service.service.serving import serve
+from filter_service.service.worker_handle import WorkerHandle
 from tests.end_to_end.doubles import RendererDouble, check_profile
 
 

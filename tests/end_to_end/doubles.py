@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from filter_service.build_job import BuiltStore
-from filter_service.camera_match import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
+from filter_service.psfs.camera_match import is_same_camera
+from filter_service.service.build_job import BuiltStore
 
 SLICE_BYTES = 4 * 2**20
 

@@ -15,12 +15,12 @@ from estimator.estimation import estimate_eye
 from estimator.profile_files import load_profile
 from estimator.psf import compute_psf_batch
 from estimator.traced_eye import TracedEye
-from filter_service.psf_grid import GridSpec, pupil_nodes_mm
-from filter_service.psf_nodes import bracket_axis
-from filter_service.psf_pack import pack_kernels, square_kernel
-from filter_service.psf_plan_paper import DISTANCES_DPT
-from filter_service.psf_plan_use import FIELD_OF_AXIS, sample_use
-from filter_service.psf_slopes import PupilStates
+from filter_service.planning.grid import GridSpec, pupil_nodes_mm
+from filter_service.planning.nodes import bracket_axis
+from filter_service.planning.paper_grid import DISTANCES_DPT
+from filter_service.planning.slopes import PupilStates
+from filter_service.planning.use import FIELD_OF_AXIS, sample_use
+from filter_service.psfs.pack import pack_kernels, square_kernel
 
 SPECTRUM_SIDE_PX = 256
 

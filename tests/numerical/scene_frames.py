@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service.frame import View
+from filter_service.rendering.frame import View
 
 _SCRIPT = """
 import sys

@@ -6,11 +6,11 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from estimator.profiles import parse_profile
-from filter_service.frame import View
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import frame_layers, neighbours
-from filter_service.renderer import FilterRenderer
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.store import frame_layers, neighbours
+from filter_service.rendering.frame import View
+from filter_service.rendering.renderer import FilterRenderer
 
 
 def tangents(width_px, height_px, vertical_fov_deg):

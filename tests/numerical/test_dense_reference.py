@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from filter_service.frame import View
-from filter_service.psf_grid import GridSpec
+from filter_service.planning.grid import GridSpec
+from filter_service.rendering.frame import View
 from tests.benchmarks.dense_reference import EyeState, dense_reference, view_sources
 from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez

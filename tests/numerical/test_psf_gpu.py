@@ -12,13 +12,17 @@ from estimator.psf_fourier_kernels import EDGE_HALF_WIDTH
 from estimator.psf_reference import reference_kernel
 from estimator.psf_types import disc_mask
 from estimator.stiles_crawford import StilesCrawford
-from filter_service import psf_gpu, psf_gpu_constants, psf_records
 from filter_service.constants import WEIGHT_MAX
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_engine import psf_engine
-from filter_service.psf_gpu import gpu_psf_batch, gpu_psfs
-from filter_service.psf_grid import GridSpec
-from filter_service.psf_pack import square_kernel
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs import (
+    gpu_build,
+    gpu_build_constants,
+    gpu_build_records,
+)
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.engine import psf_engine
+from filter_service.psfs.gpu_build import gpu_psf_batch, gpu_psfs
+from filter_service.psfs.pack import square_kernel
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,
     case_zernike_um,
@@ -70,14 +74,14 @@ def distances(batch, other):
 def test_sine_series_is_the_cpus_smoothed_edge():
     depth = np.linspace(-EDGE_HALF_WIDTH, EDGE_HALF_WIDTH, edge_response().size)
     series = 0.5 + depth / (2 * EDGE_HALF_WIDTH)
-    for m, b in enumerate(psf_gpu_constants.edge_series(), 1):
+    for m, b in enumerate(gpu_build_constants.edge_series(), 1):
         series = series + b * np.sin(math.pi * m * depth / EDGE_HALF_WIDTH)
     assert np.abs(series - edge_response()).max() < 5e-4
 
 
-@pytest.mark.parametrize("length", psf_gpu_constants.FFT_RADICES)
+@pytest.mark.parametrize("length", gpu_build_constants.FFT_RADICES)
 def test_work_groups_stay_within_what_core_opengl_promises(length):
-    defines = psf_gpu_constants.fft_defines(length)
+    defines = gpu_build_constants.fft_defines(length)
     radices = [defines[f"FFT_RADIX_{i}"] for i in range(3)]
     assert math.prod(radices) == length
     assert defines["FFT_GROUP"] == defines["FFT_LINES"] * defines["FFT_THREADS"]
@@ -89,9 +93,11 @@ def test_work_groups_stay_within_what_core_opengl_promises(length):
 
 def test_records_have_the_layout_of_the_shader():
     """std430: members of 16 bytes in the order of common/psf_record.glsl."""
-    offsets = [psf_records.RECORD.fields[n][1] for n in psf_records.RECORD.names]
+    offsets = [
+        gpu_build_records.RECORD.fields[n][1] for n in gpu_build_records.RECORD.names
+    ]
     assert all(offset % 16 == 0 for offset in offsets)
-    assert psf_records.RECORD.itemsize == 22 * 16
+    assert gpu_build_records.RECORD.itemsize == 22 * 16
 
 
 # ----- against the quadrature
@@ -196,17 +202,17 @@ def test_every_length_of_the_fft_equals_the_cpu(gpu):
     zernike_um[:, 7] = np.linspace(0.0, 0.1, len(zernike_um))
     options = COMMON | {"pupil_diameter_mm": 4.0, "radius_px": 60}
     options |= {"method": "fourier"}
-    plan = psf_gpu.plan_psfs(zernike_um, **options)
-    jobs, on_cpu = psf_records.plan_waves(
+    plan = gpu_build.plan_psfs(zernike_um, **options)
+    jobs, on_cpu = gpu_build_records.plan_waves(
         plan,
         np.arange(len(zernike_um)),
-        psf_records.kernel_starts(plan),
+        gpu_build_records.kernel_starts(plan),
         accuracy="normal",
         limit_count=1 << 30,
     )
     assert on_cpu.size == 0
     used = {n for chunk in jobs.chunks for n in chunk.lengths}
-    assert used == set(psf_gpu_constants.FFT_RADICES)
+    assert used == set(gpu_build_constants.FFT_RADICES)
     batch = gpu_psf_batch(gpu, zernike_um, **options)
     expected = compute_psf_batch(zernike_um, accuracy="fine", **options)
     assert distances(batch, expected).max() < 1.5e-2
@@ -311,10 +317,10 @@ def test_positive_tilt_moves_light_to_the_right_and_up(gpu):
 
 
 def _small_limits(monkeypatch):
-    monkeypatch.setattr(psf_gpu, "BLOCK_PSFS", 5)
-    monkeypatch.setattr(psf_gpu, "KERNEL_BYTES", 40_000)
-    monkeypatch.setattr(psf_gpu, "SOFTWARE_SCRATCH_BYTES", 150_000)
-    monkeypatch.setattr(psf_gpu, "SCRATCH_BYTES", 150_000)
+    monkeypatch.setattr(gpu_build, "BLOCK_PSFS", 5)
+    monkeypatch.setattr(gpu_build, "KERNEL_BYTES", 40_000)
+    monkeypatch.setattr(gpu_build, "SOFTWARE_SCRATCH_BYTES", 150_000)
+    monkeypatch.setattr(gpu_build, "SCRATCH_BYTES", 150_000)
 
 
 def _mixed_batch():

@@ -8,21 +8,21 @@ import pytest
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profile_files import load_profile
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import defocus_nodes_dpt, pupil_nodes_mm
-from filter_service.psf_nodes import (
-    RaggedNodes,
-    bracket_axis,
-)
-from filter_service.psf_plan import PlanTooLarge, plan_cache, unchecked_plan
-from filter_service.psf_plan_law import (
+from filter_service.planning.axis_nodes import TOLERANCE_DB
+from filter_service.planning.error_law import (
     allowed_difference_px,
     blend_error,
     combined_error,
     equal_share,
 )
-from filter_service.psf_plan_nodes import TOLERANCE_DB
-from filter_service.psf_plan_use import sample_use
+from filter_service.planning.grid import defocus_nodes_dpt, pupil_nodes_mm
+from filter_service.planning.nodes import (
+    RaggedNodes,
+    bracket_axis,
+)
+from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
+from filter_service.planning.use import sample_use
+from filter_service.psfs.build import build_psf_store
 from tests.numerical.plan_cases import (
     mean_db,
     node_errors,

@@ -5,18 +5,18 @@ import pytest
 
 from estimator.profiles import parse_profile
 from estimator.psf import compute_psf_batch
-from filter_service.eye_model import prepare_eye
-from filter_service.field_directions import (
+from filter_service.planning.field_directions import (
     angles_deg,
     field_deg,
     gaze_rotation,
     pixel_from_mrad,
     unit_direction,
 )
-from filter_service.frame import View
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.renderer import FilterRenderer
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.eye_model import prepare_eye
+from filter_service.rendering.frame import View
+from filter_service.rendering.renderer import FilterRenderer
 from tests.numerical.synthetic import psnr_db, tangents, texture
 
 WIDTH, HEIGHT = 160, 120

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from filter_service import (
-    constants,
+from filter_service import constants
+from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.rendering import (
     frame_kernels,
     frame_passes,
     kernel_passes,
     reference,
 )
-from filter_service.errors import BadMessage, CameraMismatch
-from filter_service.frame import View
-from filter_service.image_cells import image_cells
+from filter_service.rendering.frame import View
+from filter_service.rendering.image_cells import image_cells
 from tests.numerical.synthetic import Bench, psnr_db, tangents, texture
 
 MYOPIA = {"kind": "preset", "name": "myopia"}

@@ -5,11 +5,11 @@ from functools import cache
 import pytest
 
 from estimator.profiles import parse_profile, preset_names
-from filter_service import reference
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import frame_layers
-from filter_service.renderer import FilterRenderer
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering import reference
+from filter_service.rendering.renderer import FilterRenderer
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
 

@@ -12,13 +12,13 @@ from estimator.traced_eye import TracedEye
 from estimator.units import RGB_WAVELENGTHS_NM
 from estimator.wavefront import wavefront_aberrations
 from estimator.zernike import remove_central_tilt, rescale_pupil
-from filter_service import reference
-from filter_service.frame_kernels import frame_kernels, interval_count
-from filter_service.image_cells import image_cells
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.psf_store import frame_layers
-from filter_service.wire_images import Camera
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering import reference
+from filter_service.rendering.frame_kernels import frame_kernels, interval_count
+from filter_service.rendering.image_cells import image_cells
+from filter_service.wire.images import Camera
 
 PUPILS_MM = (3.0, 4.0, 5.0, 6.0)
 AXIS = {"h_deg": 0.0, "v_deg": 0.0}
@@ -118,7 +118,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
         pupil_range_mm=(4.0, 5.0),
         focus_range_dpt=(0, 6),
     )
-    from filter_service.eye_model import prepare_eye
+    from filter_service.psfs.eye_model import prepare_eye
 
     eye, notes = prepare_eye(parse_profile(body), spec, eye_model="traced")
     assert "estimated" in notes[0]

@@ -1,8 +1,8 @@
 """After warming up, frames meet no shader that is not compiled."""
 
-from filter_service.gpu import Gpu
-from filter_service.renderer import FilterRenderer
-from filter_service.warm_up import warm_up
+from filter_service.gl.gpu import Gpu
+from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.warm_up import warm_up
 from tests.numerical.synthetic import Bench, texture
 
 

@@ -16,30 +16,42 @@ MAY_IMPORT = {
 }
 """Ours that each package may import, as dotted prefixes."""
 
+LAYERS = {
+    # package of the service: those of its own packages that it may import
+    "gl": (),
+    "wire": (),
+    "planning": ("wire",),
+    "psfs": ("planning", "wire", "gl"),
+    "rendering": ("psfs", "planning", "wire", "gl"),
+    "service": ("rendering", "psfs", "planning", "wire", "gl"),
+    "commands": ("service", "rendering", "psfs", "planning", "wire", "gl"),
+}
+"""A frame's data runs one way; each layer knows only those before it."""
+
 HOME = {
     # library: files that may import it, each with its reason
     "torch": ("training/*",),  # the service must run without it
     "onnx": ("training/*",),
     "onnxruntime": ("estimator/networks.py",),
     "moderngl": (
-        "filter_service/gpu.py",  # one owner of the context
+        "filter_service/gl/gpu.py",  # one owner of the context
         "clients/window.py",  # shows frames in a window of its own
     ),
     "glfw": ("clients/window.py",),
     "zmq": (
-        "filter_service/server.py",
-        "filter_service/mailbox.py",  # the server's socket and nothing else
+        "filter_service/service/server.py",
+        "filter_service/service/mailbox.py",  # the server's socket and nothing else
         "clients/connection.py",  # the client's socket and nothing else
     ),
-    "msgpack": ("filter_service/messages.py", "filter_service/wire_checks.py"),
+    "msgpack": ("filter_service/messages.py", "filter_service/wire/checks.py"),
     "numba": (
         "estimator/psf_*.py",  # kernels of the PSF engines
         "estimator/raytrace_kernels.py",
         "estimator/wavefront_*.py",  # aiming and fitting
-        "filter_service/reference*.py",  # twins of the passes
-        "filter_service/psf_pack.py",  # loops over single kernels
-        "filter_service/doctor_probes.py",  # asks which threads it runs on
-        "filter_service/threads.py",
+        "filter_service/rendering/reference*.py",  # twins of the passes
+        "filter_service/psfs/pack.py",  # loops over single kernels
+        "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
+        "filter_service/service/threads.py",
     ),
     "pyrender": ("clients/*",),
     "trimesh": ("clients/*",),
@@ -52,10 +64,10 @@ HOME = {
         "tests/*",  # plots of measurements
         "estimator/eye_plot.py",  # `ocufilter estimate --plot`
     ),
-    "OpenEXR": ("filter_service/image_files.py",),
+    "OpenEXR": ("filter_service/commands/image_files.py",),
     "PIL": (
-        "filter_service/image_files.py",
-        "filter_service/psf_picture.py",
+        "filter_service/commands/image_files.py",
+        "filter_service/psfs/picture.py",
         "clients/*",  # captions, textures, contact sheet
     ),
     "typer": ("filter_service/__main__.py", "filter_service/commands/*"),
@@ -69,7 +81,7 @@ SCIPY_FREE = ("clients/*",)  # a client needs no scientific stack
 
 NEVER_LOADED_BY_CLIENT_LIBRARY = (
     "estimator",
-    "filter_service.gpu",
+    "filter_service.gl.gpu",
     "moderngl",
     "numba",
     "scipy",
@@ -90,6 +102,23 @@ def test_packages_import_only_in_the_allowed_direction(package):
         and not _may(entry.module, MAY_IMPORT[package])
     ]
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_layers_of_the_service_import_only_those_before_them(layer):
+    allowed = [f"filter_service.{name}" for name in (layer, *LAYERS[layer])]
+    layers = [f"filter_service.{name}" for name in LAYERS]
+    wrong = [
+        f"{entry.file}:{entry.line} imports {entry.module}"
+        for entry in package_imports(f"filter_service/{layer}")
+        if _may(entry.module, tuple(layers)) and not _may(entry.module, tuple(allowed))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_folder_of_the_service_is_a_layer():
+    folders = (ROOT / "filter_service").glob("*/__init__.py")
+    assert {path.parent.name for path in folders} == set(LAYERS)
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -129,9 +158,9 @@ def test_the_rules_catch_a_wrong_import(tmp_path, monkeypatch):
     folder = tmp_path / "estimator"
     folder.mkdir()
     (folder / "bad.py").write_text(
-        "def f():\n    import torch\n    from filter_service import gpu\n"
+        "def f():\n    import torch\n    from filter_service.gl import gpu\n"
     )
     modules = [entry.module for entry in package_imports("estimator")]
-    assert modules == ["torch", "filter_service.gpu"]
-    assert not _may("filter_service.gpu", MAY_IMPORT["estimator"])
+    assert modules == ["torch", "filter_service.gl.gpu"]
+    assert not _may("filter_service.gl.gpu", MAY_IMPORT["estimator"])
     assert not _may("filter_service.messages_extra", MAY_IMPORT["clients"])

@@ -2,9 +2,9 @@
 
 import pytest
 
-from filter_service.camera_match import distinct_cameras, is_same_camera, serves
 from filter_service.messages import Camera
-from filter_service.psf_grid import GridSpec
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.camera_match import distinct_cameras, is_same_camera, serves
 
 CAMERA = Camera(200, 100, (-0.5, 0.5, 0.25, -0.25))  # 5 mrad
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from filter_service.config import ServiceConfig, default_cache_dir, load_config
+from filter_service.service.config import ServiceConfig, default_cache_dir, load_config
 
 
 def test_the_defaults_listen_on_loopback_only():

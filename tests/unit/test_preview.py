@@ -2,11 +2,12 @@
 
 import pytest
 
-from filter_service import psf_grid, wire_profiles
-from filter_service.build_job import LookAt
 from filter_service.messages import Camera, ProfileSettings
-from filter_service.preview import is_worthwhile, preview_spec
-from filter_service.psf_grid import GridSpec
+from filter_service.planning import grid
+from filter_service.planning.grid import GridSpec
+from filter_service.service.build_job import LookAt
+from filter_service.service.preview import is_worthwhile, preview_spec
+from filter_service.wire import profiles
 
 CAMERA = Camera(200, 100, (-0.5, 0.5, 0.25, -0.25))
 
@@ -49,13 +50,13 @@ def test_a_preview_is_built_only_where_the_whole_takes_long():
 
 
 def test_the_wire_knows_the_choices_and_defaults_of_the_grid():
-    assert wire_profiles.MODES == psf_grid.MODES
-    assert wire_profiles.GRIDS == psf_grid.GRIDS
-    assert wire_profiles.TOLERANCES == psf_grid.TOLERANCES
+    assert profiles.MODES == grid.MODES
+    assert profiles.GRIDS == grid.GRIDS
+    assert profiles.TOLERANCES == grid.TOLERANCES
     # A stream follows the field unless told otherwise; a bare grid is the simplest one.
     settings, spec = ProfileSettings(), GridSpec(CAMERA, mode="dynamic")
     for name in vars(settings).keys() & vars(spec).keys():
         assert getattr(settings, name) == getattr(spec, name), name
-    for mode in psf_grid.MODES:
+    for mode in grid.MODES:
         follows = ProfileSettings(mode=mode).follows_field
         assert follows == GridSpec(CAMERA, mode=mode).follows_field

@@ -7,7 +7,8 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from filter_service import errors, messages, wire_replies
+from filter_service import errors, messages
+from filter_service.wire import replies
 
 PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
 
@@ -83,7 +84,7 @@ def test_every_error_code_that_the_service_sends_is_explained():
 
 
 def test_every_drop_reason_is_explained():
-    for reason in wire_replies.DROP_REASONS:
+    for reason in replies.DROP_REASONS:
         assert f"`{reason}`" in PAGE
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filter_service.psf_picture import DECADES, draw_psf, half_light_radius_px
+from filter_service.psfs.picture import DECADES, draw_psf, half_light_radius_px
 
 
 def _disc(radius_px, half_size_px):

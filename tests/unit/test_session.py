@@ -2,7 +2,6 @@
 
 import pytest
 
-from filter_service.build_job import LookAt
 from filter_service.errors import BuildFailed, CreditExceeded, NoProfile
 from filter_service.messages import (
     Camera,
@@ -11,7 +10,8 @@ from filter_service.messages import (
     ProfileSettings,
     ViewHeader,
 )
-from filter_service.session import PreparedStore, Session, WaitingFrame
+from filter_service.service.build_job import LookAt
+from filter_service.service.session import PreparedStore, Session, WaitingFrame
 
 SMALL = Camera(100, 100, (-0.5, 0.5, 0.5, -0.5))  # 10 mrad
 LARGE = Camera(200, 200, (-0.5, 0.5, 0.5, -0.5))  # 5 mrad

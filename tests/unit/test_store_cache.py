@@ -13,12 +13,12 @@ import pytest
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import parse_profile
-from filter_service import store_cache, store_codec, store_file
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
-from filter_service.psf_build import build_psf_store
-from filter_service.psf_grid import GridSpec
-from filter_service.store_cache import StoreCache, Stored, store_key
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs import store_cache, store_codec, store_file
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.store_cache import StoreCache, Stored, store_key
 
 PROFILE = parse_profile({"kind": "prescription", "sphere_dpt": -1.0})
 CAMERA = Camera(96, 54, (-0.5, 0.5, 0.28, -0.28))
@@ -275,10 +275,11 @@ def test_the_code_version_follows_every_file(tmp_path, monkeypatch):
     shader.parent.mkdir(parents=True)
     for path in (
         tmp_path / "estimator" / "presets.json",
-        tmp_path / "filter_service" / "psf_build.py",
+        tmp_path / "filter_service" / "psfs" / "build.py",
         shader,
     ):
         versions.add(store_cache.code_version.__wrapped__())
+        path.parent.mkdir(exist_ok=True)
         path.write_text("changed")
         versions.add(store_cache.code_version.__wrapped__())
     assert len(versions) == 4

@@ -4,14 +4,17 @@ import subprocess
 import sys
 import textwrap
 
-from filter_service.threads import UNSAFE_THREADING_LAYER, require_safe_threading_layer
+from filter_service.service.threads import (
+    UNSAFE_THREADING_LAYER,
+    require_safe_threading_layer,
+)
 
 WITHOUT_SAFE_LAYERS = """
     import sys
     sys.modules["numba.np.ufunc.omppool"] = None
     sys.modules["numba.np.ufunc.tbbpool"] = None
     from filter_service.errors import RenderFailed
-    from filter_service.threads import require_safe_threading_layer
+    from filter_service.service.threads import require_safe_threading_layer
     try:
         require_safe_threading_layer()
     except RenderFailed as error:

@@ -1,0 +1,75 @@
+"""Trials that `ocufilter doctor` runs in a process of their own, one JSON line each.
+
+A broken driver may crash or hang instead of raising; then only the probe is lost.
+
+    python -m filter_service.commands.doctor_probes gl|threads
+"""
+
+import json
+import sys
+
+import numpy as np
+from numba import njit, prange, threading_layer
+
+PROBE_COUNT = 1000
+
+LIMITS = (
+    "GL_MAX_SHADER_STORAGE_BLOCK_SIZE",
+    "GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS",
+    "GL_MAX_SHADER_STORAGE_BUFFER_BINDINGS",
+    "GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS",
+    "GL_MAX_COMPUTE_WORK_GROUP_COUNT",
+    "GL_MAX_TEXTURE_SIZE",
+)
+"""Limits that bound frame and PSF sizes."""
+
+PROBE_SHADER = """
+#version 430
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) buffer Values { uint values[]; };
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i < uint(values.length())) values[i] = values[i] * values[i] + 1u;
+}
+"""
+
+
+def probe_gl() -> dict:
+    """Open a context, run a compute shader and read its result back."""
+    from filter_service.gl.gpu import Gpu
+
+    gpu = Gpu()
+    before = np.arange(PROBE_COUNT, dtype=np.uint32)
+    buffer = gpu.context.buffer(before.tobytes())
+    buffer.bind_to_storage_buffer(0)
+    gpu.context.compute_shader(PROBE_SHADER).run(group_x=-(-PROBE_COUNT // 64))
+    after = np.frombuffer(buffer.read(), dtype=np.uint32)
+    buffer.release()
+    info = gpu.context.info
+    return {
+        "info": {key: gpu.info[key] for key in ("renderer", "version", "vendor")},
+        "limits": {key: info[key] for key in LIMITS},
+        "compute_correct": bool((after == before * before + 1).all()),
+        "gl_error": gpu.context.error,
+    }
+
+
+@njit(parallel=True)
+def _sum_of_squares(count: int) -> float:
+    total = 0.0
+    for i in prange(count):
+        total += float(i) * i
+    return total
+
+
+def probe_threads() -> dict:
+    """Run one parallel kernel and ask which layer carried it."""
+    total = _sum_of_squares(PROBE_COUNT)
+    expected = (PROBE_COUNT - 1) * PROBE_COUNT * (2 * PROBE_COUNT - 1) / 6
+    return {"layer": threading_layer(), "sum_correct": bool(total == expected)}
+
+
+PROBES = {"gl": probe_gl, "threads": probe_threads}
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(PROBES[sys.argv[1]](), default=str) + "\n")

@@ -1,0 +1,295 @@
+"""The OpenGL context, buffers, programs and timers: the home of moderngl."""
+
+import time
+from contextlib import contextmanager
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service import constants
+from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
+from filter_service.gl.shader_source import legend, load_shader
+
+Buffer = moderngl.Buffer
+Pages = moderngl.TextureArray
+
+GROWTH = 1.25
+"""A buffer that must grow gets this much more than asked, so that slowly rising needs
+do not reallocate every frame."""
+
+ATLAS_TEXEL_BYTES = 16
+
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
+
+
+class Gpu:
+    """A standalone EGL context with named, grow-only storage buffers.
+
+    Attributes
+    ----------
+    info : dict
+        Renderer, version, and the limits that the renderer plans with.
+    is_software : bool
+        Whether a CPU does the work.
+    """
+
+    def __init__(self):
+        try:
+            self.context = moderngl.create_context(
+                standalone=True, require=430, backend="egl"
+            )
+        except Exception as error:
+            raise RenderFailed(
+                f"no OpenGL 4.3 context through EGL ({error}); "
+                "run 'ocufilter doctor' to see what is missing"
+            ) from error
+        info = self.context.info
+        self.info = {
+            "renderer": info["GL_RENDERER"],
+            "version": info["GL_VERSION"],
+            "vendor": info["GL_VENDOR"],
+            "max_storage_block_bytes": info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"],
+        }
+        name = self.info["renderer"].lower()
+        self.is_software = any(word in name for word in SOFTWARE_RENDERERS)
+        self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
+        self._buffers: dict[str, moderngl.Buffer] = {}
+        self._programs: dict[tuple, moderngl.ComputeShader] = {}
+        self._atlases: dict[str, moderngl.Texture] = {}
+
+    def close(self) -> None:
+        """Free everything; the object is of no use afterwards."""
+        for buffer in self._buffers.values():
+            buffer.release()
+        self._buffers.clear()
+        for atlas in self._atlases.values():
+            atlas.release()
+        self._atlases.clear()
+        self._programs.clear()
+        self.context.release()
+
+    # ----- buffers
+
+    def storage(self, name: str, n_bytes: int) -> moderngl.Buffer:
+        """Buffer of at least this size; its contents are lost when it grows.
+
+        Raises
+        ------
+        OutOfGpuMemory
+            More than one storage block may hold, or than the device has.
+        """
+        buffer = self._buffers.get(name)
+        if buffer is not None and buffer.size >= n_bytes:
+            return buffer
+        if n_bytes > self.max_block_bytes:
+            raise OutOfGpuMemory(
+                f"buffer '{name}' needs {n_bytes / 1e6:.0f} MB, "
+                f"a storage block holds {self.max_block_bytes / 1e6:.0f} MB here"
+            )
+        wanted = max(int(n_bytes * (GROWTH if buffer is not None else 1.0)), 16)
+        if buffer is not None:
+            buffer.release()
+            del self._buffers[name]
+        try:
+            created = self.context.buffer(
+                reserve=min(wanted, self.max_block_bytes), dynamic=True
+            )
+        except moderngl.Error as error:
+            raise OutOfGpuMemory(
+                f"buffer '{name}' of {wanted} bytes: {error}"
+            ) from error
+        self._buffers[name] = created
+        return created
+
+    def upload(self, name: str, data: NDArray) -> moderngl.Buffer:
+        """Copy an array to the start of a named buffer."""
+        data = np.ascontiguousarray(data)
+        buffer = self.storage(name, data.nbytes)
+        if data.nbytes:
+            buffer.write(data.reshape(-1).view(np.uint8))
+        return buffer
+
+    def pages(self, n_words: int) -> Pages:
+        """Texture array of 16-bit words for data that outlives a frame.
+
+        Pages of STORE_SIDE lines of STORE_SIDE words; the last line, or page, is whole.
+
+        Raises
+        ------
+        OutOfGpuMemory
+            More pages than a texture array may have, or than the device holds.
+        """
+        side = constants.STORE_SIDE
+        lines = max(-(-n_words // side), 1)
+        count = -(-lines // side)
+        limit = int(self.context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
+        size = (side, min(lines, side), count)
+        if count <= limit:
+            try:
+                pages = self.context.texture_array(size, 1, dtype="u2")
+            except moderngl.Error as error:
+                raise OutOfGpuMemory(
+                    f"{2e-6 * n_words:.0f} MB of PSFs: {error}"
+                ) from error
+            pages.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            return pages
+        raise OutOfGpuMemory(
+            f"{2e-6 * n_words:.0f} MB of PSFs, a texture array holds "
+            f"{2e-6 * limit * side * side:.0f} MB here; narrow the pupil, focus or "
+            "object range, or use a smaller image"
+        )
+
+    def write_pages(self, pages: Pages, first_line: int, lines: NDArray) -> None:
+        """Copy whole lines (n, STORE_SIDE) of words to pages, from a line on."""
+        side = constants.STORE_SIDE
+        while len(lines):
+            page, row = divmod(first_line, side)
+            count = min(len(lines), side - row)
+            pages.write(
+                np.ascontiguousarray(lines[:count]),
+                viewport=(0, row, page, side, count, 1),
+            )
+            first_line, lines = first_line + count, lines[count:]
+
+    def atlas(self, name: str, n_texels: int) -> moderngl.Texture:
+        """Named, grow-only texture of four uints a texel, in lines of ATLAS_WIDTH."""
+        rows = -(-n_texels // constants.ATLAS_WIDTH)
+        atlas = self._atlases.get(name)
+        if atlas is not None and atlas.height >= rows:
+            return atlas
+        limit = int(self.context.info["GL_MAX_TEXTURE_SIZE"])
+        if rows > limit:
+            raise OutOfGpuMemory(
+                f"the frame's kernels need {n_texels} texels, "
+                f"a texture holds {limit * constants.ATLAS_WIDTH} here"
+            )
+        wanted = rows
+        if atlas is not None:
+            atlas.release()
+            del self._atlases[name]
+            wanted = min(int(rows * GROWTH) + 1, limit)
+        atlas = self.context.texture((constants.ATLAS_WIDTH, wanted), 4, dtype="u4")
+        atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._atlases[name] = atlas
+        return atlas
+
+    def read(self, buffer: moderngl.Buffer, shape: tuple, dtype) -> NDArray:
+        """Read the start of a buffer as an array."""
+        out = np.empty(shape, dtype=dtype)
+        if out.nbytes:
+            buffer.read_into(out.reshape(-1).view(np.uint8), size=out.nbytes)
+        return out
+
+    @property
+    def memory_mb(self) -> float:
+        """Bytes held by the named buffers and atlases."""
+        buffers = sum(buffer.size for buffer in self._buffers.values())
+        texels = sum(a.width * a.height for a in self._atlases.values())
+        return (buffers + ATLAS_TEXEL_BYTES * texels) / 1e6
+
+    # ----- programs
+
+    @property
+    def program_count(self) -> int:
+        """Passes compiled so far, each variant by itself."""
+        return len(self._programs)
+
+    def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
+        """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
+        key = (name, *sorted(defines.items()))
+        if key not in self._programs:
+            text, files = load_shader(f"passes/{name}.comp.glsl", **defines)
+            try:
+                self._programs[key] = self.context.compute_shader(text)
+            except moderngl.Error as error:
+                raise ShaderError(legend(str(error), files)) from error
+        return self._programs[key]
+
+    def dispatch(
+        self,
+        name: str,
+        groups: tuple[int, int],
+        *,
+        buffers: dict[str, moderngl.Buffer],
+        uniforms: dict | None = None,
+        defines: dict | None = None,
+        images: dict[str, moderngl.Texture] | None = None,
+        textures: dict[str, moderngl.Texture | Pages] | None = None,
+    ) -> None:
+        """Run a pass and order its writes before what follows.
+
+        Parameters
+        ----------
+        groups : (x, y)
+        buffers : dict
+            Binding name without the ``BINDING_`` prefix to buffer.
+        uniforms : dict, optional
+            A uniform that the compiler removed is skipped.
+        defines : dict, optional
+            Variant of the pass.
+        images, textures : dict, optional
+            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture.
+        """
+        program = self.program(name, **(defines or {}))
+        for binding, buffer in buffers.items():
+            buffer.bind_to_storage_buffer(constants.BINDINGS[f"BINDING_{binding}"])
+        for key, value in (uniforms or {}).items():
+            member = program.get(key, None)
+            if member is not None:
+                member.value = value
+        for name_of, image in (images or {}).items():
+            unit = getattr(constants, f"IMAGE_{name_of}")
+            image.bind_to_image(unit, read=True, write=True)
+        for name_of, texture in (textures or {}).items():
+            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
+        program.run(max(groups[0], 1), max(groups[1], 1), 1)
+        self.context.memory_barrier()
+
+    def check(self, where: str) -> None:
+        """Raise if OpenGL has noted an error since the last look."""
+        error = self.context.error
+        if error == "GL_OUT_OF_MEMORY":
+            raise OutOfGpuMemory(f"{where}: {error}")
+        if error != "GL_NO_ERROR":
+            raise RenderFailed(f"{where}: {error}")
+
+
+class StageTimer:
+    """Times of named stages, ms: GPU queries on hardware, wall clock on software.
+
+    A software renderer works inside the call, so waiting for it costs nothing there.
+    """
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self._ms: dict[str, float] = {}
+        self._queries: list[tuple[str, moderngl.Query]] = []
+
+    @contextmanager
+    def stage(self, name: str):
+        """Time a GPU stage; entering a name twice adds up."""
+        if self._gpu.is_software:
+            with self.wall(name):
+                yield
+                self._gpu.context.finish()
+            return
+        query = self._gpu.context.query(time=True)
+        with query:
+            yield
+        self._queries.append((name, query))
+
+    @contextmanager
+    def wall(self, name: str):
+        """Time a CPU stage."""
+        started_s = time.perf_counter()
+        yield
+        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
+
+    def result_ms(self) -> dict[str, float]:
+        """Return times by stage; waits for the GPU."""
+        for name, query in self._queries:
+            self._ms[name] = self._ms.get(name, 0.0) + query.elapsed / 1e6
+        self._queries.clear()
+        return dict(self._ms)

@@ -1,0 +1,149 @@
+"""Where the planned nodes lie: closer where PSFs change faster and blur hides less.
+
+Along each axis nodes are spread so that blending errs equally between all neighbours,
+and as many are taken as the axis' share of the tolerance needs.  With errors that fall
+as the same power of the number of nodes, equal shares make the smallest product.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.planning.error_law import (
+    AXIS_FACTOR,
+    MEAN_OF_HALF_WAY,
+    allowed_difference_px,
+    mean_square,
+    spot_covariance,
+)
+from filter_service.planning.eye import Eye
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import RaggedNodes
+from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.use import Use, axis_error, moved
+
+TOLERANCE_DB = {"loose": 40.0, "normal": 46.0, "fine": 52.0}
+"""PSNR that interpolation may cost down to."""
+
+QUALITY_GAIN_DB = 3.0
+"""What the mode for still eyes gives on top of it."""
+
+MAX_NODES = 64
+"""On one axis but defocus."""
+
+_LADDER = 33
+_STATES_ON_LADDER = 16
+_DEFOCUS_LADDER = 49
+
+
+def target_error(spec: GridSpec) -> float:
+    """Mean square error that interpolation may make in all."""
+    gain_db = QUALITY_GAIN_DB if spec.mode == "quality" else 0.0
+    return 10.0 ** (-(TOLERANCE_DB[spec.tolerance] + gain_db) / 10.0)
+
+
+def axis_nodes(
+    use: Use, axis: str, range_: tuple[float, float], *, allowed_error: float
+) -> tuple[NDArray[np.float64], float]:
+    """Nodes (n,) of one axis from end to end of its range, and their error.
+
+    Parameters
+    ----------
+    range_ : (low, high)
+        Not a point.
+    allowed_error : float
+        Mean square error that as few nodes as possible must meet.
+    """
+    low, high = range_
+    ladder = np.linspace(low, high, _LADDER)
+    needed = _needed_over_ladder(use, axis, ladder, allowed_error)
+    count = 1 + min(max(1, math.floor(0.8 * needed[-1])), MAX_NODES - 1)
+    while True:
+        nodes = np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
+        error = axis_error(use, axis, nodes)
+        if error <= allowed_error or count >= MAX_NODES:
+            return nodes, error
+        # The error falls as the fourth power of the intervals, a little slower where
+        # rays do not move in proportion; do not overshoot.
+        grown = (count - 1) * (error / allowed_error) ** 0.25
+        count = min(max(count + 1, 1 + math.floor(0.9 * grown)), MAX_NODES)
+
+
+def _half_way_error(axis: str, allowed_error: float) -> float:
+    """RMS error by the law half-way between nodes that makes a mean square error."""
+    return math.sqrt(allowed_error / MEAN_OF_HALF_WAY / AXIS_FACTOR[axis])
+
+
+def _needed_over_ladder(
+    use: Use, axis: str, ladder: NDArray, allowed_error: float
+) -> NDArray[np.float64]:
+    """Intervals needed up to each step of a ladder along an axis."""
+    count = min(_STATES_ON_LADDER, use.object_dpt.size)
+    some = use.taken(np.arange(count))
+    repeated = use.taken(np.tile(np.arange(count), ladder.size))
+    states = moved(repeated, axis, np.repeat(ladder, count))
+    slopes = slopes_px(state_frames(use.eye, use.spec, states))
+    slopes = slopes.reshape(ladder.size, count, *slopes.shape[1:])
+    difference_px = np.sqrt(mean_square(np.diff(slopes, axis=0)))
+    allowed_px = allowed_difference_px(
+        spot_covariance(0.5 * (slopes[1:] + slopes[:-1])),
+        unit_px=some.unit_px,
+        half_way_error=_half_way_error(axis, allowed_error),
+    )
+    # The mean square error goes with the fourth power of the difference.
+    dense = np.mean((difference_px / allowed_px) ** 4, axis=1) ** 0.25
+    return np.concatenate([[0.0], np.cumsum(dense + 0.1 * dense.mean() + 1e-12)])
+
+
+def defocus_groups(
+    eye: Eye,
+    spec: GridSpec,
+    groups: PupilStates,
+    ranges_dpt: NDArray[np.float64],
+    *,
+    allowed_error: float,
+    unit_px: NDArray[np.float64],
+) -> RaggedNodes:
+    """Nodes of total defocus of every group, for a mean square error.
+
+    Parameters
+    ----------
+    groups : PupilStates
+        Field, pupil, accommodation and wavelength of each group (P,).
+    ranges_dpt : (P, 2)
+        Total defocus from end to end.
+    unit_px : (P,)
+        lambda / pupil diameter.
+    """
+    lows, highs = ranges_dpt.T
+    columns = vars(groups.taken(np.tile(np.arange(lows.size), 2)))
+    columns["total_defocus_dpt"] = np.concatenate([lows, lows + 1.0])
+    low_px, above_px = np.split(
+        slopes_px(state_frames(eye, spec, PupilStates(**columns))), 2
+    )
+    per_dpt = above_px - low_px  # rays move in proportion to defocus
+    steps_dpt = (highs - lows) / (_DEFOCUS_LADDER - 1)
+    difference_px = np.sqrt(mean_square(per_dpt)) * steps_dpt
+    # The covariance is a square polynomial of defocus: through three points of it.
+    at_low, at_one, spread = (
+        spot_covariance(slopes) for slopes in (low_px, above_px, per_dpt)
+    )
+    middles_dpt = steps_dpt * (np.arange(_DEFOCUS_LADDER - 1)[:, None] + 0.5)
+    x = middles_dpt[..., None]
+    allowed_px = allowed_difference_px(
+        at_low + x * (at_one - at_low - spread) + x * x * spread,
+        unit_px=unit_px,
+        half_way_error=_half_way_error("defocus", allowed_error),
+    )
+    needed = np.zeros((lows.size, _DEFOCUS_LADDER))
+    np.cumsum((difference_px / allowed_px).T, axis=1, out=needed[:, 1:])
+    nodes = []
+    for low, high, own in zip(lows, highs, needed, strict=True):
+        if high - low < 1e-9:
+            nodes.append(np.array([low]))
+            continue
+        count = 1 + max(1, math.ceil(own[-1] - 1e-9))
+        ladder = np.linspace(low, high, _DEFOCUS_LADDER)
+        nodes.append(np.interp(np.linspace(0.0, own[-1], count), own, ladder))
+    return RaggedNodes.of(nodes)

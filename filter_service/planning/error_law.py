@@ -1,0 +1,154 @@
+"""How much an image suffers when neighbouring PSFs are blended.
+
+The law is a fit (`python -m tests.benchmarks.plan_law` repeats it).  3,600 random pairs
+of neighbours in defocus, pupil, accommodation and field - five eyes, pupils of 2 to
+7 mm, fields to 40 x 25 deg, pixels of 0.8 to 3.5 mrad - were blended half and half and
+compared with the exact PSF between them on linear 720p frames of the scene *Courtyard*.
+Blending errs in two ways: rays that lie apart by D are doubled, which counts as D²
+against the blur; and where rays do not move in proportion, the blend aims beside the
+exact PSF, which counts at first order.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.planning.slopes import WEIGHTS
+
+DOUBLING = 0.00463
+ASIDE = 0.0248
+BLUR_EXPONENT = 0.795
+"""RMS error of the image, in units of white, at a difference and a blur of 1 px."""
+
+SHARP_PX = 0.384
+OWN_SHARE = 0.41
+DIFFRACTION_SHARE = 2.9
+"""Squared blur added to the rays' own: the pixel's; per squared difference D²; per
+squared lambda / pupil diameter."""
+
+AXIS_FACTOR = {
+    "h": 1.15,
+    "v": 1.0,
+    "pupil": 0.8,
+    "accommodation": 2.5,
+    "defocus": 2.2,
+}
+"""Mean square error measured over that of the law, by what is interpolated."""
+
+COHERENCE = 0.09
+"""How far the errors of several axes add up as amplitudes: all of them blur."""
+
+FLOOR = 1.8e-6
+"""Mean square error that denser nodes leave: rims of spots that cross the edge of a
+pixel between two nodes, and the change from one PSF method to the other.  Both from
+whole plans, measured and predicted (36 of three eyes, spread 0.7 dB)."""
+
+LEAST_SHARE = 0.02
+"""Of the whole error, for an axis whose others have spent it all."""
+
+MEAN_OF_HALF_WAY = 8.0 / 15.0
+"""Mean square over an interval of an error that is 4 f (1 - f) of its middle's."""
+
+
+def mean_square(vectors_px: NDArray) -> NDArray[np.float64]:
+    """Mean (P,) over the pupil of squared vectors (P, n, 2)."""
+    return (WEIGHTS[:, None] * np.square(vectors_px)).sum(axis=(-2, -1))
+
+
+def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
+    """Covariance (P, 3) xx, yy, xy of where rays land, px²."""
+    centred = slopes_px - (WEIGHTS[:, None] * slopes_px).sum(axis=-2, keepdims=True)
+    x, y = centred[..., 0], centred[..., 1]
+    return np.stack([(x * x) @ WEIGHTS, (y * y) @ WEIGHTS, (x * y) @ WEIGHTS], axis=-1)
+
+
+def _blur_px2(
+    covariance_px2: NDArray, difference_px2: NDArray, unit_px: NDArray
+) -> NDArray[np.float64]:
+    """Blur (P,), px²: the geometric mean of the spot's larger and smaller variance."""
+    xx, yy, xy = np.moveaxis(covariance_px2, -1, 0)
+    more = (
+        SHARP_PX**2
+        + OWN_SHARE * difference_px2
+        + DIFFRACTION_SHARE * np.square(unit_px)
+    )
+    return np.sqrt(np.maximum((xx + more) * (yy + more) - xy * xy, more * more))
+
+
+def blend_error(
+    lower_px: NDArray,
+    upper_px: NDArray,
+    exact_px: NDArray,
+    *,
+    share_ratio: NDArray,
+    unit_px: NDArray,
+) -> NDArray[np.float64]:
+    """Mean square error (P,) of images filtered with blends of two PSFs.
+
+    Parameters
+    ----------
+    lower_px, upper_px, exact_px : (P, n, 2)
+        Slopes of the neighbours and of the exact PSF between them.
+    share_ratio : (P,)
+        Share of the upper neighbour.
+    unit_px : (P,)
+        lambda / pupil diameter.
+    """
+    share = share_ratio[:, None, None]
+    difference_px2 = mean_square(upper_px - lower_px)
+    aside_px2 = mean_square((1.0 - share) * lower_px + share * upper_px - exact_px)
+    blur_px2 = _blur_px2(spot_covariance(exact_px), difference_px2, unit_px)
+    half_way = 4.0 * share_ratio * (1.0 - share_ratio)
+    doubled = DOUBLING * half_way * difference_px2 / blur_px2**BLUR_EXPONENT
+    # A miss larger than the blur counts less and less: an image has no more contrast.
+    aside_square = (
+        ASIDE**2 * aside_px2 * (blur_px2 + aside_px2) ** (1.0 - 2.0 * BLUR_EXPONENT)
+    )
+    return doubled**2 + aside_square
+
+
+def allowed_difference_px(
+    covariance_px2: NDArray, *, unit_px: NDArray, half_way_error: float
+) -> NDArray[np.float64]:
+    """RMS difference (P,) of neighbours whose blend has a given RMS error half-way.
+
+    Parameters
+    ----------
+    covariance_px2 : (P, 3)
+        See `spot_covariance`.
+    """
+    difference_px2 = np.zeros(covariance_px2.shape[:-1])
+    for _ in range(12):  # a contraction: the blur grows slower than the difference
+        blur_px2 = _blur_px2(covariance_px2, difference_px2, unit_px)
+        difference_px2 = half_way_error / DOUBLING * blur_px2**BLUR_EXPONENT
+    return np.sqrt(difference_px2)
+
+
+def combined_error(errors: list[float]) -> float:
+    """Mean square error of several interpolations at once, from those of each."""
+    amplitude = float(np.sum(np.sqrt(errors)))
+    return FLOOR + (1.0 - COHERENCE) * float(np.sum(errors)) + COHERENCE * amplitude**2
+
+
+def equal_share(allowed_error: float, *, spent: list[float], count: int) -> float:
+    """Mean square error that each of some more interpolations may add.
+
+    Parameters
+    ----------
+    spent : list
+        Errors of the interpolations that are decided.
+    count : int
+        Equal ones still to come.
+    """
+    # combined_error is a square polynomial of their amplitude.
+    square = (1.0 - COHERENCE) * count + COHERENCE * count**2
+    linear = COHERENCE * count * float(np.sum(np.sqrt(spent)))
+    left = allowed_error - combined_error(spent)
+    if left <= 0.0:
+        return LEAST_SHARE * allowed_error
+    amplitude = (np.sqrt(linear**2 + square * left) - linear) / square
+    return max(float(amplitude**2), LEAST_SHARE * allowed_error)
+
+
+def psnr_db(mean_square_error: float) -> float:
+    """PSNR against a white of 1."""
+    return float(-10.0 * np.log10(max(mean_square_error, 1e-12)))

@@ -1,0 +1,118 @@
+"""Directions of a camera in the visual field of an eye that may look elsewhere.
+
+The camera is a pinhole in the eye's entrance pupil; gaze turns the eye within it.
+Field directions (h, v) are the eye's (CONVENTIONS.md), so that the PSFs of a field
+direction move over the image with the gaze.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator import pinhole
+from filter_service.wire.images import Camera
+
+MAX_FIELD_DEG = 80.0
+"""Directions farther from the camera's axis or the gaze have no PSF nodes."""
+
+BORDER_SAMPLES = 33
+"""Points along each image edge at which the extent of the field is looked for."""
+
+
+def unit_direction(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
+    """Return unit vectors (..., 3) to sources at azimuth h and elevation v."""
+    h, v = np.radians(np.asarray(h_deg, float)), np.radians(np.asarray(v_deg, float))
+    return np.stack(
+        [np.sin(h) * np.cos(v), np.sin(v) * np.ones_like(h), -np.cos(h) * np.cos(v)],
+        axis=-1,
+    )
+
+
+def angles_deg(direction: NDArray) -> tuple[NDArray, NDArray]:
+    """Azimuth and elevation (...) of vectors (..., 3)."""
+    x, y, z = np.moveaxis(np.asarray(direction, float), -1, 0)
+    return (
+        np.degrees(np.arctan2(x, -z)),
+        np.degrees(np.arctan2(y, np.hypot(x, z))),
+    )
+
+
+def gaze_rotation(gaze_deg: tuple[float, float]) -> NDArray[np.float64]:
+    """Rotation (3, 3) from the eye's frame to the camera's: up by v, aside by h."""
+    h, v = np.radians(gaze_deg)
+    up = np.array([[1, 0, 0], [0, np.cos(v), -np.sin(v)], [0, np.sin(v), np.cos(v)]])
+    aside = np.array([[np.cos(h), 0, -np.sin(h)], [0, 1, 0], [np.sin(h), 0, np.cos(h)]])
+    return aside @ up
+
+
+def field_deg(
+    camera: Camera,
+    x_px: ArrayLike,
+    y_px: ArrayLike,
+    *,
+    gaze_deg: tuple[float, float] = (0.0, 0.0),
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Field direction (h, v) in degrees seen at an image point, y downwards.
+
+    The middle of the top-left pixel is (0.5, 0.5).
+    """
+    tangent_x, tangent_y = pinhole.tangents_at(
+        x_px,
+        y_px,
+        tangents=camera.tangents,
+        size_px=(camera.width_px, camera.height_px),
+    )
+    direction = np.stack(
+        np.broadcast_arrays(tangent_x, tangent_y, -np.ones(())), axis=-1
+    )
+    return angles_deg(direction @ gaze_rotation(gaze_deg))
+
+
+def field_range_deg(
+    camera: Camera, *, gaze_deg: tuple[float, float] = (0.0, 0.0)
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Smallest and largest h and v that an image holds, within ±`MAX_FIELD_DEG`."""
+    along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
+    x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
+    return tuple(
+        (
+            float(np.clip(angle.min(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
+            float(np.clip(angle.max(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
+        )
+        for angle in field_deg(camera, x, y, gaze_deg=gaze_deg)
+    )
+
+
+def pixel_from_mrad(
+    camera: Camera,
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    *,
+    gaze_deg: tuple[float, float] = (0.0, 0.0),
+) -> NDArray[np.float64]:
+    """Local scale (..., 2, 2) of the image at a field direction.
+
+    Pixels (x right, y up) per mrad along the pupil axes (ex, ey) of that field; see
+    `pinhole.pixel_from_mrad`.  Directions beyond the camera's ±`MAX_FIELD_DEG` take
+    the scale there.
+    """
+    turn = gaze_rotation(gaze_deg)
+    direction = unit_direction(h_deg, v_deg)
+    camera_h, camera_v = angles_deg(direction @ turn.T)
+    scale = pinhole.pixel_from_mrad(
+        np.clip(camera_h, -MAX_FIELD_DEG, MAX_FIELD_DEG),
+        np.clip(camera_v, -MAX_FIELD_DEG, MAX_FIELD_DEG),
+        tangents=camera.tangents,
+        size_px=(camera.width_px, camera.height_px),
+    )
+    # The eye's pupil axes, turned into the camera's frame, against the camera's own.
+    eye_axes = np.stack(_pupil_axes(direction), axis=-1)  # (..., 3, 2)
+    camera_axes = np.stack(_pupil_axes(direction @ turn.T), axis=-1)
+    roll = np.swapaxes(camera_axes, -1, -2) @ (turn @ eye_axes)
+    return scale @ roll
+
+
+def _pupil_axes(direction: NDArray) -> tuple[NDArray, NDArray]:
+    """Return ex = u x y normalised and ey = ex x u, each (..., 3)."""
+    ex = np.cross(direction, np.array([0.0, 1.0, 0.0]))
+    ex /= np.linalg.norm(ex, axis=-1, keepdims=True)
+    return ex, np.cross(ex, direction)

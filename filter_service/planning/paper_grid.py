@@ -1,0 +1,75 @@
+"""The paper's fixed grids, as plans of this cache.
+
+Angles and distances are those of the released code; its nodes of focus become nodes of
+accommodation, and its nodes of object distance nodes of the total defocus that green
+light then has, with the other channels beside it.
+
+References
+----------
+Csoba & Kunkli 2023, section 7.2.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.planning.eye import Eye
+from filter_service.planning.grid import PAPER_REACH_DEG, GridSpec
+from filter_service.planning.nodes import RaggedNodes
+
+ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
+DISTANCE_COUNTS = {"on-axis": 33, "quality": 9, "dynamic": 9}
+PUPILS_MM = {
+    "on-axis": (2.0, 3.0, 4.0, 5.0, 6.0, 7.0),
+    "quality": (5.0,),
+    "dynamic": (2.0, 3.0, 4.0, 5.0, 6.0),
+}
+FOCI_DPT = {
+    "on-axis": tuple(0.125 + np.arange(7.0)),
+    "quality": (0.125,),
+    "dynamic": tuple(0.125 + np.arange(5.0)),
+}
+DISTANCES_DPT = (0.125, 8.125)
+
+GREEN = 1
+
+
+def paper_axes(
+    eye: Eye, spec: GridSpec
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray, NDArray]:
+    """Azimuths, elevations, pupils and accommodations.
+
+    Pupils and foci outside of the ranges in use become their ends.  Foci that the eye
+    meets with one and the same accommodation, as a myopic eye beyond its far point,
+    are one node.
+    """
+    reach_deg = PAPER_REACH_DEG.get(spec.mode, (0.0, 0.0))
+    angles_deg = (
+        np.linspace(-reach, reach, count)
+        for reach, count in zip(reach_deg, ANGLE_COUNTS[spec.mode], strict=True)
+    )
+    pupils_mm = np.clip(PUPILS_MM[spec.mode], *spec.pupil_range_mm)
+    foci_dpt = np.clip(FOCI_DPT[spec.mode], *spec.focus_range_dpt)
+    return (
+        *angles_deg,
+        np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm]),
+        np.unique([eye.accommodation_dpt(focus_dpt) for focus_dpt in foci_dpt]),
+    )
+
+
+def paper_defocus(
+    eye: Eye, spec: GridSpec, axes: tuple[NDArray, NDArray, NDArray, NDArray]
+) -> tuple[RaggedNodes, NDArray[np.float64]]:
+    """Nodes of total defocus, and the channels' shifts (n_groups, 3) against them."""
+    h_deg, v_deg, pupils_mm, used_dpt = axes
+    at_infinity_dpt = eye.total_defocus_dpt(
+        h_deg=h_deg[:, None, None, None],
+        v_deg=v_deg[:, None, None, None, None],
+        pupil_diameter_mm=pupils_mm[:, None, None],
+        accommodation_dpt=used_dpt[:, None],
+        wavelength_nm=spec.channel_wavelengths_nm,
+    ).reshape(-1, 3)
+    green_dpt = at_infinity_dpt[:, GREEN, None]
+    count = DISTANCE_COUNTS[spec.mode]
+    values = green_dpt + np.linspace(*DISTANCES_DPT, count)
+    starts = count * np.arange(len(values) + 1)
+    return RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt

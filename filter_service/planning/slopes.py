@@ -1,0 +1,87 @@
+"""Slopes of wavefronts over their pupils, in pixels: what a PSF will look like.
+
+Where a ray of the pupil lands is the slope of its wavefront; PSFs differ by how far
+their rays lie apart, point by point of the pupil.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.psf_pupil import PupilFrames, pupil_frames
+from estimator.zernike import EXPONENTS, wavefront_polynomial
+from filter_service.planning.eye import Eye
+from filter_service.planning.grid import GridSpec
+
+N_RINGS, N_AZIMUTHS = 5, 16
+
+
+@dataclass(frozen=True)
+class PupilStates:
+    """What a wavefront depends on; arrays (P,)."""
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    pupil_diameter_mm: NDArray[np.float64]
+    accommodation_dpt: NDArray[np.float64]
+    wavelength_nm: NDArray[np.float64]
+    total_defocus_dpt: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, **values: ArrayLike) -> "PupilStates":
+        """Broadcast the fields against each other, in C order."""
+        arrays = np.broadcast_arrays(*(np.asarray(v, float) for v in values.values()))
+        return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
+
+    def taken(self, index: NDArray[np.int64] | slice) -> "PupilStates":
+        """Return some of the states, in any order."""
+        return PupilStates(**{name: v[index] for name, v in vars(self).items()})
+
+
+def state_frames(eye: Eye, spec: GridSpec, states: PupilStates) -> PupilFrames:
+    """Pupils and wavefronts of states (P,), in the coordinates of the pixels."""
+    found = eye.wavefronts(**vars(states))
+    return pupil_frames(
+        wavefront_polynomial(found.zernike_um),
+        circle_radius_mm=found.circle_diameter_mm / 2.0,
+        wavelength_nm=states.wavelength_nm,
+        pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
+        pupil_ellipse=found.pupil_ellipse,
+    )
+
+
+def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:
+    """Weights (n,) and slopes (28, n) of every monomial over the unit disc."""
+    node, weight = np.polynomial.legendre.leggauss(N_RINGS)
+    radius = np.sqrt((node + 1.0) / 2.0)[:, None]
+    # Every ring turned by its own angle, so that rings do not line up.
+    turn = np.arange(N_RINGS)[:, None] / N_RINGS
+    angle = 2.0 * np.pi * (np.arange(N_AZIMUTHS) + turn) / N_AZIMUTHS
+    x, y = (radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()
+    a, b = EXPONENTS[:, :1], EXPONENTS[:, 1:]
+    return (
+        np.repeat(weight / 2.0, N_AZIMUTHS) / N_AZIMUTHS,
+        a * x ** np.maximum(a - 1, 0) * y**b,
+        b * x**a * y ** np.maximum(b - 1, 0),
+    )
+
+
+WEIGHTS, _SLOPE_X, _SLOPE_Y = _sample_slopes()
+"""Shares (n,) of the pupil that its sample points stand for."""
+
+
+def slopes_px(frames: PupilFrames) -> NDArray[np.float64]:
+    """Slopes (P, n, 2), px, x right and y up, at the same points of each pupil."""
+    along_x = frames.disc_polynomial_um @ _SLOPE_X
+    along_y = frames.disc_polynomial_um @ _SLOPE_Y
+    shear = frames.shear_ratio[:, None]
+    scale = np.sqrt(1.0 - shear * shear)
+    half = frames.half_width_um_per_px
+    return np.stack(
+        [
+            (along_x - shear / scale * along_y) / half[:, :1],
+            along_y / scale / half[:, 1:],
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,192 @@
+"""What frames will ask of a cache, sampled, and how far blended PSFs miss it there."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.planning.error_law import AXIS_FACTOR, blend_error
+from filter_service.planning.eye import Eye
+from filter_service.planning.field_directions import MAX_FIELD_DEG, field_deg
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import (
+    CachePlan,
+    bracket_axis,
+)
+from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+
+AXES = ("h", "v", "pupil", "accommodation", "defocus")
+FIELD_OF_AXIS = {
+    "h": "h_deg",
+    "v": "v_deg",
+    "pupil": "pupil_diameter_mm",
+    "accommodation": "accommodation_dpt",
+}
+
+_PLASTIC = 1.1127756842787055
+"""Root of x^7 = x + 1: its powers fill six dimensions evenly (R-sequence)."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """Sampled states of frames, with their exact PSFs.
+
+    Attributes
+    ----------
+    states : PupilStates
+    object_dpt : (P,)
+    exact_px : (P, n, 2)
+        Slopes, px.
+    """
+
+    eye: Eye
+    spec: GridSpec
+    states: PupilStates
+    object_dpt: NDArray[np.float64]
+    exact_px: NDArray[np.float64]
+
+    @property
+    def unit_px(self) -> NDArray[np.float64]:
+        """Lambda over pupil diameter (P,), px."""
+        return unit_px(self.spec, self.states)
+
+    def taken(self, index: NDArray[np.int64]) -> "Use":
+        """Return some of the states, in any order."""
+        return replace(
+            self,
+            states=self.states.taken(index),
+            object_dpt=self.object_dpt[index],
+            exact_px=self.exact_px[index],
+        )
+
+
+def unit_px(spec: GridSpec, states: PupilStates) -> NDArray[np.float64]:
+    """Lambda over pupil diameter (P,) in pixels of the camera's axis."""
+    unit_mrad = states.wavelength_nm / 1e3 / states.pupil_diameter_mm  # um/mm
+    return unit_mrad / min(spec.pixel_pitch_mrad)
+
+
+def sample_use(eye: Eye, spec: GridSpec, count: int) -> Use:
+    """Sample states evenly: image positions, pupils, foci, distances and channels.
+
+    Half of the objects are where the eye focuses, where interpolation shows most; the
+    others anywhere in the range.
+    """
+    steps = 1.0 / _PLASTIC ** np.arange(1, 7)
+    unit = (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+    x, y, pupil, focus, distance, channel = unit.T
+    if spec.follows_field:
+        camera = spec.camera
+        h_deg, v_deg = (
+            np.clip(angle, -MAX_FIELD_DEG, MAX_FIELD_DEG)
+            for angle in field_deg(
+                camera,
+                x * camera.width_px,
+                y * camera.height_px,
+                gaze_deg=spec.gaze_deg,
+            )
+        )
+    else:
+        h_deg = v_deg = np.zeros(count)
+    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
+    foci_dpt = spec.focus_range_dpt[0] + np.ptp(spec.focus_range_dpt) * focus
+    used_dpt = np.array([eye.accommodation_dpt(f) for f in foci_dpt])
+    focused_dpt = np.array([eye.reachable_focus_dpt(f) for f in foci_dpt])
+    low_dpt, high_dpt = spec.object_range_dpt
+    object_dpt = np.where(
+        distance < 0.5,
+        np.clip(focused_dpt, low_dpt, high_dpt),
+        low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
+    )
+    wavelengths_nm = spec.channel_wavelengths_nm
+    known = {
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "pupil_diameter_mm": low_mm + (high_mm - low_mm) * pupil,
+        "accommodation_dpt": used_dpt,
+        "wavelength_nm": wavelengths_nm[(channel * len(wavelengths_nm)).astype(int)],
+    }
+    states = PupilStates(
+        **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + object_dpt
+    )
+    exact_px = slopes_px(state_frames(eye, spec, states))
+    return Use(eye, spec, states, object_dpt, exact_px)
+
+
+def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
+    """Neighbouring states (P,) at which a frame's states are read along an axis.
+
+    Along the field the object stays, along the pupil the geometric blur, along
+    accommodation the total defocus.
+    """
+    columns = vars(use.states) | {FIELD_OF_AXIS[axis]: to}
+    total_dpt = columns.pop("total_defocus_dpt")
+    if axis == "pupil":
+        total_dpt = total_dpt * use.states.pupil_diameter_mm / to
+    elif axis in ("h", "v"):
+        total_dpt = use.eye.total_defocus_dpt(**columns) + use.object_dpt
+    return PupilStates(**columns, total_defocus_dpt=total_dpt)
+
+
+def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
+    """Mean square error of the states when one axis is interpolated between nodes."""
+    lower, upper, share = bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]])
+    twice = use.taken(np.tile(np.arange(share.size), 2))
+    neighbours = moved(twice, axis, nodes[np.append(lower, upper)])
+    return AXIS_FACTOR[axis] * _error(use, neighbours, share)
+
+
+def defocus_error(use: Use, plan: CachePlan) -> float:
+    """Mean square error of the states when defocus is interpolated within its groups.
+
+    Each state reads the group of its nearest field, pupil and accommodation.
+    """
+    states = use.states
+    corner = [
+        np.abs(nodes - values[:, None]).argmin(axis=1)
+        for nodes, values in (
+            (plan.v_deg, states.v_deg),
+            (plan.h_deg, states.h_deg),
+            (plan.pupils_mm, states.pupil_diameter_mm),
+            (plan.accommodations_dpt, states.accommodation_dpt),
+        )
+    ]
+    groups = np.ravel_multi_index(corner, plan.group_shape)
+    # A group holds the range of its own field.
+    node = PupilStates(
+        **vars(states)
+        | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
+    )
+    own_dpt = use.object_dpt - states.total_defocus_dpt + _at_infinity_dpt(use, node)
+    channel = np.argmin(
+        np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
+    )
+    shift_dpt = plan.channel_shift_dpt[groups, channel]
+    scale = states.pupil_diameter_mm / plan.pupils_mm[corner[2]]
+    read_dpt = (states.total_defocus_dpt + own_dpt) * scale - shift_dpt
+    lower, upper, share = plan.defocus.bracket(groups, read_dpt)
+    columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
+    columns["total_defocus_dpt"] = np.concatenate(
+        [
+            (plan.defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
+            for index in (lower, upper)
+        ]
+    )
+    return AXIS_FACTOR["defocus"] * _error(use, PupilStates(**columns), share)
+
+
+def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
+    columns = dict(vars(states))
+    del columns["total_defocus_dpt"]
+    return use.eye.total_defocus_dpt(**columns)
+
+
+def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
+    """Mean square error with all lower neighbours and then all upper ones."""
+    lower_px, upper_px = np.split(
+        slopes_px(state_frames(use.eye, use.spec, neighbours)), 2
+    )
+    errors = blend_error(
+        lower_px, upper_px, use.exact_px, share_ratio=share, unit_px=use.unit_px
+    )
+    return float(errors.mean())

@@ -1,0 +1,168 @@
+"""Dispatches of the passes that build PSFs, over jobs of `gpu_build_records`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.psf_geometric import fresnel_table
+from filter_service.gl.gpu import Buffer, Gpu
+from filter_service.psfs.gpu_build_constants import (
+    CLEAR_THREADS,
+    DEFINES,
+    RAY_ROWS,
+    fft_defines,
+)
+from filter_service.psfs.gpu_build_records import Chunk, Jobs
+
+
+def _groups(count: int, size: int) -> int:
+    return -(-count // size)
+
+
+class PsfPasses:
+    """The buffers and passes of one caller; the context must be current.
+
+    Attributes
+    ----------
+    kernels, totals : Buffer
+        What the passes write.
+    """
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self.kernels: Buffer | None = None
+        self.totals: Buffer | None = None
+
+    def begin(self, *, kernel_count: int, total_count: int) -> None:
+        """Make room for the kernels of a slab."""
+        self.kernels = self._gpu.storage("psf_kernels", 4 * kernel_count)
+        self.totals = self._gpu.upload(
+            "psf_totals", np.zeros(max(total_count, 1), np.float32)
+        )
+
+    def put(
+        self, start: int, kernel: NDArray, *, slot: int, light_ratio: float
+    ) -> None:
+        """Write a kernel that was computed elsewhere, and its light."""
+        self.kernels.write(kernel.tobytes(), offset=4 * start)
+        self.totals.write(np.float32(light_ratio).tobytes(), offset=4 * slot)
+
+    def waves(self, jobs: Jobs) -> None:
+        """Compute wave-optical kernels."""
+        if not jobs.chunks:
+            return
+        gpu = self._gpu
+        buffers = {
+            "PSF_RECORDS": gpu.upload("psf_wave_records", jobs.records),
+            "PSF_TABLES": gpu.upload("psf_filters", jobs.filter_weights),
+            "PSF_KERNELS": self.kernels,
+            "PSF_TOTALS": self.totals,
+        }
+        most = max(c.scratch_count for c in jobs.chunks)
+        buffers["PSF_FIELD"] = gpu.storage("psf_field", 8 * most)
+        most = max(c.stripe_count for c in jobs.chunks)
+        buffers["PSF_STRIPES"] = gpu.storage("psf_stripes", 4 * max(most, 1))
+        for chunk in jobs.chunks:
+            self._waves_of(chunk, buffers, jobs.is_apodised)
+
+    def _waves_of(self, chunk: Chunk, buffers: dict, is_apodised: bool) -> None:
+        length_x, length_y = chunk.lengths
+        first = {"first_record": chunk.first}
+
+        def run(name, groups, defines, uniforms, *bindings) -> None:
+            self._gpu.dispatch(
+                name,
+                (groups, chunk.count),
+                buffers={b: buffers[b] for b in bindings},
+                uniforms={**first, **uniforms},
+                defines={**DEFINES, **defines},
+            )
+
+        rows = fft_defines(length_x)
+        pairs = _groups(chunk.largest[0], 2)
+        extra = {"APODISED": 1} if is_apodised else {}
+        run(
+            "psf_wave_rows",
+            _groups(pairs, rows["FFT_LINES"]),
+            {**rows, **extra},
+            {},
+            *("PSF_RECORDS", "PSF_FIELD"),
+        )
+        columns = fft_defines(length_y)
+        run(
+            "psf_wave_columns",
+            _groups(length_x // 2, columns["FFT_LINES"]),
+            columns,
+            {"column_pairs": length_x // 2},
+            *("PSF_RECORDS", "PSF_FIELD", "PSF_TABLES", "PSF_STRIPES"),
+        )
+        run(
+            "psf_wave_pixels",
+            1,
+            {},
+            {"row_length": length_x},
+            *("PSF_RECORDS", "PSF_STRIPES", "PSF_TABLES", "PSF_KERNELS", "PSF_TOTALS"),
+        )
+
+    def rays(self, jobs: Jobs, *, diffraction: bool) -> None:
+        """Compute ray-optical kernels, or add their share to wave-optical ones."""
+        if not jobs.chunks:
+            return
+        gpu = self._gpu
+        most = max(c.scratch_count for c in jobs.chunks)
+        buffers = {
+            "PSF_RECORDS": gpu.upload("psf_ray_records", jobs.records),
+            "PSF_TABLES": gpu.upload("psf_fresnel", fresnel_table().astype(np.float32)),
+            "PSF_IMAGES": gpu.storage("psf_images", 16 * _groups(most, 4)),
+            "PSF_KERNELS": self.kernels,
+            "PSF_TOTALS": self.totals,
+        }
+        for chunk in jobs.chunks:
+            self._rays_of(chunk, buffers, jobs.is_apodised, diffraction)
+
+    def _rays_of(self, chunk: Chunk, buffers, is_apodised, diffraction) -> None:
+        n_quads = _groups(chunk.scratch_count, 4)
+        first = {"first_record": chunk.first}
+
+        def run(name, groups, uniforms, bindings, **variant) -> None:
+            self._gpu.dispatch(
+                name,
+                groups,
+                buffers={f"PSF_{b}": buffers[f"PSF_{b}"] for b in bindings},
+                uniforms=uniforms,
+                defines={**DEFINES, **variant},
+            )
+
+        clear = (_groups(n_quads, CLEAR_THREADS), 1)
+        run("psf_ray_clear", clear, {"n_quads": n_quads}, ("IMAGES",))
+        n_cells, n_points = chunk.largest
+        run(
+            "psf_ray_splat",
+            (_groups(n_cells, RAY_ROWS), chunk.count),
+            first,
+            ("RECORDS", "IMAGES"),
+            **({"APODISED": 1} if is_apodised else {}),
+        )
+        if diffraction:
+            run(
+                "psf_ray_edge",
+                (_groups(n_points, RAY_ROWS), chunk.count),
+                first,
+                ("RECORDS", "TABLES", "IMAGES"),
+            )
+        run(
+            "psf_ray_pixels",
+            (1, chunk.count),
+            first,
+            ("RECORDS", "IMAGES", "KERNELS", "TOTALS"),
+            **({"DIFFRACTING": 1} if diffraction else {}),
+        )
+
+    def read_kernels(self, out: NDArray[np.float32]) -> None:
+        """Fill an array with the slab's kernels; waits for the GPU."""
+        if out.size:
+            self.kernels.read_into(out.view(np.uint8), size=out.nbytes)
+
+    def read_totals(self, count: int) -> NDArray[np.float64]:
+        """Light (P,) in the discs of a block's kernels."""
+        totals = self._gpu.read(self.totals, (count, 2), np.float32)
+        return totals.astype(np.float64).sum(axis=1)

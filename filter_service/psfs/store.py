@@ -1,0 +1,259 @@
+"""The PSF cache of one eye and camera, and the layers of one frame.
+
+Plain arrays without GL: the worker fills it, the renderer uploads it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import RGB
+from filter_service.planning.eye import Eye
+from filter_service.planning.grid import GridSpec, layer_distances_dpt
+from filter_service.planning.nodes import bracket_axis
+from filter_service.planning.plan import CachePlan
+
+
+@dataclass(frozen=True)
+class PsfStore:
+    """Kernels over field, pupil, accommodation, total defocus and channel.
+
+    Node n of ``plan.defocus`` and channel c have PSF 3 n + c.
+
+    Attributes
+    ----------
+    plan : CachePlan
+        Where the nodes are.
+    kernels : (n_texels,), uint16
+        All kernels, rows downwards, one after the other; in steps of the kernel's peak
+        over WEIGHT_MAX, which is finer than half floats and half of what floats take.
+    offsets : (n_psfs,)
+        Where a kernel starts.
+    reach_px : (n_psfs, 4)
+        Its columns to the left and right, its rows up and down of the centre.
+    radius_px : (n_psfs,)
+        It lies within dx² + dy² <= (R + 0.5)².
+    blur_px : (n_psfs,)
+        Geometric blur radius.
+    spread_px : (n_psfs,)
+        Radius of the disc with the kernel's sum of squares: how far it really smears,
+        which for a bright core in a wide skirt is much less than ``blur_px``.
+    peak_ratio : (n_psfs,)
+        Largest weight.
+    """
+
+    spec: GridSpec
+    eye: Eye
+    plan: CachePlan
+    kernels: NDArray[np.uint16]
+    offsets: NDArray[np.int64]
+    reach_px: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    blur_px: NDArray[np.float64]
+    spread_px: NDArray[np.float64]
+    peak_ratio: NDArray[np.float64]
+    methods: dict[str, int] = field(default_factory=dict)
+    max_lost_energy_ratio: float = 0.0
+    build_ms: float = 0.0
+
+    @property
+    def psf_count(self) -> int:
+        """Number of kernels."""
+        return len(self.offsets)
+
+    @property
+    def memory_mb(self) -> float:
+        """Size of the kernels."""
+        return self.kernels.nbytes / 1e6
+
+
+@dataclass(frozen=True)
+class FrameLayers:
+    """How an eye in one state reads its cache, and the layers that frames then have.
+
+    Attributes
+    ----------
+    object_dpt : (n_layers,)
+        Object distances, ascending; the same over the whole field.
+    at_infinity_dpt : (n_fields, 3)
+        Total defocus for an object at infinity, per field node and channel.
+    corners : list of (pupil node, accommodation node, weight)
+        Cached neighbours of the state.
+    max_radius_px : int
+        No kernel of these layers is larger.
+    """
+
+    object_dpt: NDArray[np.float64]
+    at_infinity_dpt: NDArray[np.float64]
+    corners: tuple[tuple[int, int, float], ...]
+    max_radius_px: int
+    pupil_diameter_mm: float
+    focus_dpt: float
+    blur_px_per_dpt: float
+    notes: tuple[str, ...]
+
+
+def channel_defocus_dpt(
+    eye: Eye,
+    spec: GridSpec,
+    *,
+    h_deg: NDArray,
+    v_deg: NDArray,
+    pupil_diameter_mm: float,
+    accommodation_dpt: float,
+) -> NDArray[np.float64]:
+    """Total defocus (n_fields, 3) per channel for an object at infinity."""
+    return eye.total_defocus_dpt(
+        h_deg=np.asarray(h_deg, float)[:, None],
+        v_deg=np.asarray(v_deg, float)[:, None],
+        pupil_diameter_mm=pupil_diameter_mm,
+        accommodation_dpt=accommodation_dpt,
+        wavelength_nm=spec.channel_wavelengths_nm,
+    )
+
+
+def frame_layers(
+    store: PsfStore,
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    object_range_dpt: tuple[float, float] | None = None,
+) -> FrameLayers:
+    """Plan a frame's layers for a pupil and focus.
+
+    The pupil is clamped to the cache's range and to what was measured, with a note.
+
+    Parameters
+    ----------
+    object_range_dpt : (low, high), optional
+        Distances in the frame; default and limit is the cache's range.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
+    """
+    plan, eye = store.plan, store.eye
+    pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
+    notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
+    accommodation_dpt = eye.accommodation_dpt(focus_dpt)
+    v_deg, h_deg = (
+        axis.ravel() for axis in np.meshgrid(plan.v_deg, plan.h_deg, indexing="ij")
+    )
+    at_infinity_dpt = channel_defocus_dpt(
+        eye,
+        store.spec,
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameter_mm=pupil_mm,
+        accommodation_dpt=accommodation_dpt,
+    )
+    corners = tuple(
+        (pupil, used, pupil_weight * used_weight)
+        for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
+        for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
+        if pupil_weight * used_weight > 0.0
+    )
+    state = (store, pupil_mm, corners, at_infinity_dpt)
+    gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
+    object_dpt = layer_distances_dpt(
+        object_range_dpt or store.spec.object_range_dpt,
+        focused_dpt=-at_infinity_dpt[gaze],
+        blur_radius_px=lambda distance_dpt: _blur_px(*state, distance_dpt),
+        max_blur_step_px=store.spec.max_blur_step_px,
+    )
+    return FrameLayers(
+        object_dpt=object_dpt,
+        at_infinity_dpt=at_infinity_dpt,
+        corners=corners,
+        max_radius_px=_max_radius_px(*state, object_dpt),
+        pupil_diameter_mm=pupil_mm,
+        focus_dpt=eye.reachable_focus_dpt(focus_dpt),
+        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
+        notes=notes,
+    )
+
+
+def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
+    usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
+    low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
+    clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
+    if abs(clamped_mm - usable_mm) <= 1e-9:
+        return clamped_mm, ()
+    note = (
+        f"pupil {pupil_diameter_mm:g} mm is outside the prepared "
+        f"{low_mm:.3g} to {high_mm:.3g} mm: {clamped_mm:.3g} mm used"
+    )
+    return clamped_mm, (note,)
+
+
+def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
+    lower, upper, share = bracket_axis(nodes, value)
+    return [(int(lower), 1.0 - float(share)), (int(upper), float(share))]
+
+
+def neighbours(
+    store: PsfStore,
+    pupil_mm: float,
+    corners: tuple[tuple[int, int, float], ...],
+    fields: NDArray[np.int64],
+    total_dpt: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """PSFs and weights (n, 3, 2 n_corners) that make up n states of total defocus.
+
+    Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i is
+    read at total defocus t A / A_i, so no blended pair differs in size.
+
+    Parameters
+    ----------
+    fields : (n,)
+        Field nodes.
+    total_dpt : (n, 3)
+    """
+    plan = store.plan
+    channels = np.arange(RGB)
+    psfs, weights = [], []
+    for pupil, used, corner_weight in corners:
+        groups = (
+            fields * plan.pupils_mm.size + pupil
+        ) * plan.accommodations_dpt.size + used
+        lower, upper, share = plan.defocus.bracket(
+            groups[:, None],
+            total_dpt * (pupil_mm / plan.pupils_mm[pupil])
+            - plan.channel_shift_dpt[groups],
+        )
+        psfs += [RGB * lower + channels, RGB * upper + channels]
+        weights += [corner_weight * (1.0 - share), corner_weight * share]
+    return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
+
+
+def _blur_px(store, pupil_mm, corners, at_infinity_dpt, distance_dpt) -> NDArray:
+    """Geometric blur radius (n, n_fields * 3), px, of n object distances."""
+    n_fields = len(at_infinity_dpt)
+    fields = np.tile(np.arange(n_fields), len(distance_dpt))
+    total_dpt = distance_dpt[:, None, None] + at_infinity_dpt
+    psfs, weights = neighbours(
+        store, pupil_mm, corners, fields, total_dpt.reshape(-1, RGB)
+    )
+    blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
+    return blur_px.reshape(len(distance_dpt), n_fields * RGB)
+
+
+def _max_radius_px(store, pupil_mm, corners, at_infinity_dpt, object_dpt) -> int:
+    """Largest kernel that the range of distances can read."""
+    plan = store.plan
+    fields = np.arange(len(at_infinity_dpt))
+    largest = 0
+    for pupil, used, _ in corners:
+        groups = (
+            fields * plan.pupils_mm.size + pupil
+        ) * plan.accommodations_dpt.size + used
+        scale = pupil_mm / plan.pupils_mm[pupil]
+        shift_dpt = plan.channel_shift_dpt[groups]
+        low = ((at_infinity_dpt + object_dpt[0]) * scale - shift_dpt).min(axis=1)
+        high = ((at_infinity_dpt + object_dpt[-1]) * scale - shift_dpt).max(axis=1)
+        first, _, _ = plan.defocus.bracket(groups, low)
+        _, last, _ = plan.defocus.bracket(groups, high)
+        for start, end in zip(RGB * first, RGB * (last + 1), strict=True):
+            largest = max(largest, int(store.radius_px[start:end].max()))
+    return largest

@@ -1,0 +1,191 @@
+"""Finished PSF stores on disk, for the next time the same eye is wanted.
+
+A folder of files, each named by a hash of what decides its content: the profile, the
+grid and the code.  Several services may share it without a lock: files appear complete
+(see `store_file`), a file that is being read stays whole when another process removes
+it, and those unused for longest are removed beyond a limit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import estimator
+import filter_service
+from estimator.profiles import EyeProfile
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.store_codec import NotStorable, pack
+from filter_service.psfs.store_file import (
+    UNFINISHED,
+    DamagedFile,
+    read_file,
+    write_file,
+)
+
+SUFFIX = ".psfs"
+ABANDONED_S = 3600.0
+"""A file that has not been finished for so long never will be: its writer is gone."""
+
+MB = 1e6
+
+_WRITING = threading.Lock()
+
+log = logging.getLogger("ocufilter.cache")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What is kept of a build."""
+
+    store: Any
+    notes: tuple[str, ...]
+
+
+@cache
+def code_version() -> str:
+    """Return a hash of the files that decide what a store holds.
+
+    All of both packages and the shaders that compute PSFs: to leave out one that
+    matters would serve wrong images; to take in one that does not costs a build.
+    """
+    ours = Path(filter_service.__file__).parent
+    eyes = Path(estimator.__file__).parent
+    files = [
+        *(path for path in eyes.rglob("*") if path.suffix in (".py", ".json", ".onnx")),
+        *ours.rglob("*.py"),
+        *ours.parent.glob("shaders/**/psf*"),
+    ]
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(files):
+        name = path.relative_to(ours.parent).as_posix()
+        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def store_key(profile: EyeProfile, spec: GridSpec, *, eye_model: str) -> str:
+    """Return the name under which the store of an eye and a grid is kept."""
+    spec_tree, _ = pack(spec)
+    if not spec.follows_field:
+        spec_tree["object"][1]["camera"] = list(spec.pixel_pitch_mrad)
+    profile_tree, arrays = pack(profile)
+    digest = hashlib.blake2b(digest_size=16)
+    text = json.dumps(
+        [code_version(), eye_model, spec_tree, profile_tree], sort_keys=True
+    )
+    digest.update(text.encode())
+    for array in arrays.values():
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+class StoreCache:
+    """A folder of stores.
+
+    Parameters
+    ----------
+    folder : str
+        Made when it is first needed, for its owner only; ``""`` keeps nothing.
+    max_mb : int
+        What the folder may hold.
+    """
+
+    def __init__(self, folder: str, *, max_mb: int) -> None:
+        self._folder = Path(folder).expanduser() if folder else None
+        self._max_bytes = max_mb * MB
+
+    def load(self, key: str, *, go_on: Callable[[], None]) -> Stored | None:
+        """Return what is kept under a key; a damaged file is removed.
+
+        Parameters
+        ----------
+        go_on : callable
+            Called now and then; raises to give up.
+        """
+        if self._folder is None:
+            return None
+        path = self._path(key)
+        try:
+            stored = read_file(path, go_on=go_on)
+        except FileNotFoundError:
+            return None
+        except DamagedFile as error:
+            log.warning("%s is removed: %s", path, error)
+            path.unlink(missing_ok=True)
+            return None
+        except OSError as error:
+            log.warning("%s cannot be read: %s", path, error)
+            return None
+        with suppress(OSError):  # another service has removed it meanwhile
+            os.utime(path)
+        return stored
+
+    def save(self, key: str, stored: Stored) -> None:
+        """Keep a store; where that fails the log says why, and nothing else happens."""
+        if self._folder is None or stored.store.memory_mb * MB > self._max_bytes:
+            return
+        started_s = time.monotonic()
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            n_bytes = write_file(self._path(key), stored)
+            self._evict()
+        except (OSError, NotStorable) as error:
+            log.warning("a store cannot be kept in %s: %s", self._folder, error)
+            return
+        log.info(
+            "a store of %.0f MB is kept for the next time, written in %.1f s",
+            n_bytes / MB,
+            time.monotonic() - started_s,
+        )
+
+    def save_aside(self, key: str, stored: Stored) -> None:
+        """Keep a store while the caller goes on; a process that ends does not wait.
+
+        While an older one is still being written it is not kept: memory would fill up
+        with stores that wait for a slow disk.
+        """
+        if not _WRITING.acquire(blocking=False):
+            log.info("a store is not kept: the disk is busy with the last one")
+            return
+
+        def save() -> None:
+            try:
+                self.save(key, stored)
+            finally:
+                _WRITING.release()
+
+        threading.Thread(target=save, daemon=True).start()
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{key}{SUFFIX}"
+
+    def _evict(self) -> None:
+        """Remove what was used longest ago until the rest is within the limit."""
+        found = []
+        for path in self._folder.iterdir():
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                continue  # another service has removed it
+            if path.suffix == SUFFIX:
+                found.append((status.st_mtime, status.st_size, path))
+            elif path.suffix == UNFINISHED:
+                if time.time() - status.st_mtime > ABANDONED_S:
+                    path.unlink(missing_ok=True)
+        n_bytes = sum(size for _, size, _ in found)
+        for _, size, path in sorted(found):
+            if n_bytes <= self._max_bytes:
+                return
+            path.unlink(missing_ok=True)
+            n_bytes -= size
+            log.info("%s is removed: the cache is full", path.name)

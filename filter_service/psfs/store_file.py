@@ -1,0 +1,163 @@
+"""One file with an object and its arrays: written whole or not at all, read if intact.
+
+Layout: a preamble with sizes and checksums, a header in JSON, and from a page boundary
+on the arrays.  No part of it can run code.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.psfs.store_codec import pack, unpack
+
+MAGIC = b"OCUPSFS1"
+PREAMBLE = struct.Struct("<8sQQQII")
+"""Magic, bytes of the header, start and bytes of the arrays, checksums of both."""
+
+UNFINISHED = ".unfinished"
+PAGE_BYTES = 4096
+ALIGNMENT_BYTES = 64
+BLOCK_BYTES = 2**24
+"""Read or written between two looks at cancellation: 5 to 20 ms."""
+
+Look = Callable[[], None]
+
+
+class DamagedFile(ValueError):
+    """The file is not as it was written."""
+
+
+def write_file(path: Path, value: object, *, go_on: Look = lambda: None) -> int:
+    """Write an object so that the file appears complete or not at all; return its size.
+
+    Parameters
+    ----------
+    go_on : callable, optional
+        Called now and then; raises to give up.
+
+    Raises
+    ------
+    NotStorable, OSError
+    """
+    tree, arrays = pack(value)
+    places, n_bytes = _places(arrays)
+    header = json.dumps({"arrays": places, "tree": tree}).encode()
+    start = _round_up(PREAMBLE.size + len(header), PAGE_BYTES)
+    descriptor, name = tempfile.mkstemp(
+        prefix=path.stem[:16] + ".", suffix=UNFINISHED, dir=path.parent
+    )
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.seek(start)
+            checksum = 0
+            for block in _blocks(arrays):
+                file.write(block)
+                checksum = zlib.crc32(block, checksum)
+                go_on()
+            file.seek(0)
+            file.write(
+                PREAMBLE.pack(
+                    MAGIC, len(header), start, n_bytes, zlib.crc32(header), checksum
+                )
+            )
+            file.write(header)
+            file.truncate(start + n_bytes)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+    return start + n_bytes
+
+
+def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
+    """Return the object of a file.
+
+    Raises
+    ------
+    DamagedFile
+        It was cut off or changed, or is none of ours.
+    OSError
+        Also where it is not there.
+    """
+    with path.open("rb", buffering=0) as file:
+        preamble = file.read(PREAMBLE.size)
+        if len(preamble) < PREAMBLE.size:
+            raise DamagedFile("it is cut off")
+        magic, n_header, start, n_bytes, header_sum, data_sum = PREAMBLE.unpack(
+            preamble
+        )
+        n_there = os.fstat(file.fileno()).st_size
+        if magic != MAGIC or not PREAMBLE.size + n_header <= start <= n_there:
+            raise DamagedFile("it begins otherwise than was written")
+        if n_there != start + n_bytes:
+            raise DamagedFile(f"it has {n_there} bytes, {start + n_bytes} were written")
+        header = file.read(n_header)
+        if zlib.crc32(header) != header_sum:
+            raise DamagedFile("its header is damaged")
+        file.seek(start)
+        data, checksum = np.empty(n_bytes, np.uint8), 0
+        for first in range(0, n_bytes, BLOCK_BYTES):
+            block = memoryview(data[first : first + BLOCK_BYTES])
+            if file.readinto(block) != len(block):
+                raise DamagedFile("it was cut off while it was read")
+            checksum = zlib.crc32(block, checksum)
+            go_on()
+    if checksum != data_sum:
+        raise DamagedFile("its arrays are damaged")
+    try:
+        content = json.loads(header)
+        arrays = {key: _array(data, p) for key, p in content["arrays"].items()}
+        return unpack(content["tree"], arrays)
+    except (ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
+        raise DamagedFile(f"it is of another version: {error}") from error
+
+
+def _round_up(size: int, step: int) -> int:
+    return -(-size // step) * step
+
+
+def _places(arrays: dict[str, NDArray]) -> tuple[dict[str, list], int]:
+    """Return [dtype, shape, start] of each array, and the size of all."""
+    places, end = {}, 0
+    for key, array in arrays.items():
+        places[key] = [array.dtype.str, array.shape, end]
+        end += _round_up(array.nbytes, ALIGNMENT_BYTES)
+    return places, end
+
+
+def _blocks(arrays: dict[str, NDArray]) -> Iterator[bytes | memoryview]:
+    for array in arrays.values():
+        if array.nbytes:
+            plain = memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+            for first in range(0, len(plain), BLOCK_BYTES):
+                yield plain[first : first + BLOCK_BYTES]
+        yield bytes(_round_up(array.nbytes, ALIGNMENT_BYTES) - array.nbytes)
+
+
+def _array(data: NDArray[np.uint8], place: list) -> NDArray:
+    name, shape, start = place
+    dtype = np.dtype(name)
+    n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    return data[start : start + n_bytes].view(dtype).reshape(shape)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the new name last through a crash of the machine."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,368 @@
+"""The passes of one frame or strip of it: what runs when, on which buffers."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    BYTES_PER_WORD,
+    MAX_LEVEL,
+    PAPER_SORT_KEY_BITS,
+    RGB,
+    SORT_KEY_BITS,
+    THREADS,
+    TILE_SIZE_PX,
+)
+from filter_service.gl.gpu import Buffer, Gpu, StageTimer
+from filter_service.psfs.store import FrameLayers
+from filter_service.rendering.frame import View
+from filter_service.rendering.image_cells import ImageCells
+from filter_service.rendering.kernel_passes import (
+    MAX_GROUPS,
+    KernelSet,
+    used_pairs,
+    words_per_cell,
+)
+
+ENTRY_BYTES = 4
+MAX_BAND_ENTRIES = 16 * 2**20
+"""Tile list entries in flight; more go through in bands.  Keeps each list buffer at
+64 MB, half of the smallest storage block that the service runs on."""
+
+SOFTWARE_PIXELS_PER_THREAD = 8
+"""2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
+
+SOFTWARE_LIST_THREADS = 8
+"""Threads that make and sort a tile's list on a software renderer: one vector."""
+
+
+def group_count(count: int, size: int) -> int:
+    """Return how many groups of a size hold a count."""
+    return (count + size - 1) // size
+
+
+class FramePasses:
+    """The passes of one strip, in order; buffers are the context's named ones.
+
+    Parameters
+    ----------
+    view : View
+        The strip, with depth filled in.
+    layers : FrameLayers
+    image : ImageCells
+        Cells of the whole frame.
+    first_row : int
+        Of the strip within the frame.
+    frame_pixel_count : int, optional
+        Of the whole frame, where it is larger than the strip.
+    white_level : float
+        Light against which the contrast of a merged quad counts.
+    """
+
+    def __init__(
+        self,
+        gpu: Gpu,
+        view: View,
+        timer: StageTimer,
+        *,
+        layers: FrameLayers,
+        image: ImageCells,
+        paper_rule: bool,
+        merge: bool,
+        first_row: int = 0,
+        frame_pixel_count: int | None = None,
+        white_level: float = 1.0,
+    ):
+        self.gpu = gpu
+        self.view = view
+        self.paper_rule = paper_rule
+        self.merge = merge
+        self.timer = timer
+        self.size = (view.width_px, view.height_px)
+        self.pixel_count = view.width_px * view.height_px
+        self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
+        self.tile_count = self.grid[0] * self.grid[1]
+        self.buffers: dict[str, Buffer] = {}
+        self.layers = layers
+        self.image = image
+        self.first_row = first_row
+        self.scan = (
+            first_row * view.width_px,
+            frame_pixel_count or self.pixel_count,
+        )
+        self.white_level = white_level
+        self.entry_count = 0
+        self.kernel_count = 0
+        self.kernel_texel_count = 0
+
+    def _reserve(self, **n_bytes: int) -> None:
+        for name, size in n_bytes.items():
+            self.buffers[name] = self.gpu.storage(name, size)
+
+    def _run(
+        self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
+    ) -> None:
+        defines = uniforms.pop("defines", None)
+        textures = uniforms.pop("textures", None)
+        self.gpu.dispatch(
+            name,
+            groups,
+            buffers={binding: self.buffers[binding] for binding in bindings},
+            uniforms=uniforms,
+            defines=defines,
+            textures=textures,
+        )
+
+    def upload(self) -> None:
+        """Send the strip; bytes are padded to whole words."""
+        color, depth_m = self.view.color, self.view.depth_m
+        with self.timer.stage("upload_ms"):
+            n_bytes = group_count(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
+            packed = (
+                group_count(self.pixel_count, BYTES_PER_WORD) * RGB * BYTES_PER_WORD
+            )
+            self._reserve(COLOR_IN=max(n_bytes, packed))
+            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
+            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
+
+    def run(self, kernels: Callable[[NDArray[np.bool_]], KernelSet]) -> None:
+        """Filter the strip; `read_back` fetches the picture.
+
+        Parameters
+        ----------
+        kernels : callable
+            From the used (cell, interval) pairs to the kernels for them.
+        """
+        self.upload()
+        self.merge_fragments(kernels(self.build_fragments()))
+        self.count_tiles()
+        self.splat_bands()
+
+    def build_fragments(self) -> NDArray[np.bool_]:
+        """Linear light, dioptres and layers; returns the used pairs."""
+        n_words = words_per_cell(self.layers)
+        used = np.zeros((self.image.count, n_words), np.uint32)
+        self._reserve(PIXELS=16 * self.pixel_count, PIXEL_LAYER=4 * self.pixel_count)
+        self.buffers["LAYER_DPT"] = self.gpu.upload(
+            "LAYER_DPT", self.layers.object_dpt.astype(np.float32)
+        )
+        self.buffers["USED"] = self.gpu.upload("USED", used)
+        with self.timer.stage("fragments_ms"):
+            self._run(
+                "build_fragments",
+                self.grid,
+                *("COLOR_IN", "DEPTH_IN", "LAYER_DPT"),
+                *("PIXELS", "PIXEL_LAYER", "USED"),
+                **self._common,
+                words_per_cell=n_words,
+                tangents=self.view.tangents,
+                depth_is_planar=int(self.view.depth_kind == "planar"),
+                defines=(
+                    {"COLOR_IS_LINEAR": 1}
+                    if self.view.color.dtype == np.float32
+                    else None
+                ),
+            )
+        with self.timer.wall("psf_plan_ms"):
+            words = self.gpu.read(self.buffers["USED"], used.shape, np.uint32)
+            return used_pairs(words, self.layers)
+
+    @property
+    def _common(self) -> dict:
+        return {
+            "frame_size_px": self.size,
+            "layer_count": len(self.layers.object_dpt),
+            "cell_px": self.image.cell_px,
+            "cell_columns": self.image.grid[0],
+            "first_row": self.first_row,
+        }
+
+    def merge_fragments(self, kernels: KernelSet) -> None:
+        """Merge pixels into fragments, in blocks."""
+        slots = self.tile_count * THREADS
+        self.buffers.update(kernels.buffers)
+        self.kernel_count = kernels.kernels.count
+        self.kernel_texel_count = kernels.texel_count
+        self._reserve(
+            FRAGMENT_COLOR=16 * slots,
+            FRAGMENT_PLACE=16 * slots,
+            BLOCKS=16 * self.tile_count,
+        )
+        with self.timer.stage("merge_ms"):
+            self._run(
+                "merge_fragments",
+                self.grid,
+                *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
+                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
+                **self._common,
+                blur_px_per_dpt=self.layers.blur_px_per_dpt,
+                max_level=self._max_level,
+                white_level=self.white_level,
+                paper_order=int(self.paper_rule),
+                scan_px=self.scan,
+            )
+        reach_px = int(kernels.kernels.reach_px.max()) + 1.5
+        self.search_blocks = min(
+            group_count(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
+        )
+
+    def count_tiles(self) -> None:
+        """Lengths and offsets of the tile lists, and the bands they are made in."""
+        self._reserve(
+            TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2)
+        )
+        with self.timer.stage("bin_ms"):
+            self._run(
+                "count_tiles",
+                self.grid,
+                *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
+                tile_grid=self.grid,
+                search_blocks=self.search_blocks,
+                order_always=int(self.paper_rule),
+                defines=self._list_threads,
+            )
+            self._run(
+                "scan_tiles",
+                (1, 1),
+                "TILE_COUNTS",
+                "TILE_OFFSETS",
+                tile_count=self.tile_count,
+            )
+        with self.timer.wall("plan_ms"):
+            self.bands = self._plan_bands()
+
+    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
+        """Bands as (first tile, tile count, first entry, entry count)."""
+        total, total_float = self._totals()
+        self.entry_count = round(total_float) if total_float > 2**31 else total
+        fits = self.entry_count <= MAX_BAND_ENTRIES and self.tile_count <= MAX_GROUPS
+        if fits:
+            return [(0, self.tile_count, 0, total)]
+        counts = self.gpu.read(
+            self.buffers["TILE_COUNTS"], (self.tile_count, 2), np.uint32
+        )[:, 0].astype(np.int64)
+        offsets, bands = _split(counts, MAX_BAND_ENTRIES)
+        self.buffers["TILE_OFFSETS"] = self.gpu.upload(
+            "TILE_OFFSETS", offsets.astype(np.uint32)
+        )
+        return bands
+
+    def _totals(self) -> tuple[int, float]:
+        data = self.buffers["TILE_OFFSETS"].read(8, offset=4 * self.tile_count)
+        return (
+            int(np.frombuffer(data, np.uint32, 1)[0]),
+            float(np.frombuffer(data, np.float32, 1, offset=4)[0]),
+        )
+
+    def splat_bands(self) -> None:
+        """Scatter, sort and splat, band by band."""
+        longest = max(band[3] for band in self.bands)
+        self._reserve(
+            ENTRIES=ENTRY_BYTES * longest,
+            ENTRIES_SPARE=ENTRY_BYTES * longest,
+            COLOR_OUT=16 * self.pixel_count,
+        )
+        for first_tile, tile_count, first_entry, _ in self.bands:
+            band = {"first_tile": first_tile, "first_entry": first_entry}
+            groups = (tile_count, 1)
+            with self.timer.stage("bin_ms"):
+                self._run(
+                    "scatter_fragments",
+                    groups,
+                    *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
+                    tile_grid=self.grid,
+                    search_blocks=self.search_blocks,
+                    **band,
+                    defines=self._list_threads,
+                )
+            with self.timer.stage("sort_ms"):
+                self._run(
+                    "sort_tiles",
+                    groups,
+                    *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
+                    *("ENTRIES", "ENTRIES_SPARE"),
+                    **band,
+                    defines={
+                        **self._list_threads,
+                        "KEY_BITS": (
+                            PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
+                        ),
+                    },
+                )
+            with self.timer.stage("splat_ms"):
+                self._run(
+                    "splat_tiles",
+                    groups,
+                    *(
+                        "FRAGMENT_COLOR",
+                        "FRAGMENT_PLACE",
+                        "TILE_COUNTS",
+                        "TILE_OFFSETS",
+                    ),
+                    *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
+                    textures={"ATLAS": self.gpu.atlas("kernels", 1)},
+                    frame_size_px=self.size,
+                    tile_grid=self.grid,
+                    **band,
+                    defines=self._splat_variant(),
+                )
+
+    @property
+    def _list_threads(self) -> dict[str, int]:
+        software = self.gpu.is_software
+        return {"GROUP_THREADS": SOFTWARE_LIST_THREADS if software else THREADS}
+
+    def _splat_variant(self) -> dict[str, int]:
+        pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
+        rows = TILE_SIZE_PX // pixels
+        rule = {"PAPER_RULE": 1} if self.paper_rule else {}
+        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **rule}
+
+    def read_back(self, output: str) -> NDArray:
+        """Fetch the filtered picture, encoded as asked."""
+        width, height = self.size
+        if output == "linear":
+            with self.timer.wall("readback_ms"):
+                pixels = self.gpu.read(
+                    self.buffers["COLOR_OUT"], (height, width, 4), np.float32
+                )
+                return np.ascontiguousarray(pixels[..., :RGB])
+        with self.timer.stage("encode_ms"):
+            quads = group_count(self.pixel_count, BYTES_PER_WORD)
+            self._run(
+                "encode_srgb",
+                (group_count(quads, THREADS), 1),
+                *("COLOR_OUT", "COLOR_IN"),
+                pixel_count=self.pixel_count,
+            )
+        with self.timer.wall("readback_ms"):
+            return self.gpu.read(
+                self.buffers["COLOR_IN"], (height, width, RGB), np.uint8
+            )
+
+    @property
+    def _max_level(self) -> int:
+        """Level up to which fragments merge; the paper merges once."""
+        if not self.merge:
+            return 0
+        return 1 if self.paper_rule else MAX_LEVEL
+
+    def fragment_counts(self) -> tuple[int, int]:
+        """Fragments after merging, and pixels that went into merged ones."""
+        blocks = self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)
+        return int(blocks[:, 0].sum()), int(blocks[:, 3].sum())
+
+
+def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
+    """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
+    bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
+    first = 0
+    while first < len(counts):
+        sums = np.cumsum(counts[first:])
+        tiles = max(int(np.searchsorted(sums, limit, side="right")), 1)
+        tiles = min(tiles, MAX_GROUPS)
+        offsets[first : first + tiles] = sums[:tiles] - counts[first : first + tiles]
+        bands.append((first, tiles, 0, int(sums[tiles - 1])))
+        first += tiles
+    return offsets, bands

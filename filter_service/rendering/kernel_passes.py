@@ -1,0 +1,163 @@
+"""The passes that make a frame's kernels from the cache; kept between frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
+from filter_service.errors import GridTooLarge
+from filter_service.gl.gpu import Buffer, Gpu, Pages, StageTimer
+from filter_service.psfs.pack import box_sizes
+from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.rendering.frame_kernels import (
+    FrameKernels,
+    frame_kernels,
+    interval_count,
+    kernel_table,
+    level_sizes,
+    node_table,
+    pair_index,
+    part_table,
+    work_list,
+)
+from filter_service.rendering.image_cells import ImageCells
+
+MAX_GROUPS = 65535
+"""Work groups along one axis that every OpenGL 4.3 allows."""
+
+
+@dataclass(frozen=True)
+class KernelSet:
+    """Kernels on the GPU, in the context's atlas.
+
+    Attributes
+    ----------
+    kernels : FrameKernels
+    texel_count : int
+        Of all kernels, at all levels.
+    buffers : dict
+        KERNELS and KERNEL_OF.
+    """
+
+    kernels: FrameKernels
+    texel_count: int
+    buffers: dict[str, Buffer]
+
+
+class KernelMaker:
+    """Makes the kernels that a frame uses; the last frame's serve if they can."""
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self._made_for: tuple | None = None
+        self._have: NDArray[np.bool_] | None = None
+        self._set: KernelSet | None = None
+
+    def kernels(
+        self,
+        store: PsfStore,
+        pages: Pages,
+        layers: FrameLayers,
+        image: ImageCells,
+        used: NDArray[np.bool_],
+        timer: StageTimer,
+    ) -> KernelSet:
+        """Return kernels for all used (cell, interval) pairs (n_cells, n_intervals)."""
+        key = (pages, layers, image)
+        if self._made_for is not None and all(
+            a is b for a, b in zip(self._made_for, key, strict=True)
+        ):
+            if not np.any(used & ~self._have):
+                return self._set
+        self._made_for = None  # stays so if what follows fails
+        with timer.wall("psf_plan_ms"):
+            kernels = frame_kernels(store, layers, image, used)
+        with timer.stage("psf_blend_ms"):
+            self._set = self._blend(kernels, pages, used.shape)
+        self._made_for, self._have = key, used
+        return self._set
+
+    def _blend(self, kernels: FrameKernels, pages: Pages, shape: tuple) -> KernelSet:
+        gpu = self._gpu
+        nodes, node_texels = node_table(kernels.nodes)
+        table, texels = kernel_table(kernels)
+        node_atlas = gpu.atlas("nodes", node_texels)
+        atlas = gpu.atlas("kernels", texels)
+        buffers = {
+            "NODES": gpu.upload("NODES", nodes),
+            "RECIPES": gpu.upload("RECIPES", kernels.nodes.recipes),
+            "KERNELS": gpu.upload("KERNELS", table),
+            "PARTS": gpu.upload("PARTS", part_table(kernels)),
+            "KERNEL_OF": gpu.upload("KERNEL_OF", pair_index(kernels, shape)),
+        }
+        node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
+        widths, heights = box_sizes(kernels.reach_px)
+        self._run(
+            "blend_psfs",
+            node_widths * node_heights,
+            {name: buffers[name] for name in ("NODES", "RECIPES")},
+            images={"NODES": node_atlas},
+            textures={"STORE": pages},
+        )
+        self._run(
+            "blend_cells",
+            widths * heights,
+            {name: buffers[name] for name in ("NODES", "PARTS", "KERNELS")},
+            images={"ATLAS": atlas},
+            textures={"NODES": node_atlas},
+        )
+        for level in range(1, MAX_LEVEL + 1):
+            self._run(
+                "merge_psfs",
+                level_sizes(kernels, level),
+                {"KERNELS": buffers["KERNELS"]},
+                images={"ATLAS": atlas},
+                uniforms={"level": level},
+            )
+        kept = {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
+        return KernelSet(kernels, texels, kept)
+
+    def _run(
+        self,
+        name: str,
+        n_texels: NDArray,
+        buffers: dict,
+        *,
+        uniforms: dict | None = None,
+        **bindings,
+    ) -> None:
+        work = work_list(n_texels, THREADS)
+        if not len(work):
+            return
+        columns = min(len(work), MAX_GROUPS)
+        self._gpu.dispatch(
+            name,
+            (columns, -(-len(work) // columns)),
+            buffers={**buffers, "WORK": self._gpu.upload("WORK", work)},
+            uniforms={"group_count": len(work), **(uniforms or {})},
+            **bindings,
+        )
+
+
+def words_per_cell(layers: FrameLayers) -> int:
+    """32-bit words that note the used intervals of a cell.
+
+    Raises
+    ------
+    GridTooLarge
+        More layers than a frame may have.
+    """
+    if len(layers.object_dpt) > MAX_LAYERS:
+        raise GridTooLarge(
+            f"{len(layers.object_dpt)} layers between "
+            f"{layers.object_dpt[0]:g} and {layers.object_dpt[-1]:g} dpt",
+            allowed=f"{MAX_LAYERS} layers: a smaller pupil or fewer pixels per degree",
+        )
+    return -(-interval_count(layers) // 32)
+
+
+def used_pairs(words: NDArray[np.uint32], layers: FrameLayers) -> NDArray[np.bool_]:
+    """Return used pairs (n_cells, n_intervals) from words (n_cells, n_words)."""
+    bits = np.unpackbits(words.astype("<u4").view(np.uint8), axis=1, bitorder="little")
+    return bits[:, : interval_count(layers)].astype(bool)

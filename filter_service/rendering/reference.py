@@ -1,0 +1,174 @@
+"""Slow, plain twins of the passes in float64; tests and benchmarks only.
+
+`gather` asks every output pixel for all the light that reaches it and sorts that
+itself: no tiles, no lists, no merging, no shared code with the passes beyond the PSF
+store and the planned layers.
+"""
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from filter_service.constants import MIN_COVERAGE, PAPER_FAR_M, PAPER_TIE_BREAK_M
+from filter_service.psfs.pack import square_kernel
+from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.frame_kernels import (
+    FrameKernels,
+    NodeKernels,
+    frame_kernels,
+    interval_count,
+)
+from filter_service.rendering.image_cells import ImageCells, image_cells
+
+
+def linear_from_srgb(srgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """IEC 61966-2-1 decoding of 8-bit values."""
+    value = srgb.astype(np.float64) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
+    """IEC 61966-2-1 encoding to 8 bits, rounded."""
+    value = np.clip(linear_rgb, 0.0, 1.0)
+    curve = 1.055 * np.power(value, 1.0 / 2.4) - 0.055
+    encoded = np.where(value <= 0.0031308, 12.92 * value, curve)
+    return np.floor(255.0 * encoded + 0.5).astype(np.uint8)
+
+
+def recipe_kernels(
+    store: PsfStore, nodes: NodeKernels, radius_px: int
+) -> NDArray[np.float64]:
+    """Kernels (n_recipes, size, size, 3) of field nodes at layers, float64."""
+    size = 2 * radius_px + 1
+    kernels = np.zeros((len(nodes.recipes), size, size, 3))
+    for k, by_channel in enumerate(nodes.recipes):
+        for channel, words in enumerate(by_channel):
+            offsets, reaches, bits = words.reshape(3, -1)
+            weights = bits.view(np.float32)
+            for offset, own, weight in zip(offsets, reaches, weights, strict=True):
+                if weight > 0.0:
+                    reach_px = np.uint32(own).reshape(1).view(np.uint8)
+                    kernels[k, ..., channel] += float(weight) * square_kernel(
+                        store.kernels, int(offset), reach_px, radius_px
+                    )
+    return kernels
+
+
+def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
+    """Kernels (n, 2, size, size, 3) of a frame, at both ends of their intervals."""
+    radius = int(kernels.reach_px.max())
+    of_recipe = recipe_kernels(store, kernels.nodes, radius)
+    nodes = kernels.nodes
+    ends = np.stack([of_recipe[nodes.near], of_recipe[nodes.far]], axis=1)
+    out = np.zeros((kernels.count, *ends.shape[1:]))
+    for k in range(kernels.count):
+        for part, weight in zip(kernels.parts[k], kernels.weight_ratio[k], strict=True):
+            if weight > 0.0:
+                out[k] += weight * ends[part]
+    return out
+
+
+def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
+    """Cell (height, width) of each pixel."""
+    if image.cell_px == 0:
+        return np.zeros((view.height_px, view.width_px), np.int64)
+    rows = np.arange(view.height_px) // image.cell_px
+    columns = np.arange(view.width_px) // image.cell_px
+    return rows[:, None] * image.grid[0] + columns
+
+
+def gather(
+    view: View,
+    store: PsfStore,
+    layers: FrameLayers,
+    *,
+    accumulation: str = "coverage",
+) -> NDArray[np.float64]:
+    """Filter a view by sorted per-pixel gathering.
+
+    Returns
+    -------
+    linear_rgb : (height, width, 3)
+    """
+    depth_m, _ = fill_missing_depth(view.depth_m)
+    distance_dpt = np.clip(
+        object_dpt(view, depth_m), layers.object_dpt[0], layers.object_dpt[-1]
+    )
+    linear = view.color.astype(np.float64)
+    if view.color.dtype == np.uint8:
+        linear = linear_from_srgb(view.color)
+    n_intervals = interval_count(layers)
+    position = np.interp(
+        distance_dpt, layers.object_dpt, np.arange(len(layers.object_dpt))
+    )
+    interval = np.minimum(position.astype(np.int64), n_intervals - 1)
+    image = image_cells(store.spec, store.plan)
+    cell = cell_index(view, image)
+    used = np.zeros((image.count, n_intervals), bool)
+    used[cell, interval] = True
+    kernels = frame_kernels(store, layers, image, used)
+    kernel = np.zeros(used.shape, np.int64)
+    kernel[kernels.cells, kernels.intervals] = np.arange(kernels.count)
+    out = np.empty_like(linear)
+    _gather(
+        linear,
+        kernel[cell, interval],
+        position - interval,
+        _sort_key(distance_dpt, accumulation),
+        kernel_pairs(store, kernels),
+        accumulation == "paper",
+        out,
+    )
+    return out
+
+
+def _sort_key(distance_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
+    """Smaller is nearer; the paper adds the scan position to the distance."""
+    if accumulation == "coverage":
+        return -distance_dpt
+    with np.errstate(divide="ignore"):
+        distance_m = np.minimum(1.0 / distance_dpt, PAPER_FAR_M)
+    scan = np.arange(distance_m.size).reshape(distance_m.shape) / distance_m.size
+    return distance_m + PAPER_TIE_BREAK_M * scan
+
+
+@njit(parallel=True, cache=True)
+def _gather(linear, kernel, fraction, key, kernels, paper_rule, out):
+    height, width = kernel.shape
+    size = kernels.shape[2]
+    radius = size // 2
+    for y in prange(height):
+        found_key = np.empty(size * size)
+        found_weight = np.empty((size * size, 3))
+        found_color = np.empty((size * size, 3))
+        for x in range(width):
+            count = 0
+            for sy in range(max(0, y - radius), min(height, y + radius + 1)):
+                for sx in range(max(0, x - radius), min(width, x + radius + 1)):
+                    k, share = kernel[sy, sx], fraction[sy, sx]
+                    any_light = False
+                    for c in range(3):
+                        weight = kernels[k, 0, y - sy + radius, x - sx + radius, c]
+                        if share > 0.0:
+                            far = kernels[k, 1, y - sy + radius, x - sx + radius, c]
+                            weight += share * (far - weight)
+                        found_weight[count, c] = weight
+                        any_light = any_light or weight > 0.0
+                    if any_light:
+                        found_key[count] = key[sy, sx]
+                        found_color[count] = linear[sy, sx]
+                        count += 1
+            order = np.argsort(found_key[:count], kind="mergesort")
+            for c in range(3):
+                light, coverage = 0.0, 0.0
+                for i in order:
+                    room = 1.0 - coverage
+                    weight = found_weight[i, c]
+                    weight = weight * room if paper_rule else min(weight, room)
+                    light += weight * found_color[i, c]
+                    coverage += weight
+                if coverage >= MIN_COVERAGE:
+                    out[y, x, c] = light / coverage
+                else:
+                    out[y, x, c] = linear[y, x, c]

@@ -1,0 +1,339 @@
+"""Filters one view: checks, layers, strips that fit the buffers, and the answer."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
+from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
+from filter_service.gl.gpu import Gpu, Pages, StageTimer
+from filter_service.psfs.camera_match import serves
+from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.rendering.frame import (
+    View,
+    check_view,
+    fill_missing_depth,
+    finite_color,
+    object_dpt,
+)
+from filter_service.rendering.frame_passes import FramePasses
+from filter_service.rendering.image_cells import ImageCells, image_cells
+from filter_service.rendering.kernel_passes import KernelMaker
+from filter_service.wire.images import Camera
+
+BYTES_PER_PIXEL = 16
+"""Of the largest per-pixel buffers: a strip's must fit one storage block."""
+
+UPLOAD_LINES = 512
+"""Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
+
+ACCUMULATIONS = ("coverage", "paper")
+OUTPUTS = ("linear", "srgb8")
+
+
+@dataclass(frozen=True)
+class LoadedStore:
+    """A PSF store whose kernels are on the GPU."""
+
+    store: PsfStore
+    pages: Pages
+    image: ImageCells
+
+    def release(self) -> None:
+        """Free the GPU copy."""
+        self.pages.release()
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A filtered view and how it was made.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        float32 linear light, or uint8 sRGB.
+    stage_times_ms : dict
+        By stage; their sum is the time spent in the renderer.
+    missing_depth_count, clamped_depth_count, bad_color_count : int
+        Pixels whose depth was filled in, lay outside the prepared distances, or whose
+        colour was not finite (taken as black).
+    pupil_diameter_mm, focus_dpt : float
+        As used.
+    fragment_count, merged_count, entry_count : int
+        Fragments, pixels merged into some, and tile list entries; rows that two strips
+        of a very large frame share count twice.
+    kernel_count, kernel_texel_count : int
+        Kernels in use, and texels of all their levels.
+    """
+
+    color: NDArray
+    stage_times_ms: dict[str, float]
+    missing_depth_count: int
+    clamped_depth_count: int
+    bad_color_count: int
+    pupil_diameter_mm: float
+    focus_dpt: float
+    fragment_count: int
+    merged_count: int
+    entry_count: int
+    kernel_count: int
+    kernel_texel_count: int
+    layer_count: int
+    notes: list[str]
+
+
+class FilterRenderer:
+    """Runs the passes for one view at a time; not thread-safe."""
+
+    def __init__(self, gpu: Gpu):
+        self._gpu = gpu
+        self._layers_of: LoadedStore | None = None
+        self._layers_state: tuple[float, float] = (0.0, 0.0)
+        self._layers: FrameLayers | None = None
+        self._kernels = KernelMaker(gpu)
+
+    def load(self, store: PsfStore) -> LoadedStore:
+        """Copy a store's kernels to the GPU at once."""
+        *_, loaded = self.load_steps(store)
+        return loaded
+
+    def load_steps(
+        self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
+    ) -> Iterator[LoadedStore | None]:
+        """Copy a store's kernels in steps of a few MB, so that frames go on between.
+
+        Yields
+        ------
+        LoadedStore or None
+            None after each step, and in the end the loaded store.  The copy is given up
+            when the iterator is closed before.
+        """
+        n_lines = -(-store.kernels.size // STORE_SIDE)
+        with self._gpu.context:
+            pages = self._gpu.pages(store.kernels.size)
+        try:
+            for first in range(0, n_lines, lines_per_step):
+                lines = _lines(store.kernels, first, first + lines_per_step)
+                with self._gpu.context:
+                    self._gpu.write_pages(pages, first, lines)
+                yield None
+        except GeneratorExit:
+            pages.release()
+            raise
+        yield LoadedStore(
+            store=store, pages=pages, image=image_cells(store.spec, store.plan)
+        )
+
+    def render(
+        self,
+        view: View,
+        handle: LoadedStore,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        accumulation: str = "coverage",
+        merge: bool = True,
+        output: str = "linear",
+    ) -> Rendered:
+        """Filter one view through the eye of a loaded store.
+
+        Raises
+        ------
+        BadMessage
+            Arrays or options that cannot be used.
+        CameraMismatch
+            The store is for another camera, see `camera_match`.
+        OutOfGpuMemory, RenderFailed
+        """
+        check_view(view)
+        _check_choice("accumulation", accumulation, ACCUMULATIONS)
+        _check_choice("output", output, OUTPUTS)
+        _check_camera(view, handle.store)
+        # Another library's context (a renderer of the input) may be current.
+        with self._gpu.context:
+            return self._render(
+                view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+            )
+
+    def _render(
+        self, view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+    ) -> Rendered:
+        timer = StageTimer(self._gpu)
+        with timer.wall("prepare_ms"):
+            depth = self._prepared_depth(view, handle.store)
+            color, bad_color_count = finite_color(view.color)
+            whole = replace(view, color=color, depth_m=depth.depth_m)
+        layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
+        counts = np.zeros(5, dtype=np.int64)
+        for strip in _strips(whole, layers, self._gpu.max_block_bytes):
+            passes = FramePasses(
+                self._gpu,
+                strip.view,
+                timer,
+                layers=layers,
+                image=handle.image,
+                paper_rule=accumulation == "paper",
+                merge=merge,
+                first_row=strip.first_row,
+                frame_pixel_count=view.width_px * view.height_px,
+                white_level=_white_level(color),
+            )
+            passes.run(
+                lambda used: self._kernels.kernels(
+                    handle.store, handle.pages, layers, handle.image, used, timer
+                )
+            )
+            picture[strip.wanted] = passes.read_back(output)[strip.kept]
+            counts += (
+                *passes.fragment_counts(),
+                passes.entry_count,
+                passes.kernel_count,
+                passes.kernel_texel_count,
+            )
+        self._gpu.check("render")
+        notes = list(layers.notes)
+        if bad_color_count:
+            notes.append(
+                f"{bad_color_count} pixels with non-finite colour taken as black"
+            )
+        return Rendered(
+            color=picture,
+            stage_times_ms=timer.result_ms(),
+            missing_depth_count=depth.missing_count,
+            clamped_depth_count=depth.clamped_count,
+            bad_color_count=bad_color_count,
+            pupil_diameter_mm=layers.pupil_diameter_mm,
+            focus_dpt=layers.focus_dpt,
+            fragment_count=int(counts[0]),
+            merged_count=int(counts[1]),
+            entry_count=int(counts[2]),
+            kernel_count=int(counts[3]),
+            kernel_texel_count=int(counts[4]),
+            layer_count=len(layers.object_dpt),
+            notes=notes,
+        )
+
+    def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
+        depth_m, missing_count = fill_missing_depth(view.depth_m)
+        distances = object_dpt(view, depth_m)
+        low_dpt, high_dpt = store.spec.object_range_dpt
+        margin = 1e-6 * max(high_dpt, 1.0)
+        clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
+        return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
+
+    def _frame_layers(self, timer, handle, pupil_diameter_mm, focus_dpt) -> FrameLayers:
+        """Layers of this pupil and focus; those of the last frame when unchanged."""
+        state = (pupil_diameter_mm, focus_dpt)
+        if self._layers_of is not handle or self._layers_state != state:
+            self._layers_of = None  # stays so if what follows fails
+            with timer.wall("psf_plan_ms"):
+                self._layers = frame_layers(
+                    handle.store,
+                    pupil_diameter_mm=pupil_diameter_mm,
+                    focus_dpt=focus_dpt,
+                )
+            self._layers_of, self._layers_state = handle, state
+        return self._layers
+
+
+def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
+    """Words as whole lines (n, STORE_SIDE); the last is filled up with zeros."""
+    part = words[first * STORE_SIDE : end * STORE_SIDE]
+    missing = -part.size % STORE_SIDE
+    if missing:
+        part = np.concatenate([part, np.zeros(missing, words.dtype)])
+    return part.reshape(-1, STORE_SIDE)
+
+
+def _white_level(color: NDArray) -> float:
+    """Light against which a merged quad's contrast counts.
+
+    1 for 8-bit input; brighter for scenes in absolute or HDR units, whose mean is
+    taken as a quarter of white.
+    """
+    if color.dtype == np.uint8:
+        return 1.0
+    return max(1.0, 4.0 * float(color.mean()))
+
+
+@dataclass(frozen=True)
+class _Depth:
+    depth_m: NDArray[np.float32]
+    missing_count: int
+    clamped_count: int
+
+
+def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:
+    if value not in options:
+        raise BadMessage(f"{value!r}", field=field, allowed=", ".join(options))
+
+
+def _check_camera(view: View, store: PsfStore) -> None:
+    camera = Camera(view.width_px, view.height_px, tuple(view.tangents))
+    if not serves(store.spec, camera):
+        raise CameraMismatch(
+            f"PSFs are for {store.spec.camera}, the view's is {camera}",
+            field="tangents",
+        )
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Rows of a frame that go through the passes together.
+
+    ``view`` has the rows that send light to the wanted ones; ``wanted`` are the rows of
+    the frame to fill and ``kept`` the rows of the strip that do it.
+    """
+
+    view: View
+    first_row: int
+    wanted: slice
+    kept: slice
+
+
+def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Strip]:
+    """Cut a frame so that each strip's buffers fit a storage block.
+
+    Strips start on tile rows, so that tiles and merged quads are those of the whole.
+    """
+    reach_px = layers.max_radius_px + 2
+    halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)
+    rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
+    if rows >= view.height_px:
+        return [_Strip(view, 0, slice(None), slice(None))]
+    step = rows - 2 * halo
+    if step < TILE_SIZE_PX:
+        raise OutOfGpuMemory(
+            f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
+            f"a storage block of {max_block_bytes / 1e6:.0f} MB"
+        )
+    strips = []
+    for top in range(0, view.height_px, step):
+        bottom = min(top + step, view.height_px)
+        first, last = max(top - halo, 0), min(bottom + halo, view.height_px)
+        strips.append(
+            _Strip(
+                view=_rows_of(view, first, last),
+                first_row=first,
+                wanted=slice(top, bottom),
+                kept=slice(top - first, bottom - first),
+            )
+        )
+    return strips
+
+
+def _rows_of(view: View, first: int, last: int) -> View:
+    """Rows first..last of a view, with the tangents of their edges."""
+    left, right, up, down = view.tangents
+    per_row = (down - up) / view.height_px
+    return replace(
+        view,
+        color=np.ascontiguousarray(view.color[first:last]),
+        depth_m=np.ascontiguousarray(view.depth_m[first:last]),
+        tangents=(left, right, up + first * per_row, up + last * per_row),
+    )

@@ -1,0 +1,1 @@
+"""The running service: socket, sessions, builds of profiles, the render loop."""

@@ -1,0 +1,216 @@
+"""The service's settings, read once from TOML and command line, and checked once."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from filter_service.constants import PSF_ENGINES
+from filter_service.messages import DEFAULT_ENDPOINT, Limits
+from filter_service.service.build_job import BuildLimits
+
+LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
+MB = 2**20
+
+
+def default_cache_dir() -> str:
+    """Return where finished PSFs are kept if nothing else is said."""
+    own = os.environ.get("OCUFILTER_CACHE_DIR")
+    if own is not None:
+        return own
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return str(Path(base) / "ocufilter")
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """Everything a user may set.
+
+    Attributes
+    ----------
+    bind : str
+        Where to listen: ``tcp://127.0.0.1:5577``, port ``*`` for any free one, or
+        ``ipc://`` and a path.
+    allow_remote : bool
+        Listen on other interfaces than loopback.  Nothing is encrypted and anybody
+        who reaches the port can use up the memory: only behind a tunnel.
+    credit : int
+        Unanswered frames a client may have.
+    max_sessions : int
+        Clients served at once.
+    max_width_px, max_height_px, max_views, max_part_mb, max_profile_kb : int
+        Limits of one message; published in ``welcome``.
+    max_blur_radius_px : int
+        A profile that needs a wider kernel is refused.
+    max_store_mb : int
+        A profile that needs more memory for its PSFs is refused.
+    psf_engine : "auto", "cpu" or "gpu"
+        What computes PSFs; "auto" is the GPU unless a processor imitates it.
+    max_cameras : int
+        Cameras that one session keeps prepared.
+    store_cache_dir : str
+        Where finished PSFs are kept for the next time; ``""`` keeps none.  By default
+        ``$OCUFILTER_CACHE_DIR``, or ``ocufilter`` in ``$XDG_CACHE_HOME`` or ~/.cache.
+    store_cache_max_mb : int
+        What that folder may hold; those unused for longest go.
+    build_niceness : int
+        Of what is computed after a profile's first PSFs, so that the render loop wins
+        where cores are few.
+    cancel_grace_s : float
+        A build that does not stop within this time is stopped by force.
+    alive_interval_s : float
+        How often clients are probed; a session without a client ends then.
+    ready_file : Path, optional
+        Written with the bound endpoint once the service is ready; removed at its end.
+    """
+
+    bind: str = DEFAULT_ENDPOINT
+    allow_remote: bool = False
+    credit: int = 2
+    max_sessions: int = 8
+    max_width_px: int = 4096
+    max_height_px: int = 4096
+    max_views: int = 2
+    max_part_mb: int = 100
+    max_profile_kb: int = 1024
+    max_blur_radius_px: int = 255
+    max_store_mb: int = 2000
+    psf_engine: str = "auto"
+    max_cameras: int = 4
+    store_cache_dir: str = default_cache_dir()
+    store_cache_max_mb: int = 2000
+    build_niceness: int = 5
+    cancel_grace_s: float = 3.0
+    alive_interval_s: float = 5.0
+    ready_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work, naming the setting."""
+        _check_bind(self.bind, self.allow_remote)
+        if self.psf_engine not in PSF_ENGINES:
+            raise ValueError(
+                f"psf_engine is {self.psf_engine!r}; allowed: {', '.join(PSF_ENGINES)}"
+            )
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} is {value!r}; allowed: {low} to {high}")
+
+    @property
+    def limits(self) -> Limits:
+        """Return the limits of one message."""
+        return Limits(
+            max_width_px=self.max_width_px,
+            max_height_px=self.max_height_px,
+            max_views=self.max_views,
+            max_part_bytes=self.max_part_mb * MB,
+            max_profile_bytes=self.max_profile_kb * 1024,
+        )
+
+    @property
+    def build_limits(self) -> BuildLimits:
+        """Return what every build has to keep to."""
+        return BuildLimits(
+            max_blur_radius_px=self.max_blur_radius_px,
+            max_store_mb=self.max_store_mb,
+            psf_engine=self.psf_engine,
+            store_cache_dir=self.store_cache_dir,
+            store_cache_max_mb=self.store_cache_max_mb,
+        )
+
+    @property
+    def max_message_part_bytes(self) -> int:
+        """Return the size beyond which libzmq cuts a client off."""
+        limits = self.limits
+        return max(limits.max_part_bytes, limits.max_profile_bytes)
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "credit": (1, 16),
+    "max_sessions": (1, 64),
+    "max_width_px": (1, 16384),
+    "max_height_px": (1, 16384),
+    "max_views": (1, 8),
+    "max_part_mb": (1, 2047),
+    "max_profile_kb": (1, 1024),
+    "max_blur_radius_px": (1, 255),
+    "max_store_mb": (1, 1_000_000),
+    "max_cameras": (1, 16),
+    "store_cache_max_mb": (1, 1_000_000),
+    "build_niceness": (0, 19),
+    "cancel_grace_s": (0.05, 600.0),
+    "alive_interval_s": (0.05, 600.0),
+}
+
+
+def _check_bind(bind: object, allow_remote: bool) -> None:
+    if not isinstance(bind, str) or "://" not in bind:
+        raise ValueError(
+            f"bind is {bind!r}; allowed: tcp://127.0.0.1:PORT or ipc://PATH"
+        )
+    transport, address = bind.split("://", 1)
+    if transport == "ipc" and address:
+        return
+    if transport != "tcp":
+        raise ValueError(f"bind is {bind!r}; allowed: tcp://HOST:PORT or ipc://PATH")
+    host, _, port = address.rpartition(":")
+    is_port = port == "*" or (port.isdigit() and int(port) < 65536)
+    if not host or not is_port:
+        raise ValueError(
+            f"bind is {bind!r}; allowed: tcp://HOST:PORT, PORT 0 to 65535 or *"
+        )
+    if host not in LOOPBACK_HOSTS and not allow_remote:
+        raise ValueError(
+            f"bind is {bind!r}, which other machines can reach: nothing is encrypted "
+            "or authenticated, and whoever connects can use up this machine's memory. "
+            "Listen on tcp://127.0.0.1:PORT and let clients come through an SSH "
+            "tunnel, or set allow_remote = true in the configuration file"
+        )
+
+
+def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConfig:
+    """Return the settings of a TOML file, with overrides that are not None on top.
+
+    Raises
+    ------
+    ValueError
+        Unknown setting, wrong type or value out of range; the text names it.
+    OSError
+        The file cannot be read.
+    """
+    settings: dict[str, Any] = {}
+    if path is not None:
+        try:
+            settings = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is no TOML file: {error}") from None
+    settings |= {name: value for name, value in overrides.items() if value is not None}
+    return ServiceConfig(**_typed(settings))
+
+
+def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings with the types of their fields."""
+    defaults = {field.name: field.default for field in fields(ServiceConfig)}
+    unknown = sorted(set(settings) - set(defaults))
+    if unknown:
+        raise ValueError(
+            f"unknown setting {unknown[0]!r}; allowed: {', '.join(defaults)}"
+        )
+    typed = {}
+    for name, value in settings.items():
+        if name == "ready_file":
+            if not isinstance(value, str | Path):
+                raise ValueError(f"{name} is {value!r}; allowed: str")
+            typed[name] = Path(value)
+            continue
+        wanted = type(defaults[name])
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if type(value) is not wanted:
+            raise ValueError(f"{name} is {value!r}; allowed: {wanted.__name__}")
+        typed[name] = value
+    return typed

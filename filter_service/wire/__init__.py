@@ -1,0 +1,1 @@
+"""Fields, requests and replies of the messages, one kind each."""
