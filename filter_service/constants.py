@@ -95,6 +95,8 @@ could hold a cache over the whole field."""
 
 KERNEL_WORDS = 3
 NODE_WORDS = 2
+PART_WORDS = 6
+FIELD_CORNERS = 4
 """uvec4 words of one record: of a frame's kernel; of a node kernel or its share."""
 
 MAX_LEVEL = 3
@@ -160,6 +162,7 @@ BINDINGS = {
     "BINDING_PARTS": 1,
     "BINDING_RECIPES": 2,
     "BINDING_WORK": 3,
+    "BINDING_FIELD_DEFOCUS": 12,
 }
 """Storage buffer bindings; the reference software renderer allows 16 per stage.  Those
 of the blending passes take numbers of the frame's again."""

@@ -82,6 +82,29 @@ def field_range_deg(
     )
 
 
+def nearest_inside_deg(
+    camera: Camera,
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    *,
+    gaze_deg: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Field directions (h, v), moved to the image's edge where they lie outside."""
+    turn = gaze_rotation(gaze_deg)
+    x, y, z = np.moveaxis(unit_direction(h_deg, v_deg) @ turn.T, -1, 0)
+    left, right, up, down = camera.tangents
+    ahead = np.maximum(-z, np.cos(np.radians(MAX_FIELD_DEG)))
+    seen = np.stack(
+        [
+            np.clip(x / ahead, left, right),
+            np.clip(y / ahead, down, up),
+            -np.ones_like(x),
+        ],
+        axis=-1,
+    )
+    return angles_deg(seen @ turn)
+
+
 def pixel_from_mrad(
     camera: Camera,
     h_deg: ArrayLike,

@@ -18,7 +18,11 @@ from estimator.units import (
     REFERENCE_WAVELENGTH_NM,
     RGB_WAVELENGTHS_NM,
 )
-from filter_service.planning.field_directions import field_range_deg, pixel_from_mrad
+from filter_service.planning.field_directions import (
+    field_range_deg,
+    nearest_inside_deg,
+    pixel_from_mrad,
+)
 from filter_service.wire.images import Camera
 
 PUPIL_RATIO = 1.16
@@ -41,6 +45,9 @@ coarser grid (of the planner, or of the paper)."""
 
 PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
 """Azimuth and elevation to both sides (released code)."""
+
+MAX_GAZE_RANGE_DEG = 45.0
+"""How far eyes turn."""
 
 GRIDS = ("planned", "paper")
 TOLERANCES = ("loose", "normal", "fine")
@@ -68,6 +75,8 @@ class GridSpec:
         How much interpolation between planned nodes may cost.
     gaze_deg : (h, v)
         Where the eye looks within the camera's image.
+    gaze_range_deg : (h, v)
+        How far frames may turn the gaze from there, to either side.
     memory_budget_mb : float
         A larger plan is refused.
     max_blur_step_px : float
@@ -91,6 +100,7 @@ class GridSpec:
     grid: str = "planned"
     tolerance: str = "normal"
     gaze_deg: tuple[float, float] = (0.0, 0.0)
+    gaze_range_deg: tuple[float, float] = (0.0, 0.0)
     memory_budget_mb: float = 2000.0
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
@@ -108,6 +118,12 @@ class GridSpec:
             if getattr(self, name) not in options:
                 raise ValueError(
                     f"{name} {getattr(self, name)!r}: allowed are {', '.join(options)}"
+                )
+        for reach_deg in self.gaze_range_deg:
+            if not 0.0 <= reach_deg <= MAX_GAZE_RANGE_DEG:
+                raise ValueError(
+                    f"gaze_range_deg {self.gaze_range_deg}: 0 to "
+                    f"{MAX_GAZE_RANGE_DEG:g} allowed"
                 )
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
@@ -141,7 +157,14 @@ class GridSpec:
         """Field directions (h, v) from smallest to largest that PSFs are needed for."""
         if not self.follows_field:
             return (0.0, 0.0), (0.0, 0.0)
-        seen_deg = field_range_deg(self.camera, gaze_deg=self.gaze_deg)
+        ranges = [
+            field_range_deg(self.camera, gaze_deg=gaze_deg)
+            for gaze_deg in self.gaze_samples_deg()
+        ]
+        seen_deg = tuple(
+            (min(r[axis][0] for r in ranges), max(r[axis][1] for r in ranges))
+            for axis in range(2)
+        )
         if self.grid == "planned":
             return seen_deg
         return tuple(
@@ -150,6 +173,15 @@ class GridSpec:
                 seen_deg, PAPER_REACH_DEG[self.mode], strict=True
             )
         )
+
+    @property
+    def blends_at_equal_blur(self) -> bool:
+        """Whether field nodes are blended at equal defocus, not at equal distance.
+
+        Nodes that the planner chose hold the defocus that their neighbours read; the
+        paper's hold nine object distances of their own.
+        """
+        return self.grid == "planned"
 
     @property
     def channel_wavelengths_nm(self) -> NDArray[np.float64]:
@@ -162,12 +194,45 @@ class GridSpec:
         """Radius of the geometric blur disc on axis per dioptre of defocus, px."""
         return pupil_diameter_mm / 2.0 / min(self.pixel_pitch_mrad)
 
-    def pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
+    def gaze_samples_deg(self) -> list[tuple[float, float]]:
+        """Directions of gaze over the range: its middle, edges and corners."""
+        steps = [
+            (-reach, 0.0, reach) if reach > 0.0 else (0.0,)
+            for reach in self.gaze_range_deg
+        ]
+        return [
+            (self.gaze_deg[0] + h, self.gaze_deg[1] + v)
+            for h in steps[0]
+            for v in steps[1]
+        ]
+
+    def pixel_from_mrad(
+        self, h_deg, v_deg, *, gaze_deg: tuple[float, float] | None = None
+    ) -> NDArray[np.float64]:
         """Local scale (..., 2, 2) of the image at field directions; on axis its own."""
         if not self.follows_field:
             axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
             return np.broadcast_to(axis, (*np.shape(h_deg), 2, 2))
-        return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=self.gaze_deg)
+        gaze_deg = self.gaze_deg if gaze_deg is None else gaze_deg
+        return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=gaze_deg)
+
+    def node_pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
+        """Scale (..., 2, 2) of the pixels that kernels of a field node are stored in.
+
+        That of the image where the node is seen.  A node that the gaze moves over the
+        image has the pixels of its axis, made so much smaller that no place in the
+        image has smaller ones: frames then only ever average stored pixels.
+        """
+        if not any(self.gaze_range_deg) or not self.follows_field:
+            return self.pixel_from_mrad(h_deg, v_deg)
+        axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
+        finest = np.ones(np.shape(h_deg))
+        for gaze_deg in self.gaze_samples_deg():
+            inside = nearest_inside_deg(self.camera, h_deg, v_deg, gaze_deg=gaze_deg)
+            local = self.pixel_from_mrad(*inside, gaze_deg=gaze_deg)
+            ratio = np.linalg.norm(np.linalg.solve(axis, local), ord=2, axis=(-2, -1))
+            finest = np.maximum(finest, ratio)
+        return finest[..., None, None] * axis
 
 
 def _check_range(name: str, values: tuple, low: float, high: float) -> None:

@@ -224,6 +224,15 @@ def _neighbours(index: int, count: int) -> list[int]:
     return list(range(max(index - 1, 0), min(index + 2, count)))
 
 
+def _over_neighbours(values: NDArray, axis: int, extreme) -> NDArray:
+    """Extreme over a node and those beside it along an axis."""
+    count = values.shape[axis]
+    beside = [_neighbours(i, count) for i in range(count)]
+    return np.stack(
+        [extreme(values.take(own, axis), axis=axis) for own in beside], axis=axis
+    )
+
+
 def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.float64]:
     """Smallest and largest total defocus (n_v, n_h, n_pupils, n_accommodations, 2).
 
@@ -245,6 +254,9 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
         beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
         lows = np.stack([lows[..., j].min(axis=-1) for j in beside], axis=-1)
         highs = np.stack([highs[..., j].max(axis=-1) for j in beside], axis=-1)
+    for axis in (0, 1):  # nodes are read at the defocus of the field between them
+        lows = _over_neighbours(lows, axis, np.min)
+        highs = _over_neighbours(highs, axis, np.max)
     near_far = np.stack(
         [lows + spec.object_range_dpt[0], highs + spec.object_range_dpt[1]], axis=-1
     )

@@ -39,14 +39,28 @@ class PupilStates:
         return PupilStates(**{name: v[index] for name, v in vars(self).items()})
 
 
-def state_frames(eye: Eye, spec: GridSpec, states: PupilStates) -> PupilFrames:
-    """Pupils and wavefronts of states (P,), in the coordinates of the pixels."""
+def state_frames(
+    eye: Eye,
+    spec: GridSpec,
+    states: PupilStates,
+    *,
+    pixel_from_mrad: NDArray | None = None,
+) -> PupilFrames:
+    """Pupils and wavefronts of states (P,), in the coordinates of the pixels.
+
+    Parameters
+    ----------
+    pixel_from_mrad : (P, 2, 2), optional
+        Pixels other than those that kernels of these states are stored in.
+    """
+    if pixel_from_mrad is None:
+        pixel_from_mrad = spec.node_pixel_from_mrad(states.h_deg, states.v_deg)
     found = eye.wavefronts(**vars(states))
     return pupil_frames(
         wavefront_polynomial(found.zernike_um),
         circle_radius_mm=found.circle_diameter_mm / 2.0,
         wavelength_nm=states.wavelength_nm,
-        pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
+        pixel_from_mrad=pixel_from_mrad,
         pupil_ellipse=found.pupil_ellipse,
     )
 

@@ -35,6 +35,10 @@ class Use:
     ----------
     states : PupilStates
     object_dpt : (P,)
+    pixel_from_mrad : (P, 2, 2) or None
+        Scale of the image there, where frames map stored kernels to it.  None without
+        a range of gaze: between the nodes around a pixel the scale changes so little
+        that to map a kernel costs as much as it gains.
     exact_px : (P, n, 2)
         Slopes, px.
     """
@@ -43,6 +47,7 @@ class Use:
     spec: GridSpec
     states: PupilStates
     object_dpt: NDArray[np.float64]
+    pixel_from_mrad: NDArray[np.float64] | None
     exact_px: NDArray[np.float64]
 
     @property
@@ -56,6 +61,9 @@ class Use:
             self,
             states=self.states.taken(index),
             object_dpt=self.object_dpt[index],
+            pixel_from_mrad=(
+                None if self.pixel_from_mrad is None else self.pixel_from_mrad[index]
+            ),
             exact_px=self.exact_px[index],
         )
 
@@ -75,19 +83,7 @@ def sample_use(eye: Eye, spec: GridSpec, count: int) -> Use:
     steps = 1.0 / _PLASTIC ** np.arange(1, 7)
     unit = (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
     x, y, pupil, focus, distance, channel = unit.T
-    if spec.follows_field:
-        camera = spec.camera
-        h_deg, v_deg = (
-            np.clip(angle, -MAX_FIELD_DEG, MAX_FIELD_DEG)
-            for angle in field_deg(
-                camera,
-                x * camera.width_px,
-                y * camera.height_px,
-                gaze_deg=spec.gaze_deg,
-            )
-        )
-    else:
-        h_deg = v_deg = np.zeros(count)
+    h_deg, v_deg, scale = _seen_directions(spec, x, y)
     low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
     foci_dpt = spec.focus_range_dpt[0] + np.ptp(spec.focus_range_dpt) * focus
     used_dpt = np.array([eye.accommodation_dpt(f) for f in foci_dpt])
@@ -109,21 +105,51 @@ def sample_use(eye: Eye, spec: GridSpec, count: int) -> Use:
     states = PupilStates(
         **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + object_dpt
     )
-    exact_px = slopes_px(state_frames(eye, spec, states))
-    return Use(eye, spec, states, object_dpt, exact_px)
+    if not any(spec.gaze_range_deg):
+        scale = None
+    exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
+    return Use(eye, spec, states, object_dpt, scale, exact_px)
+
+
+def _seen_directions(
+    spec: GridSpec, x: NDArray, y: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Field directions (P,) at image positions in 0..1, and the image's scale there.
+
+    One after the other they take the directions of gaze that frames may have.
+    """
+    if not spec.follows_field:
+        zeros = np.zeros(x.size)
+        return zeros, zeros, spec.pixel_from_mrad(zeros, zeros)
+    camera, gazes = spec.camera, spec.gaze_samples_deg()
+    h_deg, v_deg = np.empty(x.size), np.empty(x.size)
+    scale = np.empty((x.size, 2, 2))
+    for k, gaze_deg in enumerate(gazes):
+        own = slice(k, None, len(gazes))
+        h_deg[own], v_deg[own] = (
+            np.clip(angle, -MAX_FIELD_DEG, MAX_FIELD_DEG)
+            for angle in field_deg(
+                camera,
+                x[own] * camera.width_px,
+                y[own] * camera.height_px,
+                gaze_deg=gaze_deg,
+            )
+        )
+        scale[own] = spec.pixel_from_mrad(h_deg[own], v_deg[own], gaze_deg=gaze_deg)
+    return h_deg, v_deg, scale
 
 
 def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
     """Neighbouring states (P,) at which a frame's states are read along an axis.
 
-    Along the field the object stays, along the pupil the geometric blur, along
-    accommodation the total defocus.
+    Along the field and accommodation the total defocus stays, along the pupil the
+    geometric blur.  The paper's grids are read at the distance of the object.
     """
     columns = vars(use.states) | {FIELD_OF_AXIS[axis]: to}
     total_dpt = columns.pop("total_defocus_dpt")
     if axis == "pupil":
         total_dpt = total_dpt * use.states.pupil_diameter_mm / to
-    elif axis in ("h", "v"):
+    elif axis in ("h", "v") and not use.spec.blends_at_equal_blur:
         total_dpt = use.eye.total_defocus_dpt(**columns) + use.object_dpt
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
 
@@ -152,12 +178,14 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
         )
     ]
     groups = np.ravel_multi_index(corner, plan.group_shape)
-    # A group holds the range of its own field.
-    node = PupilStates(
-        **vars(states)
-        | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
-    )
-    own_dpt = use.object_dpt - states.total_defocus_dpt + _at_infinity_dpt(use, node)
+    own_dpt = np.zeros(states.h_deg.size)
+    if not use.spec.blends_at_equal_blur:  # a group holds the range of its own field
+        node = PupilStates(
+            **vars(states)
+            | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
+        )
+        own_dpt += use.object_dpt - states.total_defocus_dpt
+        own_dpt += _at_infinity_dpt(use, node)
     channel = np.argmin(
         np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
@@ -183,9 +211,11 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
 
 def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
     """Mean square error with all lower neighbours and then all upper ones."""
-    lower_px, upper_px = np.split(
-        slopes_px(state_frames(use.eye, use.spec, neighbours)), 2
-    )
+    scale = use.pixel_from_mrad
+    if scale is not None:
+        scale = np.tile(scale, (2, 1, 1))
+    frames = state_frames(use.eye, use.spec, neighbours, pixel_from_mrad=scale)
+    lower_px, upper_px = np.split(slopes_px(frames), 2)
     errors = blend_error(
         lower_px, upper_px, use.exact_px, share_ratio=share, unit_px=use.unit_px
     )

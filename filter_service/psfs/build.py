@@ -117,7 +117,7 @@ def _computed(
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
         wavelength_nm=states.wavelength_nm,
-        pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
+        pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.diffraction,
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),

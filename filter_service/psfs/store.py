@@ -13,6 +13,7 @@ from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec, layer_distances_dpt
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.plan import CachePlan
+from filter_service.psfs.field_defocus import FieldDefocus, field_defocus
 
 
 @dataclass(frozen=True)
@@ -74,18 +75,25 @@ class FrameLayers:
 
     Attributes
     ----------
-    object_dpt : (n_layers,)
-        Object distances, ascending; the same over the whole field.
-    at_infinity_dpt : (n_fields, 3)
-        Total defocus for an object at infinity, per field node and channel.
+    layer_dpt : (n_layers,)
+        Ascending: object distance plus the change of defocus over the field, so that
+        at one layer field nodes have the same defocus and are blended at equal blur.
+    field : FieldDefocus
+        That change; none in the paper's grids, whose nodes are object distances.
+    object_range_dpt : (low, high)
+        Object distances that the layers are for.
+    layer_zero_dpt : (n_fields, 3)
+        Total defocus at layer 0 dpt, per field node and channel.
     corners : list of (pupil node, accommodation node, weight)
         Cached neighbours of the state.
     max_radius_px : int
         No kernel of these layers is larger.
     """
 
-    object_dpt: NDArray[np.float64]
-    at_infinity_dpt: NDArray[np.float64]
+    layer_dpt: NDArray[np.float64]
+    object_range_dpt: tuple[float, float]
+    field: FieldDefocus
+    layer_zero_dpt: NDArray[np.float64]
     corners: tuple[tuple[int, int, float], ...]
     max_radius_px: int
     pupil_diameter_mm: float
@@ -148,25 +156,35 @@ def frame_layers(
         pupil_diameter_mm=pupil_mm,
         accommodation_dpt=accommodation_dpt,
     )
+    change = field_defocus(
+        eye,
+        store.spec,
+        pupil_diameter_mm=pupil_mm,
+        accommodation_dpt=accommodation_dpt,
+    )
+    layer_zero_dpt = at_infinity_dpt - change.at(h_deg, v_deg)[:, None]
     corners = tuple(
         (pupil, used, pupil_weight * used_weight)
         for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
         for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
         if pupil_weight * used_weight > 0.0
     )
-    state = (store, pupil_mm, corners, at_infinity_dpt)
+    state = (store, pupil_mm, corners, layer_zero_dpt)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
-    object_dpt = layer_distances_dpt(
-        object_range_dpt or store.spec.object_range_dpt,
-        focused_dpt=-at_infinity_dpt[gaze],
+    near_far_dpt = object_range_dpt or store.spec.object_range_dpt
+    layer_dpt = layer_distances_dpt(
+        tuple(np.add(near_far_dpt, change.range_dpt)),
+        focused_dpt=-layer_zero_dpt[gaze],
         blur_radius_px=lambda distance_dpt: _blur_px(*state, distance_dpt),
         max_blur_step_px=store.spec.max_blur_step_px,
     )
     return FrameLayers(
-        object_dpt=object_dpt,
-        at_infinity_dpt=at_infinity_dpt,
+        layer_dpt=layer_dpt,
+        object_range_dpt=near_far_dpt,
+        field=change,
+        layer_zero_dpt=layer_zero_dpt,
         corners=corners,
-        max_radius_px=_max_radius_px(*state, object_dpt),
+        max_radius_px=_max_radius_px(*state, layer_dpt),
         pupil_diameter_mm=pupil_mm,
         focus_dpt=eye.reachable_focus_dpt(focus_dpt),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
@@ -227,22 +245,22 @@ def neighbours(
     return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
 
 
-def _blur_px(store, pupil_mm, corners, at_infinity_dpt, distance_dpt) -> NDArray:
-    """Geometric blur radius (n, n_fields * 3), px, of n object distances."""
-    n_fields = len(at_infinity_dpt)
-    fields = np.tile(np.arange(n_fields), len(distance_dpt))
-    total_dpt = distance_dpt[:, None, None] + at_infinity_dpt
+def _blur_px(store, pupil_mm, corners, layer_zero_dpt, at_dpt) -> NDArray:
+    """Geometric blur radius (n, n_fields * 3), px, of n layers."""
+    n_fields = len(layer_zero_dpt)
+    fields = np.tile(np.arange(n_fields), len(at_dpt))
+    total_dpt = at_dpt[:, None, None] + layer_zero_dpt
     psfs, weights = neighbours(
         store, pupil_mm, corners, fields, total_dpt.reshape(-1, RGB)
     )
     blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
-    return blur_px.reshape(len(distance_dpt), n_fields * RGB)
+    return blur_px.reshape(len(at_dpt), n_fields * RGB)
 
 
-def _max_radius_px(store, pupil_mm, corners, at_infinity_dpt, object_dpt) -> int:
-    """Largest kernel that the range of distances can read."""
+def _max_radius_px(store, pupil_mm, corners, layer_zero_dpt, layer_dpt) -> int:
+    """Largest kernel that the range of layers can read."""
     plan = store.plan
-    fields = np.arange(len(at_infinity_dpt))
+    fields = np.arange(len(layer_zero_dpt))
     largest = 0
     for pupil, used, _ in corners:
         groups = (
@@ -250,8 +268,8 @@ def _max_radius_px(store, pupil_mm, corners, at_infinity_dpt, object_dpt) -> int
         ) * plan.accommodations_dpt.size + used
         scale = pupil_mm / plan.pupils_mm[pupil]
         shift_dpt = plan.channel_shift_dpt[groups]
-        low = ((at_infinity_dpt + object_dpt[0]) * scale - shift_dpt).min(axis=1)
-        high = ((at_infinity_dpt + object_dpt[-1]) * scale - shift_dpt).max(axis=1)
+        low = ((layer_zero_dpt + layer_dpt[0]) * scale - shift_dpt).min(axis=1)
+        high = ((layer_zero_dpt + layer_dpt[-1]) * scale - shift_dpt).max(axis=1)
         first, _, _ = plan.defocus.bracket(groups, low)
         _, last, _ = plan.defocus.bracket(groups, high)
         for start, end in zip(RGB * first, RGB * (last + 1), strict=True):

@@ -16,12 +16,19 @@ from filter_service.constants import (
     MERGE_MIN_SPREAD_PX,
     NO_LEVEL,
     NODE_WORDS,
+    PART_WORDS,
     RECIPE_TAPS,
     WEIGHT_MAX,
 )
 from filter_service.psfs.pack import box_sizes, pack_reach
 from filter_service.psfs.store import FrameLayers, PsfStore, neighbours
 from filter_service.rendering.image_cells import ImageCells
+
+UNMOVED_PX = 0.5
+"""Light that a map would move by less stays where it is stored."""
+
+MAX_REACH_PX = 255
+"""A byte a side; light that a map takes beyond it is cut."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,11 @@ class FrameKernels:
     parts : (n, 4)
         Node kernels it is blended from.
     weight_ratio : (n, 4)
+        Share of a part; where its map turns or shears, times the area of a mapped pixel
+        over that of its sides.
+    maps : (n, 4, 2, 2)
+        From offsets in the image's pixels to those of the part; exactly the identity
+        where it is as good as that.
     reach_px : (n, 4)
         Left, right, up, down.
     radius_px : (n,)
@@ -78,6 +90,7 @@ class FrameKernels:
     intervals: NDArray[np.int64]
     parts: NDArray[np.int64]
     weight_ratio: NDArray[np.float64]
+    maps: NDArray[np.float64]
     reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     peak_ratio: NDArray[np.float64]
@@ -91,7 +104,7 @@ class FrameKernels:
 
 def interval_count(layers: FrameLayers) -> int:
     """Intervals between layers; a single layer is its own."""
-    return max(len(layers.object_dpt) - 1, 1)
+    return max(len(layers.layer_dpt) - 1, 1)
 
 
 def frame_kernels(
@@ -117,23 +130,59 @@ def frame_kernels(
     parts = parts.reshape(wanted.shape)
     nodes = _node_kernels(store, layers, *np.divmod(pairs, n_intervals))
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
+    maps = _part_maps(image.node_from_cell[cells], nodes.radius_px[parts])
+    area = np.abs(np.linalg.det(maps))
+    in_use = weights > 0.0
+    reach_px, radius_px = _mapped_sizes(
+        nodes.reach_px[parts], nodes.radius_px[parts], maps
+    )
     return FrameKernels(
         nodes=nodes,
         cells=cells,
         intervals=intervals,
         parts=parts,
-        weight_ratio=weights,
-        reach_px=nodes.reach_px[parts].max(axis=1),
-        radius_px=nodes.radius_px[parts].max(axis=1),
-        peak_ratio=(nodes.peak_ratio[parts] * weights).sum(axis=1),
-        spread_px=(spread_px[parts] * weights[..., None]).sum(axis=1),
+        weight_ratio=weights * area / np.abs(maps[..., 0, 0] * maps[..., 1, 1]),
+        maps=maps,
+        reach_px=np.where(in_use[..., None], reach_px, 0).max(axis=1),
+        radius_px=np.where(in_use, radius_px, 0).max(axis=1),
+        peak_ratio=(nodes.peak_ratio[parts] * weights * area).sum(axis=1),
+        spread_px=(spread_px[parts] * (weights / np.sqrt(area))[..., None]).sum(axis=1),
     )
+
+
+def _part_maps(maps: NDArray, radius_px: NDArray) -> NDArray[np.float64]:
+    """Return the maps (n, 4, 2, 2) of parts; the identity where no light moves visibly."""
+    moved_px = np.linalg.norm(maps - np.eye(2), axis=(-2, -1)) * radius_px
+    still = (moved_px <= UNMOVED_PX)[..., None, None]
+    return np.where(still, np.eye(2), maps)
+
+
+def _mapped_sizes(
+    reach_px: NDArray, radius_px: NDArray, maps: NDArray
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Reaches (n, 4, 4) and radii (n, 4) of parts in the image's pixels.
+
+    Light that is interpolated ends one stored pixel beyond the last one.
+    """
+    out = np.linalg.inv(maps)
+    left, right, up, down = np.moveaxis(reach_px + 1.0, -1, 0)
+    sides = []
+    for row in range(2):
+        a, b = out[..., row, 0], out[..., row, 1]
+        low = np.minimum(-a * left, a * right) + np.minimum(-b * up, b * down)
+        high = np.maximum(-a * left, a * right) + np.maximum(-b * up, b * down)
+        sides += [-low, high]
+    mapped_px = np.clip(np.ceil(np.stack(sides, axis=-1) - 1e-9) - 1, 0, MAX_REACH_PX)
+    moved = np.any(maps != np.eye(2), axis=(-2, -1))
+    stretch = np.linalg.norm(out, ord=2, axis=(-2, -1))
+    wider_px = np.minimum(np.ceil(stretch * (radius_px + 1.0)), MAX_REACH_PX)
+    return mapped_px.astype(np.int64), np.where(moved, wider_px, radius_px).astype(int)
 
 
 def _node_kernels(
     store: PsfStore, layers: FrameLayers, fields: NDArray, intervals: NDArray
 ) -> NodeKernels:
-    n_layers = len(layers.object_dpt)
+    n_layers = len(layers.layer_dpt)
     ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
     wanted, recipe_of = np.unique(fields * n_layers + ends, return_inverse=True)
     near, far = recipe_of.reshape(ends.shape)
@@ -143,7 +192,7 @@ def _node_kernels(
         layers.pupil_diameter_mm,
         layers.corners,
         recipe_fields,
-        layers.object_dpt[recipe_layers, None] + layers.at_infinity_dpt[recipe_fields],
+        layers.layer_dpt[recipe_layers, None] + layers.layer_zero_dpt[recipe_fields],
     )
     taken = weights > 0.0
     own_px = np.where(taken[..., None], store.reach_px[psfs], 0).max(axis=(1, 2))
@@ -223,10 +272,12 @@ def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
 
 
 def part_table(kernels: FrameKernels) -> NDArray[np.uint32]:
-    """Make records (n, 2, 4) for blend_cells: four node kernels and their weights."""
-    table = np.empty((kernels.count, NODE_WORDS, 4), dtype=np.uint32)
+    """Make records (n, 6, 4) for blend_cells: four node kernels, weights and maps."""
+    table = np.empty((kernels.count, PART_WORDS, 4), dtype=np.uint32)
     table[:, 0] = kernels.parts
     table[:, 1] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
+    maps = kernels.maps.reshape(kernels.count, 4, 4)
+    table[:, 2:] = maps.astype(np.float32).view(np.uint32)
     return table
 
 

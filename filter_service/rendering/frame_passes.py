@@ -145,18 +145,25 @@ class FramePasses:
         used = np.zeros((self.image.count, n_words), np.uint32)
         self._reserve(PIXELS=16 * self.pixel_count, PIXEL_LAYER=4 * self.pixel_count)
         self.buffers["LAYER_DPT"] = self.gpu.upload(
-            "LAYER_DPT", self.layers.object_dpt.astype(np.float32)
+            "LAYER_DPT", self.layers.layer_dpt.astype(np.float32)
+        )
+        change_dpt = self.layers.field.at(
+            self.image.corner_h_deg, self.image.corner_v_deg
+        )
+        self.buffers["FIELD_DEFOCUS"] = self.gpu.upload(
+            "FIELD_DEFOCUS", change_dpt.astype(np.float32)
         )
         self.buffers["USED"] = self.gpu.upload("USED", used)
         with self.timer.stage("fragments_ms"):
             self._run(
                 "build_fragments",
                 self.grid,
-                *("COLOR_IN", "DEPTH_IN", "LAYER_DPT"),
+                *("COLOR_IN", "DEPTH_IN", "LAYER_DPT", "FIELD_DEFOCUS"),
                 *("PIXELS", "PIXEL_LAYER", "USED"),
                 **self._common,
                 words_per_cell=n_words,
                 tangents=self.view.tangents,
+                object_range_dpt=self.layers.object_range_dpt,
                 depth_is_planar=int(self.view.depth_kind == "planar"),
                 defines=(
                     {"COLOR_IS_LINEAR": 1}
@@ -172,7 +179,7 @@ class FramePasses:
     def _common(self) -> dict:
         return {
             "frame_size_px": self.size,
-            "layer_count": len(self.layers.object_dpt),
+            "layer_count": len(self.layers.layer_dpt),
             "cell_px": self.image.cell_px,
             "cell_columns": self.image.grid[0],
             "first_row": self.first_row,
@@ -346,7 +353,9 @@ class FramePasses:
         """Level up to which fragments merge; the paper merges once."""
         if not self.merge:
             return 0
-        return 1 if self.paper_rule else MAX_LEVEL
+        most = 1 if self.paper_rule else MAX_LEVEL
+        cell_px = self.image.cell_px
+        return min(most, cell_px.bit_length() - 1) if cell_px else most
 
     def fragment_counts(self) -> tuple[int, int]:
         """Fragments after merging, and pixels that went into merged ones."""

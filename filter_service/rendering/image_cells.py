@@ -3,7 +3,9 @@
 PSFs change slowly over the field, so all pixels of a cell share the kernels of the
 cell's middle direction, blended there from the four field nodes around it.  That costs
 a frame one look-up per fragment and pixel, on axis and off, where blending in the
-splatting loop costs four (paper section 6.3).
+splatting loop costs four (paper section 6.3).  What changes fastest over the field is
+left out of the blend: each node's kernel is mapped from the pixels it is stored in to
+those of the cell, and defocus follows every pixel by its layer.
 """
 
 import math
@@ -18,14 +20,14 @@ from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.plan import CachePlan
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
-"""Largest edge of a cell on the camera's axis.  One kernel set a cell is what limits
-frames off the axis: at 640x360 cells of 16 px (2.4 degrees) cost 52 to 55 dB against
-cells of 8 px; at 320x180 and the finest field nodes, cells of 8 px (2.3 degrees) leave
-49 dB against the exact PSF of every pixel (bench_field), and 4 px would leave 54 dB."""
+"""Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
+of 8, 16 and 32 px (1.2, 2.4 and 4.8 degrees) leave 46.6, 46.4, 46.0 dB of myopia, 47.7,
+46.8, 44.6 dB of keratoconus and 50.8, 49.7, 46.9 dB of cataract, whose kernels then
+take 611, 268 and 127 MB."""
 
-MIN_CELL_PX = 8
+MIN_CELL_PX = 4
 MAX_CELL_PX = 256
-"""Cells are powers of two: tiles and merged quads lie in one cell."""
+"""Cells are powers of two: a merged square lies in one cell."""
 
 CORNERS = 4
 
@@ -43,12 +45,26 @@ class ImageCells:
         Field nodes around a cell's middle, index into [v, h] in C order.
     weight_ratio : (n_cells, 4)
         Of the nodes; sum 1.
+    node_from_cell : (n_cells, 4, 2, 2)
+        From offsets in the cell's pixels (x right, y down) to those of the pixels that
+        a node's kernels are stored in.
+    corner_h_deg, corner_v_deg : (rows + 1, columns + 1)
+        Field directions of the cells' corners.
     """
 
     cell_px: int
     grid: tuple[int, int]
     nodes: NDArray[np.int64]
     weight_ratio: NDArray[np.float64]
+    node_from_cell: NDArray[np.float64]
+    corner_h_deg: NDArray[np.float64]
+    corner_v_deg: NDArray[np.float64]
+
+    @property
+    def largest_stretch_ratio(self) -> float:
+        """How much larger a kernel can be in the image than as stored."""
+        smallest = np.linalg.svd(self.node_from_cell, compute_uv=False).min()
+        return float(max(1.0, 1.0 / smallest))
 
     @property
     def count(self) -> int:
@@ -77,7 +93,11 @@ def image_cells(
             grid=(1, 1),
             nodes=np.zeros((1, CORNERS), np.int64),
             weight_ratio=np.array([[1.0, 0.0, 0.0, 0.0]]),
+            node_from_cell=np.broadcast_to(np.eye(2), (1, CORNERS, 2, 2)),
+            corner_h_deg=np.zeros((2, 2)),
+            corner_v_deg=np.zeros((2, 2)),
         )
+    gaze_deg = spec.gaze_deg if gaze_deg is None else gaze_deg
     cell_px = _cell_px(spec)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
@@ -89,19 +109,41 @@ def image_cells(
         camera,
         np.minimum(x_px, camera.width_px).ravel(),
         np.minimum(y_px, camera.height_px).ravel(),
-        gaze_deg=spec.gaze_deg if gaze_deg is None else gaze_deg,
+        gaze_deg=gaze_deg,
     )
     h_low, h_high, h_part = bracket_axis(plan.h_deg, h_deg)
     v_low, v_high, v_part = bracket_axis(plan.v_deg, v_deg)
     n_h = plan.h_deg.size
-    nodes = [v * n_h + h for v in (v_low, v_high) for h in (h_low, h_high)]
+    nodes = np.stack(
+        [v * n_h + h for v in (v_low, v_high) for h in (h_low, h_high)], axis=-1
+    )
+    scale = spec.pixel_from_mrad(h_deg, v_deg, gaze_deg=gaze_deg)
+    corner_h_deg, corner_v_deg = field_deg(
+        camera,
+        np.arange(grid[0] + 1) * cell_px,
+        np.arange(grid[1] + 1)[:, None] * cell_px,
+        gaze_deg=gaze_deg,
+    )
     weights = [v * h for v in (1 - v_part, v_part) for h in (1 - h_part, h_part)]
     return ImageCells(
         cell_px=cell_px,
         grid=grid,
-        nodes=np.stack(nodes, axis=-1),
+        nodes=nodes,
         weight_ratio=np.stack(weights, axis=-1),
+        node_from_cell=_node_from_cell(spec, plan, nodes, scale),
+        corner_h_deg=corner_h_deg,
+        corner_v_deg=corner_v_deg,
     )
+
+
+def _node_from_cell(
+    spec: GridSpec, plan: CachePlan, nodes: NDArray, cell_scale: NDArray
+) -> NDArray[np.float64]:
+    """Return maps (n_cells, 4, 2, 2) of offsets in pixels, y downwards."""
+    v_deg, h_deg = np.meshgrid(plan.v_deg, plan.h_deg, indexing="ij")
+    stored = spec.node_pixel_from_mrad(h_deg.ravel(), v_deg.ravel())
+    upwards = stored[nodes] @ np.linalg.inv(cell_scale)[:, None]
+    return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 def _cell_px(spec: GridSpec) -> int:

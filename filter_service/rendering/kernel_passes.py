@@ -148,10 +148,10 @@ def words_per_cell(layers: FrameLayers) -> int:
     GridTooLarge
         More layers than a frame may have.
     """
-    if len(layers.object_dpt) > MAX_LAYERS:
+    if len(layers.layer_dpt) > MAX_LAYERS:
         raise GridTooLarge(
-            f"{len(layers.object_dpt)} layers between "
-            f"{layers.object_dpt[0]:g} and {layers.object_dpt[-1]:g} dpt",
+            f"{len(layers.layer_dpt)} layers between "
+            f"{layers.layer_dpt[0]:g} and {layers.layer_dpt[-1]:g} dpt",
             allowed=f"{MAX_LAYERS} layers: a smaller pupil or fewer pixels per degree",
         )
     return -(-interval_count(layers) // 32)

@@ -8,6 +8,7 @@ store and the planned layers.
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from filter_service.constants import MIN_COVERAGE, PAPER_FAR_M, PAPER_TIE_BREAK_M
 from filter_service.psfs.pack import square_kernel
@@ -57,16 +58,54 @@ def recipe_kernels(
 
 def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
     """Kernels (n, 2, size, size, 3) of a frame, at both ends of their intervals."""
-    radius = int(kernels.reach_px.max())
+    radius = int(max(kernels.reach_px.max(), kernels.nodes.reach_px.max()))
     of_recipe = recipe_kernels(store, kernels.nodes, radius)
     nodes = kernels.nodes
     ends = np.stack([of_recipe[nodes.near], of_recipe[nodes.far]], axis=1)
     out = np.zeros((kernels.count, *ends.shape[1:]))
     for k in range(kernels.count):
-        for part, weight in zip(kernels.parts[k], kernels.weight_ratio[k], strict=True):
-            if weight > 0.0:
-                out[k] += weight * ends[part]
+        for corner in np.flatnonzero(kernels.weight_ratio[k] > 0.0):
+            part = ends[kernels.parts[k, corner]]
+            out[k] += kernels.weight_ratio[k, corner] * _mapped(
+                part, kernels.maps[k, corner]
+            )
     return out
+
+
+def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
+    """Light (2, size, size, 3) of stored pixels that each pixel's sides cover."""
+    if np.array_equal(to_stored, np.eye(2)):
+        return stored
+    radius = stored.shape[1] // 2
+    sums = (
+        np.pad(stored, ((0, 0), (1, 0), (1, 0), (0, 0))).cumsum(axis=1).cumsum(axis=2)
+    )
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    middle = np.einsum("ij,jyx->iyx", to_stored, np.stack([x, y])) + radius + 0.5
+    half = np.abs(np.diag(to_stored))[:, None, None] / 2.0
+    (left, top), (right, bottom) = middle - half, middle + half
+
+    def within(rows: NDArray, columns: NDArray) -> NDArray:
+        """Light up to a point: bilinear in the sums over whole pixels."""
+        return np.stack(
+            [
+                [
+                    map_coordinates(
+                        end[..., channel], (rows, columns), order=1, mode="nearest"
+                    )
+                    for channel in range(3)
+                ]
+                for end in sums
+            ]
+        )
+
+    light = (
+        within(bottom, right)
+        - within(bottom, left)
+        - within(top, right)
+        + within(top, left)
+    )
+    return np.moveaxis(light, 1, -1)
 
 
 def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
@@ -78,12 +117,26 @@ def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
     return rows[:, None] * image.grid[0] + columns
 
 
+def field_change_dpt(
+    view: View, layers: FrameLayers, image: ImageCells
+) -> NDArray[np.float64]:
+    """Change of defocus (height, width) over the field, bilinear within cells."""
+    if image.cell_px == 0:
+        return np.zeros((view.height_px, view.width_px))
+    corners_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
+    y, x = np.mgrid[: view.height_px, : view.width_px]
+    return map_coordinates(
+        corners_dpt, (np.stack([y, x]) + 0.5) / image.cell_px, order=1
+    )
+
+
 def gather(
     view: View,
     store: PsfStore,
     layers: FrameLayers,
     *,
     accumulation: str = "coverage",
+    gaze_deg: tuple[float, float] | None = None,
 ) -> NDArray[np.float64]:
     """Filter a view by sorted per-pixel gathering.
 
@@ -92,18 +145,18 @@ def gather(
     linear_rgb : (height, width, 3)
     """
     depth_m, _ = fill_missing_depth(view.depth_m)
-    distance_dpt = np.clip(
-        object_dpt(view, depth_m), layers.object_dpt[0], layers.object_dpt[-1]
-    )
+    distance_dpt = np.clip(object_dpt(view, depth_m), *layers.object_range_dpt)
     linear = view.color.astype(np.float64)
     if view.color.dtype == np.uint8:
         linear = linear_from_srgb(view.color)
     n_intervals = interval_count(layers)
+    image = image_cells(store.spec, store.plan, gaze_deg)
     position = np.interp(
-        distance_dpt, layers.object_dpt, np.arange(len(layers.object_dpt))
+        distance_dpt + field_change_dpt(view, layers, image),
+        layers.layer_dpt,
+        np.arange(len(layers.layer_dpt)),
     )
     interval = np.minimum(position.astype(np.int64), n_intervals - 1)
-    image = image_cells(store.spec, store.plan)
     cell = cell_index(view, image)
     used = np.zeros((image.count, n_intervals), bool)
     used[cell, interval] = True

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,6 @@ class LoadedStore:
 
     store: PsfStore
     pages: Pages
-    image: ImageCells
 
     def release(self) -> None:
         """Free the GPU copy."""
@@ -92,6 +92,9 @@ class FilterRenderer:
         self._layers_of: LoadedStore | None = None
         self._layers_state: tuple[float, float] = (0.0, 0.0)
         self._layers: FrameLayers | None = None
+        self._image_of: LoadedStore | None = None
+        self._image_gaze_deg: tuple[float, float] = (0.0, 0.0)
+        self._image: ImageCells | None = None
         self._kernels = KernelMaker(gpu)
 
     def load(self, store: PsfStore) -> LoadedStore:
@@ -122,9 +125,7 @@ class FilterRenderer:
         except GeneratorExit:
             pages.release()
             raise
-        yield LoadedStore(
-            store=store, pages=pages, image=image_cells(store.spec, store.plan)
-        )
+        yield LoadedStore(store=store, pages=pages)
 
     def render(
         self,
@@ -136,8 +137,14 @@ class FilterRenderer:
         accumulation: str = "coverage",
         merge: bool = True,
         output: str = "linear",
+        gaze_deg: tuple[float, float] | None = None,
     ) -> Rendered:
         """Filter one view through the eye of a loaded store.
+
+        Parameters
+        ----------
+        gaze_deg : (h, v), optional
+            Where the eye looks; the store's own where it is None.
 
         Raises
         ------
@@ -154,27 +161,35 @@ class FilterRenderer:
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
             return self._render(
-                view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+                view,
+                handle,
+                (pupil_diameter_mm, focus_dpt),
+                gaze_deg or handle.store.spec.gaze_deg,
+                accumulation,
+                merge,
+                output,
             )
 
     def _render(
-        self, view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+        self, view, handle, state, gaze_deg, accumulation, merge, output
     ) -> Rendered:
         timer = StageTimer(self._gpu)
         with timer.wall("prepare_ms"):
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
-        layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        layers = self._frame_layers(timer, handle, *state)
+        image = self._image_cells(timer, handle, gaze_deg)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
         counts = np.zeros(5, dtype=np.int64)
-        for strip in _strips(whole, layers, self._gpu.max_block_bytes):
+        reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
+        for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
                 strip.view,
                 timer,
                 layers=layers,
-                image=handle.image,
+                image=image,
                 paper_rule=accumulation == "paper",
                 merge=merge,
                 first_row=strip.first_row,
@@ -183,7 +198,7 @@ class FilterRenderer:
             )
             passes.run(
                 lambda used: self._kernels.kernels(
-                    handle.store, handle.pages, layers, handle.image, used, timer
+                    handle.store, handle.pages, layers, image, used, timer
                 )
             )
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
@@ -212,7 +227,7 @@ class FilterRenderer:
             entry_count=int(counts[2]),
             kernel_count=int(counts[3]),
             kernel_texel_count=int(counts[4]),
-            layer_count=len(layers.object_dpt),
+            layer_count=len(layers.layer_dpt),
             notes=notes,
         )
 
@@ -237,6 +252,17 @@ class FilterRenderer:
                 )
             self._layers_of, self._layers_state = handle, state
         return self._layers
+
+    def _image_cells(self, timer, handle, gaze_deg) -> ImageCells:
+        """Cells of this gaze; those of the last frame when unchanged."""
+        if self._image_of is not handle or self._image_gaze_deg != gaze_deg:
+            self._image_of = None
+            with timer.wall("psf_plan_ms"):
+                self._image = image_cells(
+                    handle.store.spec, handle.store.plan, gaze_deg
+                )
+            self._image_of, self._image_gaze_deg = handle, gaze_deg
+        return self._image
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
@@ -294,12 +320,11 @@ class _Strip:
     kept: slice
 
 
-def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Strip]:
+def _strips(view: View, reach_px: int, max_block_bytes: int) -> list[_Strip]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
     Strips start on tile rows, so that tiles and merged quads are those of the whole.
     """
-    reach_px = layers.max_radius_px + 2
     halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)

@@ -1,4 +1,5 @@
-// Layers of this frame: increasing object distances in dioptres.  Kernels belong to the
+// Layers of this frame: increasing sums, in dioptres, of object distance and the change
+// of defocus over the field.  Kernels belong to the
 // intervals between them; a single layer is its own interval.  A layer position is the
 // interval plus the fraction of the way through it.
 // Needs a buffer `layer_dpt` of float in scope.

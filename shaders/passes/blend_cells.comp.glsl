@@ -1,6 +1,9 @@
 // Blends the kernels of up to four field nodes into the kernel of an image cell.
-// In:  the node atlas, NODES (as in blend_psfs), PARTS (four node kernels, four weights),
-//      KERNELS (common/kernels.glsl), WORK.
+// Each is mapped from the pixels it is stored in to the image's: a pixel takes the light
+// of the stored pixels that its sides cover.
+// In:  the node atlas, NODES (as in blend_psfs), PARTS (four node kernels, four weights,
+//      four maps from offsets in the image to those in a node's kernel), KERNELS
+//      (common/kernels.glsl), WORK.
 // Out: the kernel atlas, single kernels.
 // Dispatch: one group of THREADS texels per item of WORK.
 // Twin: reference.kernel_pairs.  Source: Csoba & Kunkli 2023, section 6.3.
@@ -19,15 +22,40 @@ layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 #include "common/work.glsl"
 #include "common/reach.glsl"
 
-void add_node(uint node, float weight, ivec2 at, inout vec3 near, inout vec3 far) {
+void add_texel(int first, Reach reach, ivec2 at, float weight, inout vec3 near,
+               inout vec3 far) {
+    if (!within(reach, at)) return;
+    uvec4 ends = texelFetch(node_atlas, atlas_position(first + reach_texel(reach, at)), 0);
+    near += weight * near_weights(ends);
+    far += weight * far_weights(ends);
+}
+
+// Adds one part of a kernel at an offset from its centre.
+void add_node(uint part, uint index, ivec2 at, inout vec3 near, inout vec3 far) {
+    float weight = uintBitsToFloat(parts[part + 1u][index]);
+    if (weight == 0.0) return;
+    uint node = parts[part][index];
     uvec4 place = nodes[node * uint(NODE_WORDS)];
     Reach reach = unpack_reach(place.w);
-    if (weight == 0.0 || !within(reach, at)) return;
-    float scale = uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x);
-    int texel = int(place.z) + reach_texel(reach, at);
-    uvec4 ends = texelFetch(node_atlas, atlas_position(texel), 0);
-    near += weight * scale / WEIGHT_MAX * near_weights(ends);
-    far += weight * scale / WEIGHT_MAX * far_weights(ends);
+    weight *= uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x) / WEIGHT_MAX;
+    vec4 map = uintBitsToFloat(parts[part + 2u + index]);
+    if (map == vec4(1.0, 0.0, 0.0, 1.0)) {
+        add_texel(int(place.z), reach, at, weight, near, far);
+        return;
+    }
+    vec2 middle = vec2(dot(map.xy, vec2(at)), dot(map.zw, vec2(at)));
+    vec2 low = middle - 0.5 * abs(map.xw);
+    vec2 high = middle + 0.5 * abs(map.xw);
+    ivec2 first = max(ivec2(floor(low + 0.5)), -ivec2(reach.left, reach.up));
+    ivec2 last = min(ivec2(ceil(high - 0.5)), ivec2(reach.right, reach.down));
+    for (int y = first.y; y <= last.y; ++y) {
+        for (int x = first.x; x <= last.x; ++x) {
+            vec2 stored = vec2(x, y);
+            vec2 covered = max(min(high, stored + 0.5) - max(low, stored - 0.5), 0.0);
+            add_texel(int(place.z), reach, ivec2(x, y), weight * covered.x * covered.y,
+                      near, far);
+        }
+    }
 }
 
 void main() {
@@ -37,14 +65,11 @@ void main() {
     Reach reach = unpack_reach(kernel_reach(kernel));
     if (texel >= reach_width(reach) * reach_height(reach)) return;
     ivec2 at = reach_offset(reach, texel);
-    uvec4 node = parts[kernel * uint(NODE_WORDS)];
-    vec4 weight = uintBitsToFloat(parts[kernel * uint(NODE_WORDS) + 1u]);
+    uint part = kernel * uint(PART_WORDS);
     vec3 near = vec3(0.0);
     vec3 far = vec3(0.0);
-    add_node(node.x, weight.x, at, near, far);
-    add_node(node.y, weight.y, at, near, far);
-    add_node(node.z, weight.z, at, near, far);
-    add_node(node.w, weight.w, at, near, far);
+    for (uint index = 0u; index < uint(FIELD_CORNERS); ++index)
+        add_node(part, index, at, near, far);
     uvec4 ends = pack_weights(near, far, kernel_scale(kernel, 0));
     imageStore(atlas, atlas_position(int(kernel_offset(kernel, 0)) + texel), ends);
 }

@@ -1,10 +1,11 @@
 // Turns colour and depth of the input frame into linear light, dioptres and layer
 // positions, and notes which kernels the frame needs.
 // In:  COLOR_IN (bytes RGB, sRGB; or f32 RGB, linear when COLOR_IS_LINEAR),
-//      DEPTH_IN (f32 metres, all valid), LAYER_DPT.
+//      DEPTH_IN (f32 metres, all valid), LAYER_DPT, FIELD_DEFOCUS (change of defocus at
+//      the corners of the cells).
 // Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
 //      cell and interval).
-// Dispatch: one thread a pixel, 8 x 8 groups; a group lies in one cell.
+// Dispatch: one thread a pixel, 8 x 8 groups.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
 #include "common/color.glsl"
@@ -16,6 +17,7 @@ layout(std430, binding = BINDING_DEPTH_IN) readonly buffer DepthIn { float depth
 layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float layer_dpt[]; };
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
+layout(std430, binding = BINDING_FIELD_DEFOCUS) readonly buffer Field { float field_dpt[]; };
 layout(std430, binding = BINDING_USED) buffer Used { uint used[]; };
 
 #include "common/layers.glsl"
@@ -26,6 +28,9 @@ uniform int layer_count;
 uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
+uniform vec2 object_range_dpt;    // beyond which distances are taken as its ends
+
+bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; }
 
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 
@@ -53,6 +58,18 @@ float object_dpt(float depth_m, vec2 position) {
     return isinf(depth_m) ? 0.0 : 1.0 / (depth_m * stretch);
 }
 
+// Change of defocus over the field, between the corners of a pixel's cell.
+float field_defocus_dpt(ivec2 at) {
+    if (cell_px == 0) return 0.0;
+    int cell = cell_of(at);
+    int corner = cell + cell / cell_columns;  // a corner more than cells in each row
+    vec2 inside = vec2(at.x % cell_px, (at.y + first_row) % cell_px) + 0.5;
+    vec2 share = inside / float(cell_px);
+    float above = mix(field_dpt[corner], field_dpt[corner + 1], share.x);
+    int below = corner + cell_columns + 1;
+    return mix(above, mix(field_dpt[below], field_dpt[below + 1], share.x), share.y);
+}
+
 // Layer position of a distance between the first and the last layer.
 float layer_position(float dpt) {
     int low = 0;
@@ -76,14 +93,22 @@ void main() {
     if (all(lessThan(at, frame_size_px))) {
         uint pixel = uint(at.y * frame_size_px.x + at.x);
         float dpt = object_dpt(depth_in[pixel], vec2(at));
-        dpt = clamp(dpt, layer_dpt[0], layer_dpt[layer_count - 1]);
-        float place = layer_position(dpt);
+        dpt = clamp(dpt, object_range_dpt.x, object_range_dpt.y);
+        float place = layer_position(dpt + field_defocus_dpt(at));
         int interval = position_interval(place, layer_count);
         pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
         position[pixel] = place;
-        atomicOr(group_used[interval / BITS_PER_WORD], 1u << uint(interval % BITS_PER_WORD));
+        uint bit = 1u << uint(interval % BITS_PER_WORD);
+        uint word = uint(interval / BITS_PER_WORD);
+        if (group_lies_in_one_cell()) {
+            atomicOr(group_used[word], bit);
+        } else {
+            word += uint(cell_of(at) * words_per_cell);
+            if ((used[word] & bit) == 0u) atomicOr(used[word], bit);
+        }
     }
     barrier();  // all pixels of the group have noted theirs
+    if (!group_lies_in_one_cell()) return;
     int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
         if (group_used[word] != 0u) atomicOr(used[uint(first) + word], group_used[word]);

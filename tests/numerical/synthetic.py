@@ -63,7 +63,7 @@ class Bench:
     def blur_px(self, **options):
         """Blur radius (n_layers, 3) of a frame's layers, on axis."""
         layers = self.layers(**options)
-        total_dpt = layers.object_dpt[:, None] + layers.at_infinity_dpt[0]
+        total_dpt = layers.layer_dpt[:, None] + layers.layer_zero_dpt[0]
         psfs, weights = neighbours(
             self.store,
             layers.pupil_diameter_mm,

@@ -127,7 +127,7 @@ def test_blended_kernels_equal_their_twin(gpu, rng, mode):
 
 
 def test_layers_are_no_farther_apart_than_the_blur_step(bench):
-    assert np.all(np.diff(bench.layers().object_dpt) > 0)
+    assert np.all(np.diff(bench.layers().layer_dpt) > 0)
     change_px = np.abs(np.diff(bench.blur_px(), axis=0))
     assert change_px.max() <= bench.spec.max_blur_step_px + 1e-9
 

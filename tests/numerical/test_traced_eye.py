@@ -125,7 +125,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     store = build_psf_store(eye, spec)
     pupil_mm, focus_dpt, object_dpt = 4.5, 3.37, 4.2
     layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
-    k = int(np.argmin(np.abs(layers.object_dpt - object_dpt)))
+    k = int(np.argmin(np.abs(layers.layer_dpt - object_dpt)))
     used = np.zeros((1, interval_count(layers)), bool)
     used[0, k] = True
     image = image_cells(spec, store.plan)
@@ -137,7 +137,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     zernike_um = rescale_pupil(
         direct.zernike_um, radius_ratio=pupil_mm / 2 / direct.zernike_radius_mm
     )
-    zernike_um[C20] -= layers.object_dpt[k] * (pupil_mm / 2) ** 2 / (4 * np.sqrt(3))
+    zernike_um[C20] -= layers.layer_dpt[k] * (pupil_mm / 2) ** 2 / (4 * np.sqrt(3))
     truth = compute_psfs(
         zernike_um[None],
         pupil_diameter_mm=pupil_mm,
