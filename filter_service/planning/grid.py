@@ -18,8 +18,12 @@ from estimator.units import (
     REFERENCE_WAVELENGTH_NM,
     RGB_WAVELENGTHS_NM,
 )
-from filter_service.planning.field_directions import field_range_deg, pixel_from_mrad
-from filter_service.wire.images import Camera
+from filter_service.planning.field_directions import (
+    MAX_FIELD_DEG,
+    field_range_deg,
+    pixel_from_mrad,
+)
+from filter_service.wire.images import MAX_GAZE_DEG, Camera
 
 PUPIL_RATIO = 1.16
 """Neighbouring pupil nodes differ by at most this factor (tests/benchmarks)."""
@@ -68,6 +72,8 @@ class GridSpec:
         How much interpolation between planned nodes may cost.
     gaze_deg : (h, v)
         Where the eye looks within the camera's image.
+    gaze_range_deg : (h, v)
+        By how much frames may turn the gaze from there, to both sides.
     memory_budget_mb : float
         A larger plan is refused.
     max_blur_step_px : float
@@ -91,6 +97,7 @@ class GridSpec:
     grid: str = "planned"
     tolerance: str = "normal"
     gaze_deg: tuple[float, float] = (0.0, 0.0)
+    gaze_range_deg: tuple[float, float] = (0.0, 0.0)
     memory_budget_mb: float = 2000.0
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
@@ -113,6 +120,25 @@ class GridSpec:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise ValueError(
                     f"pixel_pitch_mrad {self.pixel_pitch_mrad}: 0.005 to 100 allowed"
+                )
+        self._check_gaze()
+
+    def _check_gaze(self) -> None:
+        """Refuse a gaze no eye has, or one that turns the image out of all PSFs."""
+        for name, low_deg in (("gaze_deg", -MAX_GAZE_DEG), ("gaze_range_deg", 0.0)):
+            values = getattr(self, name)
+            if not all(low_deg <= value <= MAX_GAZE_DEG for value in values):
+                raise ValueError(
+                    f"{name} {values}: allowed are {low_deg:g} to {MAX_GAZE_DEG:g}"
+                )
+        if not (self.follows_field and any(self.gaze_range_deg)):
+            return
+        seen_deg = field_range_deg(self.camera, gaze_deg=self.gaze_deg)
+        for (low, high), turn in zip(seen_deg, self.gaze_range_deg, strict=True):
+            if turn > 0.0 and max(-low, high) + turn > MAX_FIELD_DEG:
+                raise ValueError(
+                    f"gaze_range_deg {self.gaze_range_deg}: {turn:g} beside a field of "
+                    f"{low:.3g} to {high:.3g} deg; allowed: {MAX_FIELD_DEG:g} together"
                 )
 
     @classmethod

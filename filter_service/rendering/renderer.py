@@ -19,6 +19,7 @@ from filter_service.rendering.frame import (
     object_dpt,
 )
 from filter_service.rendering.frame_passes import FramePasses
+from filter_service.rendering.gaze import usable_gaze
 from filter_service.rendering.image_cells import ImageCells, image_cells
 from filter_service.rendering.kernel_passes import KernelMaker
 from filter_service.wire.images import Camera
@@ -61,9 +62,13 @@ class Rendered:
         colour was not finite (taken as black).
     pupil_diameter_mm, focus_dpt : float
         As used.
+    gaze_deg : (h, v)
+        As used.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into some, and tile list entries; rows that two strips
         of a very large frame share count twice.
+    overflow_count : int
+        Tile list entries that could not be kept; the lists are sized by need.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -75,6 +80,7 @@ class Rendered:
     bad_color_count: int
     pupil_diameter_mm: float
     focus_dpt: float
+    gaze_deg: tuple[float, float]
     fragment_count: int
     merged_count: int
     entry_count: int
@@ -82,6 +88,7 @@ class Rendered:
     kernel_texel_count: int
     layer_count: int
     notes: list[str]
+    overflow_count: int = 0
 
 
 class FilterRenderer:
@@ -92,6 +99,7 @@ class FilterRenderer:
         self._layers_of: LoadedStore | None = None
         self._layers_state: tuple[float, float] = (0.0, 0.0)
         self._layers: FrameLayers | None = None
+        self._turned: tuple[LoadedStore, tuple[float, float], ImageCells] | None = None
         self._kernels = KernelMaker(gpu)
 
     def load(self, store: PsfStore) -> LoadedStore:
@@ -136,8 +144,15 @@ class FilterRenderer:
         accumulation: str = "coverage",
         merge: bool = True,
         output: str = "linear",
+        gaze_deg: tuple[float, float] | None = None,
     ) -> Rendered:
         """Filter one view through the eye of a loaded store.
+
+        Parameters
+        ----------
+        gaze_deg : (h, v), optional
+            Where the eye looks in the image, clamped to what was prepared with a note;
+            the store's where it is None.
 
         Raises
         ------
@@ -151,14 +166,27 @@ class FilterRenderer:
         _check_choice("accumulation", accumulation, ACCUMULATIONS)
         _check_choice("output", output, OUTPUTS)
         _check_camera(view, handle.store)
+        gaze = usable_gaze(handle.store.spec, gaze_deg)
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
             return self._render(
-                view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+                view,
+                handle,
+                *(pupil_diameter_mm, focus_dpt, accumulation, merge, output),
+                *gaze,
             )
 
     def _render(
-        self, view, handle, pupil_diameter_mm, focus_dpt, accumulation, merge, output
+        self,
+        view,
+        handle,
+        pupil_diameter_mm,
+        focus_dpt,
+        accumulation,
+        merge,
+        output,
+        gaze_deg,
+        gaze_notes,
     ) -> Rendered:
         timer = StageTimer(self._gpu)
         with timer.wall("prepare_ms"):
@@ -166,6 +194,7 @@ class FilterRenderer:
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        image = self._image_cells(timer, handle, gaze_deg)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
         counts = np.zeros(5, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
@@ -174,7 +203,7 @@ class FilterRenderer:
                 strip.view,
                 timer,
                 layers=layers,
-                image=handle.image,
+                image=image,
                 paper_rule=accumulation == "paper",
                 merge=merge,
                 first_row=strip.first_row,
@@ -183,7 +212,7 @@ class FilterRenderer:
             )
             passes.run(
                 lambda used: self._kernels.kernels(
-                    handle.store, handle.pages, layers, handle.image, used, timer
+                    handle.store, handle.pages, layers, image, used, timer
                 )
             )
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
@@ -194,7 +223,7 @@ class FilterRenderer:
                 passes.kernel_texel_count,
             )
         self._gpu.check("render")
-        notes = list(layers.notes)
+        notes = [*layers.notes, *gaze_notes]
         if bad_color_count:
             notes.append(
                 f"{bad_color_count} pixels with non-finite colour taken as black"
@@ -207,6 +236,7 @@ class FilterRenderer:
             bad_color_count=bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
+            gaze_deg=gaze_deg,
             fragment_count=int(counts[0]),
             merged_count=int(counts[1]),
             entry_count=int(counts[2]),
@@ -237,6 +267,20 @@ class FilterRenderer:
                 )
             self._layers_of, self._layers_state = handle, state
         return self._layers
+
+    def _image_cells(self, timer, handle, gaze_deg) -> ImageCells:
+        """Cells of this gaze; those of the last frame when unchanged."""
+        last, self._turned = self._turned, None  # no hold on a store out of use
+        spec = handle.store.spec
+        if gaze_deg == spec.gaze_deg:
+            return handle.image
+        if last is not None and last[0] is handle and last[1] == gaze_deg:
+            image = last[2]
+        else:
+            with timer.wall("psf_plan_ms"):
+                image = image_cells(spec, handle.store.plan, gaze_deg)
+        self._turned = (handle, gaze_deg, image)
+        return image
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:

@@ -73,6 +73,7 @@ def _render_view(renderer: Any, frame: Frame, index: int, store: Any) -> Any:
         accumulation=frame.accumulation,
         merge=frame.merge,
         output="srgb8" if frame.output == SRGB8 else "linear",
+        gaze_deg=frame.gaze_deg,
     )
 
 
@@ -96,6 +97,8 @@ def _result(
         focus_dpt=float(rendered[0].focus_dpt),
         missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
         clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
+        gaze_deg=tuple(float(angle) for angle in rendered[0].gaze_deg),
+        overflow_count=sum(int(v.overflow_count) for v in rendered),
         total_ms=total_ms,
         stage_times_ms=stages_ms,
         notes=tuple(notes),

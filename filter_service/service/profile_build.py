@@ -58,6 +58,8 @@ def grid_spec(job: BuildJob) -> GridSpec:
         pupil_range_mm=settings.pupil_range_mm,
         object_range_dpt=settings.object_range_dpt,
         focus_range_dpt=settings.focus_range_dpt,
+        gaze_deg=settings.gaze_deg,
+        gaze_range_deg=settings.gaze_range_deg,
         diffraction=settings.diffraction,
         chromatic=settings.chromatic,
         mode=settings.mode,

@@ -25,6 +25,7 @@ MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
 MAX_PUPIL_MM = 9.0
 MAX_PREPARED_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
+MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 MAX_IMAGE_SIDE_PX = 16384
 
 COLOR_SPACE_OF_DTYPE = {"uint8": "srgb", "float32": "linear"}

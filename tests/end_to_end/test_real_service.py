@@ -78,6 +78,32 @@ def test_one_profile_sent_twice_and_two_views_work(real_client):
         np.testing.assert_array_equal(color, colors[0])
 
 
+def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
+    view = edge_view()
+    settings = NARROW | {
+        "focus_range_dpt": (0, 0),
+        "tolerance": "loose",
+        "gaze_range_deg": (15.0, 0.0),
+    }
+    eye = {"kind": "preset", "name": "keratoconus"}
+    real_client.set_profile(eye, settings=settings, views=[view])
+    straight, aside, beyond = (
+        real_client.filter(view, **SEE, gaze_deg=gaze_deg)
+        for gaze_deg in (None, (15.0, 0.0), (30.0, 0.0))
+    )
+    assert straight.header.gaze_deg == (0.0, 0.0)
+    assert aside.header.gaze_deg == beyond.header.gaze_deg == (15.0, 0.0)
+    assert np.abs(straight.color - aside.color).max() > 0.01
+    np.testing.assert_array_equal(aside.color, beyond.color)
+    assert any("gaze (30, 0) deg" in note for note in beyond.header.notes)
+    assert not any("gaze" in note for note in aside.header.notes)
+    assert aside.header.overflow_count == 0
+    with pytest.raises(errors.BuildFailed, match="gaze_range_deg"):
+        real_client.set_profile(
+            eye, settings=settings | {"gaze_range_deg": (55.0, 0.0)}, views=[view]
+        )
+
+
 def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
     view = edge_view()
     old = real_client.set_profile(PLAIN, settings=NARROW, views=[view])

@@ -67,8 +67,14 @@ REQUESTS = [
     messages.Ping(12.5),
     messages.Bye(),
     frame(),
+    frame(gaze_deg=(12.5, -60.0)),
     ProfileRequest(
-        3, {"kind": "preset"}, ProfileSettings(age_years=40.0), (CAMERA, CAMERA)
+        3,
+        {"kind": "preset"},
+        ProfileSettings(
+            age_years=40.0, gaze_deg=(-5.0, 2.0), gaze_range_deg=(10.0, 0.0)
+        ),
+        (CAMERA, CAMERA),
     ),
 ]
 REPLIES = [
@@ -124,6 +130,8 @@ def test_a_result_carries_its_images_and_stage_times():
         clamped_depth_count=6,
         total_ms=3.0,
         stage_times_ms={"decode_ms": 1.0, "other_ms": 2.0},
+        gaze_deg=(3.5, -2.0),
+        overflow_count=7,
         notes=("capped",),
         colors=(color,),
     )
@@ -167,6 +175,10 @@ def refusal(parts, error=errors.BadMessage):
         ({"pupil_diameter_mm": "4"}, "pupil_diameter_mm"),
         ({"focus_dpt": float("-inf")}, "focus_dpt"),
         ({"focus_dpt": -0.1}, "focus_dpt"),
+        ({"gaze_deg": 5.0}, "gaze_deg"),
+        ({"gaze_deg": [0.0, 0.0, 0.0]}, "gaze_deg"),
+        ({"gaze_deg": [0.0, 60.5]}, "gaze_deg[1]"),
+        ({"gaze_deg": [float("nan"), 0.0]}, "gaze_deg[0]"),
         ({"views": []}, "views"),
         ({"views": {}}, "views"),
         ({"views": [view_map()] * 3}, "views"),
@@ -210,6 +222,9 @@ def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):
         ({"focus_range_dpt": 3}, "settings.focus_range_dpt"),
         ({"object_range_dpt": [-1, 3]}, "settings.object_range_dpt[0]"),
         ({"diffraction": "no"}, "settings.diffraction"),
+        ({"gaze_deg": [61, 0]}, "settings.gaze_deg[0]"),
+        ({"gaze_range_deg": [5, -1]}, "settings.gaze_range_deg[1]"),
+        ({"gaze_range_deg": 5}, "settings.gaze_range_deg"),
         ({"age_years": 200}, "settings.age_years"),
     ],
 )
