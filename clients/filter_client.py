@@ -27,6 +27,7 @@ from filter_service.errors import FilterError
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
     LINEAR,
+    LINEAR16,
     SRGB8,
     Accepted,
     Camera,
@@ -52,7 +53,7 @@ __all__ = [
     "tangents_from_fov",
 ]
 
-OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR}
+OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR, "linear16": LINEAR16}
 
 
 class FilterClient:
@@ -308,6 +309,8 @@ class FilterClient:
         gaze_deg : (h, v), optional
             Where the eye looks in the image, to the right and up from the camera's
             axis; as in the profile's settings where it is None.
+        output : {"srgb8", "linear", "linear16"}
+            8-bit sRGB, or linear light in float32 or float16.
         """
         if output not in OUTPUTS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(OUTPUTS)}")

@@ -75,7 +75,8 @@ def filter_image(
         Path,
         typer.Option(
             metavar="IMG",
-            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr.",
+            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr; linear "
+            "light may be above 1 and below 0.",
         ),
     ],
     depth: Annotated[
@@ -96,7 +97,7 @@ def filter_image(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear float32)."
+            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear floats)."
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
@@ -149,6 +150,9 @@ def filter_image(
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
     ] = False,
+    half: Annotated[
+        bool, typer.Option("--half", help="Half floats in the .npy or .exr.")
+    ] = False,
     plan: Annotated[
         bool,
         typer.Option("--plan", help="Say which PSFs would be computed, and stop."),
@@ -179,6 +183,8 @@ def filter_image(
         depth_scale=depth_scale,
     )
     linear = out.suffix.lower() in image_files.LINEAR_SUFFIXES
+    if half and not linear:
+        raise ValueError("--half: allowed with an output of .npy or .exr")
     settings = one_image.ImageSettings(
         pupil_diameter_mm=pupil_mm,
         focus_dpt=focus_dpt,
@@ -186,7 +192,7 @@ def filter_image(
         diffraction=not no_diffraction,
         chromatic=not no_chromatic,
         merge=not no_merge,
-        output="linear" if linear else "srgb8",
+        output=("linear16" if half else "linear") if linear else "srgb8",
         eye_model=eye_model.value,
         mode=mode.value,
         grid=grid.value,
@@ -245,6 +251,8 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "object_range_dpt": list(filtered.grid.object_range_dpt),
         "missing_depth_count": int(rendered.missing_depth_count),
         "clamped_depth_count": int(rendered.clamped_depth_count),
+        "bad_color_count": int(rendered.bad_color_count),
+        "overflow_count": int(rendered.overflow_count),
         "build_ms": filtered.build_ms,
         "start_ms": filtered.start_ms,
         "render_ms": filtered.render_ms,

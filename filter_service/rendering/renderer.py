@@ -31,7 +31,15 @@ UPLOAD_LINES = 512
 """Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
 
 ACCUMULATIONS = ("coverage", "paper")
-OUTPUTS = ("linear", "srgb8")
+OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
+OUTPUTS = tuple(OUTPUT_DTYPES)
+
+WHITE_STEP_PX = 8
+"""Every so many pixels count for the level of white."""
+
+WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
+"""White of a linear image is its brightest light, but no more than so many times what
+nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ class Rendered:
     Attributes
     ----------
     color : (height, width, 3)
-        float32 linear light, or uint8 sRGB.
+        float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
         By stage; their sum is the time spent in the renderer.
     missing_depth_count, clamped_depth_count, bad_color_count : int
@@ -195,7 +203,7 @@ class FilterRenderer:
             whole = replace(view, color=color, depth_m=depth.depth_m)
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         image = self._image_cells(timer, handle, gaze_deg)
-        picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
+        picture = np.empty(color.shape, OUTPUT_DTYPES[output])
         counts = np.zeros(5, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
@@ -295,12 +303,16 @@ def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16
 def _white_level(color: NDArray) -> float:
     """Light against which a merged quad's contrast counts.
 
-    1 for 8-bit input; brighter for scenes in absolute or HDR units, whose mean is
-    taken as a quarter of white.
+    1 for 8-bit input.  Linear light may have any unit, so that merging, and with it the
+    whole filter, must scale with the light.
     """
     if color.dtype == np.uint8:
         return 1.0
-    return max(1.0, 4.0 * float(color.mean()))
+    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
+    lit = light[light > 0.0]
+    if lit.size == 0:
+        return 0.0
+    return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))
 
 
 @dataclass(frozen=True)

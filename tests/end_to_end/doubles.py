@@ -85,6 +85,8 @@ class RendererDouble:
             color = 255 - _as_bytes(view.color)
         else:
             color = np.float32(1) - _as_floats(view.color)
+            if output == "linear16":
+                color = color.astype(np.float16)
         color[0, 0] = handle.mark
         return RenderedDouble(
             color=color,

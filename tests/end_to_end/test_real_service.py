@@ -104,6 +104,20 @@ def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
         )
 
 
+def test_bright_half_floats_scale_through_the_service(real_client):
+    view = edge_view()
+    bright = RgbdView(
+        (100 * view.color - 10).astype(np.float16), view.depth_m, view.tangents
+    )
+    real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+    plain = real_client.filter(view, **SEE)
+    seen = real_client.filter(bright, **SEE | {"output": "linear16"})
+    assert seen.color.dtype == np.float16
+    expected = 100 * plain.color - 10
+    assert np.abs(seen.color.astype(np.float32) - expected).max() <= 0.05
+    assert seen.header.views[0].color.dtype == "float16"
+
+
 def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
     view = edge_view()
     old = real_client.set_profile(PLAIN, settings=NARROW, views=[view])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from filter_service import errors, messages
 from filter_service.messages import (
     LINEAR,
+    LINEAR16,
     SRGB8,
     Camera,
     Frame,
@@ -99,7 +100,10 @@ def test_what_the_service_says_arrives_unchanged(message):
     assert decode_reply(as_bytes(encode(message))) == message
 
 
-@pytest.mark.parametrize(("color", "dtype"), [(SRGB8, np.uint8), (LINEAR, np.float32)])
+@pytest.mark.parametrize(
+    ("color", "dtype"),
+    [(SRGB8, np.uint8), (LINEAR, np.float32), (LINEAR16, np.float16)],
+)
 def test_images_of_two_views_arrive_bit_for_bit(color, dtype):
     images = (view_images(dtype), ViewImages(*reversed_images(dtype)))
     views = (ViewHeader(CAMERA, color), ViewHeader(CAMERA, color, "radial"))
@@ -198,6 +202,10 @@ def refusal(parts, error=errors.BadMessage):
         ),
         (
             {"views": [view_map(color={"dtype": "uint8", "space": "linear"})]},
+            "views[0].color.space",
+        ),
+        (
+            {"views": [view_map(color={"dtype": "float16", "space": "srgb"})]},
             "views[0].color.space",
         ),
         ({"views": [view_map(color=None)]}, "views[0].color"),
