@@ -147,6 +147,13 @@ def filter_image(
     no_chromatic: Annotated[
         bool, typer.Option("--no-chromatic", help="Focus all colours alike.")
     ] = False,
+    lateral_color: Annotated[
+        bool,
+        typer.Option(
+            "--lateral-color",
+            help="Displace red and blue against green off the axis; a traced eye only.",
+        ),
+    ] = False,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
     ] = False,
@@ -191,6 +198,7 @@ def filter_image(
         accumulation=accumulation.value,
         diffraction=not no_diffraction,
         chromatic=not no_chromatic,
+        lateral_color=lateral_color,
         merge=not no_merge,
         output=("linear16" if half else "linear") if linear else "srgb8",
         eye_model=eye_model.value,

@@ -64,6 +64,8 @@ class GridSpec:
         For red, green, blue.
     diffraction, chromatic : bool
         Off: geometrical optics; all channels at the reference wavelength.
+    lateral_color : bool
+        The channels' images of a point lie apart, as their chief rays do; green stays.
     mode : "on-axis", "quality" or "dynamic"
         Whether PSFs follow the visual field, and over how fine a grid.
     grid : "planned" or "paper"
@@ -93,6 +95,7 @@ class GridSpec:
     wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
     diffraction: bool = True
     chromatic: bool = True
+    lateral_color: bool = False
     mode: str = "on-axis"
     grid: str = "planned"
     tolerance: str = "normal"

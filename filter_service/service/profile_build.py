@@ -62,6 +62,7 @@ def grid_spec(job: BuildJob) -> GridSpec:
         gaze_range_deg=settings.gaze_range_deg,
         diffraction=settings.diffraction,
         chromatic=settings.chromatic,
+        lateral_color=settings.lateral_color,
         mode=settings.mode,
         grid=settings.grid,
         tolerance=settings.tolerance,
@@ -132,7 +133,7 @@ def _built(
         progress=progress,
         cancelled=cancelled,
     )
-    done = ABERRATION_SHARE if notes else 0.0
+    done = ABERRATION_SHARE if eye_model == "traced" else 0.0
 
     def report(part: float, stage: str) -> None:
         progress(done + (1.0 - done) * part, stage)

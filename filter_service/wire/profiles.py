@@ -51,6 +51,7 @@ class ProfileSettings:
     gaze_range_deg: tuple[float, float] = (0.0, 0.0)
     diffraction: bool = True
     chromatic: bool = True
+    lateral_color: bool = False
     eye_model: str = "traced"
     age_years: float | None = None
 
@@ -97,7 +98,7 @@ class ProfileSettings:
             name: take_bool(
                 source, name, path=f"settings.{name}", default=getattr(default, name)
             )
-            for name in ("diffraction", "chromatic")
+            for name in ("diffraction", "chromatic", "lateral_color")
         }
         age_years = take_float(
             source,

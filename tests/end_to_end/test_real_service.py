@@ -253,6 +253,31 @@ def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(
     assert not any("capped" in note for note in reply.header.notes)
 
 
+def test_lateral_color_is_asked_of_a_traced_eye(real_client):
+    view = edge_view()
+    settings = {
+        **NARROW,
+        "focus_range_dpt": (0, 0),
+        "tolerance": "loose",
+        "lateral_color": True,
+    }
+    images = {}
+    for eye_model, lateral in (
+        ("traced", True),
+        ("traced", False),
+        ("wavefront", True),
+    ):
+        ready = real_client.set_profile(
+            {"kind": "preset", "name": "emmetropia"},
+            settings=settings | {"eye_model": eye_model, "lateral_color": lateral},
+            views=[view],
+        )
+        holds_none = any("no lateral colour" in note for note in ready.notes)
+        assert holds_none == (eye_model == "wavefront")
+        images[eye_model, lateral] = real_client.filter(view, **SEE).color
+    assert np.abs(images["traced", True] - images["traced", False]).max() > 0.005
+
+
 def test_the_light_option_is_the_measured_wavefront_up_to_its_pupil(real_client):
     view = edge_view()
     real_client.set_profile(
