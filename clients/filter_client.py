@@ -27,6 +27,7 @@ from filter_service.errors import FilterError
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
     LINEAR,
+    LINEAR16,
     SRGB8,
     Accepted,
     Camera,
@@ -52,7 +53,7 @@ __all__ = [
     "tangents_from_fov",
 ]
 
-OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR}
+OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR, "linear16": LINEAR16}
 
 
 class FilterClient:
@@ -224,12 +225,13 @@ class FilterClient:
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
         output: str = "srgb8",
         accumulation: str = "coverage",
         merge: bool = True,
         timeout_s: float | None = None,
     ) -> FilteredFrame:
-        """Send one frame and return it filtered.
+        """Send one frame and return it filtered; `submit` explains the arguments.
 
         Where the service is still preparing the eye for this camera, or has just been
         restarted, the frame is sent again until the time is over.
@@ -245,6 +247,7 @@ class FilterClient:
                 views,
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
+                gaze_deg=gaze_deg,
                 output=output,
                 accumulation=accumulation,
                 merge=merge,
@@ -290,6 +293,7 @@ class FilterClient:
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
         output: str = "srgb8",
         accumulation: str = "coverage",
         merge: bool = True,
@@ -299,6 +303,14 @@ class FilterClient:
         The images are copied, so the caller may reuse its arrays at once.  If the
         service is busy the frame waits here, and a frame that already waits is
         dropped for it with the reason ``superseded``.
+
+        Parameters
+        ----------
+        gaze_deg : (h, v), optional
+            Where the eye looks in the image, to the right and up from the camera's
+            axis; as in the profile's settings where it is None.
+        output : {"srgb8", "linear", "linear16"}
+            8-bit sRGB, or linear light in float32 or float16.
         """
         if output not in OUTPUTS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(OUTPUTS)}")
@@ -315,6 +327,7 @@ class FilterClient:
             views=tuple(item.header for item in items),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
+            gaze_deg=None if gaze_deg is None else tuple(map(float, gaze_deg)),
             output=OUTPUTS[output],
             accumulation=accumulation,
             merge=merge,

@@ -14,6 +14,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from clients.streaming import FrameLog, view_of
 from clients.window import LiveWindow, NoDisplay
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import DEFAULT_ENDPOINT, Dropped, ErrorReply
+
+FRAMES_PER_ROUND = 60
+MAX_LOOK_AROUND_DEG = 30.0
 
 
 def profile_body(name_or_file: str) -> dict[str, Any]:
@@ -97,6 +101,16 @@ def _looped_frames(
                 )
 
 
+def looking_around(
+    frames: Iterator[SceneFrame], reach_deg: float
+) -> Iterator[SceneFrame]:
+    """Let the eye's gaze go round the image, twice as far to the sides as up."""
+    for number, frame in enumerate(frames):
+        turn = 2 * np.pi * number / FRAMES_PER_ROUND
+        h_deg, v_deg = reach_deg * np.sin(turn), 0.5 * reach_deg * np.cos(turn)
+        yield replace(frame, gaze_deg=(float(h_deg), float(v_deg)))
+
+
 def stream(
     client: FilterClient, frames: Iterator[SceneFrame], log: FrameLog, show=None
 ) -> int:
@@ -122,6 +136,7 @@ def stream(
             view_of(frame),
             pupil_diameter_mm=frame.pupil_diameter_mm,
             focus_dpt=frame.focus_dpt,
+            gaze_deg=frame.gaze_deg,
         )
         sent[frame_id], n_sent = frame, n_sent + 1
         if not _take_answers(client, sent, log, show, timeout_s=0.0):
@@ -156,7 +171,9 @@ def _title(answer: FilteredFrame) -> str:
     header = answer.header
     return (
         f"ocufilter   pupil {header.pupil_diameter_mm:.1f} mm   "
-        f"focus {header.focus_dpt:.2f} dpt   {answer.age_ms:.0f} ms   (Esc ends)"
+        f"focus {header.focus_dpt:.2f} dpt   "
+        f"gaze {header.gaze_deg[0]:+.0f} {header.gaze_deg[1]:+.0f} deg   "
+        f"{answer.age_ms:.0f} ms   (Esc ends)"
     )
 
 
@@ -176,12 +193,24 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--window", action="store_true", help="show it live; the path repeats until Esc"
     )
+    parser.add_argument(
+        "--look-around",
+        default=0.0,
+        type=float,
+        metavar="DEG",
+        help=f"how far the gaze goes round the image, 0 to {MAX_LOOK_AROUND_DEG:g}",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser.parse_args(argv)
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Connect, stream, and return what the log says."""
+    reach_deg = options.look_around
+    if not 0.0 <= reach_deg <= MAX_LOOK_AROUND_DEG:
+        raise ValueError(
+            f"look-around {reach_deg:g}; allowed: 0 to {MAX_LOOK_AROUND_DEG:g} deg"
+        )
     scene = build_scene(options.scene)
     log = FrameLog()
     with ExitStack() as stack:
@@ -196,12 +225,16 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             FilterClient(options.endpoint, client_name="pyrender_stream")
         )
         frames = stack.enter_context(closing(frames))
+        settings = path_settings(options.scene)
+        if reach_deg:
+            frames = looking_around(frames, reach_deg)
+            settings["gaze_range_deg"] = (reach_deg, 0.5 * reach_deg)
         first = next(frames)
         if show is not None:
             show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
         client.set_profile(
             profile_body(options.profile),
-            settings=path_settings(options.scene),
+            settings=settings,
             views=[view_of(first)],
         )
         n_sent = stream(client, chain([first], frames), log, show)

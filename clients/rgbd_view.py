@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.messages import LINEAR, SRGB8, Camera, ViewHeader
+from filter_service.messages import LINEAR, LINEAR16, SRGB8, Camera, ViewHeader
+
+COLOR_FORMATS = {np.uint8: SRGB8, np.float32: LINEAR, np.float16: LINEAR16}
 
 
 def tangents_from_fov(
@@ -29,7 +31,8 @@ class RgbdView:
 
     Parameters
     ----------
-    color : (height, width, 3) uint8 sRGB or float32 linear
+    color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
+        Linear light may be above 1, and negative in a wide gamut.
     depth_m : (height, width) float32, metres
         View-space z (``planar``) or distance (``radial``).  +inf is infinity;
         0, negative and NaN are missing.
@@ -49,9 +52,10 @@ class RgbdView:
             raise ValueError(
                 f"color has shape {self.color.shape}; allowed: (height, width, 3)"
             )
-        if self.color.dtype not in (np.uint8, np.float32):
+        if self.color.dtype.type not in COLOR_FORMATS:
             raise ValueError(
-                f"color is {self.color.dtype}; allowed: uint8 (sRGB), float32 (linear)"
+                f"color is {self.color.dtype}; allowed: uint8 (sRGB), float32 or "
+                "float16 (linear)"
             )
         if self.depth_m.shape != self.color.shape[:2]:
             raise ValueError(
@@ -70,5 +74,5 @@ class RgbdView:
     @property
     def header(self) -> ViewHeader:
         """Return what a frame's header says about this view."""
-        color = SRGB8 if self.color.dtype == np.uint8 else LINEAR
+        color = COLOR_FORMATS[self.color.dtype.type]
         return ViewHeader(self.camera, color, self.depth_kind)

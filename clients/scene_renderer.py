@@ -25,6 +25,7 @@ class SceneFrame:
     tangents : left, right, up, down of the view
     pose : (4, 4), camera to world
     pupil_diameter_mm, focus_dpt : suggested state of the eye
+    gaze_deg : (h, v), where it looks in the image; None is straight on
     """
 
     color: NDArray[np.uint8]
@@ -33,6 +34,7 @@ class SceneFrame:
     pose: Array
     pupil_diameter_mm: float
     focus_dpt: float
+    gaze_deg: tuple[float, float] | None = None
 
 
 class SceneRenderer:

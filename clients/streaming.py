@@ -120,6 +120,7 @@ def _submit(client: FilterClient, frame: SceneFrame) -> int:
         view_of(frame),
         pupil_diameter_mm=frame.pupil_diameter_mm,
         focus_dpt=frame.focus_dpt,
+        gaze_deg=frame.gaze_deg,
     )
 
 

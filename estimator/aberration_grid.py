@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.chief_rays import chief_shift_mrad
 from estimator.estimation import EstimatedEye
 from estimator.wavefront import wavefront_grid
 from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
@@ -23,6 +24,8 @@ class AberrationGrid:
         nan where no light passes.
     zernike_radius_mm, rms_residual_um, open_ratio : the same without the last axis
     ellipse_mm : the same with 5 last, see `wavefront.FieldResults`
+    chief_shift_mrad : (n_h, n_v, n_accommodations, n_wavelengths, 2)
+        Lateral colour, see `chief_rays`.
     """
 
     h_deg: NDArray[np.float64]
@@ -35,6 +38,7 @@ class AberrationGrid:
     rms_residual_um: NDArray[np.float64]
     open_ratio: NDArray[np.float64]
     ellipse_mm: NDArray[np.float64]
+    chief_shift_mrad: NDArray[np.float64]
 
 
 def aberration_grid(
@@ -75,7 +79,7 @@ def aberration_grid(
         )
     )
     fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
-    parts = []
+    parts, shifts = [], []
     for k, state in enumerate(
         eye.accommodating.focused_at(used_dpt - eye.refraction_dpt)
     ):
@@ -88,6 +92,13 @@ def aberration_grid(
             n_azimuths=n_azimuths,
         )
         parts.append(found)
+        shifts.append(
+            chief_shift_mrad(
+                state.surfaces,
+                fields_deg=fields_deg.reshape(-1, 2),
+                wavelengths_nm=wavelengths_nm,
+            )
+        )
         if progress is not None:
             progress((k + 1) / len(used_dpt))
 
@@ -97,6 +108,7 @@ def aberration_grid(
         values = np.moveaxis(values, (1, 3, 0, 2), (0, 1, 2, 3))
         return values.reshape(len(h_deg), len(v_deg), *values.shape[1:])
 
+    shift_mrad = np.moveaxis(np.stack(shifts), 0, 1)
     return AberrationGrid(
         h_deg=h_deg,
         v_deg=v_deg,
@@ -108,4 +120,7 @@ def aberration_grid(
         rms_residual_um=stacked("rms_residual_um"),
         open_ratio=stacked("open_ratio"),
         ellipse_mm=stacked("ellipse_mm"),
+        chief_shift_mrad=shift_mrad.reshape(
+            len(h_deg), len(v_deg), *shift_mrad.shape[1:]
+        ),
     )

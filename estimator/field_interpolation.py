@@ -125,7 +125,8 @@ class FieldInterpolation:
             closed = ~is_open[:, :, i]
             values[:, :, i][closed] = values[:, :, i - 1][closed]
         passed_mm = pupils_mm[..., 0] * np.sqrt(grid.open_ratio)
-        self.passes = bool(is_open[:, :, 0].all())
+        has_chief_rays = np.isfinite(grid.chief_shift_mrad).all()
+        self.passes = bool(is_open[:, :, 0].all() and has_chief_rays)
         self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
         self.all_open = bool(is_open.all())
         # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), in one piece: it is
@@ -196,6 +197,30 @@ class FieldInterpolation:
             found[part] = low + share[part] * (high - low)
         rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
         return found[:, :N_TERMS], rim_mm
+
+    def chief_shift_mrad(
+        self,
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Lateral colour (n, 2) at states (n,), mrad, see `chief_rays`."""
+        over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
+        over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
+        used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
+        channel = self._channels(wavelength_nm)
+        found = np.empty((h_deg.size, 2))
+        for c in np.unique(channel):
+            at = channel == c
+            found[at] = np.einsum(
+                "nh,nv,na,hvak->nk",
+                *(over_h[at], over_v[at], used[at]),
+                self.grid.chief_shift_mrad[:, :, :, c],
+                optimize=True,
+            )
+        return found
 
     def _over_field(
         self, h_deg: NDArray, v_deg: NDArray, channels: NDArray, pupils: slice

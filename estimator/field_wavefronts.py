@@ -17,6 +17,9 @@ from estimator.zernike import EXPONENTS, monomial_matrix, wavefront_polynomial
 DEGREE = EXPONENTS.sum(axis=1)
 """(28,): degree of each monomial."""
 
+TILT_Y, TILT_X = 1, 2
+"""Index of C(1,-1) and C(1,1)."""
+
 N_RIM = 5
 """Columns of a rim: centre x, y and the matrix' xx, xy, yy, mm."""
 
@@ -138,6 +141,19 @@ def with_defocus(
         circle_diameter_mm=2.0 * radius_mm,
         pupil_ellipse=ellipse_from_rim(rim_mm),
     )
+
+
+def with_tilt(
+    zernike_um: NDArray[np.float64], radius_mm: ArrayLike, shift_mrad: ArrayLike
+) -> NDArray[np.float64]:
+    """Wavefronts (P, 28) on circles (P,) whose PSFs lie aside by (P, 2), x and y.
+
+    A PSF lies at +grad W (mrad = um/mm), and Z(1,1) = 2 x / r.
+    """
+    zernike_um = zernike_um.copy()
+    tilt_um = 0.5 * np.asarray(radius_mm)[..., None] * shift_mrad
+    zernike_um[..., [TILT_X, TILT_Y]] += tilt_um
+    return zernike_um
 
 
 def distinct_rows(*columns: NDArray) -> tuple[NDArray, NDArray]:

@@ -151,6 +151,20 @@ class MeasuredWavefront(FocusingEye):
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
         return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
 
+    def chief_ray_shift_mrad(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Lateral colour (..., 2), mrad: none, a measurement at one colour has none."""
+        states = np.broadcast_shapes(
+            *map(np.shape, (h_deg, v_deg, accommodation_dpt, wavelength_nm))
+        )
+        return np.zeros((*states, 2))
+
     def wavefronts(
         self,
         *,

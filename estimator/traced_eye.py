@@ -229,6 +229,32 @@ class TracedEye(FocusingEye):
             total_defocus_dpt=total_dpt,
         )
 
+    def chief_ray_shift_mrad(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Lateral colour against 555 nm along the pupil axes, mrad; see `chief_rays`.
+
+        All arguments broadcast, and the result has their shape with 2 last.  What a
+        worn correction adds is not in it.
+        """
+        states = np.broadcast_arrays(h_deg, v_deg, accommodation_dpt, wavelength_nm)
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h, v, used_dpt, nm = (column[first] for column in columns)
+        h, v = (
+            np.clip(angle, *limits)
+            for angle, limits in zip((h, v), self.traced_range_deg, strict=True)
+        )
+        found = self._field.chief_shift_mrad(
+            h_deg=h, v_deg=v, accommodation_dpt=used_dpt, wavelength_nm=nm
+        )
+        return found[number].reshape(*states[0].shape, 2)
+
     def _distinct(self, states: list[NDArray]) -> tuple[NDArray, ...]:
         """Coefficients, rims and radii of distinct states, and the number of each."""
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]

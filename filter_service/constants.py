@@ -67,6 +67,10 @@ SRGB_GAMMA = 2.4
 BYTE_MAX = 255.0
 """IEC 61966-2-1."""
 
+HALF_MAX = 65504.0
+HALF_DROPPED_BITS = 13
+"""Largest half float, and bits by which its mantissa is shorter than a float's."""
+
 PLACE_BITS = 16
 PLACE_MASK = 0xFFFF
 KERNEL_MASK = 0xFFFFFFF
@@ -125,6 +129,7 @@ RECIPE_WORDS = 6
 
 BITS_PER_WORD = 32
 BYTES_PER_WORD = 4
+HALVES_PER_WORD = 2
 BYTE_BITS = 8
 BYTE_MASK = 0xFF
 RGB = 3

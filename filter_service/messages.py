@@ -27,6 +27,7 @@ from filter_service.wire.checks import (
 from filter_service.wire.images import (
     DEPTH_KINDS,
     LINEAR,
+    LINEAR16,
     SRGB8,
     Camera,
     ImageFormat,
@@ -65,6 +66,7 @@ __all__ = [
     "DEFAULT_ENDPOINT",
     "DEPTH_KINDS",
     "LINEAR",
+    "LINEAR16",
     "MAX_HEADER_BYTES",
     "PROTOCOL_VERSION",
     "SRGB8",

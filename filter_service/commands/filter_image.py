@@ -75,7 +75,8 @@ def filter_image(
         Path,
         typer.Option(
             metavar="IMG",
-            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr.",
+            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr; linear "
+            "light may be above 1 and below 0.",
         ),
     ],
     depth: Annotated[
@@ -96,7 +97,7 @@ def filter_image(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear float32)."
+            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear floats)."
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
@@ -146,8 +147,18 @@ def filter_image(
     no_chromatic: Annotated[
         bool, typer.Option("--no-chromatic", help="Focus all colours alike.")
     ] = False,
+    lateral_color: Annotated[
+        bool,
+        typer.Option(
+            "--lateral-color",
+            help="Displace red and blue against green off the axis; a traced eye only.",
+        ),
+    ] = False,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
+    ] = False,
+    half: Annotated[
+        bool, typer.Option("--half", help="Half floats in the .npy or .exr.")
     ] = False,
     plan: Annotated[
         bool,
@@ -179,14 +190,17 @@ def filter_image(
         depth_scale=depth_scale,
     )
     linear = out.suffix.lower() in image_files.LINEAR_SUFFIXES
+    if half and not linear:
+        raise ValueError("--half: allowed with an output of .npy or .exr")
     settings = one_image.ImageSettings(
         pupil_diameter_mm=pupil_mm,
         focus_dpt=focus_dpt,
         accumulation=accumulation.value,
         diffraction=not no_diffraction,
         chromatic=not no_chromatic,
+        lateral_color=lateral_color,
         merge=not no_merge,
-        output="linear" if linear else "srgb8",
+        output=("linear16" if half else "linear") if linear else "srgb8",
         eye_model=eye_model.value,
         mode=mode.value,
         grid=grid.value,
@@ -245,6 +259,8 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "object_range_dpt": list(filtered.grid.object_range_dpt),
         "missing_depth_count": int(rendered.missing_depth_count),
         "clamped_depth_count": int(rendered.clamped_depth_count),
+        "bad_color_count": int(rendered.bad_color_count),
+        "overflow_count": int(rendered.overflow_count),
         "build_ms": filtered.build_ms,
         "start_ms": filtered.start_ms,
         "render_ms": filtered.render_ms,

@@ -1,8 +1,9 @@
 """Colour and depth files in, filtered images out; used by the command line only.
 
-Colour is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float32 linear (``.npy``,
-``.exr``).  OpenEXR is the reference library of the format, kept by its foundation,
-and comes as a wheel; Pillow reads and writes the rest, 32-bit float TIFF included.
+Colour is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float linear (``.npy``, ``.exr``),
+of which what is negative or not finite is left to the filter's own rule.  OpenEXR is
+the reference library of the format, kept by its foundation, and comes as a wheel;
+Pillow reads and writes the rest, 32-bit float TIFF included.
 """
 
 import math
@@ -29,7 +30,7 @@ def read_color(path: Path) -> NDArray:
     Returns
     -------
     (height, width, 3)
-        uint8 sRGB or float32 linear.  An alpha channel is dropped.
+        uint8 sRGB, or float32 or float16 linear.  An alpha channel is dropped.
 
     Raises
     ------
@@ -104,11 +105,19 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Write uint8 sRGB to ``.png``, or float32 linear to ``.npy`` or ``.exr``."""
+    """Write uint8 sRGB to ``.png``, or linear floats to ``.npy`` or ``.exr``.
+
+    Raises
+    ------
+    ValueError
+        Neither float32 nor float16 for the latter.
+    """
     suffix = path.suffix.lower()
-    wanted = np.float32 if suffix in LINEAR_SUFFIXES else np.uint8
-    if image.dtype != wanted:
-        raise ValueError(f"{path}: got {image.dtype}, needs {np.dtype(wanted)}")
+    is_linear = suffix in LINEAR_SUFFIXES
+    wanted = (np.float32, np.float16) if is_linear else (np.uint8,)
+    if image.dtype not in wanted:
+        names = " or ".join(np.dtype(kind).name for kind in wanted)
+        raise ValueError(f"{path}: got {image.dtype}, needs {names}")
     if suffix == ".npy":
         np.save(path, image)
     elif suffix == ".exr":
@@ -181,7 +190,7 @@ def _exr_depth(channels: dict[str, NDArray], path: Path) -> NDArray:
     _refuse("depth", path, found, "a channel Z, Y or R")
 
 
-def _write_exr(path: Path, linear_rgb: NDArray[np.float32]) -> None:
+def _write_exr(path: Path, linear_rgb: NDArray) -> None:
     import OpenEXR
 
     header = {
@@ -201,7 +210,7 @@ def _checked_color(pixels: NDArray, path: Path) -> NDArray:
         return pixels
     if pixels.dtype.kind != "f":
         _refuse("color", path, f"type {pixels.dtype}", "uint8 sRGB or float linear")
-    if not np.isfinite(pixels).all() or pixels.min() < 0.0:
-        found = "pixels that are negative or not finite"
-        _refuse("color", path, found, "finite linear light, 0 or more")
-    return pixels.astype(np.float32)
+    if pixels.dtype == np.float16:
+        return pixels
+    with np.errstate(over="ignore"):  # infinity is dealt with as such
+        return pixels.astype(np.float32)

@@ -33,6 +33,7 @@ class ImageSettings:
     accumulation: str = "coverage"
     diffraction: bool = True
     chromatic: bool = True
+    lateral_color: bool = False
     merge: bool = True
     output: str = "linear"
     eye_model: str = "wavefront"
@@ -88,6 +89,7 @@ def grid_spec(view: View, settings: ImageSettings) -> GridSpec:
         focus_range_dpt=(focus_dpt, focus_dpt),
         diffraction=settings.diffraction,
         chromatic=settings.chromatic,
+        lateral_color=settings.lateral_color,
         mode=settings.mode,
         grid=settings.grid,
         tolerance=settings.tolerance,

@@ -46,6 +46,16 @@ class Eye(Protocol):
         On the circle about the pupil, worn correction included.
         """
 
+    def chief_ray_shift_mrad(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Lateral colour against 555 nm along the pupil axes, (..., 2)."""
+
     def wavefronts(
         self,
         *,

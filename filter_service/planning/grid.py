@@ -19,11 +19,12 @@ from estimator.units import (
     RGB_WAVELENGTHS_NM,
 )
 from filter_service.planning.field_directions import (
+    MAX_FIELD_DEG,
     field_range_deg,
     nearest_inside_deg,
     pixel_from_mrad,
 )
-from filter_service.wire.images import Camera
+from filter_service.wire.images import MAX_GAZE_DEG, Camera
 
 PUPIL_RATIO = 1.16
 """Neighbouring pupil nodes differ by at most this factor (tests/benchmarks)."""
@@ -46,9 +47,6 @@ coarser grid (of the planner, or of the paper)."""
 PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
 """Azimuth and elevation to both sides (released code)."""
 
-MAX_GAZE_RANGE_DEG = 45.0
-"""How far eyes turn."""
-
 GRIDS = ("planned", "paper")
 TOLERANCES = ("loose", "normal", "fine")
 
@@ -67,6 +65,8 @@ class GridSpec:
         For red, green, blue.
     diffraction, chromatic : bool
         Off: geometrical optics; all channels at the reference wavelength.
+    lateral_color : bool
+        The channels' images of a point lie apart, as their chief rays do; green stays.
     mode : "on-axis", "quality" or "dynamic"
         Whether PSFs follow the visual field, and over how fine a grid.
     grid : "planned" or "paper"
@@ -96,6 +96,7 @@ class GridSpec:
     wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
     diffraction: bool = True
     chromatic: bool = True
+    lateral_color: bool = False
     mode: str = "on-axis"
     grid: str = "planned"
     tolerance: str = "normal"
@@ -119,16 +120,29 @@ class GridSpec:
                 raise ValueError(
                     f"{name} {getattr(self, name)!r}: allowed are {', '.join(options)}"
                 )
-        for reach_deg in self.gaze_range_deg:
-            if not 0.0 <= reach_deg <= MAX_GAZE_RANGE_DEG:
-                raise ValueError(
-                    f"gaze_range_deg {self.gaze_range_deg}: 0 to "
-                    f"{MAX_GAZE_RANGE_DEG:g} allowed"
-                )
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise ValueError(
                     f"pixel_pitch_mrad {self.pixel_pitch_mrad}: 0.005 to 100 allowed"
+                )
+        self._check_gaze()
+
+    def _check_gaze(self) -> None:
+        """Refuse a gaze no eye has, or one that turns the image out of all PSFs."""
+        for name, low_deg in (("gaze_deg", -MAX_GAZE_DEG), ("gaze_range_deg", 0.0)):
+            values = getattr(self, name)
+            if not all(low_deg <= value <= MAX_GAZE_DEG for value in values):
+                raise ValueError(
+                    f"{name} {values}: allowed are {low_deg:g} to {MAX_GAZE_DEG:g}"
+                )
+        if not (self.follows_field and any(self.gaze_range_deg)):
+            return
+        seen_deg = field_range_deg(self.camera, gaze_deg=self.gaze_deg)
+        for (low, high), turn in zip(seen_deg, self.gaze_range_deg, strict=True):
+            if turn > 0.0 and max(-low, high) + turn > MAX_FIELD_DEG:
+                raise ValueError(
+                    f"gaze_range_deg {self.gaze_range_deg}: {turn:g} beside a field of "
+                    f"{low:.3g} to {high:.3g} deg; allowed: {MAX_FIELD_DEG:g} together"
                 )
 
     @classmethod

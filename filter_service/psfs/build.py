@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.field_wavefronts import with_tilt
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import EyeProfile
 from estimator.psf import PsfBatch
@@ -21,6 +22,9 @@ from filter_service.planning.slopes import PupilStates
 from filter_service.psfs.engine import CPU, PsfEngine
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.store import PsfStore
+
+GREEN = 1
+"""Channel that lateral colour leaves in its place."""
 
 COMPUTED_BEYOND = 0.2
 """Kernels are computed out to this share of the light that trimming will drop."""
@@ -112,8 +116,12 @@ def _computed(
     engine: PsfEngine, eye: Eye, spec: GridSpec, states: PupilStates
 ) -> PsfBatch:
     found = eye.wavefronts(**vars(states))
+    zernike_um = found.zernike_um
+    if spec.lateral_color and spec.chromatic:
+        shift_mrad = lateral_shift_mrad(eye, spec, states)
+        zernike_um = with_tilt(zernike_um, found.circle_diameter_mm / 2.0, shift_mrad)
     return engine.compute(
-        found.zernike_um,
+        zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
         wavelength_nm=states.wavelength_nm,
@@ -122,6 +130,22 @@ def _computed(
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )
+
+
+def lateral_shift_mrad(
+    eye: Eye, spec: GridSpec, states: PupilStates
+) -> NDArray[np.float64]:
+    """Shifts (P, 2) of PSFs along the pupil axes, against green's."""
+    place = {
+        "h_deg": states.h_deg,
+        "v_deg": states.v_deg,
+        "accommodation_dpt": states.accommodation_dpt,
+    }
+    own, green = (
+        eye.chief_ray_shift_mrad(**place, wavelength_nm=wavelength_nm)
+        for wavelength_nm in (states.wavelength_nm, spec.wavelengths_nm[GREEN])
+    )
+    return own - green
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:

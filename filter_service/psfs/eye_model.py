@@ -11,6 +11,8 @@ from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec, pupil_nodes_mm
 from filter_service.wire.profiles import EYE_MODELS
 
+NO_LATERAL_COLOR = "a measured wavefront holds no lateral colour: it needs a traced eye"
+
 ESTIMATION_SHARE = 0.1
 ABERRATION_SHARE = 0.2
 """Progress at which the eye is estimated, and at which its wavefronts are traced."""
@@ -46,7 +48,8 @@ def prepare_eye(
             f"eye_model '{eye_model}': allowed are {', '.join(EYE_MODELS)}"
         )
     if eye_model == "wavefront" and profile.eye is None:
-        return MeasuredWavefront.from_profile(profile), ()
+        notes = (NO_LATERAL_COLOR,) if spec.lateral_color else ()
+        return MeasuredWavefront.from_profile(profile), notes
 
     def report(fraction: float, stage: str) -> None:
         if cancelled is not None and cancelled():

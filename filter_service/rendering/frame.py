@@ -19,7 +19,7 @@ class View:
     Attributes
     ----------
     color : (height, width, 3)
-        uint8 sRGB, or float32 linear light.
+        uint8 sRGB; or float32 or float16 linear light, above 1 and below 0 too.
     depth_m : (height, width), float32
         +inf is infinity; 0, negative and NaN are missing.
     tangents : (left, right, up, down)
@@ -60,9 +60,11 @@ def check_view(view: View) -> None:
         raise BadMessage(
             f"shape {color.shape}", field="color", allowed=f"sides up to {MAX_SIDE_PX}"
         )
-    if color.dtype not in (np.uint8, np.float32):
+    if color.dtype not in (np.uint8, np.float32, np.float16):
         raise BadMessage(
-            f"dtype {color.dtype}", field="color", allowed="uint8 sRGB, float32 linear"
+            f"dtype {color.dtype}",
+            field="color",
+            allowed="uint8 sRGB, float32 or float16 linear",
         )
     if depth_m.shape != color.shape[:2] or depth_m.dtype != np.float32:
         raise BadMessage(
@@ -97,14 +99,18 @@ def fill_missing_depth(
 
 
 def finite_color(color: NDArray) -> tuple[NDArray, int]:
-    """Replace non-finite colour values by zero, and count their pixels."""
+    """Replace non-finite colour values by zero, and count their pixels.
+
+    Negative ones stay: filtering is linear, and colours outside of the client's
+    primaries have them.
+    """
     if color.dtype == np.uint8:
         return color, 0
     finite = np.isfinite(color)
     if finite.all():
         return color, 0
     count = int(np.count_nonzero(~finite.all(axis=2)))
-    return np.where(finite, color, np.float32(0.0)), count
+    return np.where(finite, color, color.dtype.type(0.0)), count
 
 
 def radial_stretch(view: View) -> NDArray[np.float64]:

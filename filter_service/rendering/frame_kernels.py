@@ -151,7 +151,7 @@ def frame_kernels(
 
 
 def _part_maps(maps: NDArray, radius_px: NDArray) -> NDArray[np.float64]:
-    """Return the maps (n, 4, 2, 2) of parts; the identity where no light moves visibly."""
+    """Return maps (n, 4, 2, 2) of parts: the identity where little light moves."""
     moved_px = np.linalg.norm(maps - np.eye(2), axis=(-2, -1)) * radius_px
     still = (moved_px <= UNMOVED_PX)[..., None, None]
     return np.where(still, np.eye(2), maps)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import (
     BYTES_PER_WORD,
+    HALVES_PER_WORD,
     MAX_LEVEL,
     PAPER_SORT_KEY_BITS,
     RGB,
@@ -35,6 +36,20 @@ SOFTWARE_PIXELS_PER_THREAD = 8
 
 SOFTWARE_LIST_THREADS = 8
 """Threads that make and sort a tile's list on a software renderer: one vector."""
+
+
+COLOR_VARIANTS = {
+    "uint8": None,
+    "float32": {"COLOR_IS_LINEAR": 1},
+    "float16": {"COLOR_IS_HALF": 1},
+}
+"""How `build_fragments` reads colour, by its dtype."""
+
+ENCODERS = {
+    "srgb8": ("encode_srgb", BYTES_PER_WORD, np.uint8),
+    "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
+}
+"""Outputs that are packed on the GPU: pass, pixels a thread (for RGB words), dtype."""
 
 
 def group_count(count: int, size: int) -> int:
@@ -119,10 +134,7 @@ class FramePasses:
         color, depth_m = self.view.color, self.view.depth_m
         with self.timer.stage("upload_ms"):
             n_bytes = group_count(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
-            packed = (
-                group_count(self.pixel_count, BYTES_PER_WORD) * RGB * BYTES_PER_WORD
-            )
-            self._reserve(COLOR_IN=max(n_bytes, packed))
+            self._reserve(COLOR_IN=n_bytes)
             self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
             self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
 
@@ -165,11 +177,7 @@ class FramePasses:
                 tangents=self.view.tangents,
                 object_range_dpt=self.layers.object_range_dpt,
                 depth_is_planar=int(self.view.depth_kind == "planar"),
-                defines=(
-                    {"COLOR_IS_LINEAR": 1}
-                    if self.view.color.dtype == np.float32
-                    else None
-                ),
+                defines=COLOR_VARIANTS[self.view.color.dtype.name],
             )
         with self.timer.wall("psf_plan_ms"):
             words = self.gpu.read(self.buffers["USED"], used.shape, np.uint32)
@@ -335,18 +343,18 @@ class FramePasses:
                     self.buffers["COLOR_OUT"], (height, width, 4), np.float32
                 )
                 return np.ascontiguousarray(pixels[..., :RGB])
+        name, pixels_per_thread, dtype = ENCODERS[output]
         with self.timer.stage("encode_ms"):
-            quads = group_count(self.pixel_count, BYTES_PER_WORD)
+            threads = group_count(self.pixel_count, pixels_per_thread)
+            self._reserve(COLOR_IN=threads * RGB * BYTES_PER_WORD)  # its light is used
             self._run(
-                "encode_srgb",
-                (group_count(quads, THREADS), 1),
+                name,
+                (group_count(threads, THREADS), 1),
                 *("COLOR_OUT", "COLOR_IN"),
                 pixel_count=self.pixel_count,
             )
         with self.timer.wall("readback_ms"):
-            return self.gpu.read(
-                self.buffers["COLOR_IN"], (height, width, RGB), np.uint8
-            )
+            return self.gpu.read(self.buffers["COLOR_IN"], (height, width, RGB), dtype)
 
     @property
     def _max_level(self) -> int:

@@ -10,7 +10,12 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from filter_service.constants import MIN_COVERAGE, PAPER_FAR_M, PAPER_TIE_BREAK_M
+from filter_service.constants import (
+    HALF_MAX,
+    MIN_COVERAGE,
+    PAPER_FAR_M,
+    PAPER_TIE_BREAK_M,
+)
 from filter_service.psfs.pack import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
@@ -35,6 +40,11 @@ def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
     curve = 1.055 * np.power(value, 1.0 / 2.4) - 0.055
     encoded = np.where(value <= 0.0031308, 12.92 * value, curve)
     return np.floor(255.0 * encoded + 0.5).astype(np.uint8)
+
+
+def half_from_linear(linear_rgb: NDArray) -> NDArray[np.float16]:
+    """Nearest half floats, to even; beyond the largest the largest, never infinity."""
+    return np.clip(linear_rgb, -HALF_MAX, HALF_MAX).astype(np.float16)
 
 
 def recipe_kernels(

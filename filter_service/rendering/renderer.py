@@ -20,6 +20,7 @@ from filter_service.rendering.frame import (
     object_dpt,
 )
 from filter_service.rendering.frame_passes import FramePasses
+from filter_service.rendering.gaze import usable_gaze
 from filter_service.rendering.image_cells import ImageCells, image_cells
 from filter_service.rendering.kernel_passes import KernelMaker
 from filter_service.wire.images import Camera
@@ -31,7 +32,15 @@ UPLOAD_LINES = 512
 """Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
 
 ACCUMULATIONS = ("coverage", "paper")
-OUTPUTS = ("linear", "srgb8")
+OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
+OUTPUTS = tuple(OUTPUT_DTYPES)
+
+WHITE_STEP_PX = 8
+"""Every so many pixels count for the level of white."""
+
+WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
+"""White of a linear image is its brightest light, but no more than so many times what
+nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,7 @@ class LoadedStore:
 
     store: PsfStore
     pages: Pages
+    image: ImageCells
 
     def release(self) -> None:
         """Free the GPU copy."""
@@ -53,7 +63,7 @@ class Rendered:
     Attributes
     ----------
     color : (height, width, 3)
-        float32 linear light, or uint8 sRGB.
+        float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
         By stage; their sum is the time spent in the renderer.
     missing_depth_count, clamped_depth_count, bad_color_count : int
@@ -61,9 +71,13 @@ class Rendered:
         colour was not finite (taken as black).
     pupil_diameter_mm, focus_dpt : float
         As used.
+    gaze_deg : (h, v)
+        As used.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into some, and tile list entries; rows that two strips
         of a very large frame share count twice.
+    overflow_count : int
+        Tile list entries that could not be kept; the lists are sized by need.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -75,6 +89,7 @@ class Rendered:
     bad_color_count: int
     pupil_diameter_mm: float
     focus_dpt: float
+    gaze_deg: tuple[float, float]
     fragment_count: int
     merged_count: int
     entry_count: int
@@ -82,6 +97,7 @@ class Rendered:
     kernel_texel_count: int
     layer_count: int
     notes: list[str]
+    overflow_count: int = 0
 
 
 class FilterRenderer:
@@ -92,9 +108,7 @@ class FilterRenderer:
         self._layers_of: LoadedStore | None = None
         self._layers_state: tuple[float, float] = (0.0, 0.0)
         self._layers: FrameLayers | None = None
-        self._image_of: LoadedStore | None = None
-        self._image_gaze_deg: tuple[float, float] = (0.0, 0.0)
-        self._image: ImageCells | None = None
+        self._turned: tuple[LoadedStore, tuple[float, float], ImageCells] | None = None
         self._kernels = KernelMaker(gpu)
 
     def load(self, store: PsfStore) -> LoadedStore:
@@ -125,7 +139,9 @@ class FilterRenderer:
         except GeneratorExit:
             pages.release()
             raise
-        yield LoadedStore(store=store, pages=pages)
+        yield LoadedStore(
+            store=store, pages=pages, image=image_cells(store.spec, store.plan)
+        )
 
     def render(
         self,
@@ -144,7 +160,8 @@ class FilterRenderer:
         Parameters
         ----------
         gaze_deg : (h, v), optional
-            Where the eye looks; the store's own where it is None.
+            Where the eye looks in the image, clamped to what was prepared with a note;
+            the store's where it is None.
 
         Raises
         ------
@@ -158,29 +175,36 @@ class FilterRenderer:
         _check_choice("accumulation", accumulation, ACCUMULATIONS)
         _check_choice("output", output, OUTPUTS)
         _check_camera(view, handle.store)
+        gaze = usable_gaze(handle.store.spec, gaze_deg)
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
             return self._render(
                 view,
                 handle,
-                (pupil_diameter_mm, focus_dpt),
-                gaze_deg or handle.store.spec.gaze_deg,
-                accumulation,
-                merge,
-                output,
+                *(pupil_diameter_mm, focus_dpt, accumulation, merge, output),
+                *gaze,
             )
 
     def _render(
-        self, view, handle, state, gaze_deg, accumulation, merge, output
+        self,
+        view,
+        handle,
+        pupil_diameter_mm,
+        focus_dpt,
+        accumulation,
+        merge,
+        output,
+        gaze_deg,
+        gaze_notes,
     ) -> Rendered:
         timer = StageTimer(self._gpu)
         with timer.wall("prepare_ms"):
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
-        layers = self._frame_layers(timer, handle, *state)
+        layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         image = self._image_cells(timer, handle, gaze_deg)
-        picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
+        picture = np.empty(color.shape, OUTPUT_DTYPES[output])
         counts = np.zeros(5, dtype=np.int64)
         reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
         for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
@@ -209,7 +233,7 @@ class FilterRenderer:
                 passes.kernel_texel_count,
             )
         self._gpu.check("render")
-        notes = list(layers.notes)
+        notes = [*layers.notes, *gaze_notes]
         if bad_color_count:
             notes.append(
                 f"{bad_color_count} pixels with non-finite colour taken as black"
@@ -222,6 +246,7 @@ class FilterRenderer:
             bad_color_count=bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
+            gaze_deg=gaze_deg,
             fragment_count=int(counts[0]),
             merged_count=int(counts[1]),
             entry_count=int(counts[2]),
@@ -255,14 +280,17 @@ class FilterRenderer:
 
     def _image_cells(self, timer, handle, gaze_deg) -> ImageCells:
         """Cells of this gaze; those of the last frame when unchanged."""
-        if self._image_of is not handle or self._image_gaze_deg != gaze_deg:
-            self._image_of = None
+        last, self._turned = self._turned, None  # no hold on a store out of use
+        spec = handle.store.spec
+        if gaze_deg == spec.gaze_deg:
+            return handle.image
+        if last is not None and last[0] is handle and last[1] == gaze_deg:
+            image = last[2]
+        else:
             with timer.wall("psf_plan_ms"):
-                self._image = image_cells(
-                    handle.store.spec, handle.store.plan, gaze_deg
-                )
-            self._image_of, self._image_gaze_deg = handle, gaze_deg
-        return self._image
+                image = image_cells(spec, handle.store.plan, gaze_deg)
+        self._turned = (handle, gaze_deg, image)
+        return image
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
@@ -277,12 +305,16 @@ def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16
 def _white_level(color: NDArray) -> float:
     """Light against which a merged quad's contrast counts.
 
-    1 for 8-bit input; brighter for scenes in absolute or HDR units, whose mean is
-    taken as a quarter of white.
+    1 for 8-bit input.  Linear light may have any unit, so that merging, and with it the
+    whole filter, must scale with the light.
     """
     if color.dtype == np.uint8:
         return 1.0
-    return max(1.0, 4.0 * float(color.mean()))
+    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
+    lit = light[light > 0.0]
+    if lit.size == 0:
+        return 0.0
+    return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,13 @@ def warm_up(renderer: FilterRenderer) -> None:
     """Render a tiny frame in every variant that clients may ask for."""
     handle = renderer.load(_one_pixel_store())
     depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
-    for dtype, output in ((np.uint8, "srgb8"), (np.float32, "linear")):
+    for dtype, output, accumulations in (
+        (np.uint8, "srgb8", ("coverage", "paper")),
+        (np.float32, "linear", ("coverage",)),
+        (np.float16, "linear16", ("coverage",)),
+    ):
         view = View(np.ones((SIDE_PX, SIDE_PX, RGB), dtype), depth_m, TANGENTS)
-        for accumulation in ("coverage", "paper"):
+        for accumulation in accumulations:
             renderer.render(
                 view,
                 handle,

@@ -8,6 +8,8 @@ from typing import Any
 
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.messages import (
+    LINEAR,
+    LINEAR16,
     SRGB8,
     ErrorReply,
     Frame,
@@ -18,6 +20,9 @@ from filter_service.rendering.frame import View
 from filter_service.service.session import RenderPlan, WaitingFrame
 
 MS_PER_S = 1000.0
+
+OUTPUTS = {SRGB8: "srgb8", LINEAR: "linear", LINEAR16: "linear16"}
+"""Formats by the names that the renderer gives them."""
 
 log = logging.getLogger("ocufilter")
 
@@ -72,7 +77,8 @@ def _render_view(renderer: Any, frame: Frame, index: int, store: Any) -> Any:
         focus_dpt=frame.focus_dpt,
         accumulation=frame.accumulation,
         merge=frame.merge,
-        output="srgb8" if frame.output == SRGB8 else "linear",
+        output=OUTPUTS[frame.output],
+        gaze_deg=frame.gaze_deg,
     )
 
 
@@ -96,6 +102,8 @@ def _result(
         focus_dpt=float(rendered[0].focus_dpt),
         missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
         clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
+        gaze_deg=tuple(float(angle) for angle in rendered[0].gaze_deg),
+        overflow_count=sum(int(v.overflow_count) for v in rendered),
         total_ms=total_ms,
         stage_times_ms=stages_ms,
         notes=tuple(notes),

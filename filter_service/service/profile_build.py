@@ -58,8 +58,11 @@ def grid_spec(job: BuildJob) -> GridSpec:
         pupil_range_mm=settings.pupil_range_mm,
         object_range_dpt=settings.object_range_dpt,
         focus_range_dpt=settings.focus_range_dpt,
+        gaze_deg=settings.gaze_deg,
+        gaze_range_deg=settings.gaze_range_deg,
         diffraction=settings.diffraction,
         chromatic=settings.chromatic,
+        lateral_color=settings.lateral_color,
         mode=settings.mode,
         grid=settings.grid,
         tolerance=settings.tolerance,
@@ -130,7 +133,7 @@ def _built(
         progress=progress,
         cancelled=cancelled,
     )
-    done = ABERRATION_SHARE if notes else 0.0
+    done = ABERRATION_SHARE if eye_model == "traced" else 0.0
 
     def report(part: float, stage: str) -> None:
         progress(done + (1.0 - done) * part, stage)

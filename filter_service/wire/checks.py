@@ -243,18 +243,35 @@ def take_range(
     value = _get(source, name, path, default)
     if value is default:
         return value  # type: ignore[return-value]
+    if isinstance(value, list | tuple) and len(value) == 2:
+        first, last = take_pair(source, name, low=low, high=high, path=path)
+        if first <= last:
+            return first, last
+    raise BadMessage(
+        f"it is {show(value)}", field=path, allowed="two numbers, lowest first"
+    )
+
+
+def take_pair(
+    source: Mapping[str, Any],
+    name: str,
+    *,
+    low: float,
+    high: float,
+    path: str | None = None,
+    default: object = _REQUIRED,
+) -> tuple[float, float]:
+    """Return a field of two numbers within [low, high], in any order."""
+    path = path or name
+    value = _get(source, name, path, default)
+    if value is default:
+        return value  # type: ignore[return-value]
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise BadMessage(
-            f"it is {show(value)}", field=path, allowed="two numbers, lowest first"
-        )
+        raise BadMessage(f"it is {show(value)}", field=path, allowed="two numbers")
     first, last = (
         check_float(item, low=low, high=high, path=f"{path}[{i}]")
         for i, item in enumerate(value)
     )
-    if first > last:
-        raise BadMessage(
-            f"it is {show(value)}", field=path, allowed="two numbers, lowest first"
-        )
     return first, last
 
 

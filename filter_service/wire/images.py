@@ -25,9 +25,10 @@ MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
 MAX_PUPIL_MM = 9.0
 MAX_PREPARED_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
+MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 MAX_IMAGE_SIDE_PX = 16384
 
-COLOR_SPACE_OF_DTYPE = {"uint8": "srgb", "float32": "linear"}
+COLOR_SPACE_OF_DTYPE = {"uint8": "srgb", "float32": "linear", "float16": "linear"}
 DEPTH_KINDS = ("planar", "radial")
 
 
@@ -58,7 +59,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """How colour is stored: 8-bit sRGB or linear float32."""
+    """How colour is stored: 8-bit sRGB, or linear float32 or float16."""
 
     dtype: str = "uint8"
     space: str = "srgb"
@@ -89,6 +90,7 @@ class ImageFormat:
 
 SRGB8 = ImageFormat("uint8", "srgb")
 LINEAR = ImageFormat("float32", "linear")
+LINEAR16 = ImageFormat("float16", "linear")
 
 
 @dataclass(frozen=True)
@@ -191,13 +193,13 @@ class ViewHeader:
 class ViewImages:
     """The two images of one view.
 
-    color : (height, width, 3) uint8 sRGB or float32 linear
+    color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
         The renderer takes values that are not finite as black, and says so.
     depth_m : (height, width) float32, metres
         0, negative and NaN are missing.
     """
 
-    color: NDArray[np.uint8] | NDArray[np.float32]
+    color: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
     depth_m: NDArray[np.float32]
 
 

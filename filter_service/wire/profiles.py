@@ -15,11 +15,13 @@ from filter_service.wire.checks import (
     take_int,
     take_list,
     take_map,
+    take_pair,
     take_range,
     take_text,
     unpack_profile,
 )
 from filter_service.wire.images import (
+    MAX_GAZE_DEG,
     MAX_PREPARED_PUPIL_MM,
     MAX_VERGENCE_DPT,
     Camera,
@@ -45,8 +47,11 @@ class ProfileSettings:
     pupil_range_mm: tuple[float, float] = (2.0, 7.0)
     focus_range_dpt: tuple[float, float] = (0.0, 6.0)
     object_range_dpt: tuple[float, float] = (0.0, 10.0)
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
+    gaze_range_deg: tuple[float, float] = (0.0, 0.0)
     diffraction: bool = True
     chromatic: bool = True
+    lateral_color: bool = False
     eye_model: str = "traced"
     age_years: float | None = None
 
@@ -78,11 +83,22 @@ class ProfileSettings:
                 ("object_range_dpt", 0.0, MAX_VERGENCE_DPT),
             )
         }
+        gazes = {
+            name: take_pair(
+                source,
+                name,
+                low=low,
+                high=MAX_GAZE_DEG,
+                path=f"settings.{name}",
+                default=getattr(default, name),
+            )
+            for name, low in (("gaze_deg", -MAX_GAZE_DEG), ("gaze_range_deg", 0.0))
+        }
         switches = {
             name: take_bool(
                 source, name, path=f"settings.{name}", default=getattr(default, name)
             )
-            for name in ("diffraction", "chromatic")
+            for name in ("diffraction", "chromatic", "lateral_color")
         }
         age_years = take_float(
             source,
@@ -107,7 +123,7 @@ class ProfileSettings:
                 ("eye_model", EYE_MODELS),
             )
         }
-        return cls(**choices, **ranges, **switches, age_years=age_years)
+        return cls(**choices, **ranges, **gazes, **switches, age_years=age_years)
 
 
 @dataclass(frozen=True)

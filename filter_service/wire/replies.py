@@ -22,6 +22,7 @@ from filter_service.wire.checks import (
     take_int,
     take_list,
     take_map,
+    take_pair,
     take_text,
 )
 from filter_service.wire.images import (
@@ -126,6 +127,8 @@ class Result:
     clamped_depth_count: int
     total_ms: float
     stage_times_ms: dict[str, float]
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
+    overflow_count: int = 0
     notes: tuple[str, ...] = ()
     is_complete: bool = True
     colors: tuple[NDArray[Any], ...] = field(default=(), compare=False, repr=False)
@@ -137,6 +140,7 @@ class Result:
         header = {name: value for name, value in vars(self).items() if name != "colors"}
         return header | {
             "views": [view.fields() for view in self.views],
+            "gaze_deg": list(self.gaze_deg),
             "notes": clip_notes(self.notes),
         }
 
@@ -169,6 +173,12 @@ class Result:
                 )
                 for name, value in stages.items()
             },
+            gaze_deg=take_pair(
+                header, "gaze_deg", low=-360, high=360, default=(0.0, 0.0)
+            ),
+            overflow_count=take_int(
+                header, "overflow_count", low=0, high=MAX_ID, default=0
+            ),
             notes=take_notes(header),
             is_complete=take_bool(header, "is_complete", default=True),
             colors=tuple(

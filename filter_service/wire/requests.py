@@ -19,9 +19,11 @@ from filter_service.wire.checks import (
     take_int,
     take_list,
     take_map,
+    take_pair,
     take_text,
 )
 from filter_service.wire.images import (
+    MAX_GAZE_DEG,
     MAX_PUPIL_MM,
     MAX_VERGENCE_DPT,
     SRGB8,
@@ -67,6 +69,7 @@ class Frame:
     views: tuple[ViewHeader, ...]
     pupil_diameter_mm: float
     focus_dpt: float
+    gaze_deg: tuple[float, float] | None = None
     output: ImageFormat = SRGB8
     accumulation: str = "coverage"
     merge: bool = True
@@ -75,12 +78,14 @@ class Frame:
     type_name: ClassVar[str] = "frame"
 
     def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
+        """Return the header fields; a gaze that is not given does not travel."""
+        gaze = {} if self.gaze_deg is None else {"gaze_deg": list(self.gaze_deg)}
         return {
             "frame_id": self.frame_id,
             "views": [view.fields() for view in self.views],
             "pupil_diameter_mm": self.pupil_diameter_mm,
             "focus_dpt": self.focus_dpt,
+            **gaze,
             "output": self.output.fields(),
             "options": {"accumulation": self.accumulation, "merge": self.merge},
         }
@@ -105,6 +110,9 @@ class Frame:
                 header, "pupil_diameter_mm", low=0.5, high=MAX_PUPIL_MM
             ),
             focus_dpt=take_float(header, "focus_dpt", low=0, high=MAX_VERGENCE_DPT),
+            gaze_deg=take_pair(
+                header, "gaze_deg", low=-MAX_GAZE_DEG, high=MAX_GAZE_DEG, default=None
+            ),
             output=_parse_output(output, views, limits),
             accumulation=take_choice(
                 options,

@@ -1,6 +1,7 @@
 // Turns colour and depth of the input frame into linear light, dioptres and layer
 // positions, and notes which kernels the frame needs.
-// In:  COLOR_IN (bytes RGB, sRGB; or f32 RGB, linear when COLOR_IS_LINEAR),
+// In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
+//      COLOR_IS_HALF),
 //      DEPTH_IN (f32 metres, all valid), LAYER_DPT, FIELD_DEFOCUS (change of defocus at
 //      the corners of the cells).
 // Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
@@ -39,11 +40,18 @@ uint byte_at(uint index) {
     return (word >> (uint(BYTE_BITS) * (index % uint(BYTES_PER_WORD)))) & BYTE_MASK;
 }
 
+float half_at(uint index) {
+    vec2 pair = unpackHalf2x16(color_in[index / uint(HALVES_PER_WORD)]);
+    return pair[index % uint(HALVES_PER_WORD)];
+}
+
 vec3 read_linear_rgb(uint pixel) {
     uint first = pixel * uint(RGB);
 #ifdef COLOR_IS_LINEAR
     return vec3(uintBitsToFloat(color_in[first]), uintBitsToFloat(color_in[first + 1u]),
                 uintBitsToFloat(color_in[first + 2u]));
+#elif defined(COLOR_IS_HALF)
+    return vec3(half_at(first), half_at(first + 1u), half_at(first + 2u));
 #else
     uvec3 bytes = uvec3(byte_at(first), byte_at(first + 1u), byte_at(first + 2u));
     return linear_from_srgb(vec3(bytes) / BYTE_MAX);

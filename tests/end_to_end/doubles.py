@@ -39,6 +39,8 @@ class RenderedDouble:
     clamped_depth_count: int
     pupil_diameter_mm: float
     focus_dpt: float
+    gaze_deg: tuple[float, float]
+    overflow_count: int = 0
     notes: list = field(default_factory=list)
 
 
@@ -66,6 +68,7 @@ class RendererDouble:
         accumulation="coverage",
         merge=True,
         output="linear",
+        gaze_deg=None,
     ):
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape
@@ -82,6 +85,8 @@ class RendererDouble:
             color = 255 - _as_bytes(view.color)
         else:
             color = np.float32(1) - _as_floats(view.color)
+            if output == "linear16":
+                color = color.astype(np.float16)
         color[0, 0] = handle.mark
         return RenderedDouble(
             color=color,
@@ -90,6 +95,7 @@ class RendererDouble:
             clamped_depth_count=0,
             pupil_diameter_mm=min(pupil_diameter_mm, 7.0),
             focus_dpt=focus_dpt,
+            gaze_deg=gaze_deg or (0.0, 0.0),
             notes=[accumulation] if accumulation != "coverage" else [],
         )
 

@@ -115,6 +115,23 @@ def test_exr_and_npy_outputs_hold_the_same_linear_light(scene):
     np.testing.assert_allclose(stored, np.load(folder / "out.npy"), atol=1e-5)
 
 
+def test_half_floats_and_negative_light_pass_through(scene):
+    folder, linear = scene
+    light = (30.0 * linear - 1.0).astype(np.float16)
+    light[0, 0] = np.nan
+    np.save(folder / "color.npy", light)
+    summary = run_json(*filter_arguments(folder, *IDENTITY, "--half", out="out.exr"))
+    with OpenEXR.File(str(folder / "out.exr")) as file:
+        filtered = file.channels()["RGB"].pixels
+    assert filtered.dtype == np.float16
+    light[0, 0] = 0.0
+    assert psnr_db(filtered / 30.0, light.astype(np.float64) / 30.0) >= 60.0
+    assert summary["bad_color_count"] == 1
+    assert summary["overflow_count"] == 0
+    text = refusal(*filter_arguments(folder, "--half", out="out.png"))
+    assert "--half" in text
+
+
 def test_png_input_and_output_are_srgb(scene, rng):
     folder, _ = scene
     srgb = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)

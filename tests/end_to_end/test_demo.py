@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients import demo, sheet, video
+from clients import demo, pyrender_stream, sheet, video
 from clients.demo_eyes import EYES
 from clients.pyrender_stream import parse_size, path_settings, profile_body
 from clients.scenes.scene import build_scene
@@ -177,6 +177,31 @@ def test_settings_cover_the_whole_path():
     assert low <= 3.0 and high >= 4.95
     low, high = settings["focus_range_dpt"]
     assert low <= 1 / 14 and high >= 4.0
+
+
+def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
+    asked = []
+
+    def submit(client, views, **state):
+        asked.append(state["gaze_deg"])
+        return original(client, views, **state)
+
+    original = pyrender_stream.FilterClient.submit
+    monkeypatch.setattr(pyrender_stream.FilterClient, "submit", submit)
+    with ServiceProcess(
+        command=(sys.executable, "-m", "tests.end_to_end.double_service")
+    ) as service:
+        arguments = ["--endpoint", service.endpoint, "--size", "64x36", "--frames", "4"]
+        monkeypatch.setattr(
+            pyrender_stream, "profile_body", lambda name: {"kind": "double", "mark": 1}
+        )
+        assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
+        assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
+    assert asked[0] == (0.0, 10.0)
+    assert len(asked) == 4 and all(
+        np.hypot(h, 2 * v) == pytest.approx(20) for h, v in asked
+    )
+    assert "0 to 30" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["480", "480x", "8x8", "axb", "480x270x3"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import zmq
 
-from clients.filter_client import FilteredFrame
+from clients.filter_client import FilteredFrame, RgbdView
 from filter_service import errors
 from filter_service.messages import Bye, Hello, Ping, encode
 from tests.end_to_end.conftest import make_view, small_frame
@@ -35,6 +35,16 @@ def test_a_linear_frame_comes_back_linear(client):
     reply = client.filter(view, **SEE, output="linear")
     assert reply.color.dtype == np.float32
     np.testing.assert_array_equal(reply.color[1:], 1 - view.color[1:])
+
+
+def test_half_floats_go_there_and_back(client):
+    view = make_view(dtype=np.float32)
+    half = RgbdView(view.color.astype(np.float16), view.depth_m, view.tangents)
+    client.set_profile(double(7), views=[half])
+    reply = client.filter(half, **SEE, output="linear16")
+    assert reply.color.dtype == np.float16
+    expected = (np.float32(1) - half.color).astype(np.float16)
+    np.testing.assert_array_equal(reply.color[1:], expected[1:])
 
 
 def test_a_result_says_what_it_was_made_with(client):
@@ -118,7 +128,7 @@ def broken_frames():
     def packed(**changes):
         return msgpack.packb(header | changes)
 
-    bad_dtype = header["views"][0] | {"color": {"dtype": "float16", "space": "srgb"}}
+    bad_dtype = header["views"][0] | {"color": {"dtype": "float64", "space": "srgb"}}
     return {
         "parts": ([packed(), color], "bad_message", "parts", 3),
         "more parts": ([packed(), color, depth_m, b""], "bad_message", "parts", 3),

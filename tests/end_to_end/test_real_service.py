@@ -78,6 +78,46 @@ def test_one_profile_sent_twice_and_two_views_work(real_client):
         np.testing.assert_array_equal(color, colors[0])
 
 
+def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
+    view = edge_view()
+    settings = NARROW | {
+        "focus_range_dpt": (0, 0),
+        "tolerance": "loose",
+        "gaze_range_deg": (15.0, 0.0),
+    }
+    eye = {"kind": "preset", "name": "keratoconus"}
+    real_client.set_profile(eye, settings=settings, views=[view])
+    straight, aside, beyond = (
+        real_client.filter(view, **SEE, gaze_deg=gaze_deg)
+        for gaze_deg in (None, (15.0, 0.0), (30.0, 0.0))
+    )
+    assert straight.header.gaze_deg == (0.0, 0.0)
+    assert aside.header.gaze_deg == beyond.header.gaze_deg == (15.0, 0.0)
+    assert np.abs(straight.color - aside.color).max() > 0.01
+    np.testing.assert_array_equal(aside.color, beyond.color)
+    assert any("gaze (30, 0) deg" in note for note in beyond.header.notes)
+    assert not any("gaze" in note for note in aside.header.notes)
+    assert aside.header.overflow_count == 0
+    with pytest.raises(errors.BuildFailed, match="gaze_range_deg"):
+        real_client.set_profile(
+            eye, settings=settings | {"gaze_range_deg": (55.0, 0.0)}, views=[view]
+        )
+
+
+def test_bright_half_floats_scale_through_the_service(real_client):
+    view = edge_view()
+    bright = RgbdView(
+        (100 * view.color - 10).astype(np.float16), view.depth_m, view.tangents
+    )
+    real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+    plain = real_client.filter(view, **SEE)
+    seen = real_client.filter(bright, **SEE | {"output": "linear16"})
+    assert seen.color.dtype == np.float16
+    expected = 100 * plain.color - 10
+    assert np.abs(seen.color.astype(np.float32) - expected).max() <= 0.05
+    assert seen.header.views[0].color.dtype == "float16"
+
+
 def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
     view = edge_view()
     old = real_client.set_profile(PLAIN, settings=NARROW, views=[view])
@@ -211,6 +251,31 @@ def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(
     reply = real_client.filter(view, **SEE | {"pupil_diameter_mm": 5.0})
     assert reply.header.pupil_diameter_mm == pytest.approx(5.0)
     assert not any("capped" in note for note in reply.header.notes)
+
+
+def test_lateral_color_is_asked_of_a_traced_eye(real_client):
+    view = edge_view()
+    settings = {
+        **NARROW,
+        "focus_range_dpt": (0, 0),
+        "tolerance": "loose",
+        "lateral_color": True,
+    }
+    images = {}
+    for eye_model, lateral in (
+        ("traced", True),
+        ("traced", False),
+        ("wavefront", True),
+    ):
+        ready = real_client.set_profile(
+            {"kind": "preset", "name": "emmetropia"},
+            settings=settings | {"eye_model": eye_model, "lateral_color": lateral},
+            views=[view],
+        )
+        holds_none = any("no lateral colour" in note for note in ready.notes)
+        assert holds_none == (eye_model == "wavefront")
+        images[eye_model, lateral] = real_client.filter(view, **SEE).color
+    assert np.abs(images["traced", True] - images["traced", False]).max() > 0.005
 
 
 def test_the_light_option_is_the_measured_wavefront_up_to_its_pupil(real_client):

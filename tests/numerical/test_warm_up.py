@@ -1,5 +1,7 @@
 """After warming up, frames meet no shader that is not compiled."""
 
+import numpy as np
+
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.renderer import FilterRenderer
 from filter_service.rendering.warm_up import warm_up
@@ -19,9 +21,11 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
         mode="dynamic",
         pupil_range_mm=(4.0, 5.0),
     )
-    view = bench.view(texture(rng, 64, 96), 1.0)
-    for accumulation in ("coverage", "paper"):
-        for output in ("srgb8", "linear"):
-            bench.render(view, accumulation=accumulation, output=output)
+    color = texture(rng, 64, 96)
+    for dtype in (np.uint8, np.float32, np.float16):
+        view = bench.view(color.astype(dtype), 1.0)
+        for accumulation in ("coverage", "paper"):
+            for output in ("srgb8", "linear", "linear16"):
+                bench.render(view, accumulation=accumulation, output=output)
     assert gpu.program_count == compiled
     gpu.close()

@@ -47,6 +47,7 @@ HOME = {
     "numba": (
         "estimator/psf_*.py",  # kernels of the PSF engines
         "estimator/raytrace_kernels.py",
+        "estimator/chief_ray_kernels.py",
         "estimator/wavefront_*.py",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels

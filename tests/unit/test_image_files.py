@@ -87,8 +87,6 @@ def test_float_tiff_and_exr_depth_are_metres(tmp_path, rng):
         (np.zeros((4, 6), np.float32), "shape"),
         (np.zeros((0, 6, 3), np.float32), "shape"),
         (np.zeros((4, 6, 3), np.int32), "int32"),
-        (np.full((4, 6, 3), -0.1, np.float32), "negative"),
-        (np.full((4, 6, 3), np.nan, np.float32), "not finite"),
     ],
 )
 def test_unfit_colour_is_refused_with_what_was_found(tmp_path, array, said):
@@ -96,6 +94,23 @@ def test_unfit_colour_is_refused_with_what_was_found(tmp_path, array, said):
     with pytest.raises(ValueError, match=said) as caught:
         read_color(tmp_path / "color.npy")
     assert "--color" in str(caught.value) and "allowed" in str(caught.value)
+
+
+def test_light_below_zero_and_not_finite_is_left_to_the_filter(tmp_path):
+    light = np.array([[[-0.25, 1e30, np.nan]], [[np.inf, 70000.0, 0.5]]], np.float32)
+    for name in ("color.npy", "color.exr"):
+        write_image(tmp_path / name, light)
+        np.testing.assert_array_equal(read_color(tmp_path / name), light)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr"])
+def test_half_floats_survive_a_file_exactly(tmp_path, linear, suffix):
+    path = tmp_path / f"image{suffix}"
+    write_image(path, linear.astype(np.float16))
+    np.testing.assert_array_equal(read_color(path), linear.astype(np.float16))
+    write_image(tmp_path / f"float{suffix}", linear)
+    size = path.stat().st_size
+    assert size < (tmp_path / f"float{suffix}").stat().st_size
 
 
 @pytest.mark.parametrize("name", ["depth.exr", "depth.png", "depth.npy", "depth.jpg"])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from filter_service import errors, messages
 from filter_service.messages import (
     LINEAR,
+    LINEAR16,
     SRGB8,
     Camera,
     Frame,
@@ -67,8 +68,14 @@ REQUESTS = [
     messages.Ping(12.5),
     messages.Bye(),
     frame(),
+    frame(gaze_deg=(12.5, -60.0)),
     ProfileRequest(
-        3, {"kind": "preset"}, ProfileSettings(age_years=40.0), (CAMERA, CAMERA)
+        3,
+        {"kind": "preset"},
+        ProfileSettings(
+            age_years=40.0, gaze_deg=(-5.0, 2.0), gaze_range_deg=(10.0, 0.0)
+        ),
+        (CAMERA, CAMERA),
     ),
 ]
 REPLIES = [
@@ -93,7 +100,10 @@ def test_what_the_service_says_arrives_unchanged(message):
     assert decode_reply(as_bytes(encode(message))) == message
 
 
-@pytest.mark.parametrize(("color", "dtype"), [(SRGB8, np.uint8), (LINEAR, np.float32)])
+@pytest.mark.parametrize(
+    ("color", "dtype"),
+    [(SRGB8, np.uint8), (LINEAR, np.float32), (LINEAR16, np.float16)],
+)
 def test_images_of_two_views_arrive_bit_for_bit(color, dtype):
     images = (view_images(dtype), ViewImages(*reversed_images(dtype)))
     views = (ViewHeader(CAMERA, color), ViewHeader(CAMERA, color, "radial"))
@@ -124,6 +134,8 @@ def test_a_result_carries_its_images_and_stage_times():
         clamped_depth_count=6,
         total_ms=3.0,
         stage_times_ms={"decode_ms": 1.0, "other_ms": 2.0},
+        gaze_deg=(3.5, -2.0),
+        overflow_count=7,
         notes=("capped",),
         colors=(color,),
     )
@@ -167,6 +179,10 @@ def refusal(parts, error=errors.BadMessage):
         ({"pupil_diameter_mm": "4"}, "pupil_diameter_mm"),
         ({"focus_dpt": float("-inf")}, "focus_dpt"),
         ({"focus_dpt": -0.1}, "focus_dpt"),
+        ({"gaze_deg": 5.0}, "gaze_deg"),
+        ({"gaze_deg": [0.0, 0.0, 0.0]}, "gaze_deg"),
+        ({"gaze_deg": [0.0, 60.5]}, "gaze_deg[1]"),
+        ({"gaze_deg": [float("nan"), 0.0]}, "gaze_deg[0]"),
         ({"views": []}, "views"),
         ({"views": {}}, "views"),
         ({"views": [view_map()] * 3}, "views"),
@@ -186,6 +202,10 @@ def refusal(parts, error=errors.BadMessage):
         ),
         (
             {"views": [view_map(color={"dtype": "uint8", "space": "linear"})]},
+            "views[0].color.space",
+        ),
+        (
+            {"views": [view_map(color={"dtype": "float16", "space": "srgb"})]},
             "views[0].color.space",
         ),
         ({"views": [view_map(color=None)]}, "views[0].color"),
@@ -210,6 +230,10 @@ def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):
         ({"focus_range_dpt": 3}, "settings.focus_range_dpt"),
         ({"object_range_dpt": [-1, 3]}, "settings.object_range_dpt[0]"),
         ({"diffraction": "no"}, "settings.diffraction"),
+        ({"lateral_color": 1}, "settings.lateral_color"),
+        ({"gaze_deg": [61, 0]}, "settings.gaze_deg[0]"),
+        ({"gaze_range_deg": [5, -1]}, "settings.gaze_range_deg[1]"),
+        ({"gaze_range_deg": 5}, "settings.gaze_range_deg"),
         ({"age_years": 200}, "settings.age_years"),
     ],
 )

@@ -253,6 +253,8 @@ def test_the_key_tells_apart_what_changes_a_store():
         key(spec=field),
         key(spec=replace(field, camera=shifted.camera)),
         key(spec=replace(field, gaze_deg=(1.0, 0.0))),
+        key(spec=replace(field, gaze_range_deg=(1.0, 0.0))),
+        key(spec=replace(field, lateral_color=True)),
     ]
     assert len({key(), *others}) == 1 + len(others)
 

@@ -1,0 +1,246 @@
+"""Lateral colour: chief rays against other tracers, and white points in images."""
+
+import numpy as np
+import pytest
+from scipy.optimize import root
+
+from estimator.chief_ray_kernels import fill_chief_shifts
+from estimator.chief_rays import chief_shift_mrad
+from estimator.estimation import estimate_eye
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.profiles import parse_profile
+from estimator.raytrace import trace_rays
+from estimator.surfaces import media_indices, pack_eye
+from estimator.traced_eye import TracedEye
+from estimator.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
+from filter_service.planning.field_directions import field_deg
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.eye_model import NO_LATERAL_COLOR, prepare_eye
+from filter_service.rendering.frame import View
+from filter_service.rendering.renderer import FilterRenderer
+from tests.numerical.schematic_eyes import (
+    case_eye,
+    field_axes,
+    irregular_eye,
+    navarro,
+    reference,
+)
+
+RED, GREEN, BLUE = RGB_WAVELENGTHS_NM
+
+
+def test_chief_rays_of_another_program_lie_apart_alike():
+    """Optiland's chief rays of the Navarro eye, 543 against 555 nm."""
+    data = reference()
+    cases = {
+        (case["field_deg"], case["wavelength_nm"]): case
+        for case in data["zernike_cases"]
+        if case["variant"] == "ESN1999" and case["stop_diameter_mm"] == 4.0
+    }
+    fields = np.array([10.0, 20.0, 30.0, 40.0])
+    height_mm = [cases[field, 555.0]["retinal_point_mm"][1] for field in fields]
+    powers = np.array([1, 3, 5, 7])
+    odd = np.linalg.solve(fields[:, None] ** powers, height_mm)
+    own, other = (case_eye(data, cases[20, nm]) for nm in (555.0, 543.0))
+    shifts = np.empty((2, 1, 2))
+    fill_chief_shifts(
+        pack_eye(own),
+        np.atleast_2d(media_indices(other, 543.0)),
+        media_indices(own, 555.0),
+        np.radians([[0.0, -20.0], [0.0, -40.0]]),  # its light travels upwards
+        shifts,
+    )
+    for (field, low, high), shift in zip(
+        [(20.0, 19.0, 21.0), (40.0, 39.0, 40.0)], shifts[:, 0], strict=True
+    ):
+        landed_mm = cases[field, 543.0]["retinal_point_mm"][1]
+        seen = np.linspace(low, high, 20001)
+        heights_mm = (seen[:, None] ** powers) @ odd
+        expected = -np.radians(np.interp(landed_mm, heights_mm, seen) - field)
+        assert expected > 0.0  # up: towards the axis
+        assert shift == pytest.approx([0.0, expected], rel=0.02, abs=1e-9)
+
+
+def paraxial_height_mm(eye, wavelength_nm):
+    """Height on the retina of the chief ray from a field of one radian."""
+    n = media_indices(eye, wavelength_nm)
+    matrix, z, to_stop = np.eye(2), 0.0, None  # of (height, n times slope)
+    for i, surface in enumerate(eye.surfaces):
+        if eye.stop_z_mm <= surface.z_mm and to_stop is None:
+            gap = np.array([[1.0, (eye.stop_z_mm - z) / n[i]], [0.0, 1.0]])
+            to_stop = gap @ matrix
+        matrix = np.array([[1.0, (surface.z_mm - z) / n[i]], [0.0, 1.0]]) @ matrix
+        power = (n[i + 1] - n[i]) / surface.radius_mm[0]
+        matrix = np.array([[1.0, 0.0], [-power, 1.0]]) @ matrix
+        z = surface.z_mm
+    to_retina = np.array([[1.0, (eye.retina.z_mm - z) / n[-1]], [0.0, 1.0]]) @ matrix
+    start_mm = -to_stop[0, 1] / to_stop[0, 0]  # at the cornea, towards the stop
+    return to_retina[0] @ [start_mm, 1.0]
+
+
+@pytest.mark.parametrize("wavelength_nm", [RED, GREEN, BLUE])
+def test_near_the_axis_it_is_the_paraxial_difference_of_magnification(wavelength_nm):
+    eye, h_deg = navarro(reference()), 0.5
+    ratio = paraxial_height_mm(eye, wavelength_nm) / paraxial_height_mm(
+        eye, REFERENCE_WAVELENGTH_NM
+    )
+    found = chief_shift_mrad(
+        eye, fields_deg=[[h_deg, 0.0]], wavelengths_nm=[wavelength_nm]
+    )
+    expected_mrad = 1000.0 * np.radians(h_deg) * (ratio - 1.0)
+    assert found[0, 0] == pytest.approx([expected_mrad, 0.0], rel=2e-3, abs=1e-9)
+
+
+def test_a_centred_eye_has_none_on_its_axis_and_the_same_on_both_sides():
+    fields = [(0.0, 0.0), (25.0, 10.0), (-25.0, 10.0), (25.0, -10.0)]
+    axis, *sides = chief_shift_mrad(
+        navarro(reference()), fields_deg=fields, wavelengths_nm=RGB_WAVELENGTHS_NM
+    )
+    np.testing.assert_allclose(axis, 0.0, atol=1e-9)
+    np.testing.assert_allclose(sides[1], sides[0] * [-1.0, 1.0], atol=1e-7)
+    np.testing.assert_allclose(sides[2], sides[0] * [1.0, -1.0], atol=1e-7)
+
+
+def landing(eye, direction, wavelength_nm):
+    """Point on the retina of the chief ray from a direction, by forward tracing."""
+    across = np.linalg.svd(direction[None])[2][1:]
+
+    def ray(offsets):
+        start = np.array([0.0, 0.0, 3.0]) + offsets @ across + 10.0 * direction
+        return trace_rays(
+            eye, start_mm=start, direction=-direction, wavelength_nm=wavelength_nm
+        )
+
+    def miss(offsets):
+        rays = ray(offsets)
+        return rays.points_mm[0, rays.stop_index, :2]
+
+    return ray(root(miss, np.zeros(2), tol=1e-13).x).points_mm[0, -1]
+
+
+@pytest.mark.parametrize("field", [(18.0, -11.0), (-25.0, 6.0), (0.0, 0.0)])
+@pytest.mark.parametrize("wavelength_nm", [RED, BLUE])
+def test_light_seen_there_lands_where_the_colour_does(field, wavelength_nm):
+    """An eye without symmetry: both directions traced inwards, by a solver."""
+    eye = irregular_eye()
+    shift = chief_shift_mrad(eye, fields_deg=[field], wavelengths_nm=[wavelength_nm])
+    ex, ey, u = field_axes(*field)
+    seen = u + (shift[0, 0, 0] * ex + shift[0, 0, 1] * ey) / 1000.0
+    landed_mm = landing(eye, np.asarray(u), wavelength_nm)
+    seen_mm = landing(eye, seen / np.linalg.norm(seen), REFERENCE_WAVELENGTH_NM)
+    straight_mm = landing(eye, np.asarray(u), REFERENCE_WAVELENGTH_NM)
+    apart_mm = np.linalg.norm(straight_mm - landed_mm)
+    assert apart_mm > 1e-4
+    assert np.linalg.norm(seen_mm - landed_mm) <= 1e-3 * apart_mm
+
+
+@pytest.fixture(scope="module")
+def keratoconus():
+    return estimate_eye(parse_profile({"kind": "preset", "name": "keratoconus"}))
+
+
+def test_the_table_answers_like_direct_traces(keratoconus):
+    field_range_deg = ((-40.0, 30.0), (-20.0, 22.0))
+    eye = TracedEye.trace(
+        keratoconus,
+        pupil_diameters_mm=[4.0],
+        focus_range_dpt=(2.0, 6.0),
+        wavelengths_nm=RGB_WAVELENGTHS_NM,
+        field_range_deg=field_range_deg,
+    )
+    rng = np.random.default_rng(5)
+    fields = rng.uniform([-40.0, -20.0], [30.0, 22.0], (30, 2))
+    low_dpt, high_dpt = eye.grid.accommodations_dpt[[0, -1]]
+    used_dpt = low_dpt + 0.3 * (high_dpt - low_dpt)
+    (state,) = keratoconus.accommodating.focused_at(
+        [used_dpt - keratoconus.refraction_dpt]
+    )
+    direct = chief_shift_mrad(
+        state.surfaces, fields_deg=fields, wavelengths_nm=RGB_WAVELENGTHS_NM
+    )
+    found = eye.chief_ray_shift_mrad(
+        h_deg=fields[:, :1],
+        v_deg=fields[:, 1:],
+        accommodation_dpt=used_dpt,
+        wavelength_nm=RGB_WAVELENGTHS_NM,
+    )
+    assert np.abs(direct).max() > 1.0
+    assert np.abs(found - direct).max() <= 0.005
+
+
+SIZE, PITCH_MRAD = 96, 1.15
+"""Pixels of 720p at 67 degrees, and a window onto the edge of its field."""
+
+
+def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
+    """Centroids (3, 2) of a white point from itself, x to the right and y up, px."""
+    half = 0.5e-3 * SIZE * PITCH_MRAD
+    middle = np.tan(np.radians(h_deg))
+    spec = GridSpec.for_camera(
+        width_px=SIZE,
+        height_px=SIZE,
+        tangents=(middle - half, middle + half, half, -half),
+        pupil_range_mm=(3.0, 3.0),
+        focus_range_dpt=(0.0, 0.0),
+        object_range_dpt=(0.0, 0.5),
+        mode="quality",
+        tolerance="fine",
+        kept_energy_ratio=0.998,
+        lateral_color=lateral_color,
+    )
+    eye, notes = prepare_eye(parse_profile(profile), spec, eye_model=eye_model)
+    renderer = FilterRenderer(gpu)
+    handle = renderer.load(build_psf_store(eye, spec))
+    color = np.zeros((SIZE, SIZE, 3), np.float32)
+    row, column = 40, (40 if h_deg < 0.0 else SIZE - 1 - 40)  # the middles of cells
+    color[row, column] = 1000.0
+    depth_m = np.full((SIZE, SIZE), np.inf, np.float32)
+    seen = renderer.render(
+        View(color, depth_m, spec.camera.tangents),
+        handle,
+        pupil_diameter_mm=3.0,
+        focus_dpt=0.0,
+    ).color.astype(float)
+    rows, columns = np.mgrid[0:SIZE, 0:SIZE]
+    total = seen.sum(axis=(0, 1))
+    x = (seen * columns[..., None]).sum(axis=(0, 1)) / total - column
+    y = row - (seen * rows[..., None]).sum(axis=(0, 1)) / total
+    field = field_deg(spec.camera, column + 0.5, row + 0.5)
+    return np.stack([x, y], axis=-1), eye, spec, field, notes
+
+
+EMMETROPIA = {"kind": "preset", "name": "emmetropia"}
+
+
+def test_red_and_blue_lie_beside_green_by_the_table(gpu):
+    lateral_px = {}
+    for h_deg in (-20.0, 0.0, 20.0):
+        with_it, eye, spec, field, _ = look(gpu, EMMETROPIA, h_deg)
+        without, *_ = look(gpu, EMMETROPIA, h_deg, lateral_color=False)
+        moved_px = with_it - without
+        shift_mrad = eye.chief_ray_shift_mrad(
+            h_deg=field[0],
+            v_deg=field[1],
+            accommodation_dpt=eye.accommodation_dpt(0.0),
+            wavelength_nm=np.array(RGB_WAVELENGTHS_NM),
+        )
+        to_green_mrad = shift_mrad - shift_mrad[1]
+        expected_px = to_green_mrad @ spec.pixel_from_mrad(*field).T
+        assert np.abs(moved_px - expected_px).max() <= 0.05, (moved_px, expected_px)
+        assert np.abs(moved_px[1]).max() <= 1e-3  # green
+        lateral_px[h_deg] = moved_px[:, 0]
+    red, _, blue = lateral_px[20.0]
+    assert red > 0.3 and blue < -0.8  # red outwards, blue towards the axis
+    np.testing.assert_allclose(lateral_px[-20.0], -lateral_px[20.0], atol=0.005)
+    np.testing.assert_allclose(lateral_px[0.0], 0.0, atol=0.05)
+
+
+def test_a_measured_wavefront_has_none_and_says_so(gpu):
+    with_it, eye, _, _, notes = look(gpu, EMMETROPIA, 20.0, eye_model="wavefront")
+    without, *_ = look(
+        gpu, EMMETROPIA, 20.0, eye_model="wavefront", lateral_color=False
+    )
+    assert isinstance(eye, MeasuredWavefront)
+    assert notes == (NO_LATERAL_COLOR,)
+    np.testing.assert_array_equal(with_it, without)
