@@ -1,4 +1,8 @@
-"""One view of an RGB-D frame: checked, with missing depth filled and counted."""
+"""One view of an RGB-D frame: checked, with missing depth filled and counted.
+
+A view may have a second, hidden layer: what the camera would see if what it sees were
+away.  Blurred edges let light of it pass.
+"""
 
 from dataclasses import dataclass
 
@@ -25,12 +29,33 @@ class View:
     tangents : (left, right, up, down)
     depth_kind : "planar" or "radial"
         View-space z, or distance from the eye.
+    hidden_color : (height, width, 3), optional
+        Of what is behind, of the same type as `color`.
+    hidden_depth_m : (height, width), float32, optional
+        0, negative and NaN: nothing is hidden here, and nothing is filled in.
     """
 
     color: NDArray
     depth_m: NDArray[np.float32]
     tangents: tuple[float, float, float, float]
     depth_kind: str = "planar"
+    hidden_color: NDArray | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
+
+    @property
+    def surface_count(self) -> int:
+        """1, or 2 with a hidden layer."""
+        return 1 if self.hidden_depth_m is None else 2
+
+    @property
+    def surface_colors(self) -> tuple[NDArray, ...]:
+        """Colour of each surface."""
+        return (self.color, self.hidden_color)[: self.surface_count]
+
+    @property
+    def surface_depths_m(self) -> tuple[NDArray[np.float32], ...]:
+        """Depth of each surface."""
+        return (self.depth_m, self.hidden_depth_m)[: self.surface_count]
 
     @property
     def width_px(self) -> int:
@@ -74,6 +99,21 @@ def check_view(view: View) -> None:
         raise BadMessage(
             f"{view.depth_kind!r}", field="depth.kind", allowed=", ".join(DEPTH_KINDS)
         )
+    _check_hidden(view)
+
+
+def _check_hidden(view: View) -> None:
+    """Refuse a hidden layer that is not of the kind of what is seen."""
+    if view.hidden_color is None and view.hidden_depth_m is None:
+        return
+    for field, image, seen in (
+        ("hidden_color", view.hidden_color, view.color),
+        ("hidden_depth", view.hidden_depth_m, view.depth_m),
+    ):
+        wanted = f"{seen.dtype} of shape {seen.shape}"
+        found = "missing" if image is None else f"{image.dtype} of shape {image.shape}"
+        if found != wanted:
+            raise BadMessage(found, field=field, allowed=wanted)
 
 
 def fill_missing_depth(
@@ -94,6 +134,11 @@ def fill_missing_depth(
         missing, return_distances=False, return_indices=True
     )
     return depth_m[rows, columns], count
+
+
+def hidden_or_zero(hidden_depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth with 0 wherever nothing is hidden."""
+    return np.where(hidden_depth_m > 0.0, hidden_depth_m, np.float32(0.0))
 
 
 def finite_color(color: NDArray) -> tuple[NDArray, int]:

@@ -16,6 +16,7 @@ from filter_service.rendering.frame import (
     check_view,
     fill_missing_depth,
     finite_color,
+    hidden_or_zero,
     object_dpt,
 )
 from filter_service.rendering.frame_passes import FramePasses
@@ -24,7 +25,7 @@ from filter_service.rendering.kernel_passes import KernelMaker
 from filter_service.wire.images import Camera
 
 BYTES_PER_PIXEL = 16
-"""Of the largest per-pixel buffers: a strip's must fit one storage block."""
+"""Of the largest buffers, per pixel and surface: a strip's must fit a storage block."""
 
 UPLOAD_LINES = 512
 """Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
@@ -165,6 +166,14 @@ class FilterRenderer:
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
+            if view.surface_count > 1:
+                hidden_color, bad_count = finite_color(view.hidden_color)
+                bad_color_count += bad_count
+                whole = replace(
+                    whole,
+                    hidden_color=hidden_color,
+                    hidden_depth_m=hidden_or_zero(view.hidden_depth_m),
+                )
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
         counts = np.zeros(5, dtype=np.int64)
@@ -302,7 +311,7 @@ def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Stri
     reach_px = layers.max_radius_px + 2
     halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
-    rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)
+    rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
     rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
     if rows >= view.height_px:
         return [_Strip(view, 0, slice(None), slice(None))]
@@ -331,9 +340,13 @@ def _rows_of(view: View, first: int, last: int) -> View:
     """Rows first..last of a view, with the tangents of their edges."""
     left, right, up, down = view.tangents
     per_row = (down - up) / view.height_px
+    images = {
+        name: np.ascontiguousarray(image[first:last])
+        for name in ("color", "depth_m", "hidden_color", "hidden_depth_m")
+        if (image := getattr(view, name)) is not None
+    }
     return replace(
         view,
-        color=np.ascontiguousarray(view.color[first:last]),
-        depth_m=np.ascontiguousarray(view.depth_m[first:last]),
+        **images,
         tangents=(left, right, up + first * per_row, up + last * per_row),
     )

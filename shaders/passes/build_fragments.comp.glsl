@@ -1,10 +1,12 @@
 // Turns colour and depth of the input frame into linear light, dioptres and layer
-// positions, and notes which kernels the frame needs.
+// positions, and notes which kernels the frame needs.  Surface after surface: what is
+// seen, and what it hides.
 // In:  COLOR_IN (bytes RGB, sRGB; or f32 RGB, linear when COLOR_IS_LINEAR),
-//      DEPTH_IN (f32 metres, all valid), LAYER_DPT.
-// Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
-//      cell and interval).
-// Dispatch: one thread a pixel, 8 x 8 groups; a group lies in one cell.
+//      DEPTH_IN (f32 metres; all valid in what is seen, 0 where nothing is hidden),
+//      LAYER_DPT.
+// Out: PIXELS (linear RGB, object distance dpt; negative where nothing is hidden),
+//      PIXEL_LAYER (position), USED (a bit per cell and interval).
+// Dispatch: one thread a pixel, 8 x 8 groups, z the surface; a group lies in one cell.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
 #include "common/color.glsl"
@@ -26,6 +28,7 @@ uniform int layer_count;
 uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
+uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 
@@ -67,6 +70,16 @@ float layer_position(float dpt) {
     return float(low) + clamp((dpt - layer_dpt[low]) / span, 0.0, 1.0);
 }
 
+// Object distance, or NOTHING_DPT where a hidden pixel is empty, or as good as on the
+// surface before it: the two would blur alike.
+float distance_of(uint pixel, uint seen, vec2 at) {
+    if (pixel == seen) return object_dpt(depth_in[pixel], at);
+    if (depth_in[pixel] == 0.0) return NOTHING_DPT;
+    float dpt = object_dpt(depth_in[pixel], at);
+    float behind = object_dpt(depth_in[seen], at) - dpt;
+    return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
+}
+
 void main() {
     uint thread = gl_LocalInvocationIndex;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
@@ -74,14 +87,18 @@ void main() {
     barrier();  // no bit is left from before
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (all(lessThan(at, frame_size_px))) {
-        uint pixel = uint(at.y * frame_size_px.x + at.x);
-        float dpt = object_dpt(depth_in[pixel], vec2(at));
-        dpt = clamp(dpt, layer_dpt[0], layer_dpt[layer_count - 1]);
-        float place = layer_position(dpt);
-        int interval = position_interval(place, layer_count);
+        uint seen = uint(at.y * frame_size_px.x + at.x);
+        uint pixel = seen + gl_WorkGroupID.z * uint(frame_size_px.x * frame_size_px.y);
+        float dpt = distance_of(pixel, seen, vec2(at));
+        if (dpt >= 0.0) {
+            dpt = clamp(dpt, layer_dpt[0], layer_dpt[layer_count - 1]);
+            float place = layer_position(dpt);
+            int interval = position_interval(place, layer_count);
+            position[pixel] = place;
+            atomicOr(group_used[interval / BITS_PER_WORD],
+                     1u << uint(interval % BITS_PER_WORD));
+        }
         pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
-        position[pixel] = place;
-        atomicOr(group_used[interval / BITS_PER_WORD], 1u << uint(interval % BITS_PER_WORD));
     }
     barrier();  // all pixels of the group have noted theirs
     int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
