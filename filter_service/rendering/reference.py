@@ -27,7 +27,6 @@ from filter_service.rendering.frame_kernels import (
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
 
-
 NOTHING = -1
 """Stands for the kernel of a pixel that holds nothing."""
 
