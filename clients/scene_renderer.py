@@ -207,10 +207,10 @@ def _is_behind(seen_m, hidden_m) -> NDArray[np.bool_]:
 
 
 def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
-    """Return colour and depth of pixels from those of their samples that show something.
+    """Return colour and depth of pixels from their samples that show something.
 
-    A pixel holds something where its depth is behind that of what is seen there; what is
-    behind a sliver of a nearer surface, the pixel shows already.
+    A pixel holds something where its depth is behind that of what is seen there: what
+    is behind a sliver of a nearer surface, the pixel shows already.
     """
     light = _blocks(_LINEAR_FROM_SRGB8[color] * shows[..., None], samples).sum(axis=2)
     count = _blocks(shows, samples).sum(axis=2)

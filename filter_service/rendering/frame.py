@@ -4,7 +4,7 @@ A view may have a second, hidden layer: what the camera would see if what it see
 away.  Blurred edges let light of it pass.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from filter_service.errors import BadMessage
 
 MAX_SIDE_PX = 16384
 DEPTH_KINDS = ("planar", "radial")
+IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 
 
 @dataclass(frozen=True)
@@ -136,9 +137,21 @@ def fill_missing_depth(
     return depth_m[rows, columns], count
 
 
-def hidden_or_zero(hidden_depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth with 0 wherever nothing is hidden."""
-    return np.where(hidden_depth_m > 0.0, hidden_depth_m, np.float32(0.0))
+def extended(view: View, border_px: int) -> View:
+    """Repeat the edge of a view's images all around."""
+    if border_px == 0:
+        return view
+    left, right, up, down = view.tangents
+    across = (right - left) / view.width_px * border_px
+    along = (up - down) / view.height_px * border_px
+    sides = ((border_px, border_px), (border_px, border_px), (0, 0))
+    images = {
+        name: np.pad(image, sides[: image.ndim], mode="edge")
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
+    tangents = (left - across, right + across, up + along, down - along)
+    return replace(view, **images, tangents=tangents)
 
 
 def finite_color(color: NDArray) -> tuple[NDArray, int]:
@@ -150,6 +163,23 @@ def finite_color(color: NDArray) -> tuple[NDArray, int]:
         return color, 0
     count = int(np.count_nonzero(~finite.all(axis=2)))
     return np.where(finite, color, np.float32(0.0)), count
+
+
+def with_clean_hidden(view: View) -> tuple[View, int]:
+    """Set hidden depth to 0 where nothing is hidden, and count non-finite colours.
+
+    A hidden layer that holds nothing at all is left out.
+    """
+    holds = view.hidden_depth_m > 0.0
+    if not holds.any():
+        return replace(view, hidden_color=None, hidden_depth_m=None), 0
+    color, _ = finite_color(view.hidden_color)
+    depth_m = np.where(holds, view.hidden_depth_m, np.float32(0.0))
+    bad = np.zeros(holds.shape, bool)
+    if color is not view.hidden_color:
+        bad = holds & ~np.isfinite(view.hidden_color).all(axis=2)
+    clean = replace(view, hidden_color=color, hidden_depth_m=depth_m)
+    return clean, int(np.count_nonzero(bad))
 
 
 def radial_stretch(view: View) -> NDArray[np.float64]:

@@ -56,6 +56,10 @@ class FramePasses:
         Of the strip within the frame.
     frame_pixel_count : int, optional
         Of the whole frame, where it is larger than the strip.
+    image_size_px : (width, height), optional
+        Of the whole image, where the frame has a border around it.
+    border_px : int
+        Columns and rows around the image.
     white_level : float
         Light against which the contrast of a merged quad counts.
     """
@@ -72,6 +76,8 @@ class FramePasses:
         merge: bool,
         first_row: int = 0,
         frame_pixel_count: int | None = None,
+        image_size_px: tuple[int, int] | None = None,
+        border_px: int = 0,
         white_level: float = 1.0,
     ):
         self.gpu = gpu
@@ -93,6 +99,8 @@ class FramePasses:
             first_row * view.width_px,
             frame_pixel_count or self.pixel_count,
         )
+        self.image_size_px = image_size_px or self.size
+        self.border_px = border_px
         self.white_level = white_level
         self.entry_count = 0
         self.kernel_count = 0
@@ -181,6 +189,8 @@ class FramePasses:
             "cell_px": self.image.cell_px,
             "cell_columns": self.image.grid[0],
             "first_row": self.first_row,
+            "border_px": self.border_px,
+            "image_size_px": self.image_size_px,
         }
 
     def merge_fragments(self, kernels: KernelSet) -> None:

@@ -5,6 +5,8 @@ itself: no tiles, no lists, no merging, no shared code with the passes beyond th
 store and the planned layers.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -18,7 +20,12 @@ from filter_service.constants import (
 )
 from filter_service.psfs.pack import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
-from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.frame import (
+    View,
+    extended,
+    fill_missing_depth,
+    object_dpt,
+)
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     NodeKernels,
@@ -78,12 +85,14 @@ def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
     return out
 
 
-def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
-    """Cell (height, width) of each pixel."""
+def cell_index(view: View, image: ImageCells, border_px: int = 0) -> NDArray[np.int64]:
+    """Cell (height, width) of each pixel; that of the edge in a border."""
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px), np.int64)
-    rows = np.arange(view.height_px) // image.cell_px
-    columns = np.arange(view.width_px) // image.cell_px
+    rows, columns = (
+        np.clip(np.arange(n) - border_px, 0, n - 2 * border_px - 1) // image.cell_px
+        for n in (view.height_px, view.width_px)
+    )
     return rows[:, None] * image.grid[0] + columns
 
 
@@ -100,6 +109,9 @@ def gather(
     -------
     linear_rgb : (height, width, 3)
     """
+    filled_m, _ = fill_missing_depth(view.depth_m)
+    border_px = layers.max_radius_px + 2 if view.surface_count > 1 else 0
+    view = extended(replace(view, depth_m=filled_m), border_px)
     distances_dpt = surface_distances_dpt(view, layers)
     holds = ~np.isnan(distances_dpt)
     linear = np.stack([_linear_color(color) for color in view.surface_colors])
@@ -111,14 +123,13 @@ def gather(
     )
     interval = np.minimum(position.astype(np.int64), n_intervals - 1)
     image = image_cells(store.spec, store.plan)
-    cell = np.broadcast_to(cell_index(view, image), holds.shape)
+    cell = np.broadcast_to(cell_index(view, image, border_px), holds.shape)
     used = np.zeros((image.count, n_intervals), bool)
     used[cell[holds], interval[holds]] = True
     kernels = frame_kernels(store, layers, image, used)
     kernel_of = np.zeros(used.shape, np.int64)
     kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     kernel = kernel_of[cell, interval]
-    holds[1:] &= _clears_border(kernels.radius_px[kernel])[1:]
     out = np.empty_like(linear[0])
     _gather(
         linear,
@@ -130,13 +141,16 @@ def gather(
         DISCONTINUITY_PX / max(layers.blur_px_per_dpt, MIN_BLUR_RANGE),
         out,
     )
-    return out
+    rows, columns = (slice(border_px, n - border_px) for n in out.shape[:2])
+    return out[rows, columns]
 
 
 def surface_distances_dpt(view: View, layers: FrameLayers) -> NDArray[np.float64]:
-    """Object distance (surfaces, height, width); NaN where nothing is hidden."""
-    filled_m, _ = fill_missing_depth(view.depth_m)
-    distances = [object_dpt(view, filled_m)]
+    """Object distance (surfaces, height, width); NaN where nothing is hidden.
+
+    Nothing that blurs like the surface before it counts as hidden.
+    """
+    distances = [object_dpt(view, view.depth_m)]
     for hidden_m in view.surface_depths_m[1:]:
         hidden_dpt = object_dpt(view, np.where(hidden_m > 0.0, hidden_m, np.nan))
         behind_px = (distances[0] - hidden_dpt) * layers.blur_px_per_dpt
@@ -148,19 +162,6 @@ def _linear_color(color: NDArray) -> NDArray[np.float64]:
     if color.dtype == np.uint8:
         return linear_from_srgb(color)
     return color.astype(np.float64)
-
-
-def _clears_border(radius_px: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether pixels (surfaces, height, width) are far enough inside the image.
-
-    Next to the border no surface is whole, and what it hides must not shine through.
-    """
-    height, width = radius_px.shape[1:]
-    row, column = np.ogrid[:height, :width]
-    gap = np.minimum(
-        np.minimum(row, height - 1 - row), np.minimum(column, width - 1 - column)
-    )
-    return gap >= radius_px + radius_px[0]
 
 
 def _sort_key(distances_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:

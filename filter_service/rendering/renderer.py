@@ -12,12 +12,14 @@ from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.camera_match import serves
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.frame import (
+    IMAGES,
     View,
     check_view,
+    extended,
     fill_missing_depth,
     finite_color,
-    hidden_or_zero,
     object_dpt,
+    with_clean_hidden,
 )
 from filter_service.rendering.frame_passes import FramePasses
 from filter_service.rendering.image_cells import ImageCells, image_cells
@@ -64,7 +66,8 @@ class Rendered:
         As used.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice.
+        of a very large frame share count twice, and with a hidden layer the repeated
+        border counts.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -167,15 +170,14 @@ class FilterRenderer:
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
             if view.surface_count > 1:
-                hidden_color, bad_count = finite_color(view.hidden_color)
+                whole, bad_count = with_clean_hidden(whole)
                 bad_color_count += bad_count
-                whole = replace(
-                    whole,
-                    hidden_color=hidden_color,
-                    hidden_depth_m=hidden_or_zero(view.hidden_depth_m),
-                )
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
-        picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
+        border_px = _border_px(whole, layers)
+        with timer.wall("prepare_ms"):
+            whole = extended(whole, border_px)
+        kind = np.uint8 if output == "srgb8" else np.float32
+        picture = np.empty(whole.color.shape, kind)
         counts = np.zeros(5, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
@@ -187,7 +189,9 @@ class FilterRenderer:
                 paper_rule=accumulation == "paper",
                 merge=merge,
                 first_row=strip.first_row,
-                frame_pixel_count=view.width_px * view.height_px,
+                frame_pixel_count=whole.width_px * whole.height_px,
+                image_size_px=(view.width_px, view.height_px),
+                border_px=border_px,
                 white_level=_white_level(color),
             )
             passes.run(
@@ -208,8 +212,9 @@ class FilterRenderer:
             notes.append(
                 f"{bad_color_count} pixels with non-finite colour taken as black"
             )
+        rows, columns = (slice(border_px, border_px + n) for n in color.shape[:2])
         return Rendered(
-            color=picture,
+            color=np.ascontiguousarray(picture[rows, columns]),
             stage_times_ms=timer.result_ms(),
             missing_depth_count=depth.missing_count,
             clamped_depth_count=depth.clamped_count,
@@ -289,6 +294,17 @@ def _check_camera(view: View, store: PsfStore) -> None:
         )
 
 
+def _border_px(view: View, layers: FrameLayers) -> int:
+    """Columns and rows to add all around a view with a hidden layer, whole tiles.
+
+    Next to the border of an image no surface is whole, for part of its light would come
+    from beyond; what it hides would shine through.  So the image goes on, as its edge.
+    """
+    if view.surface_count == 1:
+        return 0
+    return -(-(layers.max_radius_px + 2) // TILE_SIZE_PX) * TILE_SIZE_PX
+
+
 @dataclass(frozen=True)
 class _Strip:
     """Rows of a frame that go through the passes together.
@@ -342,7 +358,7 @@ def _rows_of(view: View, first: int, last: int) -> View:
     per_row = (down - up) / view.height_px
     images = {
         name: np.ascontiguousarray(image[first:last])
-        for name in ("color", "depth_m", "hidden_color", "hidden_depth_m")
+        for name in IMAGES
         if (image := getattr(view, name)) is not None
     }
     return replace(

@@ -1,8 +1,7 @@
 // Merges similar pixels where the blur hides the difference: 2 x 2, then 4 x 4, then the
 // whole block; and packs the fragments of each 8 x 8 block, in scan order, to the front
 // of the block's slots.  One surface a dispatch; surfaces never merge with each other.
-// What is hidden makes fragments only where an edge of what is seen is within reach, and
-// none so close to the image's border that the surface before it is not whole there.
+// What is hidden makes fragments only where an edge of what is seen is within reach.
 // In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for what
 //      is hidden, BLOCKS of what is seen.
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
@@ -51,10 +50,8 @@ shared vec4 high[QUADS];
 shared vec4 positions[QUADS];     // in layers: mean, nearest, farthest; least spread px
 shared uint edge_of[QUADS];
 
-uint seen_index(ivec2 at) { return uint(at.y * frame_size_px.x + at.x); }
-
 uint pixel_index(ivec2 at) {
-    return seen_index(at) + uint(surface * frame_size_px.x * frame_size_px.y);
+    return uint((surface * frame_size_px.y + at.y) * frame_size_px.x + at.x);
 }
 
 bool inside(ivec2 at) {
@@ -80,18 +77,6 @@ uint kernel_at(ivec2 at, float place, out float fraction) {
     return kernel_of[cell_of(at) * interval_count(layer_count) + interval];
 }
 
-// Whether a hidden pixel sends light only to where the surface before it is whole: that
-// lacks, next to the border, what lies beyond it.
-bool clears_border(ivec2 at) {
-    float fraction;
-    int reach = kernel_radius_px(kernel_at(at, position[seen_index(at)], fraction))
-              + kernel_radius_px(kernel_at(at, position[pixel_index(at)], fraction));
-    ivec2 in_frame = at + ivec2(0, first_row);
-    ivec2 last = ivec2(frame_size_px.x, scan_px.y / frame_size_px.x) - 1;
-    ivec2 gap = min(in_frame, last - in_frame);
-    return min(gap.x, gap.y) >= reach;
-}
-
 // Bits of a quad's pixels that make fragments.
 uint held_pixels(ivec2 at) {
     uint held = 0u;
@@ -99,8 +84,7 @@ uint held_pixels(ivec2 at) {
         ivec2 member = at + ivec2(i & 1, i >> 1);
         if (!inside(member)) continue;
         bool holds = surface == 0
-                  || (edge_in_reach != 0u && pixels[pixel_index(member)].a >= 0.0
-                      && clears_border(member));
+                  || (edge_in_reach != 0u && pixels[pixel_index(member)].a >= 0.0);
         if (holds) held |= 1u << uint(i);
     }
     return held;
