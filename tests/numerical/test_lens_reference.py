@@ -66,7 +66,7 @@ def test_rays_that_pass_a_near_edge_see_what_it_hides():
     hidden = np.ones((*SHAPE, 3))
     color = np.zeros((*SHAPE, 3))
     seen = lens_picture([color, hidden], layers, lens)
-    # Half a pixel on either side of the edge: rays beyond 0.5 px of the discs' 3 px pass
+    # Half a pixel beside the edge: rays beyond 0.5 px of the discs' 3 px pass
     # the near plane and end behind it.
     t = 0.5 / 3.0
     share = (np.arccos(t) - t * np.sqrt(1.0 - t**2)) / np.pi
