@@ -61,7 +61,8 @@ class Rendered:
         By stage; their sum is the time spent in the renderer.
     missing_depth_count, clamped_depth_count, bad_color_count : int
         Pixels whose depth was filled in, lay outside the prepared distances, or whose
-        colour was not finite (taken as black).
+        colour was not finite (taken as black); the last two with those of a hidden
+        layer that hold something.
     pupil_diameter_mm, focus_dpt : float
         As used.
     fragment_count, merged_count, entry_count : int
@@ -233,6 +234,11 @@ class FilterRenderer:
     def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
         depth_m, missing_count = fill_missing_depth(view.depth_m)
         distances = object_dpt(view, depth_m)
+        if view.surface_count > 1:
+            holds = view.hidden_depth_m > 0.0
+            hidden_m = np.where(holds, view.hidden_depth_m, np.float32(1.0))
+            hidden_dpt = object_dpt(view, hidden_m)[holds]
+            distances = np.concatenate([distances.ravel(), hidden_dpt])
         low_dpt, high_dpt = store.spec.object_range_dpt
         margin = 1e-6 * max(high_dpt, 1.0)
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)

@@ -5,7 +5,7 @@ Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json]
 Error: PSNR in linear light against rays through a thin lens (lens_reference), over the
 whole picture, and over the band that light from both sides of an edge reaches.  The eye
 has no aberrations but defocus, for that is what the reference has.  Fragments are not
-merged, for that costs what it may (50 to 55 dB) everywhere; one row has them merged.
+merged, for that has an error of its own, edges or not; one method has them merged.
 """
 
 import argparse
@@ -76,16 +76,14 @@ def scene_rows(renderer, gpu, scene: Scene, repeats: int, ray_count: int) -> lis
                 memory_mb=used_mb,
                 error_name=name,
                 error=error,
-                reference=f"{RAY_COUNT} rays a pixel through a thin lens",
+                reference=f"{ray_count} rays a pixel through a thin lens",
             )
             for name, error in errors.items()
         ]
 
-    # Half of the rays again: what the reference's own error is.
+    # How far the reference itself is off: it changes by this with half the rays.
     fewer = scene.traced(ray_count=ray_count // 2)
-    found = rows(
-        "rays, half of them", 1, trace_ms / 2, trace_ms / 2, memory_mb(), fewer
-    )
+    found = rows("half the rays", 1, trace_ms / 2, trace_ms / 2, memory_mb(), fewer)
     for method, (left_out, options) in METHODS.items():
         shown = replace(view, **left_out)
         results = []

@@ -120,7 +120,7 @@ def gathered(state, view, rule):
             weights[n, c] = wide[r : r + height, r : r + width]
     for y, x, c in np.ndindex(height, width, 3):
         light, coverage = 0.0, 0.0
-        # The four distances of the test are four depths: they blur more than 1 px apart.
+        # The four distances of the test blur more than 1 px apart: four depths.
         for distance_dpt in np.unique(sources.distance_dpt)[::-1]:
             here = [n for n in order if sources.distance_dpt[n] == distance_dpt]
             own = weights[here, c, y, x].astype(float)

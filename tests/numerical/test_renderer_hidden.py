@@ -171,7 +171,7 @@ def test_hidden_pixels_just_behind_what_is_seen_make_no_fragments(bench, rng):
     assert counts[1] > counts[0] + 1000
 
 
-def test_strips_and_bands_change_nothing(bench, rng, monkeypatch):
+def test_strips_change_nothing(bench, rng, monkeypatch):
     view = disc_view(bench, rng)
     whole = bench.render(view, **STATE)
     rows = 2 * 24 + 64  # halos, and tile rows between
@@ -243,3 +243,11 @@ def test_surfaces_never_merge_with_each_other(gpu):
     }
     assert set(map(tuple, colors[tiles:][alive[tiles:]][:, :3])) == {tuple(blue)}
     assert counts[:, 0].sum() == result.fragment_count
+
+
+def test_hidden_depth_beyond_the_prepared_distances_is_counted(gpu, rng):
+    bench = Bench(gpu, EMMETROPE, **SIZE, object_range_dpt=(0.5, 2.0))
+    view = disc_view(bench, rng, near_dpt=1.5, far_dpt=0.25)
+    result = bench.render(view, **STATE)
+    # Everything far, and what the disc hides of it.
+    assert result.clamped_depth_count == WIDTH * HEIGHT
