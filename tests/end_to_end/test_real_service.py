@@ -90,6 +90,27 @@ def test_a_hidden_layer_is_seen_past_a_blurred_edge(real_client):
     np.testing.assert_allclose(one[45, 120:140], two[45, 120:140], atol=1e-3)
 
 
+def test_a_scene_streams_with_what_it_hides(real_service):
+    arguments = ("--scene", "primitives", "--profile", "emmetropia", "--hidden")
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-W", "error", "-m", "clients.pyrender_stream"),
+            *("--endpoint", real_service.endpoint, *arguments),
+            *("--size", "96x54", "--frames", "3", "--json"),
+        ],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads(finished.stdout)
+    assert report["sent"] == 3
+    assert report["frames"] + sum(report["drops"].values()) == 3
+    assert report["frames"] >= 1
+
+
 def test_one_profile_sent_twice_and_two_views_work(real_client):
     view = edge_view()
     colors = []
