@@ -367,6 +367,7 @@ def _key(view: View, state: EyeState, bins: bool, accumulation: str) -> str:
         ),
         (spec.wavelengths_nm, spec.diffraction, spec.chromatic, spec.follows_field),
         (state.pupil_diameter_mm, state.focus_dpt),
+        DISCONTINUITY_PX if accumulation == "coverage" else None,
     )
     digest.update(repr(words).encode())
     (h_low, h_high), (v_low, v_high) = spec.field_range_deg
