@@ -318,10 +318,9 @@ class FilterClient:
         self._check_limits(items)
         buffers, images = [], []
         for item in items:
-            color_buffer, color = self._pool.copy_in(item.color)
-            depth_buffer, depth_m = self._pool.copy_in(item.depth_m)
-            buffers += [color_buffer, depth_buffer]
-            images.append(ViewImages(color, depth_m))
+            copies = [self._pool.copy_in(image) for image in item.images]
+            buffers += [buffer for buffer, _ in copies]
+            images.append(ViewImages(*(copy for _, copy in copies)))
         frame = Frame(
             frame_id=self._next_frame_id,
             views=tuple(item.header for item in items),

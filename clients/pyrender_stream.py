@@ -22,7 +22,12 @@ from typing import Any
 import numpy as np
 
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.scene_renderer import SceneFrame, SceneRenderer, scene_frames
+from clients.scene_renderer import (
+    SceneFrame,
+    SceneRenderer,
+    frame_at,
+    scene_frames,
+)
 from clients.scenes.paths import PATHS, path_moments
 from clients.scenes.scene import Scene, build_scene, scene_builders
 from clients.streaming import FrameLog, view_of
@@ -82,7 +87,7 @@ def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
 
 
 def _looped_frames(
-    scene: Scene, size_px: tuple[int, int], n_frames: int
+    scene: Scene, size_px: tuple[int, int], n_frames: int, *, with_hidden: bool
 ) -> Iterator[SceneFrame]:
     """Follow the scene's path to its end and back, without end."""
     moments = path_moments(PATHS[scene.name], n_frames)
@@ -90,15 +95,7 @@ def _looped_frames(
     with SceneRenderer(scene, size_px) as renderer:
         while True:
             for moment in moments:
-                color, depth_m = renderer.render(moment.pose)
-                yield SceneFrame(
-                    color,
-                    depth_m,
-                    renderer.tangents,
-                    moment.pose,
-                    moment.pupil_diameter_mm,
-                    moment.focus_dpt,
-                )
+                yield frame_at(renderer, moment, with_hidden=with_hidden)
 
 
 def looking_around(
@@ -191,6 +188,11 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--size", default="480x270", type=parse_size, metavar="WxH")
     parser.add_argument("--frames", default=96, type=int, help="frames of the path")
     parser.add_argument(
+        "--hidden",
+        action="store_true",
+        help="send what is behind the surfaces seen, too",
+    )
+    parser.add_argument(
         "--window", action="store_true", help="show it live; the path repeats until Esc"
     )
     parser.add_argument(
@@ -218,9 +220,13 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         if options.window:
             window = stack.enter_context(LiveWindow(options.size, "ocufilter"))
             show = window.show
-            frames = _looped_frames(scene, options.size, options.frames)
+            frames = _looped_frames(
+                scene, options.size, options.frames, with_hidden=options.hidden
+            )
         else:
-            frames = scene_frames(scene, None, options.frames, options.size)
+            frames = scene_frames(
+                scene, None, options.frames, options.size, with_hidden=options.hidden
+            )
         client = stack.enter_context(
             FilterClient(options.endpoint, client_name="pyrender_stream")
         )

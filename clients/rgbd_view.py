@@ -39,12 +39,17 @@ class RgbdView:
     tangents : 4 floats
         (left, right, up, down) of the image edges, left < right and down < up.
     depth_kind : {"planar", "radial"}
+    hidden_color, hidden_depth_m : like color and depth_m, optional
+        What the camera would see with what it sees taken away; both or neither.  Depth
+        of 0, negative or NaN: nothing is hidden here.
     """
 
     color: NDArray[Any]
     depth_m: NDArray[np.float32]
     tangents: tuple[float, float, float, float]
     depth_kind: str = "planar"
+    hidden_color: NDArray[Any] | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that are no RGB-D image."""
@@ -64,6 +69,25 @@ class RgbdView:
             )
         if self.depth_m.dtype != np.float32:
             raise ValueError(f"depth_m is {self.depth_m.dtype}; allowed: float32")
+        if self.hidden_color is not None or self.hidden_depth_m is not None:
+            self._check_hidden()
+
+    def _check_hidden(self) -> None:
+        for name, seen in (("hidden_color", "color"), ("hidden_depth_m", "depth_m")):
+            image, like = getattr(self, name), getattr(self, seen)
+            if image is None:
+                raise ValueError(f"{name} is missing; allowed: both layers or neither")
+            if image.shape != like.shape or image.dtype != like.dtype:
+                raise ValueError(
+                    f"{name} is {image.dtype} of shape {image.shape}; allowed: as "
+                    f"{seen}, {like.dtype} of shape {like.shape}"
+                )
+
+    @property
+    def images(self) -> tuple[NDArray[Any], ...]:
+        """Return colour and depth, and those of the hidden layer if there is one."""
+        images = (self.color, self.depth_m, self.hidden_color, self.hidden_depth_m)
+        return images[: self.header.part_count]
 
     @property
     def camera(self) -> Camera:
@@ -75,4 +99,5 @@ class RgbdView:
     def header(self) -> ViewHeader:
         """Return what a frame's header says about this view."""
         color = COLOR_FORMATS[self.color.dtype.type]
-        return ViewHeader(self.camera, color, self.depth_kind)
+        has_hidden = self.hidden_depth_m is not None
+        return ViewHeader(self.camera, color, self.depth_kind, has_hidden)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.hidden_surface import LEAST_GAP_DPT, HiddenSurface
 from clients.pyrender_setup import delete_renderer, pyrender, release_context
 from clients.scenes.geometry import Array
-from clients.scenes.paths import PATHS, Key, path_moments
+from clients.scenes.paths import PATHS, Key, Moment, path_moments
 from clients.scenes.scene import Scene
 
 _FLAGS = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.SKIP_CULL_FACES
@@ -26,6 +27,8 @@ class SceneFrame:
     pose : (4, 4), camera to world
     pupil_diameter_mm, focus_dpt : suggested state of the eye
     gaze_deg : (h, v), where it looks in the image; None is straight on
+    hidden_color, hidden_depth_m : the same of what is behind, where asked for; depth 0
+        where nothing is
     """
 
     color: NDArray[np.uint8]
@@ -35,6 +38,8 @@ class SceneFrame:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float] | None = None
+    hidden_color: NDArray[np.uint8] | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
 
 
 class SceneRenderer:
@@ -79,6 +84,7 @@ class SceneRenderer:
         self._renderer = pyrender.OffscreenRenderer(
             width * supersampling, height * supersampling
         )
+        self._hidden = HiddenSurface(self._renderer, (scene.near_m, scene.far_m))
         release_context(self._renderer)
 
     def __enter__(self) -> "SceneRenderer":
@@ -89,15 +95,40 @@ class SceneRenderer:
 
     def close(self) -> None:
         """Free the GL context."""
+        self._hidden.close()
         delete_renderer(self._renderer)
 
     def render(self, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return colour (h, w, 3) and planar depth (h, w) seen from a pose (4, 4)."""
+        return self._render(pose, with_hidden=False)[0]
+
+    def render_layers(self, pose: Array) -> tuple[tuple[NDArray, NDArray], ...]:
+        """Return colour and depth as seen, and those of what is behind.
+
+        Depth of the second is 0 where nothing is behind.  Its colour is the mean of a
+        pixel's samples that show something.
+        """
+        return self._render(pose, with_hidden=True)
+
+    def _render(self, pose: Array, *, with_hidden: bool):
         self._world.set_pose(self._camera, pose)
-        color, depth_m = self._renderer.render(self._world, _FLAGS)
+        color, raw_m = self._renderer.render(self._world, _FLAGS)
+        layers = [(color, self._with_infinity(raw_m))]
+        if with_hidden:
+            color, hidden_m = self._hidden.render(self._world, _FLAGS, raw_m)
+            layers.append((color, self._with_infinity(hidden_m)))
         release_context(self._renderer)
+        seen = self._pixels(*layers[0])
+        if not with_hidden:
+            return (seen,)
+        shows = _is_behind(layers[0][1], layers[1][1])
+        return seen, _hidden_pixels(*layers[1], shows, seen[1], self._samples)
+
+    def _with_infinity(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         nothing = (depth_m == 0) | (depth_m >= self.scene.infinite_from_m)
-        depth_m = np.where(nothing, np.float32(np.inf), depth_m)
+        return np.where(nothing, np.float32(np.inf), depth_m)
+
+    def _pixels(self, color, depth_m) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         if self._samples == 1:
             return np.ascontiguousarray(color), depth_m
         return _mean_color(color, self._samples), _sample_depth(depth_m, self._samples)
@@ -108,20 +139,35 @@ def scene_frames(
     path: tuple[Key, ...] | None,
     n_frames: int,
     size_px: tuple[int, int],
+    *,
+    with_hidden: bool = False,
 ) -> Iterator[SceneFrame]:
     """Render a scene along a camera path, the scene's own when `path` is None."""
     moments = path_moments(path or PATHS[scene.name], n_frames)
     with SceneRenderer(scene, size_px) as renderer:
         for moment in moments:
-            color, depth_m = renderer.render(moment.pose)
-            yield SceneFrame(
-                color=color,
-                depth_m=depth_m,
-                tangents=renderer.tangents,
-                pose=moment.pose,
-                pupil_diameter_mm=moment.pupil_diameter_mm,
-                focus_dpt=moment.focus_dpt,
-            )
+            yield frame_at(renderer, moment, with_hidden=with_hidden)
+
+
+def frame_at(
+    renderer: SceneRenderer, moment: Moment, *, with_hidden: bool = False
+) -> SceneFrame:
+    """Render one moment of a path."""
+    hidden = (None, None)
+    if with_hidden:
+        seen, hidden = renderer.render_layers(moment.pose)
+    else:
+        seen = renderer.render(moment.pose)
+    return SceneFrame(
+        color=seen[0],
+        depth_m=seen[1],
+        tangents=renderer.tangents,
+        pose=moment.pose,
+        pupil_diameter_mm=moment.pupil_diameter_mm,
+        focus_dpt=moment.focus_dpt,
+        hidden_color=hidden[0],
+        hidden_depth_m=hidden[1],
+    )
 
 
 def _primitive(batch) -> "pyrender.Primitive":
@@ -155,6 +201,40 @@ _SRGB8_FROM_LINEAR = np.round(
         ]
     )
 ).astype(np.uint8)
+
+
+def _is_behind(seen_m, hidden_m) -> NDArray[np.bool_]:
+    """Return whether something is behind, far enough to matter."""
+    return 1.0 / seen_m - 1.0 / hidden_m >= LEAST_GAP_DPT
+
+
+def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
+    """Return colour and depth of pixels from their samples that show something.
+
+    A pixel holds something where its depth is behind that of what is seen there: what
+    is behind a sliver of a nearer surface, the pixel shows already.
+    """
+    light = _blocks(_LINEAR_FROM_SRGB8[color] * shows[..., None], samples).sum(axis=2)
+    count = _blocks(shows, samples).sum(axis=2)
+    light /= np.maximum(count, 1)[..., None]
+    # Missing samples sort last, and the rank is among those that show something.
+    ordered = np.sort(
+        _blocks(np.where(shows, depth_m, np.float32(np.nan)), samples), axis=2
+    )
+    rank = np.minimum(count // 4, np.maximum(count - 1, 0))
+    picked = np.take_along_axis(ordered, rank[..., None], axis=2)[..., 0]
+    holds = np.zeros(count.shape, bool)
+    holds[count > 0] = _is_behind(seen_m[count > 0], picked[count > 0])
+    depth = np.where(holds, picked, np.float32(0.0)).astype(np.float32)
+    steps = (light * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)
+    return _SRGB8_FROM_LINEAR[steps], depth
+
+
+def _blocks(image, samples: int) -> NDArray:
+    """Return the samples (h, w, n, ...) of each pixel."""
+    height, width = image.shape[0] // samples, image.shape[1] // samples
+    split = image.reshape(height, samples, width, samples, *image.shape[2:])
+    return split.swapaxes(1, 2).reshape(height, width, -1, *image.shape[2:])
 
 
 def _mean_color(color, samples: int) -> NDArray[np.uint8]:

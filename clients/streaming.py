@@ -82,7 +82,13 @@ def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
 
 def view_of(frame: SceneFrame) -> RgbdView:
     """Return a rendered frame as the client library takes it."""
-    return RgbdView(frame.color, frame.depth_m, frame.tangents)
+    return RgbdView(
+        frame.color,
+        frame.depth_m,
+        frame.tangents,
+        hidden_color=frame.hidden_color,
+        hidden_depth_m=frame.hidden_depth_m,
+    )
 
 
 def filter_in_order(

@@ -26,7 +26,12 @@ of passes lets the sorted list end in the buffer it started in."""
 DISCONTINUITY_PX = 0.25
 """Blur change between neighbours above which they count as two surfaces.  Continuous
 tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %
-and are normalised away."""
+and are normalised away.  Where order matters, fragments whose blur differs by less are
+of one depth and share what nearer ones leave free; and what is hidden by less is not
+worth a fragment."""
+
+NOTHING_DPT = -1.0
+"""Object distance of a hidden pixel that holds nothing."""
 
 MERGE_MIN_SPREAD_PX = 1.5
 """Fragments whose kernels spread less than this stay single; twice as much for each

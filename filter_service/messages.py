@@ -154,6 +154,14 @@ def _payload(message: Request | Reply) -> list[Any]:
         for view, images in zip(message.views, message.images, strict=True):
             parts.append(check_output(images.color, view.color))
             parts.append(images.depth_m)
+            if view.has_hidden != images.has_hidden:
+                raise ValueError(
+                    f"has_hidden is {view.has_hidden}, but there is "
+                    f"{'a' if images.has_hidden else 'no'} hidden layer"
+                )
+            if images.has_hidden:
+                parts.append(check_output(images.hidden_color, view.color))
+                parts.append(images.hidden_depth_m)
         return parts
     if isinstance(message, Result):
         return [

@@ -16,7 +16,7 @@ class Batch:
     Attributes
     ----------
     vertices_m : (n, 3) float32, metres
-    faces : (m, 3) uint32
+    faces : (m, 3) uint32, anticlockwise as seen from where their normals point
     uv : (n, 2) float32
     srgb : (n, 3) float32, sRGB-encoded light that leaves the vertex; with a texture,
         the factor on its sRGB values
@@ -62,11 +62,19 @@ def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -
         srgb = srgb_from_linear(mesh.albedo * light + mesh.emission)
     return Batch(
         vertices_m=mesh.vertices_m.astype(np.float32),
-        faces=mesh.faces.astype(np.uint32),
+        faces=_wound(mesh).astype(np.uint32),
         uv=mesh.uv.astype(np.float32),
         srgb=srgb.astype(np.float32),
         texture=textures[mesh.texture] if mesh.texture else None,
     )
+
+
+def _wound(mesh: Mesh) -> NDArray[np.int64]:
+    """Return faces (m, 3), those of mirrored parts turned to face their normals."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    normals = mesh.normals[mesh.faces].sum(axis=1)
+    against = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0.0
+    return np.where(against[:, None], mesh.faces[:, ::-1], mesh.faces)
 
 
 def scene_builders() -> dict[str, Callable[[], Scene]]:

@@ -16,6 +16,8 @@ from filter_service.commands.console import (
 from filter_service.commands.plan_text import plan_summary, say_plan
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from estimator.profiles import EyeProfile
     from filter_service.commands.one_image import FilteredImage
     from filter_service.rendering.frame import View
@@ -100,6 +102,20 @@ def filter_image(
             "--out", "-o", help=".png (sRGB), or .npy or .exr (linear floats)."
         ),
     ],
+    hidden_color: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="IMG",
+            help="What the camera sees hides this; of the size and kind of --color.",
+        ),
+    ] = None,
+    hidden_depth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Its depth, as --depth; 0, negative and NaN: nothing is hidden here.",
+        ),
+    ] = None,
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
     focus_dpt: Annotated[
         float, typer.Option(help="Focus distance, dpt; 0 is infinity.")
@@ -188,6 +204,7 @@ def filter_image(
         fov_deg=fov_deg,
         depth_kind=depth_kind.value,
         depth_scale=depth_scale,
+        hidden_paths=(hidden_color, hidden_depth),
     )
     linear = out.suffix.lower() in image_files.LINEAR_SUFFIXES
     if half and not linear:
@@ -227,6 +244,7 @@ def _read_view(
     fov_deg: float,
     depth_kind: str,
     depth_scale: float | None,
+    hidden_paths: tuple[Path | None, Path | None] = (None, None),
 ) -> "View":
     from filter_service.commands.image_files import read_color, read_depth
     from filter_service.commands.one_image import symmetric_tangents
@@ -235,15 +253,56 @@ def _read_view(
     color = read_color(color_path)
     depth_m = read_depth(depth_path, depth_scale=depth_scale)
     height_px, width_px = color.shape[:2]
-    if depth_m.shape != (height_px, width_px):
-        raise ValueError(
-            f"--depth '{depth_path}': {depth_m.shape[1]}x{depth_m.shape[0]} px; "
-            f"allowed: the size of the colour image, {width_px}x{height_px}"
-        )
+    _check_size("depth", depth_path, depth_m, color)
+    hidden_color, hidden_depth_m = _read_hidden(
+        *hidden_paths, color=color, depth_scale=depth_scale
+    )
     tangents = symmetric_tangents(
         width_px=width_px, height_px=height_px, vertical_fov_deg=fov_deg
     )
-    return View(color=color, depth_m=depth_m, tangents=tangents, depth_kind=depth_kind)
+    return View(
+        color=color,
+        depth_m=depth_m,
+        tangents=tangents,
+        depth_kind=depth_kind,
+        hidden_color=hidden_color,
+        hidden_depth_m=hidden_depth_m,
+    )
+
+
+def _read_hidden(
+    color_path: Path | None,
+    depth_path: Path | None,
+    *,
+    color: "NDArray",
+    depth_scale: float | None,
+) -> tuple["NDArray | None", "NDArray | None"]:
+    """Colour and depth of the hidden layer; None for both where there is none."""
+    from filter_service.commands.image_files import read_color, read_depth
+
+    if color_path is None and depth_path is None:
+        return None, None
+    if color_path is None or depth_path is None:
+        lacking = "--hidden-color" if color_path is None else "--hidden-depth"
+        raise ValueError(f"{lacking}: not given; allowed: both files or neither")
+    hidden = read_color(color_path, option="hidden-color")
+    _check_size("hidden-color", color_path, hidden, color)
+    if hidden.dtype != color.dtype:
+        raise ValueError(
+            f"--hidden-color '{color_path}': {hidden.dtype}; "
+            f"allowed: as the colour image, {color.dtype}"
+        )
+    depth_m = read_depth(depth_path, depth_scale=depth_scale, option="hidden-depth")
+    _check_size("hidden-depth", depth_path, depth_m, color)
+    return hidden, depth_m
+
+
+def _check_size(option: str, path: Path, image: "NDArray", color: "NDArray") -> None:
+    if image.shape[:2] != color.shape[:2]:
+        raise ValueError(
+            f"--{option} '{path}': {image.shape[1]}x{image.shape[0]} px; allowed: "
+            f"the size of the colour image, {color.shape[1]}x{color.shape[0]}"
+        )
 
 
 def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict:

@@ -24,8 +24,13 @@ METRES_PER_INTEGER_STEP = 0.001
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
-def read_color(path: Path) -> NDArray:
+def read_color(path: Path, *, option: str = "color") -> NDArray:
     """Read a colour image.
+
+    Parameters
+    ----------
+    option : str
+        What asked for it, for the texts of errors.
 
     Returns
     -------
@@ -37,26 +42,30 @@ def read_color(path: Path) -> NDArray:
     ValueError
         The file is missing, not of a known kind, or its pixels are unfit.
     """
-    suffix = _known_suffix("color", path, COLOR_SUFFIXES)
+    suffix = _known_suffix(option, path, COLOR_SUFFIXES)
     if suffix == ".exr":
-        pixels = _exr_color(_exr_channels("color", path), path)
+        pixels = _exr_color(_exr_channels(option, path), path, option)
     elif suffix == ".npy":
-        pixels = _npy_array("color", path)
+        pixels = _npy_array(option, path)
     else:
-        with _pillow_image("color", path) as image:
+        with _pillow_image(option, path) as image:
             if image.mode.startswith(("I", "F")):
-                _refuse("color", path, f"mode {image.mode}", "8 bits per channel")
+                _refuse(option, path, f"mode {image.mode}", "8 bits per channel")
             pixels = np.asarray(image.convert("RGB"))
-    return _checked_color(pixels, path)
+    return _checked_color(pixels, path, option)
 
 
-def read_depth(path: Path, *, depth_scale: float | None = None) -> NDArray[np.float32]:
+def read_depth(
+    path: Path, *, depth_scale: float | None = None, option: str = "depth"
+) -> NDArray[np.float32]:
     """Read a depth image in metres.
 
     Parameters
     ----------
     depth_scale : float, optional
         Metres per stored unit; without it 0.001 for integers and 1 for floats.
+    option : str
+        What asked for it, for the texts of errors.
 
     Returns
     -------
@@ -69,19 +78,19 @@ def read_depth(path: Path, *, depth_scale: float | None = None) -> NDArray[np.fl
         The file is missing, not of a known kind, not one channel, or the scale is
         not positive.
     """
-    suffix = _known_suffix("depth", path, DEPTH_SUFFIXES)
+    suffix = _known_suffix(option, path, DEPTH_SUFFIXES)
     if suffix == ".exr":
-        stored = _exr_depth(_exr_channels("depth", path), path)
+        stored = _exr_depth(_exr_channels(option, path), path, option)
     elif suffix == ".npy":
-        stored = _npy_array("depth", path)
+        stored = _npy_array(option, path)
     else:
-        with _pillow_image("depth", path) as image:
+        with _pillow_image(option, path) as image:
             stored = np.asarray(image)
     if stored.ndim == 3 and stored.shape[2] == 1:
         stored = stored[:, :, 0]
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "uif":
         found = f"{stored.dtype} of shape {stored.shape}"
-        _refuse("depth", path, found, "one channel, integer or float")
+        _refuse(option, path, found, "one channel, integer or float")
     if depth_scale is None:
         depth_scale = 1.0 if stored.dtype.kind == "f" else METRES_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
@@ -175,19 +184,19 @@ def _exr_channels(field: str, path: Path) -> dict[str, NDArray]:
         raise ValueError(f"--{field} '{path}': cannot be read ({error})") from None
 
 
-def _exr_color(channels: dict[str, NDArray], path: Path) -> NDArray:
+def _exr_color(channels: dict[str, NDArray], path: Path, option: str) -> NDArray:
     if not {"R", "G", "B"} <= channels.keys():
         found = f"channels {', '.join(sorted(channels))}"
-        _refuse("color", path, found, "channels R, G and B")
+        _refuse(option, path, found, "channels R, G and B")
     return np.dstack([channels[name] for name in "RGB"])
 
 
-def _exr_depth(channels: dict[str, NDArray], path: Path) -> NDArray:
+def _exr_depth(channels: dict[str, NDArray], path: Path, option: str) -> NDArray:
     for name in ("Z", "Y", "R"):
         if name in channels:
             return channels[name]
     found = f"channels {', '.join(sorted(channels))}"
-    _refuse("depth", path, found, "a channel Z, Y or R")
+    _refuse(option, path, found, "a channel Z, Y or R")
 
 
 def _write_exr(path: Path, linear_rgb: NDArray) -> None:
@@ -202,14 +211,14 @@ def _write_exr(path: Path, linear_rgb: NDArray) -> None:
         file.write(str(path))
 
 
-def _checked_color(pixels: NDArray, path: Path) -> NDArray:
+def _checked_color(pixels: NDArray, path: Path, option: str) -> NDArray:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
-        _refuse("color", path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
+        _refuse(option, path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
     pixels = np.ascontiguousarray(pixels[:, :, :3])
     if pixels.dtype == np.uint8:
         return pixels
     if pixels.dtype.kind != "f":
-        _refuse("color", path, f"type {pixels.dtype}", "uint8 sRGB or float linear")
+        _refuse(option, path, f"type {pixels.dtype}", "uint8 sRGB or float linear")
     if pixels.dtype == np.float16:
         return pixels
     with np.errstate(over="ignore"):  # infinity is dealt with as such

@@ -69,10 +69,15 @@ def symmetric_tangents(
 def object_range_dpt(view: View) -> tuple[float, float]:
     """Farthest and nearest object distance of a view, as (low, high) dpt.
 
-    Missing depth is filled first, by the rule of `frame.fill_missing_depth`.
+    Missing depth is filled first, by the rule of `frame.fill_missing_depth`; what is
+    hidden counts where it is.
     """
     filled_m, _ = fill_missing_depth(view.depth_m)
     distance_dpt = object_dpt(view, filled_m)
+    if view.hidden_depth_m is not None:
+        holds = view.hidden_depth_m > 0.0
+        hidden_m = np.where(holds, view.hidden_depth_m, filled_m)
+        distance_dpt = np.stack([distance_dpt, object_dpt(view, hidden_m)])
     low_dpt, high_dpt = float(distance_dpt.min()), float(distance_dpt.max())
     return min(low_dpt, NEAREST_OBJECT_DPT), min(high_dpt, NEAREST_OBJECT_DPT)
 

@@ -24,6 +24,7 @@ class Bench(StrEnum):
     BUILD = "build"
     LAYERS = "layers"
     RENDER = "render"
+    OCCLUSION = "occlusion"
     SWITCH = "switch"
     ROUNDTRIP = "roundtrip"
 
@@ -35,6 +36,7 @@ BENCH_MODULES = {
     Bench.BUILD: "tests.benchmarks.bench_psf_build",
     Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
+    Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ROUNDTRIP: "clients.latency",
 }

@@ -102,12 +102,15 @@ class Gpu:
         self._buffers[name] = created
         return created
 
-    def upload(self, name: str, data: NDArray) -> moderngl.Buffer:
-        """Copy an array to the start of a named buffer."""
-        data = np.ascontiguousarray(data)
-        buffer = self.storage(name, data.nbytes)
-        if data.nbytes:
-            buffer.write(data.reshape(-1).view(np.uint8))
+    def upload(self, name: str, *arrays: NDArray) -> moderngl.Buffer:
+        """Copy arrays to the start of a named buffer, one behind the other."""
+        buffer = self.storage(name, sum(data.nbytes for data in arrays))
+        start = 0
+        for data in arrays:
+            if data.nbytes:
+                words = np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+                buffer.write(words, offset=start)
+            start += data.nbytes
         return buffer
 
     def pages(self, n_words: int) -> Pages:
@@ -209,7 +212,7 @@ class Gpu:
     def dispatch(
         self,
         name: str,
-        groups: tuple[int, int],
+        groups: tuple[int, ...],
         *,
         buffers: dict[str, moderngl.Buffer],
         uniforms: dict | None = None,
@@ -221,7 +224,7 @@ class Gpu:
 
         Parameters
         ----------
-        groups : (x, y)
+        groups : (x, y) or (x, y, z)
         buffers : dict
             Binding name without the ``BINDING_`` prefix to buffer.
         uniforms : dict, optional
@@ -243,7 +246,7 @@ class Gpu:
             image.bind_to_image(unit, read=True, write=True)
         for name_of, texture in (textures or {}).items():
             texture.use(getattr(constants, f"TEXTURE_{name_of}"))
-        program.run(max(groups[0], 1), max(groups[1], 1), 1)
+        program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
         self.context.memory_barrier()
 
     def check(self, where: str) -> None:

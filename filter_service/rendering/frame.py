@@ -1,6 +1,10 @@
-"""One view of an RGB-D frame: checked, with missing depth filled and counted."""
+"""One view of an RGB-D frame: checked, with missing depth filled and counted.
 
-from dataclasses import dataclass
+A view may have a second, hidden layer: what the camera would see if what it sees were
+away.  Blurred edges let light of it pass.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +14,7 @@ from filter_service.errors import BadMessage
 
 MAX_SIDE_PX = 16384
 DEPTH_KINDS = ("planar", "radial")
+IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 
 
 @dataclass(frozen=True)
@@ -25,12 +30,33 @@ class View:
     tangents : (left, right, up, down)
     depth_kind : "planar" or "radial"
         View-space z, or distance from the eye.
+    hidden_color : (height, width, 3), optional
+        Of what is behind, of the same type as `color`.
+    hidden_depth_m : (height, width), float32, optional
+        0, negative and NaN: nothing is hidden here, and nothing is filled in.
     """
 
     color: NDArray
     depth_m: NDArray[np.float32]
     tangents: tuple[float, float, float, float]
     depth_kind: str = "planar"
+    hidden_color: NDArray | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
+
+    @property
+    def surface_count(self) -> int:
+        """1, or 2 with a hidden layer."""
+        return 1 if self.hidden_depth_m is None else 2
+
+    @property
+    def surface_colors(self) -> tuple[NDArray, ...]:
+        """Colour of each surface."""
+        return (self.color, self.hidden_color)[: self.surface_count]
+
+    @property
+    def surface_depths_m(self) -> tuple[NDArray[np.float32], ...]:
+        """Depth of each surface."""
+        return (self.depth_m, self.hidden_depth_m)[: self.surface_count]
 
     @property
     def width_px(self) -> int:
@@ -76,6 +102,21 @@ def check_view(view: View) -> None:
         raise BadMessage(
             f"{view.depth_kind!r}", field="depth.kind", allowed=", ".join(DEPTH_KINDS)
         )
+    _check_hidden(view)
+
+
+def _check_hidden(view: View) -> None:
+    """Refuse a hidden layer that is not of the kind of what is seen."""
+    if view.hidden_color is None and view.hidden_depth_m is None:
+        return
+    for field, image, seen in (
+        ("hidden_color", view.hidden_color, view.color),
+        ("hidden_depth", view.hidden_depth_m, view.depth_m),
+    ):
+        wanted = f"{seen.dtype} of shape {seen.shape}"
+        found = "missing" if image is None else f"{image.dtype} of shape {image.shape}"
+        if found != wanted:
+            raise BadMessage(found, field=field, allowed=wanted)
 
 
 def fill_missing_depth(
@@ -98,6 +139,23 @@ def fill_missing_depth(
     return depth_m[rows, columns], count
 
 
+def extended(view: View, border_px: int) -> View:
+    """Repeat the edge of a view's images all around."""
+    if border_px == 0:
+        return view
+    left, right, up, down = view.tangents
+    across = (right - left) / view.width_px * border_px
+    along = (up - down) / view.height_px * border_px
+    sides = ((border_px, border_px), (border_px, border_px), (0, 0))
+    images = {
+        name: np.pad(image, sides[: image.ndim], mode="edge")
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
+    tangents = (left - across, right + across, up + along, down - along)
+    return replace(view, **images, tangents=tangents)
+
+
 def finite_color(color: NDArray) -> tuple[NDArray, int]:
     """Replace non-finite colour values by zero, and count their pixels.
 
@@ -111,6 +169,23 @@ def finite_color(color: NDArray) -> tuple[NDArray, int]:
         return color, 0
     count = int(np.count_nonzero(~finite.all(axis=2)))
     return np.where(finite, color, color.dtype.type(0.0)), count
+
+
+def with_clean_hidden(view: View) -> tuple[View, int]:
+    """Set hidden depth to 0 where nothing is hidden, and count non-finite colours.
+
+    A hidden layer that holds nothing at all is left out.
+    """
+    holds = view.hidden_depth_m > 0.0
+    if not holds.any():
+        return replace(view, hidden_color=None, hidden_depth_m=None), 0
+    color, _ = finite_color(view.hidden_color)
+    depth_m = np.where(holds, view.hidden_depth_m, np.float32(0.0))
+    bad = np.zeros(holds.shape, bool)
+    if color is not view.hidden_color:
+        bad = holds & ~np.isfinite(view.hidden_color).all(axis=2)
+    clean = replace(view, hidden_color=color, hidden_depth_m=depth_m)
+    return clean, int(np.count_nonzero(bad))
 
 
 def radial_stretch(view: View) -> NDArray[np.float64]:

@@ -63,7 +63,7 @@ class FramePasses:
     Parameters
     ----------
     view : View
-        The strip, with depth filled in.
+        The strip, with depth filled in; 0 in its hidden depth is nothing.
     layers : FrameLayers
     image : ImageCells
         Cells of the whole frame.
@@ -71,6 +71,10 @@ class FramePasses:
         Of the strip within the frame.
     frame_pixel_count : int, optional
         Of the whole frame, where it is larger than the strip.
+    image_size_px : (width, height), optional
+        Of the whole image, where the frame has a border around it.
+    border_px : int
+        Columns and rows around the image.
     white_level : float
         Light against which the contrast of a merged quad counts.
     """
@@ -87,6 +91,8 @@ class FramePasses:
         merge: bool,
         first_row: int = 0,
         frame_pixel_count: int | None = None,
+        image_size_px: tuple[int, int] | None = None,
+        border_px: int = 0,
         white_level: float = 1.0,
     ):
         self.gpu = gpu
@@ -98,6 +104,8 @@ class FramePasses:
         self.pixel_count = view.width_px * view.height_px
         self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
         self.tile_count = self.grid[0] * self.grid[1]
+        self.surface_count = view.surface_count
+        self.block_count = self.surface_count * self.tile_count
         self.buffers: dict[str, Buffer] = {}
         self.layers = layers
         self.image = image
@@ -106,6 +114,8 @@ class FramePasses:
             first_row * view.width_px,
             frame_pixel_count or self.pixel_count,
         )
+        self.image_size_px = image_size_px or self.size
+        self.border_px = border_px
         self.white_level = white_level
         self.entry_count = 0
         self.kernel_count = 0
@@ -116,7 +126,7 @@ class FramePasses:
             self.buffers[name] = self.gpu.storage(name, size)
 
     def _run(
-        self, name: str, groups: tuple[int, int], *bindings: str, **uniforms
+        self, name: str, groups: tuple[int, ...], *bindings: str, **uniforms
     ) -> None:
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
@@ -131,12 +141,13 @@ class FramePasses:
 
     def upload(self) -> None:
         """Send the strip; bytes are padded to whole words."""
-        color, depth_m = self.view.color, self.view.depth_m
+        colors, depths_m = self.view.surface_colors, self.view.surface_depths_m
         with self.timer.stage("upload_ms"):
-            n_bytes = group_count(color.nbytes, BYTES_PER_WORD) * BYTES_PER_WORD
+            n_bytes = sum(color.nbytes for color in colors)
+            n_bytes = group_count(n_bytes, BYTES_PER_WORD) * BYTES_PER_WORD
             self._reserve(COLOR_IN=n_bytes)
-            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", color)
-            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", depth_m)
+            self.buffers["COLOR_IN"] = self.gpu.upload("COLOR_IN", *colors)
+            self.buffers["DEPTH_IN"] = self.gpu.upload("DEPTH_IN", *depths_m)
 
     def run(self, kernels: Callable[[NDArray[np.bool_]], KernelSet]) -> None:
         """Filter the strip; `read_back` fetches the picture.
@@ -155,7 +166,8 @@ class FramePasses:
         """Linear light, dioptres and layers; returns the used pairs."""
         n_words = words_per_cell(self.layers)
         used = np.zeros((self.image.count, n_words), np.uint32)
-        self._reserve(PIXELS=16 * self.pixel_count, PIXEL_LAYER=4 * self.pixel_count)
+        n_pixels = self.surface_count * self.pixel_count
+        self._reserve(PIXELS=16 * n_pixels, PIXEL_LAYER=4 * n_pixels)
         self.buffers["LAYER_DPT"] = self.gpu.upload(
             "LAYER_DPT", self.layers.layer_dpt.astype(np.float32)
         )
@@ -169,7 +181,7 @@ class FramePasses:
         with self.timer.stage("fragments_ms"):
             self._run(
                 "build_fragments",
-                self.grid,
+                (*self.grid, self.surface_count),
                 *("COLOR_IN", "DEPTH_IN", "LAYER_DPT", "FIELD_DEFOCUS"),
                 *("PIXELS", "PIXEL_LAYER", "USED"),
                 **self._common,
@@ -177,6 +189,7 @@ class FramePasses:
                 tangents=self.view.tangents,
                 object_range_dpt=self.layers.object_range_dpt,
                 depth_is_planar=int(self.view.depth_kind == "planar"),
+                blur_px_per_dpt=self.layers.blur_px_per_dpt,
                 defines=COLOR_VARIANTS[self.view.color.dtype.name],
             )
         with self.timer.wall("psf_plan_ms"):
@@ -191,35 +204,40 @@ class FramePasses:
             "cell_px": self.image.cell_px,
             "cell_columns": self.image.grid[0],
             "first_row": self.first_row,
+            "border_px": self.border_px,
+            "image_size_px": self.image_size_px,
         }
 
     def merge_fragments(self, kernels: KernelSet) -> None:
         """Merge pixels into fragments, in blocks."""
-        slots = self.tile_count * THREADS
+        slots = self.block_count * THREADS
+        largest_reach_px = int(kernels.kernels.reach_px.max()) + 1.5
         self.buffers.update(kernels.buffers)
         self.kernel_count = kernels.kernels.count
         self.kernel_texel_count = kernels.texel_count
         self._reserve(
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,
-            BLOCKS=16 * self.tile_count,
+            BLOCKS=16 * self.block_count,
         )
-        with self.timer.stage("merge_ms"):
-            self._run(
-                "merge_fragments",
-                self.grid,
-                *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
-                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
-                **self._common,
-                blur_px_per_dpt=self.layers.blur_px_per_dpt,
-                max_level=self._max_level,
-                white_level=self.white_level,
-                paper_order=int(self.paper_rule),
-                scan_px=self.scan,
-            )
-        reach_px = int(kernels.kernels.reach_px.max()) + 1.5
+        for surface in range(self.surface_count):
+            with self.timer.stage("merge_ms"):
+                self._run(
+                    "merge_fragments",
+                    self.grid,
+                    *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
+                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
+                    **self._common,
+                    blur_px_per_dpt=self.layers.blur_px_per_dpt,
+                    max_level=self._max_level,
+                    white_level=self.white_level,
+                    paper_order=int(self.paper_rule),
+                    scan_px=self.scan,
+                    surface=surface,
+                    largest_reach_px=largest_reach_px,
+                )
         self.search_blocks = min(
-            group_count(int(np.ceil(reach_px)), TILE_SIZE_PX), max(self.grid)
+            group_count(int(np.ceil(largest_reach_px)), TILE_SIZE_PX), max(self.grid)
         )
 
     def count_tiles(self) -> None:
@@ -234,6 +252,7 @@ class FramePasses:
                 *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
                 tile_grid=self.grid,
                 search_blocks=self.search_blocks,
+                surface_count=self.surface_count,
                 order_always=int(self.paper_rule),
                 defines=self._list_threads,
             )
@@ -288,6 +307,7 @@ class FramePasses:
                     *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
                     tile_grid=self.grid,
                     search_blocks=self.search_blocks,
+                    surface_count=self.surface_count,
                     **band,
                     defines=self._list_threads,
                 )
@@ -319,6 +339,7 @@ class FramePasses:
                     textures={"ATLAS": self.gpu.atlas("kernels", 1)},
                     frame_size_px=self.size,
                     tile_grid=self.grid,
+                    blur_px_per_dpt=self.layers.blur_px_per_dpt,
                     **band,
                     defines=self._splat_variant(),
                 )
@@ -367,7 +388,7 @@ class FramePasses:
 
     def fragment_counts(self) -> tuple[int, int]:
         """Fragments after merging, and pixels that went into merged ones."""
-        blocks = self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)
+        blocks = self.gpu.read(self.buffers["BLOCKS"], (self.block_count, 4), np.uint32)
         return int(blocks[:, 0].sum()), int(blocks[:, 3].sum())
 
 

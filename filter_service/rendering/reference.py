@@ -5,20 +5,29 @@ itself: no tiles, no lists, no merging, no shared code with the passes beyond th
 store and the planned layers.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from filter_service.constants import (
+    DISCONTINUITY_PX,
     HALF_MAX,
+    MIN_BLUR_RANGE,
     MIN_COVERAGE,
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
 )
 from filter_service.psfs.pack import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
-from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.frame import (
+    View,
+    extended,
+    fill_missing_depth,
+    object_dpt,
+)
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     NodeKernels,
@@ -26,6 +35,9 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
+
+NOTHING = -1
+"""Stands for the kernel of a pixel that holds nothing."""
 
 
 def linear_from_srgb(srgb: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -118,23 +130,34 @@ def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
     return np.moveaxis(light, 1, -1)
 
 
-def cell_index(view: View, image: ImageCells) -> NDArray[np.int64]:
-    """Cell (height, width) of each pixel."""
+def cell_index(view: View, image: ImageCells, border_px: int = 0) -> NDArray[np.int64]:
+    """Cell (height, width) of each pixel; that of the edge in a border."""
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px), np.int64)
-    rows = np.arange(view.height_px) // image.cell_px
-    columns = np.arange(view.width_px) // image.cell_px
+    rows, columns = (
+        np.clip(np.arange(n) - border_px, 0, n - 2 * border_px - 1) // image.cell_px
+        for n in (view.height_px, view.width_px)
+    )
     return rows[:, None] * image.grid[0] + columns
 
 
 def field_change_dpt(
-    view: View, layers: FrameLayers, image: ImageCells
+    view: View, layers: FrameLayers, image: ImageCells, border_px: int = 0
 ) -> NDArray[np.float64]:
-    """Change of defocus (height, width) over the field, bilinear within cells."""
+    """Change of defocus (height, width) over the field, bilinear within cells.
+
+    In a border it is that of the edge.
+    """
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px))
     corners_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
-    y, x = np.mgrid[: view.height_px, : view.width_px]
+    y, x = np.meshgrid(
+        *(
+            np.clip(np.arange(n) - border_px, 0, n - 2 * border_px - 1)
+            for n in (view.height_px, view.width_px)
+        ),
+        indexing="ij",
+    )
     return map_coordinates(
         corners_dpt, (np.stack([y, x]) + 0.5) / image.cell_px, order=1
     )
@@ -154,84 +177,145 @@ def gather(
     -------
     linear_rgb : (height, width, 3)
     """
-    depth_m, _ = fill_missing_depth(view.depth_m)
-    distance_dpt = np.clip(object_dpt(view, depth_m), *layers.object_range_dpt)
-    linear = view.color.astype(np.float64)
-    if view.color.dtype == np.uint8:
-        linear = linear_from_srgb(view.color)
+    filled_m, _ = fill_missing_depth(view.depth_m)
+    border_px = layers.max_radius_px + 2 if view.surface_count > 1 else 0
+    view = extended(replace(view, depth_m=filled_m), border_px)
+    distances_dpt = surface_distances_dpt(view, layers)
+    holds = ~np.isnan(distances_dpt)
+    linear = np.stack([_linear_color(color) for color in view.surface_colors])
     n_intervals = interval_count(layers)
     image = image_cells(store.spec, store.plan, gaze_deg)
     position = np.interp(
-        distance_dpt + field_change_dpt(view, layers, image),
+        np.where(holds, distances_dpt, 0.0)
+        + field_change_dpt(view, layers, image, border_px),
         layers.layer_dpt,
         np.arange(len(layers.layer_dpt)),
     )
     interval = np.minimum(position.astype(np.int64), n_intervals - 1)
-    cell = cell_index(view, image)
+    cell = np.broadcast_to(cell_index(view, image, border_px), holds.shape)
     used = np.zeros((image.count, n_intervals), bool)
-    used[cell, interval] = True
+    used[cell[holds], interval[holds]] = True
     kernels = frame_kernels(store, layers, image, used)
-    kernel = np.zeros(used.shape, np.int64)
-    kernel[kernels.cells, kernels.intervals] = np.arange(kernels.count)
-    out = np.empty_like(linear)
+    kernel_of = np.zeros(used.shape, np.int64)
+    kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
+    kernel = kernel_of[cell, interval]
+    out = np.empty_like(linear[0])
     _gather(
         linear,
-        kernel[cell, interval],
+        np.where(holds, kernel, NOTHING),
         position - interval,
-        _sort_key(distance_dpt, accumulation),
+        _sort_key(distances_dpt, accumulation),
         kernel_pairs(store, kernels),
         accumulation == "paper",
+        DISCONTINUITY_PX / max(layers.blur_px_per_dpt, MIN_BLUR_RANGE),
         out,
     )
-    return out
+    rows, columns = (slice(border_px, n - border_px) for n in out.shape[:2])
+    return out[rows, columns]
 
 
-def _sort_key(distance_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
+def surface_distances_dpt(view: View, layers: FrameLayers) -> NDArray[np.float64]:
+    """Object distance (surfaces, height, width); NaN where nothing is hidden.
+
+    Nothing that blurs like the surface before it counts as hidden.
+    """
+    distances = [object_dpt(view, view.depth_m)]
+    for hidden_m in view.surface_depths_m[1:]:
+        hidden_dpt = object_dpt(view, np.where(hidden_m > 0.0, hidden_m, np.nan))
+        behind_px = (distances[0] - hidden_dpt) * layers.blur_px_per_dpt
+        distances.append(np.where(behind_px > DISCONTINUITY_PX, hidden_dpt, np.nan))
+    return np.clip(distances, *layers.object_range_dpt)
+
+
+def _linear_color(color: NDArray) -> NDArray[np.float64]:
+    if color.dtype == np.uint8:
+        return linear_from_srgb(color)
+    return color.astype(np.float64)
+
+
+def _sort_key(distances_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
     """Smaller is nearer; the paper adds the scan position to the distance."""
     if accumulation == "coverage":
-        return -distance_dpt
+        return -distances_dpt
     with np.errstate(divide="ignore"):
-        distance_m = np.minimum(1.0 / distance_dpt, PAPER_FAR_M)
-    scan = np.arange(distance_m.size).reshape(distance_m.shape) / distance_m.size
+        distance_m = np.minimum(1.0 / distances_dpt, PAPER_FAR_M)
+    n_pixels = distance_m[0].size
+    scan = np.arange(n_pixels).reshape(distance_m[0].shape) / n_pixels
     return distance_m + PAPER_TIE_BREAK_M * scan
 
 
 @njit(parallel=True, cache=True)
-def _gather(linear, kernel, fraction, key, kernels, paper_rule, out):
-    height, width = kernel.shape
+def _gather(linear, kernel, fraction, key, kernels, paper_rule, depth_step, out):
+    n_surfaces, height, width = kernel.shape
     size = kernels.shape[2]
     radius = size // 2
     for y in prange(height):
-        found_key = np.empty(size * size)
-        found_weight = np.empty((size * size, 3))
-        found_color = np.empty((size * size, 3))
+        found_key = np.empty(n_surfaces * size * size)
+        found_weight = np.empty((n_surfaces * size * size, 3))
+        found_color = np.empty((n_surfaces * size * size, 3))
         for x in range(width):
             count = 0
-            for sy in range(max(0, y - radius), min(height, y + radius + 1)):
-                for sx in range(max(0, x - radius), min(width, x + radius + 1)):
-                    k, share = kernel[sy, sx], fraction[sy, sx]
-                    any_light = False
-                    for c in range(3):
-                        weight = kernels[k, 0, y - sy + radius, x - sx + radius, c]
-                        if share > 0.0:
-                            far = kernels[k, 1, y - sy + radius, x - sx + radius, c]
-                            weight += share * (far - weight)
-                        found_weight[count, c] = weight
-                        any_light = any_light or weight > 0.0
-                    if any_light:
-                        found_key[count] = key[sy, sx]
-                        found_color[count] = linear[sy, sx]
-                        count += 1
+            for s in range(n_surfaces):
+                for sy in range(max(0, y - radius), min(height, y + radius + 1)):
+                    for sx in range(max(0, x - radius), min(width, x + radius + 1)):
+                        k, share = kernel[s, sy, sx], fraction[s, sy, sx]
+                        if k < 0:
+                            continue
+                        any_light = False
+                        for c in range(3):
+                            weight = kernels[k, 0, y - sy + radius, x - sx + radius, c]
+                            if share > 0.0:
+                                far = kernels[k, 1, y - sy + radius, x - sx + radius, c]
+                                weight += share * (far - weight)
+                            found_weight[count, c] = weight
+                            any_light = any_light or weight > 0.0
+                        if any_light:
+                            found_key[count] = key[s, sy, sx]
+                            found_color[count] = linear[s, sy, sx]
+                            count += 1
             order = np.argsort(found_key[:count], kind="mergesort")
             for c in range(3):
-                light, coverage = 0.0, 0.0
-                for i in order:
-                    room = 1.0 - coverage
-                    weight = found_weight[i, c]
-                    weight = weight * room if paper_rule else min(weight, room)
-                    light += weight * found_color[i, c]
-                    coverage += weight
+                args = (order, found_key, found_weight[:, c], found_color[:, c])
+                if paper_rule:
+                    light, coverage = _over(*args)
+                else:
+                    light, coverage = _by_depths(*args, depth_step)
                 if coverage >= MIN_COVERAGE:
                     out[y, x, c] = light / coverage
                 else:
-                    out[y, x, c] = linear[y, x, c]
+                    out[y, x, c] = linear[0, y, x, c]
+
+
+@njit(cache=True)
+def _over(order, key, weight, color):
+    """Light and coverage by the paper's rule: a weight is an opacity."""
+    light, coverage = 0.0, 0.0
+    for i in order:
+        share = weight[i] * (1.0 - coverage)
+        light += share * color[i]
+        coverage += share
+    return light, coverage
+
+
+@njit(cache=True)
+def _by_depths(order, key, weight, color, depth_step):
+    """Light and coverage, one depth after the other.
+
+    A depth's fragments share what nearer ones leave free in proportion: had the first
+    of them all that it wants, a surface that is hidden in part would be lit by one side
+    of the kernel alone.
+    """
+    light, coverage = 0.0, 0.0
+    first = 0
+    while first < order.size:
+        own_light, own_coverage = 0.0, 0.0
+        end = first
+        while end < order.size and key[order[end]] - key[order[first]] <= depth_step:
+            own_light += weight[order[end]] * color[order[end]]
+            own_coverage += weight[order[end]]
+            end += 1
+        share = min((1.0 - coverage) / max(own_coverage, MIN_COVERAGE), 1.0)
+        light += share * own_light
+        coverage += share * own_coverage
+        first = end
+    return light, coverage

@@ -13,11 +13,14 @@ from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.camera_match import serves
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.frame import (
+    IMAGES,
     View,
     check_view,
+    extended,
     fill_missing_depth,
     finite_color,
     object_dpt,
+    with_clean_hidden,
 )
 from filter_service.rendering.frame_passes import FramePasses
 from filter_service.rendering.gaze import usable_gaze
@@ -26,7 +29,7 @@ from filter_service.rendering.kernel_passes import KernelMaker
 from filter_service.wire.images import Camera
 
 BYTES_PER_PIXEL = 16
-"""Of the largest per-pixel buffers: a strip's must fit one storage block."""
+"""Of the largest buffers, per pixel and surface: a strip's must fit a storage block."""
 
 UPLOAD_LINES = 512
 """Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
@@ -68,14 +71,16 @@ class Rendered:
         By stage; their sum is the time spent in the renderer.
     missing_depth_count, clamped_depth_count, bad_color_count : int
         Pixels whose depth was filled in, lay outside the prepared distances, or whose
-        colour was not finite (taken as black).
+        colour was not finite (taken as black); the last two with those of a hidden
+        layer that hold something.
     pupil_diameter_mm, focus_dpt : float
         As used.
     gaze_deg : (h, v)
         As used.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice.
+        of a very large frame share count twice, and with a hidden layer the repeated
+        border counts.
     overflow_count : int
         Tile list entries that could not be kept; the lists are sized by need.
     kernel_count, kernel_texel_count : int
@@ -202,11 +207,17 @@ class FilterRenderer:
             depth = self._prepared_depth(view, handle.store)
             color, bad_color_count = finite_color(view.color)
             whole = replace(view, color=color, depth_m=depth.depth_m)
+            if view.surface_count > 1:
+                whole, bad_count = with_clean_hidden(whole)
+                bad_color_count += bad_count
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         image = self._image_cells(timer, handle, gaze_deg)
-        picture = np.empty(color.shape, OUTPUT_DTYPES[output])
-        counts = np.zeros(5, dtype=np.int64)
         reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
+        border_px = _border_px(whole, reach_px)
+        with timer.wall("prepare_ms"):
+            whole = extended(whole, border_px)
+        picture = np.empty(whole.color.shape, OUTPUT_DTYPES[output])
+        counts = np.zeros(5, dtype=np.int64)
         for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
@@ -217,7 +228,9 @@ class FilterRenderer:
                 paper_rule=accumulation == "paper",
                 merge=merge,
                 first_row=strip.first_row,
-                frame_pixel_count=view.width_px * view.height_px,
+                frame_pixel_count=whole.width_px * whole.height_px,
+                image_size_px=(view.width_px, view.height_px),
+                border_px=border_px,
                 white_level=_white_level(color),
             )
             passes.run(
@@ -238,8 +251,9 @@ class FilterRenderer:
             notes.append(
                 f"{bad_color_count} pixels with non-finite colour taken as black"
             )
+        rows, columns = (slice(border_px, border_px + n) for n in color.shape[:2])
         return Rendered(
-            color=picture,
+            color=np.ascontiguousarray(picture[rows, columns]),
             stage_times_ms=timer.result_ms(),
             missing_depth_count=depth.missing_count,
             clamped_depth_count=depth.clamped_count,
@@ -259,6 +273,11 @@ class FilterRenderer:
     def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
         depth_m, missing_count = fill_missing_depth(view.depth_m)
         distances = object_dpt(view, depth_m)
+        if view.surface_count > 1:
+            holds = view.hidden_depth_m > 0.0
+            hidden_m = np.where(holds, view.hidden_depth_m, np.float32(1.0))
+            hidden_dpt = object_dpt(view, hidden_m)[holds]
+            distances = np.concatenate([distances.ravel(), hidden_dpt])
         low_dpt, high_dpt = store.spec.object_range_dpt
         margin = 1e-6 * max(high_dpt, 1.0)
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
@@ -338,6 +357,17 @@ def _check_camera(view: View, store: PsfStore) -> None:
         )
 
 
+def _border_px(view: View, reach_px: int) -> int:
+    """Columns and rows to add all around a view with a hidden layer, whole tiles.
+
+    Next to the border of an image no surface is whole, for part of its light would come
+    from beyond; what it hides would shine through.  So the image goes on, as its edge.
+    """
+    if view.surface_count == 1:
+        return 0
+    return -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+
+
 @dataclass(frozen=True)
 class _Strip:
     """Rows of a frame that go through the passes together.
@@ -359,7 +389,7 @@ def _strips(view: View, reach_px: int, max_block_bytes: int) -> list[_Strip]:
     """
     halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
-    rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)
+    rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
     rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
     if rows >= view.height_px:
         return [_Strip(view, 0, slice(None), slice(None))]
@@ -388,9 +418,13 @@ def _rows_of(view: View, first: int, last: int) -> View:
     """Rows first..last of a view, with the tangents of their edges."""
     left, right, up, down = view.tangents
     per_row = (down - up) / view.height_px
+    images = {
+        name: np.ascontiguousarray(image[first:last])
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
     return replace(
         view,
-        color=np.ascontiguousarray(view.color[first:last]),
-        depth_m=np.ascontiguousarray(view.depth_m[first:last]),
+        **images,
         tangents=(left, right, up + first * per_row, up + last * per_row),
     )

@@ -69,6 +69,8 @@ def _render_view(renderer: Any, frame: Frame, index: int, store: Any) -> Any:
         depth_m=images.depth_m,
         tangents=header.camera.tangents,
         depth_kind=header.depth_kind,
+        hidden_color=images.hidden_color,
+        hidden_depth_m=images.hidden_depth_m,
     )
     return renderer.render(
         view,

@@ -13,6 +13,7 @@ from filter_service.errors import BadMessage
 from filter_service.wire.checks import (
     check_float,
     show,
+    take_bool,
     take_choice,
     take_int,
     take_list,
@@ -163,12 +164,19 @@ class ViewHeader:
     camera: Camera
     color: ImageFormat = SRGB8
     depth_kind: str = "planar"
+    has_hidden: bool = False
+
+    @property
+    def part_count(self) -> int:
+        """Return how many parts follow for this view."""
+        return 4 if self.has_hidden else 2
 
     def fields(self) -> dict[str, Any]:
         """Return the map that travels."""
         return self.camera.fields() | {
             "color": self.color.fields(),
             "depth": {"kind": self.depth_kind},
+            "has_hidden": self.has_hidden,
         }
 
     @classmethod
@@ -186,21 +194,33 @@ class ViewHeader:
             path=f"{path}.depth.kind",
             default="planar",
         )
-        return cls(camera, color, kind)
+        has_hidden = take_bool(
+            source, "has_hidden", path=f"{path}.has_hidden", default=False
+        )
+        return cls(camera, color, kind, has_hidden)
 
 
 @dataclass(frozen=True)
 class ViewImages:
-    """The two images of one view.
+    """The images of one view: what is seen, and maybe what it hides.
 
     color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
         The renderer takes values that are not finite as black, and says so.
     depth_m : (height, width) float32, metres
         0, negative and NaN are missing.
+    hidden_color, hidden_depth_m : like color and depth_m, optional
+        Depth of 0, negative or NaN: nothing is hidden here.
     """
 
     color: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
     depth_m: NDArray[np.float32]
+    hidden_color: NDArray[np.uint8] | NDArray[np.float32] | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
+
+    @property
+    def has_hidden(self) -> bool:
+        """Return whether there is a hidden layer."""
+        return self.hidden_color is not None and self.hidden_depth_m is not None
 
 
 def image_from_part(

@@ -151,17 +151,24 @@ def _check_part_size(
 def _parse_images(
     views: Sequence[ViewHeader], parts: Sequence[Part], limits: Limits
 ) -> tuple[ViewImages, ...]:
-    expect_parts(parts, 2 * len(views))
-    images = []
+    expect_parts(parts, sum(view.part_count for view in views))
+    images, first = [], 0
     for i, view in enumerate(views):
         path = f"views[{i}]"
         _check_part_size(view.camera, view.color, path, limits)
         shape = (view.camera.height_px, view.camera.width_px)
-        color = image_from_part(
-            parts[2 * i], (*shape, 3), view.color.dtype, f"{path}.color"
-        )
-        depth_m = image_from_part(parts[2 * i + 1], shape, "float32", f"{path}.depth")
-        images.append(ViewImages(color, depth_m))
+        kinds = (
+            ("color", (*shape, 3), view.color.dtype),
+            ("depth", shape, "float32"),
+            ("hidden_color", (*shape, 3), view.color.dtype),
+            ("hidden_depth", shape, "float32"),
+        )[: view.part_count]
+        found = [
+            image_from_part(parts[first + k], wanted, dtype, f"{path}.{name}")
+            for k, (name, wanted, dtype) in enumerate(kinds)
+        ]
+        images.append(ViewImages(*found))
+        first += view.part_count
     return tuple(images)
 
 

@@ -1,7 +1,8 @@
 // Walk over the fragments whose light reaches a tile.  Thread t takes the blocks
 // t, t + GROUP_THREADS, ... around the tile and their fragments in order: a fixed order, so
-// the same frame gives the same list.
-// Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks` in scope.
+// the same frame gives the same list.  Surface after surface.
+// Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks`,
+// `surface_count` in scope.
 
 struct Walk {
     ivec2 tile;
@@ -16,12 +17,15 @@ Walk start_walk(ivec2 tile) {
 
 // Next block in reach, or -1.
 int next_block(inout Walk walk) {
-    while (walk.next < walk.width * walk.width) {
+    int area = walk.width * walk.width;
+    while (walk.next < surface_count * area) {
+        int place = walk.next % area;
+        int surface = walk.next / area;
         ivec2 at = walk.tile - search_blocks
-                 + ivec2(walk.next % walk.width, walk.next / walk.width);
+                 + ivec2(place % walk.width, place / walk.width);
         walk.next += GROUP_THREADS;
         if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, tile_grid))) continue;
-        int block = at.y * tile_grid.x + at.x;
+        int block = (surface * tile_grid.y + at.y) * tile_grid.x + at.x;
         float reach = uintBitsToFloat(blocks[block].y);
         if (distance_squared_between_tiles(at, walk.tile) <= reach * reach) return block;
     }

@@ -1,12 +1,13 @@
 // Turns colour and depth of the input frame into linear light, dioptres and layer
-// positions, and notes which kernels the frame needs.
+// positions, and notes which kernels the frame needs.  Surface after surface: what is
+// seen, and what it hides.
 // In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
 //      COLOR_IS_HALF),
-//      DEPTH_IN (f32 metres, all valid), LAYER_DPT, FIELD_DEFOCUS (change of defocus at
-//      the corners of the cells).
-// Out: PIXELS (linear RGB, object distance dpt), PIXEL_LAYER (position), USED (a bit per
-//      cell and interval).
-// Dispatch: one thread a pixel, 8 x 8 groups.
+//      DEPTH_IN (f32 metres; all valid in what is seen, 0 where nothing is hidden),
+//      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
+// Out: PIXELS (linear RGB, object distance dpt; negative where nothing is hidden),
+//      PIXEL_LAYER (position), USED (a bit per cell and interval).
+// Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
 #include "common/color.glsl"
@@ -32,6 +33,7 @@ uniform int depth_is_planar;
 uniform vec2 object_range_dpt;    // beyond which distances are taken as its ends
 
 bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; }
+uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 
@@ -71,8 +73,7 @@ float field_defocus_dpt(ivec2 at) {
     if (cell_px == 0) return 0.0;
     int cell = cell_of(at);
     int corner = cell + cell / cell_columns;  // a corner more than cells in each row
-    vec2 inside = vec2(at.x % cell_px, (at.y + first_row) % cell_px) + 0.5;
-    vec2 share = inside / float(cell_px);
+    vec2 share = (vec2(image_place(at) % cell_px) + 0.5) / float(cell_px);
     float above = mix(field_dpt[corner], field_dpt[corner + 1], share.x);
     int below = corner + cell_columns + 1;
     return mix(above, mix(field_dpt[below], field_dpt[below + 1], share.x), share.y);
@@ -92,6 +93,27 @@ float layer_position(float dpt) {
     return float(low) + clamp((dpt - layer_dpt[low]) / span, 0.0, 1.0);
 }
 
+// Object distance, or NOTHING_DPT where a hidden pixel is empty, or as good as on the
+// surface before it: the two would blur alike.
+float distance_of(uint pixel, uint seen, vec2 at) {
+    if (pixel == seen) return object_dpt(depth_in[pixel], at);
+    if (depth_in[pixel] == 0.0) return NOTHING_DPT;
+    float dpt = object_dpt(depth_in[pixel], at);
+    float behind = object_dpt(depth_in[seen], at) - dpt;
+    return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
+}
+
+void note_use(ivec2 at, int interval) {
+    uint bit = 1u << uint(interval % BITS_PER_WORD);
+    uint word = uint(interval / BITS_PER_WORD);
+    if (group_lies_in_one_cell()) {
+        atomicOr(group_used[word], bit);
+        return;
+    }
+    word += uint(cell_of(at) * words_per_cell);
+    if ((used[word] & bit) == 0u) atomicOr(used[word], bit);
+}
+
 void main() {
     uint thread = gl_LocalInvocationIndex;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
@@ -99,21 +121,16 @@ void main() {
     barrier();  // no bit is left from before
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (all(lessThan(at, frame_size_px))) {
-        uint pixel = uint(at.y * frame_size_px.x + at.x);
-        float dpt = object_dpt(depth_in[pixel], vec2(at));
-        dpt = clamp(dpt, object_range_dpt.x, object_range_dpt.y);
-        float place = layer_position(dpt + field_defocus_dpt(at));
-        int interval = position_interval(place, layer_count);
-        pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
-        position[pixel] = place;
-        uint bit = 1u << uint(interval % BITS_PER_WORD);
-        uint word = uint(interval / BITS_PER_WORD);
-        if (group_lies_in_one_cell()) {
-            atomicOr(group_used[word], bit);
-        } else {
-            word += uint(cell_of(at) * words_per_cell);
-            if ((used[word] & bit) == 0u) atomicOr(used[word], bit);
+        uint seen = uint(at.y * frame_size_px.x + at.x);
+        uint pixel = seen + gl_WorkGroupID.z * uint(frame_size_px.x * frame_size_px.y);
+        float dpt = distance_of(pixel, seen, vec2(at));
+        if (dpt >= 0.0) {
+            dpt = clamp(dpt, object_range_dpt.x, object_range_dpt.y);
+            float place = layer_position(dpt + field_defocus_dpt(at));
+            position[pixel] = place;
+            note_use(at, position_interval(place, layer_count));
         }
+        pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
     }
     barrier();  // all pixels of the group have noted theirs
     if (!group_lies_in_one_cell()) return;

@@ -16,6 +16,7 @@ layout(std430, binding = BINDING_TILE_COUNTS) writeonly buffer Counts { uvec2 co
 
 uniform ivec2 tile_grid;
 uniform int search_blocks;
+uniform int surface_count;
 uniform int order_always;
 
 #include "common/binning.glsl"

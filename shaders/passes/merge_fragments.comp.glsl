@@ -1,9 +1,11 @@
 // Merges similar pixels where the blur hides the difference: 2 x 2, then 4 x 4, then the
 // whole block; and packs the fragments of each 8 x 8 block, in scan order, to the front
-// of the block's slots.
-// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval).
+// of the block's slots.  One surface a dispatch; surfaces never merge with each other.
+// What is hidden makes fragments only where an edge of what is seen is within reach.
+// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for what
+//      is hidden, BLOCKS of what is seen.
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
-//      reach bits, has an edge, pixels merged).
+//      reach bits, order matters, pixels merged).
 // Dispatch: one group a block, one thread a quad of pixels.
 // Twin: tests/numerical/test_renderer_passes.py.  Source: section 6.3 (merging of tiled
 // splatting), there one level.
@@ -16,13 +18,14 @@ layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernel
 layout(std430, binding = BINDING_KERNEL_OF) readonly buffer KernelOf { uint kernel_of[]; };
 layout(std430, binding = BINDING_FRAGMENT_COLOR) writeonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_FRAGMENT_PLACE) writeonly buffer Place { uvec4 places[]; };
-layout(std430, binding = BINDING_BLOCKS) writeonly buffer Blocks { uvec4 blocks[]; };
+layout(std430, binding = BINDING_BLOCKS) buffer Blocks { uvec4 blocks[]; };
 
 #include "common/layers.glsl"
 #include "common/cells.glsl"
 #include "common/kernels.glsl"
 #include "common/reach.glsl"
 #include "common/fragments.glsl"
+#include "common/tiles.glsl"
 
 uniform ivec2 frame_size_px;
 uniform int layer_count;
@@ -31,11 +34,14 @@ uniform float white_level;
 uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
 uniform int paper_order;          // sort as the paper does: metres plus scan position
+uniform int surface;              // 0: what is seen, 1: what it hides
+uniform float largest_reach_px;   // of all kernels of the frame
 
 shared uint alive[2];             // bit per thread: it keeps a fragment
 shared uint largest_reach_bits;   // reach is positive, so its bits order like it
 shared uint block_has_edge;
 shared uint block_merged_count;
+shared uint edge_in_reach;
 // The merged square that starts at a thread's quad.
 shared int level_of[QUADS];       // 0: single pixels; -1: the quad is part of another square
 shared vec4 mean[QUADS];          // linear RGB, dpt
@@ -44,7 +50,9 @@ shared vec4 high[QUADS];
 shared vec4 positions[QUADS];     // in layers: mean, nearest, farthest; least spread px
 shared uint edge_of[QUADS];
 
-uint pixel_index(ivec2 at) { return uint(at.y * frame_size_px.x + at.x); }
+uint pixel_index(ivec2 at) {
+    return uint((surface * frame_size_px.y + at.y) * frame_size_px.x + at.x);
+}
 
 bool inside(ivec2 at) {
     return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, frame_size_px));
@@ -67,6 +75,34 @@ uint kernel_at(ivec2 at, float place, out float fraction) {
     int interval = position_interval(place, layer_count);
     fraction = place - float(interval);
     return kernel_of[cell_of(at) * interval_count(layer_count) + interval];
+}
+
+// Bits of a quad's pixels that make fragments.
+uint held_pixels(ivec2 at) {
+    uint held = 0u;
+    for (int i = 0; i < int(QUAD); ++i) {
+        ivec2 member = at + ivec2(i & 1, i >> 1);
+        if (!inside(member)) continue;
+        bool holds = surface == 0
+                  || (edge_in_reach != 0u && pixels[pixel_index(member)].a >= 0.0);
+        if (holds) held |= 1u << uint(i);
+    }
+    return held;
+}
+
+// Notes whether an edge of what is seen is so close that light from this block, behind
+// it, may pass.
+void find_edge(ivec2 block, ivec2 grid, uint thread) {
+    int search = 2 * (int(largest_reach_px) / TILE_SIZE_PX + 1);
+    int width = 2 * search + 1;
+    for (int i = int(thread); i < width * width; i += QUADS) {
+        ivec2 other = block - search + ivec2(i % width, i / width);
+        if (any(lessThan(other, ivec2(0))) || any(greaterThanEqual(other, grid))) continue;
+        uvec4 seen = blocks[other.y * grid.x + other.x];
+        float reach = uintBitsToFloat(seen.y) + largest_reach_px;
+        if (seen.z != 0u && distance_squared_between_tiles(block, other) <= reach * reach)
+            atomicOr(edge_in_reach, 1u);
+    }
 }
 
 // Whether a square of four of the level below may be one fragment.  Seen from a blur of
@@ -114,9 +150,9 @@ void keep_square(uint quad, int level, vec4 sum, vec4 least, vec4 most, vec4 pla
 }
 
 // Merges the thread's own quad, if all its pixels exist and are alike.
-void merge_pixels(ivec2 at, uint quad, uint edges) {
+void merge_pixels(ivec2 at, uint quad, uint held, uint edges) {
     level_of[quad] = 0;
-    if (max_level == 0 || !inside(at + 1)) return;
+    if (max_level == 0 || held != (1u << uint(QUAD)) - 1u) return;
     vec4 sum, least, most, place;
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 member = at + ivec2(i & 1, i >> 1);
@@ -184,23 +220,33 @@ void write_fragment(uint block, uint bit, Fragment fragment) {
 
 void main() {
     uint quad = gl_LocalInvocationIndex;
-    uint block = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
+    ivec2 grid = ivec2(gl_NumWorkGroups.xy);
+    ivec2 block_at = ivec2(gl_WorkGroupID.xy);
+    uint block = uint((surface * grid.y + block_at.y) * grid.x + block_at.x);
     if (quad == 0u) {
         alive[0] = 0u;
         alive[1] = 0u;
         largest_reach_bits = 0u;
         block_has_edge = 0u;
         block_merged_count = 0u;
+        edge_in_reach = 0u;
+    }
+    if (surface != 0) {
+        barrier();  // nothing is noted from before
+        find_edge(block_at, grid, quad);
+        barrier();  // all blocks around have been looked at
     }
     ivec2 local = 2 * ivec2(quad % uint(QUADS_ACROSS), quad / uint(QUADS_ACROSS));
-    ivec2 at = ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX + local;
-    uint edges = 0u;  // a bit for each of the quad's pixels
+    ivec2 at = block_at * TILE_SIZE_PX + local;
+    uint held = held_pixels(at);  // a bit for each of the quad's pixels
+    uint edges = 0u;
     for (int i = 0; i < int(QUAD); ++i) {
+        if ((held & (1u << uint(i))) == 0u) continue;
         ivec2 member = at + ivec2(i & 1, i >> 1);
-        if (inside(member) && is_edge_pixel(member, pixels[pixel_index(member)].a))
+        if (surface != 0 || is_edge_pixel(member, pixels[pixel_index(member)].a))
             edges |= 1u << uint(i);
     }
-    merge_pixels(at, quad, edges);
+    merge_pixels(at, quad, held, edges);
     barrier();  // counters are clear and all quads are decided before anyone looks
     for (int level = 2; level <= max_level; ++level) {
         if (all(equal(local & ((1 << level) - 1), ivec2(0)))) merge_squares(at, quad, level);
@@ -213,7 +259,7 @@ void main() {
     }
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 step = ivec2(i & 1, i >> 1);
-        if (level == 0 && inside(at + step))
+        if (level == 0 && (held & (1u << uint(i))) != 0u)
             note_survivor(pixel_bit(local + step), (edges & (1u << uint(i))) != 0u);
     }
     barrier();  // every survivor is counted before slots are given out
@@ -225,7 +271,7 @@ void main() {
     for (int i = 0; i < int(QUAD); ++i) {
         ivec2 step = ivec2(i & 1, i >> 1);
         uint pixel = pixel_index(at + step);
-        if (level == 0 && inside(at + step))
+        if (level == 0 && (held & (1u << uint(i))) != 0u)
             write_fragment(block, pixel_bit(local + step),
                            make_fragment(at + step, pixels[pixel], position[pixel], 0,
                                          (edges & (1u << uint(i))) != 0u));

@@ -16,6 +16,7 @@ layout(std430, binding = BINDING_ENTRIES) writeonly buffer Entries { uint entrie
 
 uniform ivec2 tile_grid;
 uniform int search_blocks;
+uniform int surface_count;
 uniform int first_tile;           // of the band
 uniform uint first_entry;
 

@@ -5,8 +5,10 @@
 // Dispatch: one group a tile of the band; a thread serves PIXELS_PER_THREAD pixels of a
 //      column (8 on a software renderer, where a staged fragment is then read once by
 //      one vector of threads; 1 on hardware).
-// Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage:
-//      front to back, w <- min(w, 1 - A), and plain sums where one surface fills the tile.
+// Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
+//      fragments of one depth (to DISCONTINUITY_PX of blur), front to back, each of which
+//      shares what the nearer ones leave free: of a surface that another hides in part,
+//      no part is taken before the rest.
 // Twin: reference.gather.  Source: section 6.1; accumulation DESIGN 4.
 
 #include "common/reach.glsl"
@@ -30,6 +32,7 @@ uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
 uniform int first_tile;           // of the band
 uniform uint first_entry;
+uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
@@ -37,7 +40,7 @@ const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 // Staged fragments: what the pixel loop needs, ready to use.
 shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
 shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
-shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, level
+shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, depth bits
 
 void stage(uint slot, uint at) {
     vec4 color = colors[slot];
@@ -52,22 +55,36 @@ void stage(uint slot, uint at) {
     staged_color[at] = vec4(color.rgb, place_fraction(place));
     staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + extent);
     staged_kernel[at] = ivec4(kernel_offset(kernel, level), reach_width(reach) + extent,
-                              floatBitsToInt(scale), level);
+                              floatBitsToInt(scale), floatBitsToInt(color.a));
+#ifdef PAPER_RULE
+    staged_kernel[at].w = level;
+#endif
 }
 
-// Weight that remains under the accumulation rule.
-vec3 ruled_weight(vec3 weight, vec3 coverage, int level, bool ordered) {
+// The light of a pixel: of the fragments at one depth, and of those before them.
+struct Sum { vec3 light; vec3 coverage; vec3 near_light; vec3 near_coverage; };
+
+// Adds up a depth; its fragments share what nearer ones leave free.
+void close_depth(inout Sum sum) {
+    vec3 room = 1.0 - sum.near_coverage;
+    vec3 share = min(room / max(sum.coverage, vec3(MIN_COVERAGE)), 1.0);
+    sum.near_light += share * sum.light;
+    sum.near_coverage += share * sum.coverage;
+    sum.light = vec3(0.0);
+    sum.coverage = vec3(0.0);
+}
+
 #ifdef PAPER_RULE
-    if (level > 0) {  // the paper merges once: four pixels
+// What the paper's rule leaves of a weight; it merges once: four pixels.
+vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
+    if (level > 0) {
         vec3 through = 1.0 - min(weight / QUAD, 1.0);
         through *= through;
         weight = 1.0 - through * through;
     }
     return weight * (1.0 - coverage);
-#else
-    return ordered ? min(weight, 1.0 - coverage) : weight;
-#endif
 }
+#endif
 
 void main() {
     int index = first_tile + int(gl_WorkGroupID.x);
@@ -78,12 +95,10 @@ void main() {
     bool ordered = counts[index].y != 0u;
     uint first = offsets[index] - first_entry;
     uint end = first + counts[index].x;
-    vec3 light[PIXELS_PER_THREAD];
-    vec3 coverage[PIXELS_PER_THREAD];
-    for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-        light[p] = vec3(0.0);
-        coverage[p] = vec3(0.0);
-    }
+    float group_depth = ordered && end > first ? colors[entries[first]].a : 0.0;
+    Sum sums[PIXELS_PER_THREAD];
+    for (int p = 0; p < PIXELS_PER_THREAD; ++p)
+        sums[p] = Sum(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
     for (uint batch = first; batch < end; batch += uint(THREADS)) {
         barrier();  // the last batch is used up
         for (uint i = thread; i < uint(THREADS); i += uint(GROUP_THREADS))
@@ -95,15 +110,24 @@ void main() {
             ivec4 kernel = staged_kernel[i];
             vec4 color = staged_color[i];
             bool in_columns = at.x >= box.x && at.x <= box.z;
+#ifndef PAPER_RULE
+            float depth = intBitsToFloat(kernel.w);
+            if (ordered && (depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX) {
+                for (int p = 0; p < PIXELS_PER_THREAD; ++p) close_depth(sums[p]);
+                group_depth = depth;
+            }
+#endif
             int texel = kernel.x + (at.y - box.y) * kernel.y + at.x - box.x;
             for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                 bool lit = in_columns && at.y + p >= box.y && at.y + p <= box.w;
                 uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
                 vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
                 weight *= lit ? intBitsToFloat(kernel.z) : 0.0;
-                weight = ruled_weight(weight, coverage[p], kernel.w, ordered);
-                light[p] += weight * color.rgb;
-                coverage[p] += weight;
+#ifdef PAPER_RULE
+                weight = paper_weight(weight, sums[p].coverage, kernel.w);
+#endif
+                sums[p].light += weight * color.rgb;
+                sums[p].coverage += weight;
                 texel += kernel.y;
             }
         }
@@ -113,9 +137,11 @@ void main() {
         if (any(greaterThanEqual(here, frame_size_px))) continue;
         int pixel = here.y * frame_size_px.x + here.x;
         vec3 own = pixels[pixel].rgb;
-        vec3 normalised = light[p] / max(coverage[p], vec3(MIN_COVERAGE));
-        vec3 lit = vec3(greaterThanEqual(coverage[p], vec3(MIN_COVERAGE)));
+        close_depth(sums[p]);
+        vec3 coverage = sums[p].near_coverage;
+        vec3 normalised = sums[p].near_light / max(coverage, vec3(MIN_COVERAGE));
+        vec3 lit = vec3(greaterThanEqual(coverage, vec3(MIN_COVERAGE)));
         color_out[pixel] = vec4(mix(own, normalised, lit),
-                                dot(coverage[p], vec3(1.0 / float(RGB))));
+                                dot(coverage, vec3(1.0 / float(RGB))));
     }
 }

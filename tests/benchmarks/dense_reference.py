@@ -3,7 +3,8 @@
 Nothing is shared with the renderer but the eye and the PSF engine: no grid of PSFs,
 no cells, no layers, no merging, no tiles.  Sources are sorted near to far once and
 splat in that order, which gives every output pixel the sequence that a sorted gather
-gives it: w <- min(w, 1 - A), and light over coverage in the end.
+gives it: one depth after the other shares what nearer ones leave free, and light over
+coverage in the end.
 
 PSFs are computed in batches along the order, so memory does not grow with the image.
 Results are kept under out/, by what went in: pictures, camera, eye, state and PSFs.
@@ -23,7 +24,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from estimator.psf import PsfBatch, compute_psf_batch
-from filter_service.constants import MIN_COVERAGE
+from filter_service.constants import DISCONTINUITY_PX, MIN_COVERAGE
 from filter_service.planning.eye import Eye
 from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
@@ -187,7 +188,8 @@ def dense_reference(
         PSFs of the middles of bins of 0.2 degrees and 0.005 dpt, as in the paper; the
         order of occlusion is by exact distance in any case.
     accumulation : "coverage", "paper" or "sum"
-        Near to far up to full coverage; the paper's rule, whose alpha is the PSF's
+        Near to far up to full coverage, what blurs alike (to DISCONTINUITY_PX) summed
+        and then scaled to what is left; the paper's rule, whose alpha is the PSF's
         weight; or a plain weighted mean of all that arrives, which is right for one
         surface alone.
     kept : bool
@@ -217,19 +219,32 @@ def _filtered(
     places = places[order]
     light = np.zeros((3, view.height_px, view.width_px))
     coverage = np.zeros_like(light)
+    # Of the depth that is being added to each pixel: nearest distance, light, coverage.
+    depths = np.zeros((3, *light.shape))
+    step_dpt = np.inf
+    if accumulation == "coverage":
+        blur_px_per_dpt = state.spec.blur_px_per_dpt(state.pupil_diameter_mm)
+        step_dpt = DISCONTINUITY_PX / blur_px_per_dpt
     for part, found, place_of in _batches(places):
         psfs = state.exact_psfs(*found.T)
         pixels = order[part]
         add_sources(
             *np.divmod(pixels, view.width_px),
+            sources.distance_dpt[pixels],
             sources.color[pixels],
             psfs.offset_count.reshape(-1, 3)[place_of],
             psfs.radius_px.reshape(-1, 3)[place_of],
             psfs.flat_kernels,
             RULES.index(accumulation),
+            step_dpt,
+            depths,
             light,
             coverage,
         )
+    if accumulation == "coverage":
+        share = np.minimum((1.0 - coverage) / np.maximum(depths[2], MIN_COVERAGE), 1.0)
+        light += share * depths[1]
+        coverage += share * depths[2]
     return normalised(light, coverage, linear_color(view))
 
 
@@ -262,20 +277,45 @@ def normalised(
     return np.where(covered, light / np.where(covered, coverage, 1.0), unfiltered)
 
 
+@njit(cache=True)
+def _close_depth(at, depths, light, coverage):
+    """Add what a pixel has of one depth: its share of what nearer ones leave free."""
+    share = min((1.0 - coverage[at]) / max(depths[2][at], MIN_COVERAGE), 1.0)
+    light[at] += share * depths[1][at]
+    coverage[at] += share * depths[2][at]
+    depths[1][at] = 0.0
+    depths[2][at] = 0.0
+
+
 @njit(parallel=True, cache=True)
 def add_sources(
-    rows, columns, color, offset, radius_px, kernels, rule, light, coverage
+    rows,
+    columns,
+    distance_dpt,
+    color,
+    offset,
+    radius_px,
+    kernels,
+    rule,
+    step_dpt,
+    depths,
+    light,
+    coverage,
 ):
     """Splat sources one after the other; threads share the rows of the image.
 
     Parameters
     ----------
-    rows, columns : (n,)
+    rows, columns, distance_dpt : (n,)
         Near to far.
     color, offset, radius_px : (n, 3)
         Light, and where each channel's (2R+1)² weights are in ``kernels``.
     rule : int
         Index into `RULES`.
+    step_dpt : float
+        Sources no farther apart are at one depth.
+    depths : (3, 3, height, width)
+        Of the depth that a pixel is at: nearest distance, light and coverage.
     light, coverage : (3, height, width)
         Added to.
     """
@@ -292,11 +332,19 @@ def add_sources(
                     line = offset[n, c] + (to_y - y + r) * (2 * r + 1) + r - x
                     for to_x in range(left, right):
                         weight = kernels[line + to_x]
-                        room = 1.0 - coverage[c, to_y, to_x]
+                        if weight == 0.0:
+                            continue
                         if rule == 0:
-                            weight = min(weight, room)
-                        elif rule == 1:
-                            weight = weight * room
+                            at = (c, to_y, to_x)
+                            if depths[0][at] - distance_dpt[n] > step_dpt:
+                                _close_depth(at, depths, light, coverage)
+                            if depths[2][at] == 0.0:
+                                depths[0][at] = distance_dpt[n]
+                            depths[1][at] += weight * color[n, c]
+                            depths[2][at] += weight
+                            continue
+                        if rule == 1:
+                            weight = weight * (1.0 - coverage[c, to_y, to_x])
                         light[c, to_y, to_x] += weight * color[n, c]
                         coverage[c, to_y, to_x] += weight
 
@@ -319,6 +367,7 @@ def _key(view: View, state: EyeState, bins: bool, accumulation: str) -> str:
         ),
         (spec.wavelengths_nm, spec.diffraction, spec.chromatic, spec.follows_field),
         (state.pupil_diameter_mm, state.focus_dpt),
+        DISCONTINUITY_PX if accumulation == "coverage" else None,
     )
     digest.update(repr(words).encode())
     (h_low, h_high), (v_low, v_high) = spec.field_range_deg

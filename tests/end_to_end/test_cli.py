@@ -203,6 +203,59 @@ def test_depth_of_another_size_is_refused_with_both_sizes(scene):
     assert "--depth" in line and "6x4" in line and f"{WIDTH_PX}x{HEIGHT_PX}" in line
 
 
+def test_a_hidden_layer_is_seen_around_a_blurred_edge(scene):
+    folder, linear = scene
+    near = np.arange(WIDTH_PX)[None, :] < WIDTH_PX // 2
+    linear[:] = np.where(near[..., None], 1.0, 0.0)
+    behind = np.zeros_like(linear)
+    np.save(folder / "color.npy", linear)
+    depth_m = np.broadcast_to(np.where(near, 0.1, np.inf), behind.shape[:2])
+    np.save(folder / "depth.npy", depth_m.astype(np.float32))
+    np.save(folder / "behind.npy", behind)
+    hidden_m = np.where(near, np.inf, 0.0) + np.zeros((HEIGHT_PX, 1))
+    np.save(folder / "behind_m.npy", hidden_m.astype(np.float32))
+    files = ("--hidden-color", folder / "behind.npy")
+    files += ("--hidden-depth", folder / "behind_m.npy")
+    defocus = (*IDENTITY[:2], "--pupil-mm", "8")
+    shown = []
+    for extra in (defocus, (*defocus, *files)):
+        summary = run_json(*filter_arguments(folder, *extra, fov_deg=20))
+        shown.append(np.load(folder / "out.npy")[HEIGHT_PX // 2, :, 1])
+    assert summary["object_range_dpt"] == pytest.approx([0.0, 10.0], rel=0.02)
+    column = WIDTH_PX // 2 - 1
+    assert shown[0][column] > 0.98  # without it, only the near thing is there
+    assert 0.5 < shown[1][column] < 0.8
+
+
+@pytest.mark.parametrize(
+    ("arrays", "named"),
+    [
+        ({"hidden-color": np.zeros((4, 6, 3), np.float32)}, "--hidden-depth"),
+        ({"hidden-depth": np.zeros((4, 6), np.float32)}, "--hidden-color"),
+        (
+            {
+                "hidden-color": np.zeros((4, 6, 3), np.float32),
+                "hidden-depth": np.zeros((4, 6), np.float32),
+            },
+            "6x4",
+        ),
+        (
+            {
+                "hidden-color": np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8),
+                "hidden-depth": np.zeros((HEIGHT_PX, WIDTH_PX), np.float32),
+            },
+            "uint8",
+        ),
+    ],
+)
+def test_a_hidden_layer_that_does_not_fit_is_refused(scene, arrays, named):
+    extra = ()
+    for name, array in arrays.items():
+        np.save(scene[0] / f"{name}.npy", array)
+        extra += (f"--{name}", scene[0] / f"{name}.npy")
+    assert named in refusal(*filter_arguments(scene[0], *extra))
+
+
 @pytest.mark.parametrize("name", ["color.npy", "depth.npy"])
 def test_unreadable_and_missing_files_are_refused(scene, name):
     option = "--" + name.split(".")[0]

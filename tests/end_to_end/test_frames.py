@@ -1,6 +1,7 @@
 """Frames through a running service: what comes back, and what happens to bad ones."""
 
 import time
+from dataclasses import replace
 
 import msgpack
 import numpy as np
@@ -82,6 +83,15 @@ def test_two_views_come_back_in_order(client, second_size):
     reply = client.filter([left, right], **SEE)
     for view, color in zip((left, right), reply.colors, strict=True):
         np.testing.assert_array_equal(color[1:], 255 - view.color[1:])
+
+
+@pytest.mark.parametrize("name", ["hidden_color", "hidden_depth_m"])
+def test_half_a_hidden_layer_is_refused_before_it_is_sent(name):
+    view = make_view()
+    with pytest.raises(ValueError, match="missing"):
+        replace(view, **{name: getattr(view, name.removeprefix("hidden_"))})
+    with pytest.raises(ValueError, match="shape"):
+        replace(view, hidden_color=view.color[:5], hidden_depth_m=view.depth_m[:5])
 
 
 def test_the_caller_may_reuse_its_arrays_at_once(client):

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,50 @@ def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
     # About 11 dpt of defocus over 4 mm blur by 44 mrad, with 8 mrad per pixel.
     assert widths_px[0] <= 1
     assert 4 <= widths_px[1] <= 6
+
+
+def test_a_hidden_layer_is_seen_past_a_blurred_edge(real_client):
+    seen = edge_view()
+    near = np.arange(160)[None, :] >= 80
+    depth_m = np.broadcast_to(np.where(near, 0.1, np.inf), (90, 160))
+    seen = replace(seen, depth_m=depth_m.astype(np.float32))
+    hidden_m = np.broadcast_to(np.where(near, np.inf, 0.0), (90, 160))
+    layered = replace(
+        seen,
+        hidden_color=np.zeros_like(seen.color),
+        hidden_depth_m=hidden_m.astype(np.float32),
+    )
+    settings = NARROW | {"object_range_dpt": (0, 10)}
+    real_client.set_profile(PLAIN, settings=settings, views=[seen])
+    one, two = real_client.filter([seen, layered], **SEE).colors
+    # 10 dpt over 4 mm blur by 2.5 px; 1.5 px inside the edge the near white covers all
+    # of the pupil but a segment, where it is alone or lets the dark behind it through.
+    t = 0.6
+    share = (np.arccos(t) - t * np.sqrt(1 - t**2)) / np.pi
+    assert one[45, 81, 1] > 0.98
+    assert two[45, 81, 1] == pytest.approx(1 - share, abs=0.03)
+    np.testing.assert_allclose(one[45, 120:140], two[45, 120:140], atol=1e-3)
+
+
+def test_a_scene_streams_with_what_it_hides(real_service):
+    arguments = ("--scene", "primitives", "--profile", "emmetropia", "--hidden")
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-W", "error", "-m", "clients.pyrender_stream"),
+            *("--endpoint", real_service.endpoint, *arguments),
+            *("--size", "96x54", "--frames", "3", "--json"),
+        ],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads(finished.stdout)
+    assert report["sent"] == 3
+    assert report["frames"] + sum(report["drops"].values()) == 3
+    assert report["frames"] >= 1
 
 
 def test_one_profile_sent_twice_and_two_views_work(real_client):

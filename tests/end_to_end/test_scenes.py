@@ -1,9 +1,18 @@
 """The two test scenes: where things are, how frames look, that light is baked right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
-from clients.scene_renderer import SceneRenderer, _mean_color, _sample_depth
+from clients.hidden_surface import LEAST_GAP_DPT
+from clients.scene_renderer import (
+    SceneRenderer,
+    _hidden_pixels,
+    _mean_color,
+    _sample_depth,
+)
 from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
@@ -200,6 +209,51 @@ def test_baked_sun_and_sky_are_shadowed_by_what_is_above():
 def test_sphere_normals_point_outwards():
     ball = sphere(2.0)
     assert np.einsum("ij,ij->i", ball.normals, ball.vertices_m).min() > 1.9
+
+
+def test_what_the_ball_hides_is_the_floor_and_the_walls_behind_it(primitives):
+    """With the ball and the cube out of the scene, that is what is seen."""
+    size_px = (121, 68)
+    with SceneRenderer(primitives, size_px, supersampling=1) as renderer:
+        (_, depth_m), (hidden, hidden_m) = renderer.render_layers(np.eye(4))
+    without = replace(
+        primitives,
+        batches=tuple(b for b in primitives.batches if not _is_near(b)),
+    )
+    assert len(without.batches) < len(primitives.batches)
+    with SceneRenderer(without, size_px, supersampling=1) as renderer:
+        behind, behind_m = renderer.render(np.eye(4))
+        seen = renderer.render_layers(np.eye(4))
+    near = depth_m < 1.0
+    assert near.mean() > 0.1
+    # Antialiased silhouettes apart, where a sample of the ball is mixed in.
+    inner = binary_erosion(near, iterations=2)
+    shown = inner & (hidden_m > 1.0)
+    assert shown.sum() > 0.95 * inner.sum()
+    np.testing.assert_allclose(hidden_m[shown], behind_m[shown], rtol=1e-3)
+    assert np.abs(hidden[shown].astype(int) - behind[shown]).mean() < 1.0
+    gap = np.where(hidden_m > 0, 1 / depth_m - 1 / np.maximum(hidden_m, 1e-9), 1.0)
+    assert gap.min() >= LEAST_GAP_DPT - 1e-6
+    np.testing.assert_array_equal(seen[0][0], behind)  # peeling leaves no trace
+
+
+def _is_near(batch):
+    return -batch.vertices_m[:, 2].min() < 1.0
+
+
+def test_hidden_pixels_are_the_samples_that_show_something():
+    shows = np.array([[True, True], [False, False]])
+    color = np.zeros((2, 2, 3), np.uint8)
+    color[0, 0], color[0, 1], color[1] = 255, 188, 7
+    depth_m = np.array([[9.0, 5.0], [1.0, 1.0]], np.float32)
+    seen_m = np.array([[2.0]], np.float32)
+    mean, picked_m = _hidden_pixels(color, depth_m, shows, seen_m, 2)
+    assert (mean == 225).all()  # 0.75 in linear light, of 1 and 0.5
+    assert picked_m == 5.0
+    for nearest_m, none in ((5.0, shows), (2.0, ~shows & shows)):
+        seen_m = np.array([[nearest_m]], np.float32)
+        _, picked_m = _hidden_pixels(color, depth_m, none, seen_m, 2)
+        assert picked_m == 0.0
 
 
 def test_unknown_scene_is_refused_with_the_known_ones():

@@ -120,12 +120,18 @@ def gathered(state, view, rule):
             weights[n, c] = wide[r : r + height, r : r + width]
     for y, x, c in np.ndindex(height, width, 3):
         light, coverage = 0.0, 0.0
-        for n in order:
-            weight = float(weights[n, c, y, x])
-            room = 1.0 - coverage
-            weight = weight * room if rule == "paper" else min(weight, room)
-            light += weight * sources.color[n, c]
-            coverage += weight
+        # The four distances of the test blur more than 1 px apart: four depths.
+        for distance_dpt in np.unique(sources.distance_dpt)[::-1]:
+            here = [n for n in order if sources.distance_dpt[n] == distance_dpt]
+            own = weights[here, c, y, x].astype(float)
+            if rule == "paper":
+                for n, weight in zip(here, own, strict=True):
+                    light += weight * (1.0 - coverage) * sources.color[n, c]
+                    coverage += weight * (1.0 - coverage)
+                continue
+            share = min((1.0 - coverage) / max(own.sum(), 1e-12), 1.0)
+            light += share * (own @ sources.color[here, c])
+            coverage += share * own.sum()
         out[y, x, c] = light / coverage
     return out
 
@@ -135,7 +141,7 @@ def test_surfaces_in_front_of_each_other_equal_a_sorted_gather(rng, rule):
     size = (20, 14)
     state = eye_state("emmetropia", tangents_of(10, 14, 5, 8), size=size)
     color = rng.random((size[1], size[0], 3))
-    distance_dpt = rng.choice([0.25, 0.5, 1.5, 2.0], size=color.shape[:2])
+    distance_dpt = rng.choice([0.25, 2.0, 4.0, 6.0], size=color.shape[:2])
     view = radial_view(state, color, distance_dpt)
     seen = dense_reference(view, state, bins=False, accumulation=rule, kept=False)
     assert np.allclose(seen, gathered(state, view, rule), atol=1e-6)

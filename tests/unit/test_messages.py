@@ -121,6 +121,51 @@ def reversed_images(dtype):
     return images.color[::-1], np.ascontiguousarray(images.depth_m[::-1])
 
 
+def hidden_frame(dtype=np.uint8):
+    """Two views, of which the first has a hidden layer."""
+    color = SRGB8 if dtype == np.uint8 else LINEAR
+    seen, behind = view_images(dtype), ViewImages(*reversed_images(dtype))
+    layered = ViewImages(seen.color, seen.depth_m, behind.color, behind.depth_m)
+    views = (ViewHeader(CAMERA, color, has_hidden=True), ViewHeader(CAMERA, color))
+    return frame(views=views, images=(layered, seen))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_hidden_layer_arrives_with_the_view_that_it_belongs_to(dtype):
+    sent = hidden_frame(dtype)
+    received = decode_request(as_bytes(encode(sent)))
+    assert received == sent
+    first, second = received.images
+    for name in ("color", "depth_m", "hidden_color", "hidden_depth_m"):
+        np.testing.assert_array_equal(
+            getattr(first, name), getattr(sent.images[0], name)
+        )
+    assert second.hidden_color is None and second.hidden_depth_m is None
+    np.testing.assert_array_equal(second.color, sent.images[1].color)
+
+
+@pytest.mark.parametrize(
+    ("part", "n_bytes", "field"),
+    [
+        (3, 35, "views[0].hidden_color"),
+        (4, 52, "views[0].hidden_depth"),
+        (5, 35, "views[1].color"),
+    ],
+)
+def test_a_hidden_part_of_the_wrong_size_is_named(part, n_bytes, field):
+    parts = as_bytes(encode(hidden_frame()))
+    parts[part] = bytes(n_bytes)
+    assert refusal(parts).field == field
+
+
+def test_a_view_that_lacks_its_hidden_layer_is_refused():
+    sent = hidden_frame()
+    assert refusal(as_bytes(encode(sent))[:-2]).field == "parts"
+    lacking = (sent.images[1], sent.images[1])
+    with pytest.raises(ValueError, match="no hidden layer"):
+        encode(frame(views=sent.views, images=lacking))
+
+
 def test_a_result_carries_its_images_and_stage_times():
     color = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     sent = messages.Result(
@@ -210,6 +255,8 @@ def refusal(parts, error=errors.BadMessage):
         ),
         ({"views": [view_map(color=None)]}, "views[0].color"),
         ({"views": [view_map(depth={"kind": "log"})]}, "views[0].depth.kind"),
+        ({"views": [view_map(has_hidden="yes")]}, "views[0].has_hidden"),
+        ({"views": [view_map(has_hidden=True)]}, "parts"),
         ({"output": {"dtype": "uint16", "space": "srgb"}}, "output.dtype"),
         ({"options": {"accumulation": "sum"}}, "options.accumulation"),
         ({"options": {"merge": 1}}, "options.merge"),

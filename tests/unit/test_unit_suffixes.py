@@ -16,6 +16,7 @@ DIMENSIONLESS = {
     "flat_kernels": "shares of light, kernels one behind the other",
     "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",
+    "hidden_color": "as color",
     "pupil_ellipse": "centre and semi-axes in mm, angle in rad",
     "corners": "node numbers and weights",
     "tangents": "of the angles to the image edges",

@@ -1,0 +1,109 @@
+"""The surface behind the one that is seen, by depth peeling with pyrender.
+
+A scene is rendered a second time with a shader that leaves out what lies less than
+`LEAST_GAP_DPT` behind the first picture.  pyrender has no place for that, so its cache
+of programs is exchanged while the second picture is made.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from OpenGL import GL
+
+from clients.pyrender_setup import pyrender
+
+LEAST_GAP_DPT = 0.05
+"""What lies closer behind the surface that is seen would look as sharp as it."""
+
+_SHADER = Path(__file__).parent / "assets" / "hidden_surface.frag"
+_UNIT = 15
+"""Texture unit that pyrender, which counts from 0, does not come to."""
+
+
+class HiddenSurface:
+    """Renders what is behind a first picture, in that picture's context.
+
+    Parameters
+    ----------
+    renderer : pyrender.OffscreenRenderer
+    depth_range_m : near and far plane of its camera
+    """
+
+    def __init__(
+        self,
+        renderer: "pyrender.OffscreenRenderer",
+        depth_range_m: tuple[float, float],
+    ):
+        self._renderer = renderer
+        self._programs = _Programs(depth_range_m)
+
+    def render(
+        self, world: "pyrender.Scene", flags: int, seen_m: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return colour (h, w, 3) and planar depth (h, w) of what is behind.
+
+        Parameters
+        ----------
+        seen_m : (h, w)
+            Depth of the first picture, of the same pose, just rendered; 0 where there
+            is nothing.
+
+        Returns
+        -------
+        depth_m : 0 where nothing is behind
+        """
+        seen_per_m = np.zeros_like(seen_m)
+        np.divide(1.0, seen_m, out=seen_per_m, where=seen_m > 0)
+        texture = _upload(seen_per_m[::-1])
+        inner = self._renderer._renderer
+        own, inner._program_cache = inner._program_cache, self._programs
+        try:
+            return self._renderer.render(world, flags)
+        finally:
+            inner._program_cache = own
+            GL.glDeleteTextures([texture])
+
+    def close(self) -> None:
+        """Free the programs; the renderer's context must still live."""
+        self._renderer._platform.make_current()
+        self._programs.clear()
+
+
+def _upload(values: NDArray[np.float32]) -> int:
+    """Bind values (h, w), bottom row first, as a texture of their own."""
+    texture = GL.glGenTextures(1)
+    GL.glActiveTexture(GL.GL_TEXTURE0 + _UNIT)
+    GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
+    for name in (GL.GL_TEXTURE_MIN_FILTER, GL.GL_TEXTURE_MAG_FILTER):
+        GL.glTexParameteri(GL.GL_TEXTURE_2D, name, GL.GL_NEAREST)
+    height, width = values.shape
+    GL.glTexImage2D(
+        *(GL.GL_TEXTURE_2D, 0, GL.GL_R32F, width, height, 0),
+        *(GL.GL_RED, GL.GL_FLOAT, np.ascontiguousarray(values)),
+    )
+    GL.glActiveTexture(GL.GL_TEXTURE0)
+    return texture
+
+
+class _Programs(pyrender.shader_program.ShaderProgramCache):
+    """pyrender's programs with another fragment shader."""
+
+    def __init__(self, depth_range_m: tuple[float, float]):
+        super().__init__()
+        self._depth_range_m = np.array(depth_range_m)
+
+    def get_program(self, vertex_shader, fragment_shader, *others, **options):
+        """Return the program for one kind of mesh; it sets its own uniforms."""
+        program = super().get_program(vertex_shader, str(_SHADER), *others, **options)
+        if "_bind" not in vars(program):
+            bind = program._bind
+
+            def bind_and_set():
+                bind()
+                program.set_uniform("seen_per_m", _UNIT)
+                program.set_uniform("least_gap_dpt", LEAST_GAP_DPT)
+                program.set_uniform("depth_range_m", self._depth_range_m)
+
+            program._bind = bind_and_set
+        return program
