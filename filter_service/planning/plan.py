@@ -49,6 +49,16 @@ USE_SAMPLES = 96
 """States at which errors are predicted."""
 
 
+MAX_FIELD_STEP_DPT = 1.5
+"""Change of defocus to the next field node that a node's range follows.  Only where an
+eye hardly sees, as at the edge of a cataract, is it more; there the nodes' own ranges
+end the blend at equal blur, and far objects are read a little nearer."""
+
+
+_WIDE_RATIO = 0.6
+"""Of the largest blur: nodes with more keep to their own range."""
+
+
 class PlanTooLarge(ValueError):
     """A cache would need more memory than its budget.
 
@@ -224,6 +234,14 @@ def _neighbours(index: int, count: int) -> list[int]:
     return list(range(max(index - 1, 0), min(index + 2, count)))
 
 
+def _largest_defocus_dpt(spec: GridSpec, axes: _Axes) -> NDArray[np.float64]:
+    """Defocus (n_v, n_h, n_pupils, 1) whose blur is as large as kernels may be."""
+    scale = spec.node_pixel_from_mrad(axes.h_deg, axes.v_deg[:, None])
+    px_per_mrad = np.linalg.norm(scale, ord=2, axis=(-2, -1))[..., None]
+    blur_px_per_dpt = px_per_mrad * axes.pupils_mm / 2.0
+    return (spec.max_blur_radius_px / blur_px_per_dpt)[..., None]
+
+
 def _over_neighbours(values: NDArray, axis: int, extreme) -> NDArray:
     """Extreme over a node and those beside it along an axis."""
     count = values.shape[axis]
@@ -254,9 +272,15 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
         beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
         lows = np.stack([lows[..., j].min(axis=-1) for j in beside], axis=-1)
         highs = np.stack([highs[..., j].max(axis=-1) for j in beside], axis=-1)
-    for axis in (0, 1):  # nodes are read at the defocus of the field between them
-        lows = _over_neighbours(lows, axis, np.min)
-        highs = _over_neighbours(highs, axis, np.max)
+    if spec.blends_at_equal_blur:  # nodes are read at the defocus between them
+        own_lows, own_highs = lows, highs
+        for axis in (0, 1):
+            lows = _over_neighbours(lows, axis, np.min)
+            highs = _over_neighbours(highs, axis, np.max)
+        lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
+        highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
+        wide = np.abs(own_lows) > _WIDE_RATIO * _largest_defocus_dpt(spec, axes)
+        lows = np.where(wide, own_lows, lows)
     near_far = np.stack(
         [lows + spec.object_range_dpt[0], highs + spec.object_range_dpt[1]], axis=-1
     )
