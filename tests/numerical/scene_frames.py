@@ -4,6 +4,7 @@ pyrender ends the EGL display when it closes, and with it any other context of t
 process; the service and its clients never share one.
 """
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -15,15 +16,20 @@ import numpy as np
 from filter_service.rendering.frame import View
 
 _SCRIPT = """
+import json
 import sys
 import numpy as np
-from clients.scene_renderer import scene_frames
+from clients.scene_renderer import SceneRenderer
 from clients.scenes import courtyard, primitives
-name, width, height, count, index, out = sys.argv[1:]
+from clients.scenes.paths import PATHS, Key, path_moments
+name, width, height, count, first, end, keys, out = sys.argv[1:]
 scene = {"courtyard": courtyard, "primitives": primitives}[name].build()
-frames = scene_frames(scene, None, int(count), (int(width), int(height)))
-frame = list(frames)[int(index)]
-np.savez(out, color=frame.color, depth_m=frame.depth_m, tangents=frame.tangents)
+path = [Key(*key) for key in json.loads(keys)] or PATHS[name]
+moments = path_moments(path, int(count))[int(first) : int(end)]
+with SceneRenderer(scene, (int(width), int(height))) as renderer:
+    colors, depths = zip(*(renderer.render(moment.pose) for moment in moments))
+    tangents = renderer.tangents
+np.savez(out, color=np.stack(colors), depth_m=np.stack(depths), tangents=tangents)
 """
 
 SCENES = ("courtyard", "primitives")
@@ -32,16 +38,45 @@ SCENES = ("courtyard", "primitives")
 @cache
 def scene_view(name: str, *, width_px: int, height_px: int) -> View:
     """Middle frame of a scene's own camera path."""
+    return _rendered(name, width_px, height_px, 5, 2, 3)[0]
+
+
+@cache
+def scene_views(
+    name: str,
+    *,
+    width_px: int,
+    height_px: int,
+    count: int,
+    path: tuple = (),
+    first: int = 0,
+    end: int | None = None,
+) -> tuple[View, ...]:
+    """Frames of a camera path, the scene's own where it is empty.
+
+    Parameters
+    ----------
+    path : tuple
+        Arguments of `clients.scenes.paths.Key`.
+    count, first, end : int
+        Frames of the whole path, and which of them.
+    """
+    end = count if end is None else end
+    return _rendered(name, width_px, height_px, count, first, end, path)
+
+
+def _rendered(name, width_px, height_px, count, first, end, path=()) -> tuple:
     root = Path(__file__).parents[2]
+    numbers = [str(n) for n in (width_px, height_px, count, first, end)]
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "frame.npz"
-        arguments = [name, str(width_px), str(height_px), "5", "2", str(out)]
+        out = Path(folder) / "frames.npz"
+        arguments = [name, *numbers, json.dumps(path), str(out)]
         subprocess.run(
             [sys.executable, "-c", _SCRIPT, *arguments], check=True, cwd=root
         )
         with np.load(out) as data:
-            return View(
-                data["color"],
-                data["depth_m"],
-                tuple(float(t) for t in data["tangents"]),
+            tangents = tuple(float(t) for t in data["tangents"])
+            return tuple(
+                View(color, depth_m, tangents)
+                for color, depth_m in zip(data["color"], data["depth_m"], strict=True)
             )
