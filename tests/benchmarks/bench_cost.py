@@ -15,6 +15,7 @@ follows most closely says what bounds it.
 import argparse
 import json
 import math
+import sys
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from scipy.signal import fftconvolve
 
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.profiles import parse_profile
-from filter_service.constants import THREADS
+from filter_service.constants import THREADS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.build import build_psf_store
@@ -37,7 +38,6 @@ from tests.benchmarks.field_pictures import plot_costs
 from tests.benchmarks.harness import (
     RESULTS,
     machine_info,
-    print_rows,
     report,
     write_report,
 )
@@ -64,7 +64,10 @@ QUICK = {"radii": (2, 4, 8), "size": (320, 180), "sizes": ((160, 90), (320, 180)
 BUDGET_MS = 1500.0
 MAX_REPEATS = 7
 
-MERGING = {"merged": True, "unmerged": False}
+MAX_EVALUATIONS = 5e9
+"""More are not measured without merging: half a minute a frame on two cores."""
+
+MERGING = {"unmerged": False, "merged": True}
 
 SEED = 7
 OCTAVES_PX = (2, 4, 8, 16, 32, 64)
@@ -185,18 +188,23 @@ def _convolved(color: NDArray, kernels: list[NDArray]) -> NDArray[np.float64]:
 
 
 def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[CostRow]:
-    """Rows of one frame, merged and unmerged."""
+    """Rows of one frame, unmerged (unless that takes too long) and merged."""
     truth = case.truth()
+    view = case.view
+    pixel_count = view.width_px * view.height_px
+    reach_px = 2.0 * radius_px + TILE_SIZE_PX
+    methods = list(MERGING)
+    if pixel_count * reach_px**2 > MAX_EVALUATIONS:
+        methods.remove("unmerged")
     rows, pictures = [], {}
-    for method in reversed(MERGING):  # the merged frame is compared with the other
+    for method in methods:
         frames = _frames(case, MERGING[method])
         last = frames[-1]
         pictures[method] = last.color.astype(np.float64)
         merging_db = None
-        if method == "merged":
+        if method == "merged" and "unmerged" in pictures:
             merging_db = channel_psnr_db(pictures["merged"], pictures["unmerged"])
         totals_ms = [sum(frame.stage_times_ms.values()) for frame in frames]
-        view = case.view
         rows.append(
             CostRow(
                 bench="cost",
@@ -212,9 +220,9 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
                 reference=case.reference_name,
                 sweep=sweep,
                 radius_px=radius_px,
-                pixel_count=view.width_px * view.height_px,
+                pixel_count=pixel_count,
                 fragment_count=last.fragment_count,
-                merged_ratio=last.merged_count / (view.width_px * view.height_px),
+                merged_ratio=last.merged_count / pixel_count,
                 entry_count=last.entry_count,
                 evaluation_count=last.entry_count * THREADS,
                 kernel_count=last.kernel_count,
@@ -224,21 +232,21 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
                 stage_ms=_stages(frames),
             )
         )
+        print(_work(rows[-1]), file=sys.stderr, flush=True)
     case.handle.release()
     return rows
 
 
 def _frames(case: CostBench, merge: bool) -> list:
-    """Frames after one that compiles; the kernels are made anew for each."""
-    frames = []
-    budget_ms = BUDGET_MS
-    while len(frames) < 2 or (budget_ms > 0.0 and len(frames) <= MAX_REPEATS):
+    """Frames whose kernels are made anew; the first compiles, unless it is all."""
+    frames, budget_ms = [], BUDGET_MS
+    while budget_ms > 0.0 and len(frames) <= MAX_REPEATS:
         frame = FilterRenderer(case.gpu).render(
             case.view, case.handle, **case.state, merge=merge
         )
         frames.append(frame)
         budget_ms -= sum(frame.stage_times_ms.values())
-    return frames[1:]
+    return frames[1:] or frames
 
 
 def _stages(frames: list) -> dict[str, float]:
@@ -323,8 +331,7 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(content))
     else:
-        print_rows(rows)
-        print_work(rows)
+        print(*map(_work, rows), sep="\n")
         print_laws(content)
     if arguments.plot:
         plot_costs(rows, RESULTS / "cost.png")
@@ -332,15 +339,15 @@ def main() -> None:
         write_report("cost", content)
 
 
-def print_work(rows: list[CostRow]) -> None:
+def _work(row: CostRow) -> str:
     """What there was to do, and what merging cost."""
-    for row in rows:
-        merging = "" if row.merging_db is None else f", merging {row.merging_db:.1f} dB"
-        print(
-            f"{row.case:<20}{row.method:<10}{row.setting:<18}"
-            f"{row.evaluation_count:.3g} evaluations, {row.kernel_count} kernels of "
-            f"{row.layer_count} layers, {row.merged_ratio:.0%} merged{merging}"
-        )
+    merging = "" if row.merging_db is None else f", merging {row.merging_db:.1f} dB"
+    return (
+        f"{row.case:<20}{row.method:<10}{row.setting:<18}{row.median_ms:9.1f} ms "
+        f"{row.error:5.1f} dB, {row.evaluation_count:.3g} evaluations, "
+        f"{row.kernel_count} kernels of {row.layer_count} layers, "
+        f"{row.merged_ratio:.0%} merged{merging}"
+    )
 
 
 def print_laws(content: dict) -> None:

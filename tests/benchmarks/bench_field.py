@@ -9,7 +9,8 @@ the axis for all eyes, whose reference is quick, and all methods for two eyes.  
 reference of methods on the axis has the PSF of the axis everywhere; that of the others
 follows the visual field.  Methods that take any pupil and focus are also measured at
 random ones, others for each eye, scene and size, so nearly always between nodes.  Time
-is a frame's; preparation for an eye stands beside it, and so do the paper's figures.
+is a frame's, that of the renderer with the kernels that the frame before left it;
+preparation for an eye stands beside it, and so do the paper's figures.
 
 References are kept under out/dense_references; rows are kept as they come, and
 ``--resume`` goes on where a run of the same commit was cut off.

@@ -36,6 +36,10 @@ frame would take an hour a path."""
 HALO_PX = 14
 """Sources around a window that may reach it."""
 
+VISIBLE_RMS = 1e-3
+"""Change in parts of white, a quarter of an 8-bit step at mid-grey, below which nobody
+could see a jump."""
+
 NEIGHBOURS = 4
 """Frames to both sides that a jump is compared with."""
 
@@ -107,11 +111,11 @@ def eye_spec(view: View, mode: str, **settings) -> GridSpec:
 def truth(eye: str, moment: Moment, mode: str) -> list[NDArray[np.float64]]:
     """Exact pictures of the parts that are compared (`compared`)."""
     if mode == "on-axis":
-        return [dense_reference(moment.view, _exact(eye, moment, mode), bins=True)]
+        return [dense_reference(moment.view, exact_state(eye, moment, mode), bins=True)]
     pictures = []
     for window in WINDOWS:
-        part, inner = _cropped(moment.view, window)
-        state = _exact(eye, replace(moment, view=part), mode)
+        part, inner = cropped(moment.view, window)
+        state = exact_state(eye, replace(moment, view=part), mode)
         pictures.append(dense_reference(part, state, bins=False)[inner])
     return pictures
 
@@ -124,7 +128,7 @@ def compared(picture: NDArray, mode: str) -> list[NDArray[np.float64]]:
     return [picture[window] for window in WINDOWS]
 
 
-def _exact(eye: str, moment: Moment, mode: str) -> EyeState:
+def exact_state(eye: str, moment: Moment, mode: str) -> EyeState:
     spec = eye_spec(
         moment.view,
         "on-axis" if mode == "on-axis" else "quality",
@@ -135,7 +139,7 @@ def _exact(eye: str, moment: Moment, mode: str) -> EyeState:
     return EyeState(traced_eye(eye, spec), spec, moment.pupil_mm, moment.focus_dpt)
 
 
-def _cropped(view: View, window: tuple[slice, slice]) -> tuple[View, tuple]:
+def cropped(view: View, window: tuple[slice, slice]) -> tuple[View, tuple]:
     """A window with its halo as a view of its own, and the window within it."""
     sizes = (view.height_px, view.width_px)
     rows, columns = (
@@ -183,26 +187,38 @@ class Flicker:
     @property
     def flicker_db(self) -> float:
         """Largest change over the path, as -20 log10."""
-        return _db(self.step_rms.max())
+        return decibels(self.step_rms.max())
 
     @property
     def error_db(self) -> float:
         """PSNR of the worst frame."""
-        return _db(self.error_rms.max())
+        return decibels(self.error_rms.max())
 
-    @property
-    def pops(self) -> NDArray[np.float64]:
-        """Each change over the median of its neighbours' (n - 1,)."""
+    def jumps(self, least_rms: float = 1e-9) -> NDArray[np.float64]:
+        """Each change over the median of its neighbours' (n - 1,).
+
+        Parameters
+        ----------
+        least_rms : float
+            Smaller medians count as this.
+        """
         ratios = np.ones(self.step_rms.size)
         for t, step in enumerate(self.step_rms):
             around = np.r_[max(t - NEIGHBOURS, 0) : t, t + 1 : t + NEIGHBOURS + 1]
             around = around[around < self.step_rms.size]
             if around.size:
-                ratios[t] = step / max(float(np.median(self.step_rms[around])), 1e-6)
+                usual = max(float(np.median(self.step_rms[around])), least_rms)
+                ratios[t] = step / usual
         return ratios
 
+    @property
+    def popping_ratio(self) -> float:
+        """Largest jump among changes that could be seen."""
+        return float(self.jumps(VISIBLE_RMS).max())
 
-def _db(rms: float) -> float:
+
+def decibels(rms: float) -> float:
+    """RMS in parts of white as dB below it."""
     return float(-20.0 * np.log10(max(rms, 1e-15)))
 
 
