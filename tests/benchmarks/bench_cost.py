@@ -1,6 +1,7 @@
 """What a frame costs: against blur radius, resolution and number of kernels.
 
     python -m tests.benchmarks.bench_cost [--quick] [--json] [--plot]
+        [--sweeps NAME ...]
 
 An eye of -6 dpt with a pupil of 7 mm looks at infinity: its blur is 21 mrad, and the
 camera's pixels are as large as the radius in px asks for.  Frames are a textured plane
@@ -32,10 +33,11 @@ from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
 from filter_service.rendering.frame import View
 from filter_service.rendering.renderer import FilterRenderer
-from tests.benchmarks.cost_law import CostRow, bounds, laws
+from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
 from tests.benchmarks.dense_reference import EyeState, dense_reference, linear_color
 from tests.benchmarks.field_pictures import plot_costs
 from tests.benchmarks.harness import (
+    OUT,
     RESULTS,
     machine_info,
     report,
@@ -57,9 +59,14 @@ FIXED_RADIUS_PX = 8
 VERTICAL_FOV_DEG = 50.0
 BLUR_STEPS_PX = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 STEPS_RADIUS_PX = 16
+LAYERS_NEARER = np.float32(4.0)
+"""*Courtyard* this much nearer has blur from hardly any to `STEPS_RADIUS_PX`."""
+
 FIELD_EYE, FIELD_PUPIL_MM, FIELD_FOCUS_DPT = "keratoconus", 5.0, 0.5
 FIELD_MODES = ("on-axis", "dynamic", "quality")
 QUICK = {"radii": (2, 4, 8), "size": (320, 180), "sizes": ((160, 90), (320, 180))}
+
+SWEEPS = tuple(AGAINST)
 
 BUDGET_MS = 1500.0
 MAX_REPEATS = 7
@@ -292,6 +299,7 @@ def kernel_rows(renderer, gpu, size, steps_px, modes) -> list[CostRow]:
     """Kernels by layers (finer blur steps) and by cells (over the field)."""
     rows = []
     view = courtyard_view(*size, BLUR_MRAD / STEPS_RADIUS_PX)
+    view = replace(view, depth_m=view.depth_m / LAYERS_NEARER)
     for step_px in steps_px:
         case = CostBench(renderer, gpu, view, max_blur_step_px=step_px)
         rows += bench(case, "kernels", "courtyard, layers", float(STEPS_RADIUS_PX))
@@ -307,22 +315,22 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="320x180, up to 8 px")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--plot", action="store_true", help="results/cost.png")
+    parser.add_argument("--sweeps", nargs="+", choices=SWEEPS, default=SWEEPS)
     arguments = parser.parse_args()
+    is_whole = arguments.sweeps == SWEEPS and not arguments.quick
     quick = arguments.quick
     gpu = Gpu()
     renderer = FilterRenderer(gpu)
     size = QUICK["size"] if quick else SIZE
-    rows = [
-        *radius_rows(renderer, gpu, QUICK["radii"] if quick else RADII_PX, size),
-        *resolution_rows(renderer, gpu, QUICK["sizes"] if quick else SIZES),
-        *kernel_rows(
-            renderer,
-            gpu,
-            size,
-            BLUR_STEPS_PX[1:4] if quick else BLUR_STEPS_PX,
-            FIELD_MODES[:2] if quick else FIELD_MODES,
-        ),
-    ]
+    rows = []
+    if "radius" in arguments.sweeps:
+        rows += radius_rows(renderer, gpu, QUICK["radii"] if quick else RADII_PX, size)
+    if "resolution" in arguments.sweeps:
+        rows += resolution_rows(renderer, gpu, QUICK["sizes"] if quick else SIZES)
+    if "kernels" in arguments.sweeps:
+        steps_px = BLUR_STEPS_PX[::2] if quick else BLUR_STEPS_PX
+        modes = FIELD_MODES[:2] if quick else FIELD_MODES
+        rows += kernel_rows(renderer, gpu, size, steps_px, modes)
     content = report(
         rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
     )
@@ -334,8 +342,8 @@ def main() -> None:
         print(*map(_work, rows), sep="\n")
         print_laws(content)
     if arguments.plot:
-        plot_costs(rows, RESULTS / "cost.png")
-    if not quick:
+        plot_costs(rows, (RESULTS if is_whole else OUT) / "cost.png")
+    if is_whole:
         write_report("cost", content)
 
 

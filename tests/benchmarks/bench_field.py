@@ -37,8 +37,8 @@ from tests.benchmarks.field_methods import (
 )
 from tests.benchmarks.field_pictures import plot_errors, write_differences
 from tests.benchmarks.harness import (
+    OUT,
     RESULTS,
-    ROOT,
     Row,
     commit_id,
     machine_info,
@@ -66,7 +66,7 @@ TARGETS_DB = {
 }
 """Linear PSNR that no row of a method may miss."""
 
-KEPT = ROOT / "out" / "field_rows.jsonl"
+KEPT = OUT / "field_rows.jsonl"
 
 
 @dataclass(frozen=True)
@@ -375,11 +375,11 @@ def main() -> None:
     else:
         print(HEADER, *map(_line, rows), sep="\n")
         print_targets(targets)
+    is_whole = _parts(arguments) == list(PARTS) and not arguments.methods
     if arguments.plot:
-        plot_errors(rows, RESULTS / "field.png")
-    if not arguments.quick and _parts(arguments) == list(PARTS):
-        if not arguments.methods:
-            write_report("field", content)
+        plot_errors(rows, (RESULTS if is_whole else OUT) / "field.png")
+    if is_whole:
+        write_report("field", content)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build import build_psf_store
 from filter_service.rendering.renderer import FilterRenderer
 from tests.benchmarks.harness import (
+    OUT,
     RESULTS,
     Row,
     machine_info,
@@ -56,6 +57,9 @@ FOCUSING_EYES = {"on-axis": "emmetropia", "dynamic": "post_lasik"}
 accommodates to most of the path of the focus."""
 
 QUICK_FRAMES = (50, 56)
+
+STILL_DB = 100.0
+"""Plots end here."""
 
 MIN_FLICKER_DB = {"on-axis": 52.0, "dynamic": 45.0}
 MAX_POPPING_RATIO = 2.0
@@ -256,7 +260,8 @@ def plot(rows: list[SequenceRow], file: Path) -> None:
     for panel, (case, setting) in zip(np.ravel(axes), panels, strict=True):
         for row in rows:
             if (row.case, row.setting) == (case, setting):
-                panel.plot(row.flicker_db, label=row.method)
+                shown_db = np.minimum(row.flicker_db, STILL_DB)
+                panel.plot(shown_db, label=row.method)
         panel.set(title=f"{case}, {setting}", ylabel="flicker, dB below white")
         panel.grid(alpha=0.3)
     np.ravel(axes)[0].legend(fontsize="x-small")
@@ -297,10 +302,11 @@ def main() -> None:
         print(json.dumps(content))
     else:
         print(*map(_line, rows), sep="\n")
-    if arguments.plot:
-        plot(rows, RESULTS / "sequence.png")
     is_whole = (arguments.motions, arguments.modes) == (MOTIONS, MODES)
-    if is_whole and not (arguments.quick or arguments.methods):
+    is_whole = is_whole and not (arguments.quick or arguments.methods)
+    if arguments.plot:
+        plot(rows, (RESULTS if is_whole else OUT) / "sequence.png")
+    if is_whole:
         write_report("sequence", content)
 
 
