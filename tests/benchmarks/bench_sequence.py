@@ -19,7 +19,7 @@ import inspect
 import json
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -137,7 +137,7 @@ class SequenceBench:
 
     def frames(self, moments: tuple[Moment, ...], variant: Variant, gaze: bool) -> list:
         """Frames of a path with their times, ms."""
-        handle = self._store(moments[0], variant, gaze)
+        handle = self._store(moments, variant, gaze)
         renderer = FilterRenderer(self.gpu)
         frames = []
         for moment in moments:
@@ -156,13 +156,20 @@ class SequenceBench:
             frames.append((frame.color, 1e3 * (time.perf_counter() - start_s)))
         return frames
 
-    def _store(self, moment: Moment, variant: Variant, gaze: bool):
-        key = (variant.mode, variant.settings, gaze)
+    def _store(self, moments: tuple[Moment, ...], variant: Variant, gaze: bool):
+        """Store for all pupils and foci of the paths, or the finest for this one's."""
+        settings = dict(variant.settings)
+        if gaze or variant.mode:
+            settings |= {
+                "pupil_range_mm": _range([moment.pupil_mm for moment in moments]),
+                "focus_range_dpt": _range([moment.focus_dpt for moment in moments]),
+            }
+        if gaze:
+            settings["gaze_range_deg"] = GAZE_RANGE_DEG
+        mode = variant.mode or self.mode
+        key = (mode, *settings.items())
         if key not in self._stores:
-            mode = variant.mode or self.mode
-            spec = eye_spec(moment.view, mode, **dict(variant.settings))
-            if gaze:
-                spec = replace(spec, gaze_range_deg=GAZE_RANGE_DEG)
+            spec = eye_spec(moments[0].view, mode, **settings)
             store = build_psf_store(traced_eye(self.eye, spec), spec)
             self._stores[key] = FilterRenderer(self.gpu).load(store)
         return self._stores[key]
@@ -172,6 +179,10 @@ class SequenceBench:
         for handle in self._stores.values():
             handle.release()
         self._stores.clear()
+
+
+def _range(values: list[float]) -> tuple[float, float]:
+    return min(values), max(values)
 
 
 def variants_of(mode: str) -> dict[str, Variant]:
