@@ -10,8 +10,9 @@ Flicker is the RMS of the change of the error from one frame to the next; its wo
 frame is given in dB below white, with the 99.9th percentile of its pixels.  Popping is
 the largest change over the median of its neighbours'.
 
-The same path is rendered without merging, with finer layers, with smaller cells and
-with kernels made anew for every frame: what a change removes is its mechanism's share.
+The same path is rendered with kernels made anew for every frame, without merging, and
+then with finer layers, finer nodes of the cache and smaller cells one after the other:
+what a change removes is its mechanism's share.
 """
 
 import argparse
@@ -89,14 +90,14 @@ class Variant:
 
 
 FINE_LAYERS = (("max_blur_step_px", 0.125),)
+FINE_NODES = (*FINE_LAYERS, ("tolerance", "fine"))
 VARIANTS = {
     "ours": Variant(),
     "fresh kernels": Variant(is_fresh=True),
     "unmerged": Variant(merge=False),
     "unmerged, fine layers": Variant(merge=False, settings=FINE_LAYERS),
-    "unmerged, fine cells": Variant(
-        merge=False, mode="quality", settings=(*FINE_LAYERS, ("tolerance", "fine"))
-    ),
+    "unmerged, fine nodes": Variant(merge=False, mode="dynamic", settings=FINE_NODES),
+    "unmerged, fine cells": Variant(merge=False, mode="quality", settings=FINE_NODES),
 }
 
 

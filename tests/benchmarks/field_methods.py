@@ -200,12 +200,14 @@ class Baseline(Method):
         return [self.function(view, at, **dict(self.options))]
 
 
+QUALITY_WIDE = "ours quality wide"
 PAPER_RULE = (("paper_rule", True),)
 
 OURS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
     Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
     Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
+    Ours(QUALITY_WIDE, on_axis=False, any_state=True, mode="quality"),
     Ours("ours dynamic", on_axis=False, any_state=True),
     Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
 )

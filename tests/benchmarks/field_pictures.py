@@ -88,7 +88,11 @@ def plot_costs(rows: list, path: Path) -> None:
 
     sweeps = list(dict.fromkeys(row.sweep for row in rows))
     figure, panels = pyplot.subplots(
-        2, len(sweeps), figsize=(5 * len(sweeps), 8), layout="constrained"
+        2,
+        len(sweeps),
+        figsize=(5 * len(sweeps), 8),
+        layout="constrained",
+        squeeze=False,
     )
     for column, sweep in enumerate(sweeps):
         own = [row for row in rows if row.sweep == sweep]

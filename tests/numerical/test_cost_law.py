@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from filter_service.constants import THREADS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.renderer import FilterRenderer
 from tests.benchmarks.bench_cost import BLUR_MRAD, CostBench, bench, plane_view
 from tests.benchmarks.cost_law import CostRow, bounds, exponent, laws
+from tests.benchmarks.field_pictures import plot_costs
 
 SIZE = (96, 64)
 
@@ -76,6 +78,12 @@ def test_a_pass_is_bound_by_the_unit_it_follows():
     assert found["splat"].ns_per_unit == pytest.approx(2.0, rel=0.06)
     assert found["fragments"].unit == "pixel"
     assert found["fragments"].spread_ratio == pytest.approx(1.0)
+
+
+def test_one_sweep_is_enough_for_a_plot(tmp_path):
+    rows = [row(r, r**2, {"splat": r**2}) for r in (2.0, 4.0, 8.0)]
+    plot_costs(rows, tmp_path / "pictures" / "cost.png")
+    assert Image.open(tmp_path / "pictures" / "cost.png").size[0] > 300
 
 
 @pytest.fixture(scope="module")

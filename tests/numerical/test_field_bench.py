@@ -1,9 +1,10 @@
 """The field benchmark's own parts: kept rows, states, targets, published figures."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.benchmarks.bench_field import (
     FieldRow,
@@ -12,7 +13,7 @@ from tests.benchmarks.bench_field import (
     target_rows,
 )
 from tests.benchmarks.field_methods import FOCUS_RANGE_DPT, METHODS, PAPER_RANGES
-from tests.benchmarks.field_pictures import _medians
+from tests.benchmarks.field_pictures import _medians, plot_errors
 from tests.benchmarks.published_figures import CONDITIONS, published
 from tests.numerical.scene_frames import SCENES
 
@@ -102,3 +103,10 @@ def test_the_plot_has_a_point_for_each_size():
     times_ms, errors = _medians(points)
     assert times_ms == [5.0, 30.0]
     assert errors == pytest.approx([0.1, 0.01])
+
+
+def test_the_plot_shows_published_figures_too(tmp_path):
+    theirs = asdict(published("paper on-axis", "myopia", "courtyard"))
+    rows = [ROW, replace(ROW, size="640x360", median_ms=80.0, published=theirs)]
+    plot_errors(rows, tmp_path / "field.png")
+    assert Image.open(tmp_path / "field.png").size[0] > 300
