@@ -83,7 +83,8 @@ def test_a_pass_is_bound_by_the_unit_it_follows():
 def test_one_sweep_is_enough_for_a_plot(tmp_path):
     rows = [row(r, r**2, {"splat": r**2}) for r in (2.0, 4.0, 8.0)]
     plot_costs(rows, tmp_path / "pictures" / "cost.png")
-    assert Image.open(tmp_path / "pictures" / "cost.png").size[0] > 300
+    with Image.open(tmp_path / "pictures" / "cost.png") as picture:
+        assert picture.size[0] > 300
 
 
 @pytest.fixture(scope="module")

@@ -109,4 +109,5 @@ def test_the_plot_shows_published_figures_too(tmp_path):
     theirs = asdict(published("paper on-axis", "myopia", "courtyard"))
     rows = [ROW, replace(ROW, size="640x360", median_ms=80.0, published=theirs)]
     plot_errors(rows, tmp_path / "field.png")
-    assert Image.open(tmp_path / "field.png").size[0] > 300
+    with Image.open(tmp_path / "field.png") as picture:
+        assert picture.size[0] > 300
