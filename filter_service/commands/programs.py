@@ -24,7 +24,10 @@ class Bench(StrEnum):
     BUILD = "build"
     LAYERS = "layers"
     RENDER = "render"
+    FIELD = "field"
     OCCLUSION = "occlusion"
+    SEQUENCE = "sequence"
+    COST = "cost"
     SWITCH = "switch"
     ROUNDTRIP = "roundtrip"
 
@@ -36,7 +39,10 @@ BENCH_MODULES = {
     Bench.BUILD: "tests.benchmarks.bench_psf_build",
     Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
+    Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
+    Bench.SEQUENCE: "tests.benchmarks.bench_sequence",
+    Bench.COST: "tests.benchmarks.bench_cost",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ROUNDTRIP: "clients.latency",
 }

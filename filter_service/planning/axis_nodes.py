@@ -36,6 +36,9 @@ _LADDER = 33
 _STATES_ON_LADDER = 16
 _DEFOCUS_LADDER = 49
 
+_LARGEST_RATIO = 0.9
+"""Of the largest kernel: how far rays may land; diffraction and the rim lie beyond."""
+
 
 def target_error(spec: GridSpec) -> float:
     """Mean square error that interpolation may make in all."""
@@ -97,6 +100,39 @@ def _needed_over_ladder(
     # The mean square error goes with the fourth power of the difference.
     dense = np.mean((difference_px / allowed_px) ** 4, axis=1) ** 0.25
     return np.concatenate([[0.0], np.cumsum(dense + 0.1 * dense.mean() + 1e-12)])
+
+
+def limited_ranges_dpt(
+    eye: Eye, spec: GridSpec, groups: PupilStates, ranges_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Ranges (P, 2) without the defocus whose kernels would be too large.
+
+    A range that holds no kernel small enough stays as it is, to be refused with
+    numbers when it is computed.
+    """
+    lows, highs = ranges_dpt.T
+    columns = vars(groups.taken(np.tile(np.arange(lows.size), 2)))
+    columns["total_defocus_dpt"] = np.concatenate([lows, lows + 1.0])
+    low_px, above_px = np.split(
+        slopes_px(state_frames(eye, spec, PupilStates(**columns))), 2
+    )
+    per_dpt = above_px - low_px
+    # |low + x per|² = limit², ray by ray; all of them must stay within.
+    a = np.maximum((per_dpt**2).sum(axis=-1), 1e-12)
+    half_b = (low_px * per_dpt).sum(axis=-1)
+    limit_px = _LARGEST_RATIO * spec.max_blur_radius_px
+    room = half_b**2 - a * ((low_px**2).sum(axis=-1) - limit_px**2)
+    reach = np.sqrt(np.maximum(room, 0.0))
+    first_dpt = lows + ((-half_b - reach) / a).max(axis=1)
+    last_dpt = lows + ((-half_b + reach) / a).min(axis=1)
+    fits = (room > 0.0).all(axis=1) & (
+        np.maximum(first_dpt, lows) <= np.minimum(last_dpt, highs)
+    )
+    return np.where(
+        fits[:, None],
+        np.stack([np.maximum(first_dpt, lows), np.minimum(last_dpt, highs)], axis=-1),
+        ranges_dpt,
+    )
 
 
 def defocus_groups(

@@ -129,6 +129,8 @@ class CachePlan:
         a node is one defocus for all channels, but in the paper's grids, where it is
         one object distance.
     prediction : PlanPrediction
+    is_limited : (n_groups,)
+        Groups that end where the blur is as large as kernels may be.
     """
 
     h_deg: NDArray[np.float64]
@@ -138,6 +140,7 @@ class CachePlan:
     defocus: RaggedNodes
     channel_shift_dpt: NDArray[np.float64]
     prediction: PlanPrediction
+    is_limited: NDArray[np.bool_]
 
     @property
     def group_shape(self) -> tuple[int, int, int, int]:

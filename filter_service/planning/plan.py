@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import RGB
-from filter_service.planning.axis_nodes import axis_nodes, defocus_groups, target_error
+from filter_service.planning.axis_nodes import (
+    axis_nodes,
+    defocus_groups,
+    limited_ranges_dpt,
+    target_error,
+)
 from filter_service.planning.cost import predicted_cost
 from filter_service.planning.error_law import combined_error, equal_share, psnr_db
 from filter_service.planning.eye import Eye
@@ -53,10 +58,6 @@ MAX_FIELD_STEP_DPT = 1.5
 """Change of defocus to the next field node that a node's range follows.  Only where an
 eye hardly sees, as at the edge of a cataract, is it more; there the nodes' own ranges
 end the blend at equal blur, and far objects are read a little nearer."""
-
-
-_WIDE_RATIO = 0.6
-"""Of the largest blur: nodes with more keep to their own range."""
 
 
 class PlanTooLarge(ValueError):
@@ -114,20 +115,26 @@ def unchecked_plan(
     if target_db is not None:
         allowed_error = 10.0 ** (-target_db / 10.0)
     use = sample_use(eye, spec, USE_SAMPLES)
+    is_limited = None
     if spec.grid == "paper":
         axes = _Axes(*paper_axes(eye, spec))
         defocus, shift_dpt = paper_defocus(eye, spec, tuple(vars(axes).values()))
     else:
         if spec.follows_field:
             axes, left = _field_axes(use, allowed_error)
-            defocus = _field_defocus(eye, spec, axes, left)
+            defocus, is_limited = _field_defocus(eye, spec, axes, left)
         else:
             axes = _central_axes(eye, spec)
             defocus = _central_defocus(eye, spec, axes)
         shift_dpt = np.zeros((len(defocus.starts) - 1, RGB))
-    unpriced = PlanPrediction(0, 0.0, 0.0, 0, 0.0, {})
+    if is_limited is None:
+        is_limited = np.zeros(len(defocus.starts) - 1, bool)
     plan = CachePlan(
-        **vars(axes), defocus=defocus, channel_shift_dpt=shift_dpt, prediction=unpriced
+        **vars(axes),
+        defocus=defocus,
+        channel_shift_dpt=shift_dpt,
+        prediction=PlanPrediction(0, 0.0, 0.0, 0, 0.0, {}),
+        is_limited=is_limited,
     )
     errors = _errors(use, plan)
     prediction = PlanPrediction(
@@ -211,7 +218,8 @@ def _central_defocus(eye: Eye, spec: GridSpec, axes: _Axes) -> RaggedNodes:
 
 def _field_defocus(
     eye: Eye, spec: GridSpec, axes: _Axes, allowed_error: float
-) -> RaggedNodes:
+) -> tuple[RaggedNodes, NDArray[np.bool_]]:
+    """Nodes, and which groups of them end where kernels are as large as they may be."""
     groups = PupilStates.of(
         h_deg=axes.h_deg[:, None, None],
         v_deg=axes.v_deg[:, None, None, None],
@@ -220,26 +228,21 @@ def _field_defocus(
         wavelength_nm=spec.channel_wavelengths_nm[GREEN],
         total_defocus_dpt=0.0,
     )
-    return defocus_groups(
+    ranges_dpt = _readable_ranges_dpt(eye, spec, axes).reshape(-1, 2)
+    limited_dpt = limited_ranges_dpt(eye, spec, groups, ranges_dpt)
+    nodes = defocus_groups(
         eye,
         spec,
         groups,
-        _readable_ranges_dpt(eye, spec, axes).reshape(-1, 2),
+        limited_dpt,
         allowed_error=allowed_error,
         unit_px=unit_px(spec, groups),
     )
+    return nodes, np.any(limited_dpt != ranges_dpt, axis=1)
 
 
 def _neighbours(index: int, count: int) -> list[int]:
     return list(range(max(index - 1, 0), min(index + 2, count)))
-
-
-def _largest_defocus_dpt(spec: GridSpec, axes: _Axes) -> NDArray[np.float64]:
-    """Defocus (n_v, n_h, n_pupils, 1) whose blur is as large as kernels may be."""
-    scale = spec.node_pixel_from_mrad(axes.h_deg, axes.v_deg[:, None])
-    px_per_mrad = np.linalg.norm(scale, ord=2, axis=(-2, -1))[..., None]
-    blur_px_per_dpt = px_per_mrad * axes.pupils_mm / 2.0
-    return (spec.max_blur_radius_px / blur_px_per_dpt)[..., None]
 
 
 def _over_neighbours(values: NDArray, axis: int, extreme) -> NDArray:
@@ -279,8 +282,6 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
             highs = _over_neighbours(highs, axis, np.max)
         lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
-        wide = np.abs(own_lows) > _WIDE_RATIO * _largest_defocus_dpt(spec, axes)
-        lows = np.where(wide, own_lows, lows)
     near_far = np.stack(
         [lows + spec.object_range_dpt[0], highs + spec.object_range_dpt[1]], axis=-1
     )

@@ -169,6 +169,7 @@ def frame_layers(
         for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
         if pupil_weight * used_weight > 0.0
     )
+    notes += _limit_notes(store, corners)
     state = (store, pupil_mm, corners, layer_zero_dpt)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
     near_far_dpt = object_range_dpt or store.spec.object_range_dpt
@@ -189,6 +190,16 @@ def frame_layers(
         focus_dpt=eye.reachable_focus_dpt(focus_dpt),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
+    )
+
+
+def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
+    limited = store.plan.is_limited.reshape(store.plan.group_shape)
+    if not any(limited[:, :, pupil, used].any() for pupil, used, _ in corners):
+        return ()
+    return (
+        f"blur beyond {store.spec.max_blur_radius_px} px, in part of the field, is "
+        "drawn as that",
     )
 
 

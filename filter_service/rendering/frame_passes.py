@@ -386,6 +386,17 @@ class FramePasses:
         cell_px = self.image.cell_px
         return min(most, cell_px.bit_length() - 1) if cell_px else most
 
+    def counts(self) -> dict[str, int]:
+        """Return counts of `Rendered` by name."""
+        fragment_count, merged_count = self.fragment_counts()
+        return {
+            "fragment_count": fragment_count,
+            "merged_count": merged_count,
+            "entry_count": self.entry_count,
+            "kernel_count": self.kernel_count,
+            "kernel_texel_count": self.kernel_texel_count,
+        }
+
     def fragment_counts(self) -> tuple[int, int]:
         """Fragments after merging, and pixels that went into merged ones."""
         blocks = self.gpu.read(self.buffers["BLOCKS"], (self.block_count, 4), np.uint32)

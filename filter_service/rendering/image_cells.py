@@ -78,7 +78,11 @@ class ImageCells:
 
 
 def image_cells(
-    spec: GridSpec, plan: CachePlan, gaze_deg: tuple[float, float] | None = None
+    spec: GridSpec,
+    plan: CachePlan,
+    gaze_deg: tuple[float, float] | None = None,
+    *,
+    cell_px: int | None = None,
 ) -> ImageCells:
     """Cells of the spec's camera and their field nodes.
 
@@ -86,6 +90,8 @@ def image_cells(
     ----------
     gaze_deg : (h, v), optional
         Where the eye looks; the spec's where it is None.
+    cell_px : int, optional
+        Larger cells than the mode's: their kernels take less memory.
     """
     if not spec.follows_field:
         return ImageCells(
@@ -98,7 +104,7 @@ def image_cells(
             corner_v_deg=np.zeros((2, 2)),
         )
     gaze_deg = spec.gaze_deg if gaze_deg is None else gaze_deg
-    cell_px = _cell_px(spec)
+    cell_px = cell_px or _cell_px(spec)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
     x_px, y_px = np.meshgrid(
@@ -134,6 +140,11 @@ def image_cells(
         corner_h_deg=corner_h_deg,
         corner_v_deg=corner_v_deg,
     )
+
+
+def can_coarsen(image: ImageCells) -> bool:
+    """Whether larger cells are possible."""
+    return 0 < image.cell_px < MAX_CELL_PX
 
 
 def _node_from_cell(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
-from filter_service.errors import GridTooLarge
+from filter_service.errors import GridTooLarge, OutOfGpuMemory
 from filter_service.gl.gpu import Buffer, Gpu, Pages, StageTimer
 from filter_service.psfs.pack import box_sizes
 from filter_service.psfs.store import FrameLayers, PsfStore
@@ -21,10 +21,18 @@ from filter_service.rendering.frame_kernels import (
     part_table,
     work_list,
 )
-from filter_service.rendering.image_cells import ImageCells
+from filter_service.rendering.image_cells import ImageCells, can_coarsen
 
 MAX_GROUPS = 65535
 """Work groups along one axis that every OpenGL 4.3 allows."""
+
+
+MAX_KERNEL_TEXELS = 24 * 2**20
+"""Of a frame: 400 MB, 16 bytes each."""
+
+
+class KernelsTooLarge(OutOfGpuMemory):
+    """A frame's kernels take too much memory; those of larger cells take less."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,12 @@ class KernelMaker:
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
             kernels = frame_kernels(store, layers, image, used)
+            _, n_texels = kernel_table(kernels)
+        if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):
+            raise KernelsTooLarge(
+                f"the frame's kernels need {n_texels} texels; allowed are "
+                f"{MAX_KERNEL_TEXELS}",
+            )
         with timer.stage("psf_blend_ms"):
             self._set = self._blend(kernels, pages, used.shape)
         self._made_for, self._have = key, used

@@ -1,5 +1,6 @@
 """Filters one view: checks, layers, strips that fit the buffers, and the answer."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import ceil
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 
 from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
-from filter_service.gl.gpu import Gpu, Pages, StageTimer
+from filter_service.gl.gpu import Gpu, StageTimer
 from filter_service.psfs.camera_match import serves
-from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame import (
     IMAGES,
     View,
@@ -23,9 +24,10 @@ from filter_service.rendering.frame import (
     with_clean_hidden,
 )
 from filter_service.rendering.frame_passes import FramePasses
+from filter_service.rendering.frame_states import FrameStates, LoadedStore
 from filter_service.rendering.gaze import usable_gaze
 from filter_service.rendering.image_cells import ImageCells, image_cells
-from filter_service.rendering.kernel_passes import KernelMaker
+from filter_service.rendering.kernel_passes import KernelMaker, KernelsTooLarge
 from filter_service.wire.images import Camera
 
 BYTES_PER_PIXEL = 16
@@ -44,19 +46,6 @@ WHITE_STEP_PX = 8
 WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
 """White of a linear image is its brightest light, but no more than so many times what
 nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
-
-
-@dataclass(frozen=True)
-class LoadedStore:
-    """A PSF store whose kernels are on the GPU."""
-
-    store: PsfStore
-    pages: Pages
-    image: ImageCells
-
-    def release(self) -> None:
-        """Free the GPU copy."""
-        self.pages.release()
 
 
 @dataclass(frozen=True)
@@ -110,10 +99,7 @@ class FilterRenderer:
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
-        self._layers_of: LoadedStore | None = None
-        self._layers_state: tuple[float, float] = (0.0, 0.0)
-        self._layers: FrameLayers | None = None
-        self._turned: tuple[LoadedStore, tuple[float, float], ImageCells] | None = None
+        self._states = FrameStates()
         self._kernels = KernelMaker(gpu)
 
     def load(self, store: PsfStore) -> LoadedStore:
@@ -181,26 +167,13 @@ class FilterRenderer:
         _check_choice("output", output, OUTPUTS)
         _check_camera(view, handle.store)
         gaze = usable_gaze(handle.store.spec, gaze_deg)
+        options = _Options(accumulation == "paper", merge, output, gaze)
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
-            return self._render(
-                view,
-                handle,
-                *(pupil_diameter_mm, focus_dpt, accumulation, merge, output),
-                *gaze,
-            )
+            return self._render(view, handle, pupil_diameter_mm, focus_dpt, options)
 
     def _render(
-        self,
-        view,
-        handle,
-        pupil_diameter_mm,
-        focus_dpt,
-        accumulation,
-        merge,
-        output,
-        gaze_deg,
-        gaze_notes,
+        self, view, handle, pupil_diameter_mm, focus_dpt, options: "_Options"
     ) -> Rendered:
         timer = StageTimer(self._gpu)
         with timer.wall("prepare_ms"):
@@ -210,50 +183,17 @@ class FilterRenderer:
             if view.surface_count > 1:
                 whole, bad_count = with_clean_hidden(whole)
                 bad_color_count += bad_count
-        layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
-        image = self._image_cells(timer, handle, gaze_deg)
-        reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
-        border_px = _border_px(whole, reach_px)
-        with timer.wall("prepare_ms"):
-            whole = extended(whole, border_px)
-        picture = np.empty(whole.color.shape, OUTPUT_DTYPES[output])
-        counts = np.zeros(5, dtype=np.int64)
-        for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
-            passes = FramePasses(
-                self._gpu,
-                strip.view,
-                timer,
-                layers=layers,
-                image=image,
-                paper_rule=accumulation == "paper",
-                merge=merge,
-                first_row=strip.first_row,
-                frame_pixel_count=whole.width_px * whole.height_px,
-                image_size_px=(view.width_px, view.height_px),
-                border_px=border_px,
-                white_level=_white_level(color),
-            )
-            passes.run(
-                lambda used: self._kernels.kernels(
-                    handle.store, handle.pages, layers, image, used, timer
-                )
-            )
-            picture[strip.wanted] = passes.read_back(output)[strip.kept]
-            counts += (
-                *passes.fragment_counts(),
-                passes.entry_count,
-                passes.kernel_count,
-                passes.kernel_texel_count,
-            )
+        layers = self._states.layers(timer, handle, pupil_diameter_mm, focus_dpt)
+        gaze_deg, gaze_notes = options.gaze
+        picture, counts = self._filtered(timer, whole, handle, layers, options)
         self._gpu.check("render")
         notes = [*layers.notes, *gaze_notes]
         if bad_color_count:
             notes.append(
                 f"{bad_color_count} pixels with non-finite colour taken as black"
             )
-        rows, columns = (slice(border_px, border_px + n) for n in color.shape[:2])
         return Rendered(
-            color=np.ascontiguousarray(picture[rows, columns]),
+            color=picture,
             stage_times_ms=timer.result_ms(),
             missing_depth_count=depth.missing_count,
             clamped_depth_count=depth.clamped_count,
@@ -261,14 +201,57 @@ class FilterRenderer:
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
             gaze_deg=gaze_deg,
-            fragment_count=int(counts[0]),
-            merged_count=int(counts[1]),
-            entry_count=int(counts[2]),
-            kernel_count=int(counts[3]),
-            kernel_texel_count=int(counts[4]),
+            **counts,
             layer_count=len(layers.layer_dpt),
             notes=notes,
         )
+
+    def _filtered(
+        self, timer, view: View, handle, layers: FrameLayers, options: "_Options"
+    ) -> tuple[NDArray, dict[str, int]]:
+        """Picture and counts; with larger cells where kernels take too much memory."""
+        while True:
+            image = self._states.cells(timer, handle, options.gaze[0])
+            try:
+                return self._in_strips(timer, view, handle, layers, image, options)
+            except KernelsTooLarge:
+                self._states.coarsen(image)
+
+    def _in_strips(
+        self, timer, view, handle, layers, image: ImageCells, options: "_Options"
+    ) -> tuple[NDArray, dict[str, int]]:
+        reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
+        border_px = _border_px(view, reach_px)
+        with timer.wall("prepare_ms"):
+            whole = extended(view, border_px)
+        picture = np.empty(whole.color.shape, OUTPUT_DTYPES[options.output])
+        counts: Counter[str] = Counter()
+        for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
+            passes = FramePasses(
+                self._gpu,
+                strip.view,
+                timer,
+                layers=layers,
+                image=image,
+                paper_rule=options.paper_rule,
+                merge=options.merge,
+                first_row=strip.first_row,
+                frame_pixel_count=whole.width_px * whole.height_px,
+                image_size_px=(view.width_px, view.height_px),
+                border_px=border_px,
+                white_level=_white_level(view.color),
+            )
+            passes.run(
+                lambda used: self._kernels.kernels(
+                    handle.store, handle.pages, layers, image, used, timer
+                )
+            )
+            picture[strip.wanted] = passes.read_back(options.output)[strip.kept]
+            counts.update(passes.counts())
+        rows, columns = (
+            slice(border_px, border_px + n) for n in (view.height_px, view.width_px)
+        )
+        return np.ascontiguousarray(picture[rows, columns]), dict(counts)
 
     def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
         depth_m, missing_count = fill_missing_depth(view.depth_m)
@@ -282,34 +265,6 @@ class FilterRenderer:
         margin = 1e-6 * max(high_dpt, 1.0)
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
         return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
-
-    def _frame_layers(self, timer, handle, pupil_diameter_mm, focus_dpt) -> FrameLayers:
-        """Layers of this pupil and focus; those of the last frame when unchanged."""
-        state = (pupil_diameter_mm, focus_dpt)
-        if self._layers_of is not handle or self._layers_state != state:
-            self._layers_of = None  # stays so if what follows fails
-            with timer.wall("psf_plan_ms"):
-                self._layers = frame_layers(
-                    handle.store,
-                    pupil_diameter_mm=pupil_diameter_mm,
-                    focus_dpt=focus_dpt,
-                )
-            self._layers_of, self._layers_state = handle, state
-        return self._layers
-
-    def _image_cells(self, timer, handle, gaze_deg) -> ImageCells:
-        """Cells of this gaze; those of the last frame when unchanged."""
-        last, self._turned = self._turned, None  # no hold on a store out of use
-        spec = handle.store.spec
-        if gaze_deg == spec.gaze_deg:
-            return handle.image
-        if last is not None and last[0] is handle and last[1] == gaze_deg:
-            image = last[2]
-        else:
-            with timer.wall("psf_plan_ms"):
-                image = image_cells(spec, handle.store.plan, gaze_deg)
-        self._turned = (handle, gaze_deg, image)
-        return image
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
@@ -334,6 +289,16 @@ def _white_level(color: NDArray) -> float:
     if lit.size == 0:
         return 0.0
     return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))
+
+
+@dataclass(frozen=True)
+class _Options:
+    """How a frame is filtered; gaze (h, v) with notes."""
+
+    paper_rule: bool
+    merge: bool
+    output: str
+    gaze: tuple[tuple[float, float], tuple[str, ...]]
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ def _one_pixel_store() -> PsfStore:
             defocus=RaggedNodes.of([np.zeros(1)]),
             channel_shift_dpt=np.zeros((1, RGB)),
             prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
+            is_limited=np.zeros(1, bool),
         ),
         kernels=np.full(RGB, WEIGHT_MAX, np.uint16),
         offsets=np.arange(RGB),

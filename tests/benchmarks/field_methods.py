@@ -20,6 +20,7 @@ from tests.benchmarks.paper_baselines import (
     paper_quality,
     predecessor,
 )
+from tests.benchmarks.published_figures import OFF_AXIS, ON_AXIS
 from tests.numerical.plan_cases import traced_eye
 
 PUPIL_RANGE_MM = (2.0, 7.0)
@@ -57,6 +58,15 @@ class Method:
     name: str
     on_axis: bool
     any_state: bool
+
+    @property
+    def published_name(self) -> str | None:
+        """What of the paper's tables stands beside this method."""
+        if self.name in ON_AXIS:
+            return self.name
+        if self.name.startswith(("ours", "paper")):
+            return "paper on-axis" if self.on_axis else OFF_AXIS
+        return None
 
     def states(self, fixed: State, others: list[State]) -> list[State]:
         """States that it is measured in."""
@@ -190,12 +200,14 @@ class Baseline(Method):
         return [self.function(view, at, **dict(self.options))]
 
 
+QUALITY_WIDE = "ours quality wide"
 PAPER_RULE = (("paper_rule", True),)
 
 OURS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
     Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
     Ours("ours quality", on_axis=False, any_state=False, mode="quality"),
+    Ours(QUALITY_WIDE, on_axis=False, any_state=True, mode="quality"),
     Ours("ours dynamic", on_axis=False, any_state=True),
     Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
 )

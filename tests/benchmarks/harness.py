@@ -17,6 +17,8 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"
+OUT = ROOT / "out"
+"""Where what is not a whole run goes."""
 
 WARM_UPS = 2
 

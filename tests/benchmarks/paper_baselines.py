@@ -31,7 +31,7 @@ from tests.benchmarks.paper_layout import (
     QUALITY,
     PaperGrid,
     PaperTexture,
-    paper_texture,
+    kept_texture,
 )
 from tests.benchmarks.resized_psfs import full_radius_px, resized
 
@@ -141,17 +141,17 @@ def paper_dynamic(
     ----------
     Csoba & Kunkli 2023, sections 6.4 and 7.2.2.
     """
-    watch = Stopwatch()
-    corners = []
+    corners, prepare_ms = [], 0.0
     for pupil_mm, pupil_share in _ends(DYNAMIC_PUPILS_MM, state.pupil_diameter_mm):
         for focus_dpt, focus_share in _ends(DYNAMIC_FOCI_DPT, state.focus_dpt):
             if pupil_share * focus_share > 0.0:
                 at = replace(state, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
-                texture = paper_texture(at, grid)
+                texture, build_ms = kept_texture(at, grid)
+                prepare_ms += build_ms
                 corners.append((pupil_share * focus_share, texture))
     side = max(texture.weights.shape[2] for _, texture in corners)
     first = corners[0][1]
-    prepare_ms = watch.lap_ms()
+    watch = Stopwatch()
     blended = np.zeros((*first.weights.shape[:2], side, side), np.float32)
     for share, texture in corners:
         edge = (side - texture.weights.shape[2]) // 2
@@ -172,9 +172,8 @@ def paper_dynamic(
 
 
 def _from_texture(view, state, grid, taps, paper_rule) -> Filtered:
+    texture, prepare_ms = kept_texture(state, grid)
     watch = Stopwatch()
-    texture = paper_texture(state, grid)
-    prepare_ms = watch.lap_ms()
     color, evaluations = _splat_texture(view, state, texture, paper_rule)
     return Filtered(
         color=color,

@@ -5,6 +5,7 @@ R being the largest radius of all, with the PSF in its middle.
 """
 
 import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,10 @@ from tests.benchmarks.resized_psfs import (
 
 BYTES_PER_TEXEL = 4
 """R11F_G11F_B10F, the released code's format; here weights are 32-bit floats."""
+
+
+MAX_KEPT_MB = 1000.0
+"""Textures that `kept_texture` holds."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +189,31 @@ def paper_texture(state: EyeState, grid: PaperGrid) -> PaperTexture:
         *bases, *fractions, radii, *_parts(psfs, radii.shape), weights, layer_radius_px
     )
     return PaperTexture(weights, layer_radius_px, *axes, psf_count=cut.sides.size)
+
+
+_kept: dict[tuple, tuple[PaperTexture, EyeState, float]] = {}
+
+
+def kept_texture(state: EyeState, grid: PaperGrid) -> tuple[PaperTexture, float]:
+    """Texture as `paper_texture` builds it, and the ms that took; the last are kept.
+
+    Scenes, and accumulation rules, share what an eye needs.
+    """
+    key = (id(state.eye), state.spec, state.pupil_diameter_mm, state.focus_dpt)
+    key = (*key, id(grid))
+    if key not in _kept:
+        start_s = time.perf_counter()
+        texture = paper_texture(state, grid)
+        # The state is kept too, so that its eye's id is not given out again.
+        _kept[key] = (texture, state, 1e3 * (time.perf_counter() - start_s))
+        while len(_kept) > 1 and _kept_mb() > MAX_KEPT_MB:
+            del _kept[next(iter(_kept))]
+    texture, _, build_ms = _kept[key]
+    return texture, build_ms
+
+
+def _kept_mb() -> float:
+    return sum(texture.weights.nbytes for texture, *_ in _kept.values()) / 1e6
 
 
 def _parts(psfs: ResizedPsfs, shape: tuple) -> tuple[NDArray, NDArray, NDArray]:

@@ -5,6 +5,8 @@ Barsky's method ran on the processor.  The errors are of 8-bit images against a
 reference that shares their accumulation rule.
 """
 
+from dataclasses import dataclass
+
 HARDWARE = "NVIDIA TITAN Xp"
 
 CONDITIONS = (
@@ -85,10 +87,36 @@ OFF_AXIS_PRIMITIVES = (
 the previous methods are 1.0 to 1.9 h and 29.2 to 33.8 dB."""
 
 
-def published(condition: str):
-    """Rows of a condition: method, scene, time in ms, error in dB, table."""
-    number = CONDITIONS.index(condition)
-    for method, scenes in ON_AXIS.items():
-        for scene, figures in scenes.items():
-            yield (method, scene, *figures[number], "tables 7 and 8")
-    yield ("paper off-axis", "Primitives", *OFF_AXIS_PRIMITIVES[number], "table 10")
+SCENES = {"primitives": "Primitives", "courtyard": "San Miguel"}
+"""Their scene beside each of ours: the same one, or one as rich."""
+
+OFF_AXIS = "paper off-axis"
+
+
+@dataclass(frozen=True)
+class Published:
+    """Figures of a method, condition and scene."""
+
+    method: str
+    scene: str
+    median_ms: float
+    error_db: float
+    table: str
+    hardware: str = f"{HARDWARE}, 1280x720"
+
+
+def published(method: str | None, condition: str, scene: str) -> Published | None:
+    """Figures beside those of one of our scenes; None where there are none.
+
+    Parameters
+    ----------
+    method : str, optional
+        Key of `ON_AXIS`, or `OFF_AXIS`.
+    """
+    number, theirs = CONDITIONS.index(condition), SCENES[scene]
+    if method in ON_AXIS:
+        figures = ON_AXIS[method][theirs][number]
+        return Published(method, theirs, *figures, "tables 7 and 8")
+    if method == OFF_AXIS and theirs == "Primitives":
+        return Published(method, theirs, *OFF_AXIS_PRIMITIVES[number], "table 10")
+    return None

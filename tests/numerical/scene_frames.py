@@ -4,6 +4,7 @@ pyrender ends the EGL display when it closes, and with it any other context of t
 process; the service and its clients never share one.
 """
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -15,18 +16,28 @@ import numpy as np
 from filter_service.rendering.frame import View
 
 _SCRIPT = """
+import json
 import sys
 import numpy as np
-from clients.scene_renderer import scene_frames
+from clients.scene_renderer import SceneRenderer
 from clients.scenes import courtyard, primitives
-name, width, height, count, index, hidden, out = sys.argv[1:]
+from clients.scenes.paths import PATHS, Key, path_moments
+name, width, height, count, first, end, keys, hidden, out = sys.argv[1:]
 scene = {"courtyard": courtyard, "primitives": primitives}[name].build()
-size = (int(width), int(height))
-frames = scene_frames(scene, None, int(count), size, with_hidden=hidden == "hidden")
-frame = list(frames)[int(index)]
-names = ("color", "depth_m", "tangents", "hidden_color", "hidden_depth_m")
-images = {name: getattr(frame, name) for name in names}
-np.savez(out, **{name: image for name, image in images.items() if image is not None})
+path = [Key(*key) for key in json.loads(keys)] or PATHS[name]
+moments = path_moments(path, int(count))[int(first) : int(end)]
+with SceneRenderer(scene, (int(width), int(height))) as renderer:
+    frames = [
+        renderer.render_layers(moment.pose) if hidden == "hidden"
+        else (renderer.render(moment.pose),)
+        for moment in moments
+    ]
+    tangents = renderer.tangents
+names = (("color", "depth_m"), ("hidden_color", "hidden_depth_m"))
+np.savez(out, tangents=tangents, **{
+    name: np.stack([frame[layer][part] for frame in frames])
+    for layer in range(len(frames[0])) for part, name in enumerate(names[layer])
+})
 """
 
 SCENES = ("courtyard", "primitives")
@@ -37,19 +48,49 @@ def scene_view(
     name: str, *, width_px: int, height_px: int, with_hidden: bool = False
 ) -> View:
     """Middle frame of a scene's own camera path."""
+    return _rendered(name, width_px, height_px, 5, 2, 3, with_hidden=with_hidden)[0]
+
+
+@cache
+def scene_views(
+    name: str,
+    *,
+    width_px: int,
+    height_px: int,
+    count: int,
+    path: tuple = (),
+    first: int = 0,
+    end: int | None = None,
+) -> tuple[View, ...]:
+    """Frames of a camera path, the scene's own where it is empty.
+
+    Parameters
+    ----------
+    path : tuple
+        Arguments of `clients.scenes.paths.Key`.
+    count, first, end : int
+        Frames of the whole path, and which of them.
+    """
+    end = count if end is None else end
+    return _rendered(name, width_px, height_px, count, first, end, path)
+
+
+def _rendered(
+    name, width_px, height_px, count, first, end, path=(), with_hidden=False
+) -> tuple:
     root = Path(__file__).parents[2]
+    numbers = [str(n) for n in (width_px, height_px, count, first, end)]
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "frame.npz"
-        arguments = [name, str(width_px), str(height_px), "5", "2"]
-        arguments += ["hidden" if with_hidden else "seen", str(out)]
+        out = Path(folder) / "frames.npz"
+        layers = "hidden" if with_hidden else "seen"
+        arguments = [name, *numbers, json.dumps(path), layers, str(out)]
         subprocess.run(
             [sys.executable, "-c", _SCRIPT, *arguments], check=True, cwd=root
         )
         with np.load(out) as data:
-            hidden = ("hidden_color", "hidden_depth_m")
-            return View(
-                data["color"],
-                data["depth_m"],
-                tuple(float(t) for t in data["tangents"]),
-                **{name: data[name] for name in hidden if name in data},
-            )
+            tangents = tuple(float(t) for t in data["tangents"])
+            images = {name: data[name] for name in data.files if name != "tangents"}
+    return tuple(
+        View(tangents=tangents, **{name: images[name][k] for name in images})
+        for k in range(end - first)
+    )

@@ -19,6 +19,8 @@ DIMENSIONLESS = {
     "hidden_color": "as color",
     "pupil_ellipse": "centre and semi-axes in mm, angle in rad",
     "corners": "node numbers and weights",
+    "maps": "pixels per pixel",
+    "node_from_cell": "pixels per pixel",
     "tangents": "of the angles to the image edges",
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",

@@ -1,0 +1,84 @@
+"""What of a frame depends on the eye's state alone, kept while the state stays."""
+
+from dataclasses import dataclass
+
+from filter_service.gl.gpu import Pages, StageTimer
+from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.rendering.image_cells import ImageCells, image_cells
+
+
+@dataclass(frozen=True)
+class LoadedStore:
+    """A PSF store whose kernels are on the GPU."""
+
+    store: PsfStore
+    pages: Pages
+    image: ImageCells
+
+    def release(self) -> None:
+        """Free the GPU copy."""
+        self.pages.release()
+
+
+class FrameStates:
+    """Layers of the last pupil and focus, cells of the last gaze.
+
+    Whoever compares states by identity, as the kernels of a frame do, sees the same
+    objects until something changes.  Of one store at a time: no hold on those that are
+    out of use.
+    """
+
+    def __init__(self):
+        self._handle: LoadedStore | None = None
+        self._cell_px: int | None = None
+        self._layers: tuple[tuple[float, float], FrameLayers] | None = None
+        self._image: tuple[tuple, ImageCells] | None = None
+
+    def _forget_others(self, handle: LoadedStore) -> None:
+        if self._handle is not handle:
+            self.__init__()
+            self._handle = handle
+
+    def layers(
+        self,
+        timer: StageTimer,
+        handle: LoadedStore,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+    ) -> FrameLayers:
+        """Layers of a pupil and focus."""
+        self._forget_others(handle)
+        state = (pupil_diameter_mm, focus_dpt)
+        if self._layers is None or self._layers[0] != state:
+            with timer.wall("psf_plan_ms"):
+                self._layers = (
+                    state,
+                    frame_layers(
+                        handle.store,
+                        pupil_diameter_mm=pupil_diameter_mm,
+                        focus_dpt=focus_dpt,
+                    ),
+                )
+        return self._layers[1]
+
+    def cells(
+        self, timer: StageTimer, handle: LoadedStore, gaze_deg: tuple[float, float]
+    ) -> ImageCells:
+        """Cells of a gaze."""
+        self._forget_others(handle)
+        spec, state = handle.store.spec, (gaze_deg, self._cell_px)
+        if state == (spec.gaze_deg, None):
+            return handle.image
+        if self._image is None or self._image[0] != state:
+            with timer.wall("psf_plan_ms"):
+                self._image = (
+                    state,
+                    image_cells(
+                        spec, handle.store.plan, gaze_deg, cell_px=self._cell_px
+                    ),
+                )
+        return self._image[1]
+
+    def coarsen(self, image: ImageCells) -> None:
+        """Take cells twice as wide from now on."""
+        self._cell_px = 2 * image.cell_px

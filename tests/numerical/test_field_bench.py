@@ -1,0 +1,113 @@
+"""The field benchmark's own parts: kept rows, states, targets, published figures."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.benchmarks.bench_field import (
+    FieldRow,
+    KeptRows,
+    random_states,
+    target_rows,
+)
+from tests.benchmarks.field_methods import FOCUS_RANGE_DPT, METHODS, PAPER_RANGES
+from tests.benchmarks.field_pictures import _medians, plot_errors
+from tests.benchmarks.published_figures import CONDITIONS, published
+from tests.numerical.scene_frames import SCENES
+
+ROW = FieldRow(
+    bench="field",
+    method="ours quality",
+    case="myopia",
+    setting="courtyard 320x180 5.00 mm 0.50 dpt",
+    n=3,
+    median_ms=20.0,
+    p95_ms=21.0,
+    memory_mb=3.0,
+    error_name="psnr_db",
+    error=47.0,
+    reference="dense",
+    scene="courtyard",
+    size="320x180",
+    psnr_srgb8_db=44.0,
+    ssim_ratio=0.99,
+    mean_delta_e=0.3,
+    prepare_ms=500.0,
+    psf_count=10,
+    tap_count=None,
+    published=None,
+)
+
+
+def test_rows_are_kept_for_the_commit_and_machine_that_made_them(tmp_path):
+    path = tmp_path / "out" / "rows.jsonl"
+    first = KeptRows(path, "abc machine", resumes=False)
+    first.add("a", ROW)
+    assert KeptRows(path, "abc machine", resumes=True).get("a") == ROW
+    assert KeptRows(path, "abd machine", resumes=True).get("a") is None
+    assert KeptRows(path, "abc machine", resumes=False).get("a") is None
+    assert KeptRows(path, "abc machine", resumes=True).get("a") is None
+
+
+def test_random_states_differ_and_lie_between_nodes():
+    states = [
+        random_states(eye, scene, size, 1)[0]
+        for eye in CONDITIONS
+        for scene in SCENES
+        for size in ("320x180", "640x360")
+    ]
+    assert len(set(states)) == len(states)
+    assert states[0] == random_states(CONDITIONS[0], SCENES[0], "320x180", 1)[0]
+    for state in states:
+        assert 2.0 < state.pupil_mm < 6.0
+        assert PAPER_RANGES["focus_range_dpt"][0] < state.focus_dpt < FOCUS_RANGE_DPT[1]
+        assert abs(state.pupil_mm - round(state.pupil_mm)) > 1e-3
+    spread_mm = np.ptp([state.pupil_mm for state in states])
+    assert spread_mm > 3.0
+
+
+def test_targets_name_the_worst_row_of_a_method_and_size():
+    rows = [
+        ROW,
+        replace(ROW, error=44.5, case="keratoconus"),
+        replace(ROW, error=30.0, method="Celaya"),
+        replace(ROW, error=40.0, size="640x360"),
+    ]
+    found = {line["size"]: line for line in target_rows(rows)}
+    assert set(found) == {"320x180", "640x360"}
+    assert found["320x180"]["worst_db"] == 44.5
+    assert found["320x180"]["worst"].startswith("keratoconus")
+    assert (found["320x180"]["below"], found["320x180"]["n"]) == (1, 2)
+
+
+def test_published_figures_stand_beside_their_methods():
+    beside = {method.name: method.published_name for method in METHODS}
+    assert beside["Barsky"] == "Barsky"
+    assert beside["ours on-axis"] == beside["paper alpha 1 tap"] == "paper on-axis"
+    assert beside["ours dynamic"] == beside["paper quality"] == "paper off-axis"
+    assert beside["Celaya"] is None
+    # Tables 7 and 10 of the paper
+    on_axis = published("paper on-axis", "keratoconus", "primitives")
+    assert (on_axis.median_ms, on_axis.error_db) == (12.93, 45.77)
+    assert "TITAN Xp" in on_axis.hardware
+    off_axis = published("paper off-axis", "cataract", "primitives")
+    assert (off_axis.median_ms, off_axis.error_db) == (13.4, 44.8)
+    assert published("paper off-axis", "cataract", "courtyard") is None
+    assert published(None, "cataract", "courtyard") is None
+
+
+def test_the_plot_has_a_point_for_each_size():
+    points = [("a", 40.0, 40.0), ("a", 20.0, 60.0), ("a", 30.0, 40.0), ("b", 5.0, 20.0)]
+    times_ms, errors = _medians(points)
+    assert times_ms == [5.0, 30.0]
+    assert errors == pytest.approx([0.1, 0.01])
+
+
+def test_the_plot_shows_published_figures_too(tmp_path):
+    theirs = asdict(published("paper on-axis", "myopia", "courtyard"))
+    rows = [ROW, replace(ROW, size="640x360", median_ms=80.0, published=theirs)]
+    plot_errors(rows, tmp_path / "field.png")
+    with Image.open(tmp_path / "field.png") as picture:
+        assert picture.size[0] > 300
