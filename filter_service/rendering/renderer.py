@@ -62,8 +62,10 @@ class Rendered:
     pupil_diameter_mm, focus_dpt : float
         As used.
     fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice.
+        Fragments, pixels merged into some, and entries of the bins' lists; rows that
+        two strips of a very large frame share count twice.
+    overflow_count : int
+        Entries that could not be kept, for want of room; their light is missing.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -82,6 +84,7 @@ class Rendered:
     kernel_texel_count: int
     layer_count: int
     notes: list[str]
+    overflow_count: int = 0
 
 
 class FilterRenderer:
@@ -167,7 +170,7 @@ class FilterRenderer:
             whole = replace(view, color=color, depth_m=depth.depth_m)
         layers = self._frame_layers(timer, handle, pupil_diameter_mm, focus_dpt)
         picture = np.empty(color.shape, np.uint8 if output == "srgb8" else np.float32)
-        counts = np.zeros(5, dtype=np.int64)
+        counts = np.zeros(6, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
@@ -189,9 +192,10 @@ class FilterRenderer:
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
             counts += (
                 *passes.fragment_counts(),
-                passes.entry_count,
+                passes.lists.entry_count,
                 passes.kernel_count,
                 passes.kernel_texel_count,
+                passes.lists.overflow_count,
             )
         self._gpu.check("render")
         notes = list(layers.notes)
@@ -214,6 +218,7 @@ class FilterRenderer:
             kernel_texel_count=int(counts[4]),
             layer_count=len(layers.object_dpt),
             notes=notes,
+            overflow_count=int(counts[5]),
         )
 
     def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":

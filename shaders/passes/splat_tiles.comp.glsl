@@ -1,8 +1,9 @@
-// Adds up the light that a tile's fragments send to each of its pixels.
-// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, TILE_COUNTS, TILE_OFFSETS, ENTRIES, KERNELS,
+// Adds up the light that a tile's fragments send to each of its pixels: walks the list of
+// the tile's bin, stages what reaches the tile, and evaluates that.
+// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, BIN_COUNTS, BIN_OFFSETS, ENTRIES, KERNELS,
 //      the kernel atlas, PIXELS (own colour where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
-// Dispatch: one group a tile of the band; a thread serves PIXELS_PER_THREAD pixels of a
+// Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD pixels of a
 //      column (8 on a software renderer, where a staged fragment is then read once by
 //      one vector of threads; 1 on hardware).
 // Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage:
@@ -17,8 +18,8 @@ layout(local_size_x = TILE_SIZE_PX, local_size_y = GROUP_ROWS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_COLOR) readonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
-layout(std430, binding = BINDING_TILE_COUNTS) readonly buffer Counts { uvec2 counts[]; };
-layout(std430, binding = BINDING_TILE_OFFSETS) readonly buffer Offsets { uint offsets[]; };
+layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
+layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint offsets[]; };
 layout(std430, binding = BINDING_ENTRIES) readonly buffer Entries { uint entries[]; };
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
@@ -28,7 +29,8 @@ layout(std430, binding = BINDING_COLOR_OUT) writeonly buffer ColorOut { vec4 col
 
 uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
-uniform int first_tile;           // of the band
+uniform int bin_columns;
+uniform int first_bin;            // of the band
 uniform uint first_entry;
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
@@ -38,6 +40,7 @@ const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
 shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
 shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, level
+shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
 void stage(uint slot, uint at) {
     vec4 color = colors[slot];
@@ -55,6 +58,47 @@ void stage(uint slot, uint at) {
                               floatBitsToInt(scale), level);
 }
 
+// Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
+uint find_hits(uint first, uint end, uint tile_bit) {
+    uint found = 0u;
+    for (uint i = 0u; i < uint(PIXELS_PER_THREAD); ++i) {
+        bool hit = first + i < end && (entries[first + i] & tile_bit) != 0u;
+        found |= hit ? 1u << i : 0u;
+    }
+    return found;
+}
+
+// Fragments of the batch before this one of its entries.
+uint rank_of(uint entry) {
+    uint word = entry / uint(BITS_PER_WORD);
+    uint rank = bitCount(hits[word] & ((1u << (entry % uint(BITS_PER_WORD))) - 1u));
+    for (uint before = 0u; before < word; ++before) rank += bitCount(hits[before]);
+    return rank;
+}
+
+int hit_count() {
+    int count = 0;
+    for (int word = 0; word < HIT_WORDS; ++word) count += bitCount(hits[word]);
+    return count;
+}
+
+// Stages the fragments of a batch that reach the tile, in order; returns how many.
+int stage_batch(uint batch, uint end, uint tile_bit) {
+    uint mine = gl_LocalInvocationIndex * uint(PIXELS_PER_THREAD);
+    uint found = find_hits(batch + mine, end, tile_bit);
+    if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
+    barrier();  // the last batch is used up, and the bits are clear
+    atomicOr(hits[mine / uint(BITS_PER_WORD)], found << (mine % uint(BITS_PER_WORD)));
+    barrier();  // all hits are known
+    uint at = rank_of(mine);
+    for (uint i = 0u; i < uint(PIXELS_PER_THREAD); ++i)
+        if ((found & (1u << i)) != 0u)
+            stage(entries[batch + mine + i] >> uint(TILES_PER_BIN), at++);
+    int count = hit_count();
+    barrier();  // the new batch is staged
+    return count;
+}
+
 // Weight that remains under the accumulation rule.
 vec3 ruled_weight(vec3 weight, vec3 coverage, int level, bool ordered) {
 #ifdef PAPER_RULE
@@ -70,14 +114,17 @@ vec3 ruled_weight(vec3 weight, vec3 coverage, int level, bool ordered) {
 }
 
 void main() {
-    int index = first_tile + int(gl_WorkGroupID.x);
-    ivec2 tile = ivec2(index % tile_grid.x, index / tile_grid.x);
+    int bin = first_bin + int(gl_WorkGroupID.y);
+    int in_bin = int(gl_WorkGroupID.x);
+    ivec2 tile = ivec2(bin % bin_columns, bin / bin_columns) * BIN_TILES
+               + ivec2(in_bin % BIN_TILES, in_bin / BIN_TILES);
+    if (any(greaterThanEqual(tile, tile_grid))) return;  // the whole group
     ivec2 at = tile * TILE_SIZE_PX
              + ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
-    uint thread = gl_LocalInvocationIndex;
-    bool ordered = counts[index].y != 0u;
-    uint first = offsets[index] - first_entry;
-    uint end = first + counts[index].x;
+    uint tile_bit = 1u << uint(in_bin);
+    bool ordered = (counts[bin].y & tile_bit) != 0u;
+    uint first = offsets[bin] - first_entry;
+    uint end = first + counts[bin].x;
     vec3 light[PIXELS_PER_THREAD];
     vec3 coverage[PIXELS_PER_THREAD];
     for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
@@ -85,11 +132,7 @@ void main() {
         coverage[p] = vec3(0.0);
     }
     for (uint batch = first; batch < end; batch += uint(THREADS)) {
-        barrier();  // the last batch is used up
-        for (uint i = thread; i < uint(THREADS); i += uint(GROUP_THREADS))
-            if (batch + i < end) stage(entries[batch + i], i);
-        barrier();  // the new batch is staged
-        int staged = int(min(end - batch, uint(THREADS)));
+        int staged = stage_batch(batch, end, tile_bit);
         for (int i = 0; i < staged; ++i) {
             ivec4 box = staged_box[i];
             ivec4 kernel = staged_kernel[i];

@@ -1,0 +1,61 @@
+// Exclusive sum of the bins' counts: where each list starts.
+// In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts; then the total, the total as
+//      float bits, by which a caller notices a 32-bit overflow, the entries that were not
+//      kept, and the length of the longest list).
+// Dispatch: one group.
+// Twin: tests/numerical/tile_lists.py (numpy.cumsum).
+
+layout(local_size_x = SCAN_THREADS) in;
+
+layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
+layout(std430, binding = BINDING_BIN_OFFSETS) writeonly buffer Offsets { uint offsets[]; };
+
+uniform int bin_count;
+
+shared uint sums[SCAN_THREADS];
+shared float float_sums[SCAN_THREADS];
+shared uint lost_count;
+shared uint longest;
+
+void main() {
+    int thread = int(gl_LocalInvocationIndex);
+    if (thread == 0) {
+        lost_count = 0u;
+        longest = 0u;
+    }
+    int share = (bin_count + SCAN_THREADS - 1) / SCAN_THREADS;
+    int first = min(thread * share, bin_count);
+    int end = min(first + share, bin_count);
+    uint sum = 0u;
+    uint lost = 0u;
+    uint most = 0u;
+    float float_sum = 0.0;
+    for (int bin = first; bin < end; ++bin) {
+        sum += counts[bin].x;
+        float_sum += float(counts[bin].x);
+        lost += min(counts[bin].z, ~lost);  // stops at the largest number
+        most = max(most, counts[bin].x);
+    }
+    sums[thread] = sum;
+    float_sums[thread] = float_sum;
+    barrier();  // every thread's share is known
+    atomicMax(longest, most);
+    atomicAdd(lost_count, lost);
+    uint start = 0u;
+    float float_start = 0.0;
+    for (int other = 0; other < thread; ++other) {
+        start += sums[other];
+        float_start += float_sums[other];
+    }
+    for (int bin = first; bin < end; ++bin) {
+        offsets[bin] = start;
+        start += counts[bin].x;
+    }
+    barrier();  // the longest list and the losses are known
+    if (thread == SCAN_THREADS - 1) {
+        offsets[bin_count] = start;
+        offsets[bin_count + 1] = floatBitsToUint(float_start + float_sum);
+        offsets[bin_count + 2] = lost_count;
+        offsets[bin_count + TOTAL_LONGEST] = longest;
+    }
+}
