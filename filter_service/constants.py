@@ -14,12 +14,16 @@ BIN_TILES = 2
 BIN_SIZE_PX = BIN_TILES * TILE_SIZE_PX
 TILES_PER_BIN = BIN_TILES * BIN_TILES
 ALL_TILES = (1 << TILES_PER_BIN) - 1
-"""Lists are made and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An entry
-is a word: a bit for each tile of the bin that the fragment lights, and above them its
-slot, so a strip may have 2**28 slots (a storage block of 2 GiB holds 2**27)."""
+"""Lists are made and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An
+entry is a word: a bit for each tile of the bin that the fragment lights, and above them
+its slot, so a strip may have 2**28 slots (a storage block of 2 GiB holds 2**27).  Bins
+of 4 x 4 tiles halve the work on the lists again, but a tile then reads four times as
+many entries for each one that it evaluates, which costs more."""
 
-HIT_WORDS = THREADS // 32
-"""Words with a bit for each entry of a batch that the splat pass stages."""
+BATCH = 128
+HIT_WORDS = BATCH // 32
+"""Entries of a list that the splat pass looks at in one go, and words with a bit for
+each of them."""
 
 SCAN_THREADS = 256
 """Threads of the single group that sums the bins' counts."""
@@ -41,8 +45,8 @@ most.  Equal keys keep the order of the list, which is scan order."""
 
 SORT_INDEX_BITS = 12
 SORT_CAPACITIES = (512, 2048)
-"""Size classes of the sort: lists up to these lengths are sorted in shared memory, 4 and
-16 KiB, as words of depth and place in the list; longer ones through memory."""
+"""Size classes of the sort: lists up to these lengths are sorted in shared memory, 4
+and 16 KiB, as words of depth and place in the list; longer ones through memory."""
 
 DISCONTINUITY_PX = 0.25
 """Blur change between neighbours above which they count as two surfaces.  Continuous

@@ -20,9 +20,9 @@ from filter_service.constants import (
 )
 from filter_service.gl.gpu import Buffer, Gpu, StageTimer
 from filter_service.psfs.store import FrameLayers
+from filter_service.rendering import list_bands
 from filter_service.rendering.frame import View
 from filter_service.rendering.image_cells import ImageCells
-from filter_service.rendering import list_bands
 from filter_service.rendering.kernel_passes import (
     KernelSet,
     used_pairs,
@@ -243,8 +243,14 @@ class FramePasses:
             "tile_grid": self.grid,
             "search_blocks": self.search_blocks,
             "surface_count": self.surface_count,
-            "list_capacity": list_bands.MAX_BAND_ENTRIES,
+            "list_capacity": self._list_limit,
         }
+
+    @property
+    def _list_limit(self) -> int:
+        """Entries of a band, and of the longest list that is kept."""
+        fit = self.gpu.max_block_bytes // list_bands.ENTRY_BYTES
+        return min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int, int]]:
         """Bands as (first bin, bin count, first entry, entry count)."""
@@ -253,7 +259,7 @@ class FramePasses:
         )
         self.lists = list_bands.read_totals(words)
         total = self.lists.entry_count
-        limit = list_bands.MAX_BAND_ENTRIES
+        limit = self._list_limit
         if total <= limit and self.bin_count <= list_bands.MAX_GROUPS:
             return [(0, self.bin_count, 0, total)]
         counts = self.gpu.read(
@@ -263,41 +269,51 @@ class FramePasses:
         self.buffers["BIN_OFFSETS"].write(offsets.astype(np.uint32))
         return bands
 
+    def reserve_lists(self) -> None:
+        """Buffers for the lists of the longest band."""
+        n_bytes = list_bands.ENTRY_BYTES * max(band[3] for band in self.bands)
+        self._reserve(ENTRIES=n_bytes)
+        if self.lists.longest > SORT_CAPACITIES[-1]:
+            self._reserve(ENTRIES_SPARE=n_bytes)
+
     def splat_bands(self) -> None:
         """Scatter, sort and splat, band by band."""
-        longest = max(band[3] for band in self.bands)
-        self._reserve(
-            ENTRIES=list_bands.ENTRY_BYTES * longest, COLOR_OUT=16 * self.pixel_count
-        )
-        if self.lists.longest > SORT_CAPACITIES[-1]:
-            self._reserve(ENTRIES_SPARE=list_bands.ENTRY_BYTES * longest)
+        self.reserve_lists()
+        self._reserve(COLOR_OUT=16 * self.pixel_count)
         for first_bin, bin_count, first_entry, _ in self.bands:
             band = {"first_bin": first_bin, "first_entry": first_entry}
-            with self.timer.stage("bin_ms"):
-                self._run(
-                    "scatter_fragments",
-                    (bin_count, 1),
-                    *("FRAGMENT_PLACE", "BLOCKS", "BIN_OFFSETS", "ENTRIES"),
-                    **self._walk,
-                    bin_columns=self.bin_grid[0],
-                    **band,
-                    defines=self._list_threads,
-                )
-            with self.timer.stage("sort_ms"):
-                self._sort(bin_count, band)
-            with self.timer.stage("splat_ms"):
-                self._run(
-                    "splat_tiles",
-                    (TILES_PER_BIN, bin_count),
-                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
-                    *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
-                    textures={"ATLAS": self.gpu.atlas("kernels", 1)},
-                    frame_size_px=self.size,
-                    tile_grid=self.grid,
-                    bin_columns=self.bin_grid[0],
-                    **band,
-                    defines=self._splat_variant(),
-                )
+            self.make_lists(bin_count, band)
+            self._splat(bin_count, band)
+
+    def make_lists(self, bin_count: int, band: dict[str, int]) -> None:
+        """Scatter and sort the lists of a band."""
+        with self.timer.stage("bin_ms"):
+            self._run(
+                "scatter_fragments",
+                (bin_count, 1),
+                *("FRAGMENT_PLACE", "BLOCKS", "BIN_OFFSETS", "ENTRIES"),
+                **self._walk,
+                bin_columns=self.bin_grid[0],
+                **band,
+                defines=self._list_threads,
+            )
+        with self.timer.stage("sort_ms"):
+            self._sort(bin_count, band)
+
+    def _splat(self, bin_count: int, band: dict[str, int]) -> None:
+        with self.timer.stage("splat_ms"):
+            self._run(
+                "splat_tiles",
+                (TILES_PER_BIN, bin_count),
+                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
+                *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
+                textures={"ATLAS": self.gpu.atlas("kernels", 1)},
+                frame_size_px=self.size,
+                tile_grid=self.grid,
+                bin_columns=self.bin_grid[0],
+                **band,
+                defines=self._splat_variant(),
+            )
 
     def _sort(self, bin_count: int, band: dict[str, int]) -> None:
         """Sort the lists of a band, a size class at a time."""
@@ -369,4 +385,3 @@ class FramePasses:
         """Fragments after merging, and pixels that went into merged ones."""
         blocks = self.gpu.read(self.buffers["BLOCKS"], (self.tile_count, 4), np.uint32)
         return int(blocks[:, 0].sum()), int(blocks[:, 3].sum())
-

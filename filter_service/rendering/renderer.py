@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
+from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
 from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.camera_match import serves
@@ -302,17 +302,17 @@ class _Strip:
 def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Strip]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
-    Strips start on tile rows, so that tiles and merged quads are those of the whole.
+    Strips start on rows of bins, so that lists and merged squares are the whole's.
     """
     reach_px = layers.max_radius_px + 2
-    halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (BYTES_PER_PIXEL * padded_width)
-    rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
+    rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
         return [_Strip(view, 0, slice(None), slice(None))]
     step = rows - 2 * halo
-    if step < TILE_SIZE_PX:
+    if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
             f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
             f"a storage block of {max_block_bytes / 1e6:.0f} MB"

@@ -35,14 +35,16 @@ uniform uint first_entry;
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
+const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
 // Staged fragments: what the pixel loop needs, ready to use.
-shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
-shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
-shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, level
+shared vec4 staged_color[BATCH];    // linear RGB, layer fraction
+shared ivec4 staged_box[BATCH];     // first and last pixel that it lights
+shared ivec4 staged_kernel[BATCH];  // first texel, row length, scale bits, level
+shared uint staged_slot[BATCH];
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
-void stage(uint slot, uint at) {
+void stage(uint slot, int at) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
     uint kernel = place.y & KERNEL_MASK;
@@ -61,7 +63,7 @@ void stage(uint slot, uint at) {
 // Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
 uint find_hits(uint first, uint end, uint tile_bit) {
     uint found = 0u;
-    for (uint i = 0u; i < uint(PIXELS_PER_THREAD); ++i) {
+    for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i) {
         bool hit = first + i < end && (entries[first + i] & tile_bit) != 0u;
         found |= hit ? 1u << i : 0u;
     }
@@ -84,18 +86,21 @@ int hit_count() {
 
 // Stages the fragments of a batch that reach the tile, in order; returns how many.
 int stage_batch(uint batch, uint end, uint tile_bit) {
-    uint mine = gl_LocalInvocationIndex * uint(PIXELS_PER_THREAD);
+    uint mine = gl_LocalInvocationIndex * uint(ENTRIES_PER_THREAD);
     uint found = find_hits(batch + mine, end, tile_bit);
     if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
     barrier();  // the last batch is used up, and the bits are clear
     atomicOr(hits[mine / uint(BITS_PER_WORD)], found << (mine % uint(BITS_PER_WORD)));
     barrier();  // all hits are known
     uint at = rank_of(mine);
-    for (uint i = 0u; i < uint(PIXELS_PER_THREAD); ++i)
+    for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i)
         if ((found & (1u << i)) != 0u)
-            stage(entries[batch + mine + i] >> uint(TILES_PER_BIN), at++);
+            staged_slot[at++] = entries[batch + mine + i] >> uint(TILES_PER_BIN);
     int count = hit_count();
-    barrier();  // the new batch is staged
+    barrier();  // the fragments of the new batch are known
+    for (int i = int(gl_LocalInvocationIndex); i < count; i += GROUP_THREADS)
+        stage(staged_slot[i], i);
+    barrier();  // and staged
     return count;
 }
 
@@ -131,7 +136,7 @@ void main() {
         light[p] = vec3(0.0);
         coverage[p] = vec3(0.0);
     }
-    for (uint batch = first; batch < end; batch += uint(THREADS)) {
+    for (uint batch = first; batch < end; batch += uint(BATCH)) {
         int staged = stage_batch(batch, end, tile_bit);
         for (int i = 0; i < staged; ++i) {
             ivec4 box = staged_box[i];
