@@ -273,8 +273,8 @@ class FramePasses:
         """Buffers for the lists of the longest band."""
         n_bytes = list_bands.ENTRY_BYTES * max(band[3] for band in self.bands)
         self._reserve(ENTRIES=n_bytes)
-        if self.lists.longest > SORT_CAPACITIES[-1]:
-            self._reserve(ENTRIES_SPARE=n_bytes)
+        needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
+        self._reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
 
     def splat_bands(self) -> None:
         """Scatter, sort and splat, band by band."""
@@ -316,11 +316,14 @@ class FramePasses:
             )
 
     def _sort(self, bin_count: int, band: dict[str, int]) -> None:
-        """Sort the lists of a band, a size class at a time."""
+        """Sort the lists of a band, a size class at a time.
+
+        A frame of one bin meets every class, so that a warm-up compiles them all.
+        """
         key_bits = PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
         longest_before = 1
         for capacity in (*SORT_CAPACITIES, 0):
-            if self.lists.longest <= longest_before:
+            if self.lists.longest <= longest_before and bin_count > 1:
                 return
             spare = () if capacity else ("ENTRIES_SPARE",)
             self._run(
