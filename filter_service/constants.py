@@ -28,10 +28,13 @@ each of them."""
 SCAN_THREADS = 256
 """Threads of the single group that sums the bins' counts."""
 
-TOTAL_WORDS = 4
+TOTAL_ENTRIES = 0
+TOTAL_ENTRIES_FLOAT = 1
+TOTAL_LOST = 2
 TOTAL_LONGEST = 3
-"""Words behind the bins' offsets: entries, the same as a float, entries that were not
-kept, longest list."""
+TOTAL_WORDS = 4
+"""Words behind the bins' offsets: entries of all lists, the same as a float, entries that
+were not kept, length of the longest list."""
 
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS

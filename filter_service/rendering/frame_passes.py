@@ -97,7 +97,7 @@ class FramePasses:
             frame_pixel_count or self.pixel_count,
         )
         self.white_level = white_level
-        self.lists = list_bands.ListTotals(0, 0, 0)
+        self.lists = list_bands.ListTotals()
         self.kernel_count = 0
         self.kernel_texel_count = 0
 
@@ -252,16 +252,15 @@ class FramePasses:
         fit = self.gpu.max_block_bytes // list_bands.ENTRY_BYTES
         return min(list_bands.MAX_BAND_ENTRIES, fit)
 
-    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
-        """Bands as (first bin, bin count, first entry, entry count)."""
+    def _plan_bands(self) -> list[tuple[int, int, int]]:
+        """Bands as (first bin, bin count, entries)."""
         words = self.buffers["BIN_OFFSETS"].read(
             4 * TOTAL_WORDS, offset=4 * self.bin_count
         )
         self.lists = list_bands.read_totals(words)
-        total = self.lists.entry_count
         limit = self._list_limit
-        if total <= limit and self.bin_count <= list_bands.MAX_GROUPS:
-            return [(0, self.bin_count, 0, total)]
+        if self.lists.entry_count <= limit and self.bin_count <= list_bands.MAX_GROUPS:
+            return [(0, self.bin_count, self.lists.entry_count)]
         counts = self.gpu.read(
             self.buffers["BIN_COUNTS"], (self.bin_count, 4), np.uint32
         )[:, 0].astype(np.int64)
@@ -271,7 +270,7 @@ class FramePasses:
 
     def reserve_lists(self) -> None:
         """Buffers for the lists of the longest band."""
-        n_bytes = list_bands.ENTRY_BYTES * max(band[3] for band in self.bands)
+        n_bytes = list_bands.ENTRY_BYTES * max(entries for _, _, entries in self.bands)
         self._reserve(ENTRIES=n_bytes)
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         self._reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
@@ -280,12 +279,11 @@ class FramePasses:
         """Scatter, sort and splat, band by band."""
         self.reserve_lists()
         self._reserve(COLOR_OUT=16 * self.pixel_count)
-        for first_bin, bin_count, first_entry, _ in self.bands:
-            band = {"first_bin": first_bin, "first_entry": first_entry}
-            self.make_lists(bin_count, band)
-            self._splat(bin_count, band)
+        for first_bin, bin_count, _ in self.bands:
+            self.make_lists(first_bin, bin_count)
+            self._splat(first_bin, bin_count)
 
-    def make_lists(self, bin_count: int, band: dict[str, int]) -> None:
+    def make_lists(self, first_bin: int, bin_count: int) -> None:
         """Scatter and sort the lists of a band."""
         with self.timer.stage("bin_ms"):
             self._run(
@@ -294,13 +292,13 @@ class FramePasses:
                 *("FRAGMENT_PLACE", "BLOCKS", "BIN_OFFSETS", "ENTRIES"),
                 **self._walk,
                 bin_columns=self.bin_grid[0],
-                **band,
+                first_bin=first_bin,
                 defines=self._list_threads,
             )
         with self.timer.stage("sort_ms"):
-            self._sort(bin_count, band)
+            self._sort(first_bin, bin_count)
 
-    def _splat(self, bin_count: int, band: dict[str, int]) -> None:
+    def _splat(self, first_bin: int, bin_count: int) -> None:
         with self.timer.stage("splat_ms"):
             self._run(
                 "splat_tiles",
@@ -311,11 +309,11 @@ class FramePasses:
                 frame_size_px=self.size,
                 tile_grid=self.grid,
                 bin_columns=self.bin_grid[0],
-                **band,
+                first_bin=first_bin,
                 defines=self._splat_variant(),
             )
 
-    def _sort(self, bin_count: int, band: dict[str, int]) -> None:
+    def _sort(self, first_bin: int, bin_count: int) -> None:
         """Sort the lists of a band, a size class at a time.
 
         A frame of one bin meets every class, so that a warm-up compiles them all.
@@ -331,7 +329,7 @@ class FramePasses:
                 (bin_count, 1),
                 *("FRAGMENT_COLOR", "BIN_COUNTS", "BIN_OFFSETS", "ENTRIES", *spare),
                 longest_before=longest_before,
-                **band,
+                first_bin=first_bin,
                 defines={
                     **self._list_threads,
                     **self._rule,

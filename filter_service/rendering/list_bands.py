@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import TOTAL_LONGEST, TOTAL_WORDS
+from filter_service.constants import (
+    TOTAL_ENTRIES,
+    TOTAL_ENTRIES_FLOAT,
+    TOTAL_LONGEST,
+    TOTAL_LOST,
+    TOTAL_WORDS,
+)
 from filter_service.rendering.kernel_passes import MAX_GROUPS
 
 ENTRY_BYTES = 4
@@ -23,25 +29,26 @@ class ListTotals:
     Attributes
     ----------
     entry_count : int
-        Of all bins; exact below 2**32, to seven digits beyond.
+        Of all lists; exact below 2**32, to seven digits beyond.
     overflow_count : int
         Entries that did not fit a bin's list.
     longest : int
         Entries of the longest list.
     """
 
-    entry_count: int
-    overflow_count: int
-    longest: int
+    entry_count: int = 0
+    overflow_count: int = 0
+    longest: int = 0
 
 
 def read_totals(words: bytes) -> ListTotals:
     """Totals from the words behind the bins' offsets."""
     whole = np.frombuffer(words, np.uint32, TOTAL_WORDS)
-    total_float = float(whole[1:2].view(np.float32)[0])
+    as_float = whole[TOTAL_ENTRIES_FLOAT : TOTAL_ENTRIES_FLOAT + 1].view(np.float32)
+    rounded = round(float(as_float[0]))
     return ListTotals(
-        entry_count=round(total_float) if total_float > 2**31 else int(whole[0]),
-        overflow_count=int(whole[2]),
+        entry_count=rounded if rounded > 2**31 else int(whole[TOTAL_ENTRIES]),
+        overflow_count=int(whole[TOTAL_LOST]),
         longest=int(whole[TOTAL_LONGEST]),
     )
 
@@ -53,8 +60,7 @@ def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], lis
     -------
     offsets : (n_bins,)
         Starts of the lists, relative to their band.
-    bands : list of (first bin, bin count, first entry, entry count)
-        Each band's entries start at 0.
+    bands : list of (first bin, bin count, entries)
     """
     bands, offsets = [], np.zeros(len(counts), dtype=np.int64)
     first = 0
@@ -62,6 +68,6 @@ def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], lis
         sums = np.cumsum(counts[first : first + MAX_GROUPS])
         bins = max(int(np.searchsorted(sums, limit, side="right")), 1)
         offsets[first : first + bins] = sums[:bins] - counts[first : first + bins]
-        bands.append((first, bins, 0, int(sums[bins - 1])))
+        bands.append((first, bins, int(sums[bins - 1])))
         first += bins
     return offsets, bands

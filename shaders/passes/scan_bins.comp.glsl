@@ -1,6 +1,6 @@
 // Exclusive sum of the bins' counts: where each list starts.
-// In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts; then the total, the total as
-//      float bits, by which a caller notices a 32-bit overflow, the entries that were not
+// In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
+//      as float bits, by which a caller notices a 32-bit overflow, entries that were not
 //      kept, and the length of the longest list).
 // Dispatch: one group.
 // Twin: tests/numerical/tile_lists.py (numpy.cumsum).
@@ -31,14 +31,15 @@ void main() {
     uint most = 0u;
     float float_sum = 0.0;
     for (int bin = first; bin < end; ++bin) {
-        sum += counts[bin].x;
-        float_sum += float(counts[bin].x);
-        lost += min(counts[bin].z, ~lost);  // stops at the largest number
-        most = max(most, counts[bin].x);
+        uvec4 count = counts[bin];
+        sum += count.x;
+        float_sum += float(count.x);
+        lost += count.z;
+        most = max(most, count.x);
     }
     sums[thread] = sum;
     float_sums[thread] = float_sum;
-    barrier();  // every thread's share is known
+    barrier();  // every thread's share is known, and the totals are clear
     atomicMax(longest, most);
     atomicAdd(lost_count, lost);
     uint start = 0u;
@@ -51,11 +52,11 @@ void main() {
         offsets[bin] = start;
         start += counts[bin].x;
     }
-    barrier();  // the longest list and the losses are known
+    barrier();  // all threads have added to the totals
     if (thread == SCAN_THREADS - 1) {
-        offsets[bin_count] = start;
-        offsets[bin_count + 1] = floatBitsToUint(float_start + float_sum);
-        offsets[bin_count + 2] = lost_count;
+        offsets[bin_count + TOTAL_ENTRIES] = start;
+        offsets[bin_count + TOTAL_ENTRIES_FLOAT] = floatBitsToUint(float_start + float_sum);
+        offsets[bin_count + TOTAL_LOST] = lost_count;
         offsets[bin_count + TOTAL_LONGEST] = longest;
     }
 }

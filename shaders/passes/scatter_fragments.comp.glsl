@@ -20,7 +20,6 @@ uniform int surface_count;
 uniform uint list_capacity;
 uniform int bin_columns;
 uniform int first_bin;            // of the band
-uniform uint first_entry;
 
 #include "common/binning.glsl"
 
@@ -39,7 +38,7 @@ void main() {
     }
     counts[gl_LocalInvocationIndex] = count;
     barrier();  // each thread's share of the list is known
-    uint at = offsets[index] - first_entry;
+    uint at = offsets[index];
     uint last = at + list_capacity;
     for (uint other = 0u; other < gl_LocalInvocationIndex; ++other) at += counts[other];
     walk = start_walk(bin);

@@ -18,7 +18,6 @@ layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint off
 layout(std430, binding = BINDING_ENTRIES) buffer Entries { uint entries[]; };
 
 uniform int first_bin;            // of the band
-uniform uint first_entry;
 uniform uint longest_before;      // list of the class below
 
 shared uint buckets[RADIX * GROUP_THREADS];
@@ -138,7 +137,7 @@ void main() {
         farthest = 0u;
     }
     barrier();  // extremes are clear
-    uint first = offsets[bin] - first_entry;
+    uint first = offsets[bin];
     uint share = (count + uint(GROUP_THREADS) - 1u) / uint(GROUP_THREADS);
     uint my_first = min(gl_LocalInvocationIndex * share, count);
     uint my_end = min(my_first + share, count);

@@ -31,33 +31,51 @@ uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
 uniform int bin_columns;
 uniform int first_bin;            // of the band
-uniform uint first_entry;
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
-// Staged fragments: what the pixel loop needs, ready to use.
-shared vec4 staged_color[BATCH];    // linear RGB, layer fraction
-shared ivec4 staged_box[BATCH];     // first and last pixel that it lights
-shared ivec4 staged_kernel[BATCH];  // first texel, row length, scale bits, level
+// Staged fragments: what the pixel loop needs, ready to use, in as few words as may be: on
+// a software renderer each word that it reads costs a tenth of an evaluation.
+shared vec4 staged_color[BATCH];      // linear RGB, layer fraction
+shared uint staged_shape[BATCH];      // columns and rows of the tile that it lights, a
+                                      // bit each; level; length of its kernel's rows
+shared int staged_texel[BATCH];       // of the tile's first pixel, were it lit
+shared float staged_scale[BATCH];     // of the weights
 shared uint staged_slot[BATCH];
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
-void stage(uint slot, int at) {
+const int ROWS_SHIFT = TILE_SIZE_PX;
+const int SHAPE_LEVEL_SHIFT = 2 * TILE_SIZE_PX;
+const int WIDTH_SHIFT = SHAPE_LEVEL_SHIFT + 2;
+
+// Bits first to last, cut to those of a tile.
+uint bits_between(int first, int last) {
+    uint until = (2u << uint(min(last, TILE_SIZE_PX - 1))) - 1u;
+    return until & ~((1u << uint(max(first, 0))) - 1u);
+}
+
+// Stages a fragment whose box meets the tile.
+void stage(uint slot, int at, ivec2 tile_first) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
     uint kernel = place.y & KERNEL_MASK;
     int level = place_level(place);
     int extent = place_extent_px(place);
     Reach reach = unpack_reach(place.w);
-    float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
-    ivec2 origin = place_origin_px(place);
+    int width = reach_width(reach) + extent;
+    ivec2 origin = place_origin_px(place) - tile_first;
     ivec2 first = origin - ivec2(reach.left, reach.up);
+    ivec2 last = origin + ivec2(reach.right, reach.down) + extent;
+    uint columns = bits_between(first.x, last.x);
+    uint rows = bits_between(first.y, last.y);
     staged_color[at] = vec4(color.rgb, place_fraction(place));
-    staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + extent);
-    staged_kernel[at] = ivec4(kernel_offset(kernel, level), reach_width(reach) + extent,
-                              floatBitsToInt(scale), level);
+    staged_shape[at] = columns | (rows << uint(ROWS_SHIFT))
+                     | (uint(level) << uint(SHAPE_LEVEL_SHIFT))
+                     | (uint(width) << uint(WIDTH_SHIFT));
+    staged_texel[at] = int(kernel_offset(kernel, level)) - first.y * width - first.x;
+    staged_scale[at] = kernel_scale(kernel, level) / WEIGHT_MAX;
 }
 
 // Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
@@ -85,7 +103,7 @@ int hit_count() {
 }
 
 // Stages the fragments of a batch that reach the tile, in order; returns how many.
-int stage_batch(uint batch, uint end, uint tile_bit) {
+int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
     uint mine = gl_LocalInvocationIndex * uint(ENTRIES_PER_THREAD);
     uint found = find_hits(batch + mine, end, tile_bit);
     if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
@@ -99,7 +117,7 @@ int stage_batch(uint batch, uint end, uint tile_bit) {
     int count = hit_count();
     barrier();  // the fragments of the new batch are known
     for (int i = int(gl_LocalInvocationIndex); i < count; i += GROUP_THREADS)
-        stage(staged_slot[i], i);
+        stage(staged_slot[i], i, tile_first);
     barrier();  // and staged
     return count;
 }
@@ -124,11 +142,11 @@ void main() {
     ivec2 tile = ivec2(bin % bin_columns, bin / bin_columns) * BIN_TILES
                + ivec2(in_bin % BIN_TILES, in_bin / BIN_TILES);
     if (any(greaterThanEqual(tile, tile_grid))) return;  // the whole group
-    ivec2 at = tile * TILE_SIZE_PX
-             + ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
+    ivec2 in_tile = ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
+    ivec2 at = tile * TILE_SIZE_PX + in_tile;
     uint tile_bit = 1u << uint(in_bin);
     bool ordered = (counts[bin].y & tile_bit) != 0u;
-    uint first = offsets[bin] - first_entry;
+    uint first = offsets[bin];
     uint end = first + counts[bin].x;
     vec3 light[PIXELS_PER_THREAD];
     vec3 coverage[PIXELS_PER_THREAD];
@@ -137,22 +155,25 @@ void main() {
         coverage[p] = vec3(0.0);
     }
     for (uint batch = first; batch < end; batch += uint(BATCH)) {
-        int staged = stage_batch(batch, end, tile_bit);
+        int staged = stage_batch(batch, end, tile_bit, tile * TILE_SIZE_PX);
         for (int i = 0; i < staged; ++i) {
-            ivec4 box = staged_box[i];
-            ivec4 kernel = staged_kernel[i];
             vec4 color = staged_color[i];
-            bool in_columns = at.x >= box.x && at.x <= box.z;
-            int texel = kernel.x + (at.y - box.y) * kernel.y + at.x - box.x;
+            uint shape = staged_shape[i];
+            float scale = staged_scale[i];
+            int width = int(shape >> uint(WIDTH_SHIFT));
+            int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
+            uint column = (shape >> uint(in_tile.x)) & 1u;
+            uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
+            int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
             for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-                bool lit = in_columns && at.y + p >= box.y && at.y + p <= box.w;
+                bool lit = (rows & (1u << uint(p))) != 0u;
                 uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
                 vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
-                weight *= lit ? intBitsToFloat(kernel.z) : 0.0;
-                weight = ruled_weight(weight, coverage[p], kernel.w, ordered);
+                weight *= lit ? scale : 0.0;
+                weight = ruled_weight(weight, coverage[p], level, ordered);
                 light[p] += weight * color.rgb;
                 coverage[p] += weight;
-                texel += kernel.y;
+                texel += width;
             }
         }
     }

@@ -98,12 +98,15 @@ def made_lists(passes, blocks, place, color, *, reach_px):
         passes.count_bins()
         assert len(passes.bands) == 1
         passes.reserve_lists()
-        passes.make_lists(passes.bin_count, {"first_bin": 0, "first_entry": 0})
+        passes.make_lists(0, passes.bin_count)
         n_bins = passes.bin_count
         counts = gpu.read(passes.buffers["BIN_COUNTS"], (n_bins, 4), np.uint32)
-        offsets = gpu.read(passes.buffers["BIN_OFFSETS"], (n_bins + 1,), np.uint32)
-        entries = gpu.read(passes.buffers["ENTRIES"], (int(offsets[-1]),), np.uint32)
-    return counts, offsets, np.split(entries, offsets[1:-1])
+        offsets = gpu.read(passes.buffers["BIN_OFFSETS"], (n_bins,), np.uint32)
+        entries = gpu.read(
+            passes.buffers["ENTRIES"], (passes.lists.entry_count,), np.uint32
+        )
+    starts = zip(offsets, counts[:, 0], strict=True)
+    return counts, offsets, [entries[start : start + n] for start, n in starts]
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -122,11 +125,13 @@ def test_lists_equal_those_of_all_pairs(bench, rng, rule, surface_count, reach_p
         hidden_from=passes.tile_count * constants.THREADS,
         order_always=paper_rule,
     )
-    assert np.array_equal(offsets, expected.offsets)
-    assert np.array_equal(counts[:, 0], np.diff(expected.offsets))
+    lengths = np.array([len(entries) for entries in expected.entries])
+    assert np.array_equal(counts[:, 0], lengths)
+    assert np.array_equal(offsets, expected.offsets[:-1])
+    assert passes.lists.entry_count == lengths.sum()
     assert np.array_equal(counts[:, 1], expected.ordered_tiles)
     assert not counts[:, 2].any()
-    assert passes.lists.longest == max(map(len, expected.entries))
+    assert passes.lists.longest == lengths.max()
     assert passes.lists.overflow_count == 0
     sorted_bins = 0
     for listed, twin, ordered in zip(
@@ -214,11 +219,10 @@ def test_bands_change_nothing(bench, view, monkeypatch, limit, rule):
 @pytest.mark.parametrize("rule", RULES)
 def test_hardware_group_sizes_make_the_same_frame(bench, view, monkeypatch, rule):
     software = bench.render(view, accumulation=rule)
-    lists = [read(bench, "ENTRIES", (software.entry_count,), np.uint32)]
+    lists = frame_lists(bench)
     monkeypatch.setattr(bench.gpu, "is_software", not bench.gpu.is_software)
     other = bench.render(view, accumulation=rule)
-    lists.append(read(bench, "ENTRIES", (other.entry_count,), np.uint32))
-    assert np.array_equal(*lists)
+    assert np.array_equal(lists, frame_lists(bench))
     # one sum in the same order; products may be fused otherwise
     assert np.abs(other.color - software.color).max() < 1e-5
 
@@ -232,3 +236,12 @@ def read(bench, name, shape, dtype):
 def n_bins():
     edge = constants.BIN_SIZE_PX
     return -(-WIDTH // edge) * -(-HEIGHT // edge)
+
+
+def frame_lists(bench):
+    """Lists of the last frame, one behind the other."""
+    counts = read(bench, "BIN_COUNTS", (n_bins(), 4), np.uint32)[:, 0]
+    starts = read(bench, "BIN_OFFSETS", (n_bins(),), np.uint32)
+    entries = read(bench, "ENTRIES", (int(starts[-1] + counts[-1]),), np.uint32)
+    pairs = zip(starts, counts, strict=True)
+    return np.concatenate([entries[start : start + n] for start, n in pairs])
