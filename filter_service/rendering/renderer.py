@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
+from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
 from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.camera_match import serves
@@ -66,9 +66,11 @@ class Rendered:
     pupil_diameter_mm, focus_dpt : float
         As used.
     fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice, and with a hidden layer the repeated
-        border counts.
+        Fragments, pixels merged into some, and entries of the bins' lists; rows that
+        two strips of a very large frame share count twice, and with a hidden layer the
+        repeated border counts.
+    overflow_count : int
+        Entries that could not be kept, for want of room; their light is missing.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -87,6 +89,7 @@ class Rendered:
     kernel_texel_count: int
     layer_count: int
     notes: list[str]
+    overflow_count: int = 0
 
 
 class FilterRenderer:
@@ -179,7 +182,7 @@ class FilterRenderer:
             whole = extended(whole, border_px)
         kind = np.uint8 if output == "srgb8" else np.float32
         picture = np.empty(whole.color.shape, kind)
-        counts = np.zeros(5, dtype=np.int64)
+        counts = np.zeros(6, dtype=np.int64)
         for strip in _strips(whole, layers, self._gpu.max_block_bytes):
             passes = FramePasses(
                 self._gpu,
@@ -203,9 +206,10 @@ class FilterRenderer:
             picture[strip.wanted] = passes.read_back(output)[strip.kept]
             counts += (
                 *passes.fragment_counts(),
-                passes.entry_count,
+                passes.lists.entry_count,
                 passes.kernel_count,
                 passes.kernel_texel_count,
+                passes.lists.overflow_count,
             )
         self._gpu.check("render")
         notes = list(layers.notes)
@@ -229,6 +233,7 @@ class FilterRenderer:
             kernel_texel_count=int(counts[4]),
             layer_count=len(layers.object_dpt),
             notes=notes,
+            overflow_count=int(counts[5]),
         )
 
     def _prepared_depth(self, view: View, store: PsfStore) -> "_Depth":
@@ -328,17 +333,17 @@ class _Strip:
 def _strips(view: View, layers: FrameLayers, max_block_bytes: int) -> list[_Strip]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
-    Strips start on tile rows, so that tiles and merged quads are those of the whole.
+    Strips start on rows of bins, so that lists and merged squares are the whole's.
     """
     reach_px = layers.max_radius_px + 2
-    halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
-    rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
+    rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
         return [_Strip(view, 0, slice(None), slice(None))]
     step = rows - 2 * halo
-    if step < TILE_SIZE_PX:
+    if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
             f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
             f"a storage block of {max_block_bytes / 1e6:.0f} MB"
