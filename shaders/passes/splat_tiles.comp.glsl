@@ -140,6 +140,11 @@ void close_depth(inout Sum sum) {
     sum.coverage = vec3(0.0);
 }
 
+// Whether a fragment is behind the depth that is being added up.
+bool is_beyond(float depth, float group_depth) {
+    return (depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX;
+}
+
 #ifdef PAPER_RULE
 // What the paper's rule leaves of a weight; it merges once: four pixels.
 vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
@@ -172,35 +177,41 @@ void main() {
         sums[p] = Sum(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
     for (uint batch = first; batch < end; batch += uint(BATCH)) {
         int staged = stage_batch(batch, end, tile_bit, tile * TILE_SIZE_PX);
-        for (int i = 0; i < staged; ++i) {
-            vec4 color = staged_color[i];
-            uint shape = staged_shape[i];
-            float scale = staged_scale[i];
-            int width = int(shape >> uint(WIDTH_SHIFT));
-            int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
-            uint column = (shape >> uint(in_tile.x)) & 1u;
-            uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
-            int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
+        for (int i = 0; i < staged;) {
+            // Without a branch for each fragment: those of one depth in a loop of their own.
+            int run_end = staged;
 #ifndef PAPER_RULE
             if (ordered) {
-                float depth = staged_depth[i];
-                if ((depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX) {
+                if (is_beyond(staged_depth[i], group_depth)) {
                     for (int p = 0; p < PIXELS_PER_THREAD; ++p) close_depth(sums[p]);
-                    group_depth = depth;
+                    group_depth = staged_depth[i];
                 }
+                run_end = i + 1;
+                while (run_end < staged && !is_beyond(staged_depth[run_end], group_depth))
+                    ++run_end;
             }
 #endif
-            for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-                bool lit = (rows & (1u << uint(p))) != 0u;
-                uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
-                vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
-                weight *= lit ? scale : 0.0;
+            for (; i < run_end; ++i) {
+                vec4 color = staged_color[i];
+                uint shape = staged_shape[i];
+                float scale = staged_scale[i];
+                int width = int(shape >> uint(WIDTH_SHIFT));
+                int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
+                uint column = (shape >> uint(in_tile.x)) & 1u;
+                uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
+                int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
+                for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
+                    bool lit = (rows & (1u << uint(p))) != 0u;
+                    uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
+                    vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
+                    weight *= lit ? scale : 0.0;
 #ifdef PAPER_RULE
-                weight = paper_weight(weight, sums[p].coverage, level);
+                    weight = paper_weight(weight, sums[p].coverage, level);
 #endif
-                sums[p].light += weight * color.rgb;
-                sums[p].coverage += weight;
-                texel += width;
+                    sums[p].light += weight * color.rgb;
+                    sums[p].coverage += weight;
+                    texel += width;
+                }
             }
         }
     }
