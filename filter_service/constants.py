@@ -33,8 +33,8 @@ TOTAL_ENTRIES_FLOAT = 1
 TOTAL_LOST = 2
 TOTAL_LONGEST = 3
 TOTAL_WORDS = 4
-"""Words behind the bins' offsets: entries of all lists, the same as a float, entries that
-were not kept, length of the longest list."""
+"""Words behind the bins' offsets: entries of all lists, the same as a float, entries
+that were not kept, length of the longest list."""
 
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS

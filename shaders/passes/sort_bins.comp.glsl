@@ -15,7 +15,7 @@ layout(local_size_x = GROUP_THREADS) in;
 layout(std430, binding = BINDING_FRAGMENT_COLOR) readonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
 layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint offsets[]; };
-layout(std430, binding = BINDING_ENTRIES) buffer Entries { uint entries[]; };
+layout(std430, binding = BINDING_ENTRIES) coherent buffer Entries { uint entries[]; };
 
 uniform int first_bin;            // of the band
 uniform uint longest_before;      // list of the class below
@@ -56,7 +56,7 @@ void finish(uint first, uint my_first, uint my_end, bool odd) {
         entries[first + i] = read_item(i, first, !odd);
 }
 #else
-layout(std430, binding = BINDING_ENTRIES_SPARE) buffer Spare { uint spare[]; };
+layout(std430, binding = BINDING_ENTRIES_SPARE) coherent buffer Spare { uint spare[]; };
 
 uint read_item(uint i, uint first, bool odd) {
     return odd ? spare[first + i] : entries[first + i];

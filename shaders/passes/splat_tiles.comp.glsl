@@ -3,9 +3,9 @@
 // In:  FRAGMENT_COLOR, FRAGMENT_PLACE, BIN_COUNTS, BIN_OFFSETS, ENTRIES, KERNELS,
 //      the kernel atlas, PIXELS (own colour where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
-// Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD pixels of a
-//      column (8 on a software renderer, where a staged fragment is then read once by
-//      one vector of threads; 1 on hardware).
+// Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD
+//      pixels of a column (8 on a software renderer, where a staged fragment is then read
+//      once by one vector of threads; 1 on hardware).
 // Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
 //      fragments of one depth (to DISCONTINUITY_PX of blur), front to back, each of which
 //      shares what the nearer ones leave free: of a surface that another hides in part,

@@ -186,6 +186,13 @@ def test_every_size_class_sorts_alike(bench, rng, monkeypatch, rule, reach_px):
     assert np.array_equal(results[0], results[2])
 
 
+def test_a_key_holds_the_depth_and_the_place_in_the_longest_list():
+    assert max(constants.SORT_CAPACITIES) <= 2**constants.SORT_INDEX_BITS
+    assert max(KEY_BITS.values()) + constants.SORT_INDEX_BITS <= 32
+    # every sort must begin and end on whole digits
+    assert not any(bits % constants.RADIX_BITS for bits in KEY_BITS.values())
+
+
 def test_a_list_that_overflows_keeps_its_first_entries_and_is_counted(
     bench, view, monkeypatch
 ):
