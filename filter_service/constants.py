@@ -10,18 +10,46 @@ QUADS_ACROSS = TILE_SIZE_PX // 2
 QUADS = QUADS_ACROSS * QUADS_ACROSS
 """Quads of pixels in a block, and along one side of it."""
 
+BIN_TILES = 2
+BIN_SIZE_PX = BIN_TILES * TILE_SIZE_PX
+TILES_PER_BIN = BIN_TILES * BIN_TILES
+ALL_TILES = (1 << TILES_PER_BIN) - 1
+"""Lists are made and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An
+entry is a word: a bit for each tile of the bin that the fragment lights, and above them
+its slot, so a strip may have 2**28 slots (a storage block of 2 GiB holds 2**27).  Bins
+of 4 x 4 tiles halve the work on the lists again, but a tile then reads four times as
+many entries for each one that it evaluates, which costs more."""
+
+BATCH = 128
+HIT_WORDS = BATCH // 32
+"""Entries of a list that the splat pass looks at in one go, and words with a bit for
+each of them."""
+
 SCAN_THREADS = 256
-"""Threads of the single group that sums the tile counts."""
+"""Threads of the single group that sums the bins' counts."""
+
+TOTAL_ENTRIES = 0
+TOTAL_ENTRIES_FLOAT = 1
+TOTAL_LOST = 2
+TOTAL_LONGEST = 3
+TOTAL_WORDS = 4
+"""Words behind the bins' offsets: entries of all lists, the same as a float, entries
+that were not kept, length of the longest list."""
 
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS
 """Buckets of one sorting pass; with a group of 64 they fill 4 KiB of shared memory."""
 
 SORT_KEY_BITS = 16
-PAPER_SORT_KEY_BITS = 24
-"""Depth steps within a tile's own depth range.  The paper's rule weighs every pair by
-its order, so it gets finer steps; equal keys keep the order of the list.  An even count
-of passes lets the sorted list end in the buffer it started in."""
+PAPER_SORT_KEY_BITS = 20
+"""Depth steps within a bin's own depth range: dioptres / 2**16, or of the paper's
+distance, whose rule weighs every pair by its order, the float's own steps, 2**20 at
+most.  Equal keys keep the order of the list, which is scan order."""
+
+SORT_INDEX_BITS = 12
+SORT_CAPACITIES = (512, 2048)
+"""Size classes of the sort: lists up to these lengths are sorted in shared memory, 4
+and 16 KiB, as words of depth and place in the list; longer ones through memory."""
 
 DISCONTINUITY_PX = 0.25
 """Blur change between neighbours above which they count as two surfaces.  Continuous
@@ -150,8 +178,8 @@ BINDINGS = {
     "BINDING_FRAGMENT_COLOR": 4,
     "BINDING_FRAGMENT_PLACE": 5,
     "BINDING_BLOCKS": 6,
-    "BINDING_TILE_COUNTS": 7,
-    "BINDING_TILE_OFFSETS": 8,
+    "BINDING_BIN_COUNTS": 7,
+    "BINDING_BIN_OFFSETS": 8,
     "BINDING_ENTRIES": 9,
     "BINDING_ENTRIES_SPARE": 10,
     "BINDING_KERNELS": 11,

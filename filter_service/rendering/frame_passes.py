@@ -6,36 +6,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import (
+    BIN_TILES,
     BYTES_PER_WORD,
     HALVES_PER_WORD,
     MAX_LEVEL,
     PAPER_SORT_KEY_BITS,
     RGB,
+    SORT_CAPACITIES,
     SORT_KEY_BITS,
     THREADS,
     TILE_SIZE_PX,
+    TILES_PER_BIN,
+    TOTAL_WORDS,
 )
 from filter_service.gl.gpu import Buffer, Gpu, StageTimer
 from filter_service.psfs.store import FrameLayers
+from filter_service.rendering import list_bands
 from filter_service.rendering.frame import View
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rendering.kernel_passes import (
-    MAX_GROUPS,
     KernelSet,
     used_pairs,
     words_per_cell,
 )
 
-ENTRY_BYTES = 4
-MAX_BAND_ENTRIES = 16 * 2**20
-"""Tile list entries in flight; more go through in bands.  Keeps each list buffer at
-64 MB, half of the smallest storage block that the service runs on."""
-
 SOFTWARE_PIXELS_PER_THREAD = 8
 """2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
 
 SOFTWARE_LIST_THREADS = 8
-"""Threads that make and sort a tile's list on a software renderer: one vector."""
+"""Threads that make and sort a bin's list on a software renderer: one vector."""
 
 
 COLOR_VARIANTS = {
@@ -67,6 +66,9 @@ class FramePasses:
     layers : FrameLayers
     image : ImageCells
         Cells of the whole frame.
+    surface_count : int, optional
+        Surfaces whose fragments lie one behind the other in the blocks; those of the
+        view unless a test makes blocks of its own.
     first_row : int
         Of the strip within the frame.
     frame_pixel_count : int, optional
@@ -89,6 +91,7 @@ class FramePasses:
         image: ImageCells,
         paper_rule: bool,
         merge: bool,
+        surface_count: int | None = None,
         first_row: int = 0,
         frame_pixel_count: int | None = None,
         image_size_px: tuple[int, int] | None = None,
@@ -104,8 +107,10 @@ class FramePasses:
         self.pixel_count = view.width_px * view.height_px
         self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
         self.tile_count = self.grid[0] * self.grid[1]
-        self.surface_count = view.surface_count
+        self.surface_count = surface_count or view.surface_count
         self.block_count = self.surface_count * self.tile_count
+        self.bin_grid = tuple(group_count(side, BIN_TILES) for side in self.grid)
+        self.bin_count = self.bin_grid[0] * self.bin_grid[1]
         self.buffers: dict[str, Buffer] = {}
         self.layers = layers
         self.image = image
@@ -117,7 +122,7 @@ class FramePasses:
         self.image_size_px = image_size_px or self.size
         self.border_px = border_px
         self.white_level = white_level
-        self.entry_count = 0
+        self.lists = list_bands.ListTotals()
         self.kernel_count = 0
         self.kernel_texel_count = 0
 
@@ -159,7 +164,7 @@ class FramePasses:
         """
         self.upload()
         self.merge_fragments(kernels(self.build_fragments()))
-        self.count_tiles()
+        self.count_bins()
         self.splat_bands()
 
     def build_fragments(self) -> NDArray[np.bool_]:
@@ -240,109 +245,137 @@ class FramePasses:
             group_count(int(np.ceil(largest_reach_px)), TILE_SIZE_PX), max(self.grid)
         )
 
-    def count_tiles(self) -> None:
-        """Lengths and offsets of the tile lists, and the bands they are made in."""
+    def count_bins(self) -> None:
+        """Lengths and offsets of the lists, and the bands they are made in."""
         self._reserve(
-            TILE_COUNTS=8 * self.tile_count, TILE_OFFSETS=4 * (self.tile_count + 2)
+            BIN_COUNTS=16 * self.bin_count,
+            BIN_OFFSETS=4 * (self.bin_count + TOTAL_WORDS),
         )
         with self.timer.stage("bin_ms"):
             self._run(
-                "count_tiles",
-                self.grid,
-                *("FRAGMENT_PLACE", "BLOCKS", "TILE_COUNTS"),
-                tile_grid=self.grid,
-                search_blocks=self.search_blocks,
-                surface_count=self.surface_count,
+                "count_bins",
+                self.bin_grid,
+                *("FRAGMENT_PLACE", "BLOCKS", "BIN_COUNTS"),
+                **self._walk,
                 order_always=int(self.paper_rule),
                 defines=self._list_threads,
             )
             self._run(
-                "scan_tiles",
+                "scan_bins",
                 (1, 1),
-                "TILE_COUNTS",
-                "TILE_OFFSETS",
-                tile_count=self.tile_count,
+                *("BIN_COUNTS", "BIN_OFFSETS"),
+                bin_count=self.bin_count,
             )
         with self.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
 
-    def _plan_bands(self) -> list[tuple[int, int, int, int]]:
-        """Bands as (first tile, tile count, first entry, entry count)."""
-        total, total_float = self._totals()
-        self.entry_count = round(total_float) if total_float > 2**31 else total
-        fits = self.entry_count <= MAX_BAND_ENTRIES and self.tile_count <= MAX_GROUPS
-        if fits:
-            return [(0, self.tile_count, 0, total)]
-        counts = self.gpu.read(
-            self.buffers["TILE_COUNTS"], (self.tile_count, 2), np.uint32
-        )[:, 0].astype(np.int64)
-        offsets, bands = _split(counts, MAX_BAND_ENTRIES)
-        self.buffers["TILE_OFFSETS"] = self.gpu.upload(
-            "TILE_OFFSETS", offsets.astype(np.uint32)
+    @property
+    def _walk(self) -> dict:
+        """Uniforms of common/binning.glsl, and where a list ends."""
+        return {
+            "tile_grid": self.grid,
+            "search_blocks": self.search_blocks,
+            "surface_count": self.surface_count,
+            "list_capacity": self._list_limit,
+        }
+
+    @property
+    def _list_limit(self) -> int:
+        """Entries of a band, and of the longest list that is kept."""
+        fit = self.gpu.max_block_bytes // list_bands.ENTRY_BYTES
+        return min(list_bands.MAX_BAND_ENTRIES, fit)
+
+    def _plan_bands(self) -> list[tuple[int, int, int]]:
+        """Bands as (first bin, bin count, entries)."""
+        words = self.buffers["BIN_OFFSETS"].read(
+            4 * TOTAL_WORDS, offset=4 * self.bin_count
         )
+        self.lists = list_bands.read_totals(words)
+        limit = self._list_limit
+        if self.lists.entry_count <= limit and self.bin_count <= list_bands.MAX_GROUPS:
+            return [(0, self.bin_count, self.lists.entry_count)]
+        counts = self.gpu.read(
+            self.buffers["BIN_COUNTS"], (self.bin_count, 4), np.uint32
+        )[:, 0].astype(np.int64)
+        offsets, bands = list_bands.split(counts, limit)
+        self.buffers["BIN_OFFSETS"].write(offsets.astype(np.uint32))
         return bands
 
-    def _totals(self) -> tuple[int, float]:
-        data = self.buffers["TILE_OFFSETS"].read(8, offset=4 * self.tile_count)
-        return (
-            int(np.frombuffer(data, np.uint32, 1)[0]),
-            float(np.frombuffer(data, np.float32, 1, offset=4)[0]),
-        )
+    def reserve_lists(self) -> None:
+        """Buffers for the lists of the longest band."""
+        n_bytes = list_bands.ENTRY_BYTES * max(entries for _, _, entries in self.bands)
+        self._reserve(ENTRIES=n_bytes)
+        needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
+        self._reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
 
     def splat_bands(self) -> None:
         """Scatter, sort and splat, band by band."""
-        longest = max(band[3] for band in self.bands)
-        self._reserve(
-            ENTRIES=ENTRY_BYTES * longest,
-            ENTRIES_SPARE=ENTRY_BYTES * longest,
-            COLOR_OUT=16 * self.pixel_count,
-        )
-        for first_tile, tile_count, first_entry, _ in self.bands:
-            band = {"first_tile": first_tile, "first_entry": first_entry}
-            groups = (tile_count, 1)
-            with self.timer.stage("bin_ms"):
-                self._run(
-                    "scatter_fragments",
-                    groups,
-                    *("FRAGMENT_PLACE", "BLOCKS", "TILE_OFFSETS", "ENTRIES"),
-                    tile_grid=self.grid,
-                    search_blocks=self.search_blocks,
-                    surface_count=self.surface_count,
-                    **band,
-                    defines=self._list_threads,
-                )
-            with self.timer.stage("sort_ms"):
-                self._run(
-                    "sort_tiles",
-                    groups,
-                    *("FRAGMENT_COLOR", "TILE_COUNTS", "TILE_OFFSETS"),
-                    *("ENTRIES", "ENTRIES_SPARE"),
-                    **band,
-                    defines={
-                        **self._list_threads,
-                        "KEY_BITS": (
-                            PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
-                        ),
-                    },
-                )
-            with self.timer.stage("splat_ms"):
-                self._run(
-                    "splat_tiles",
-                    groups,
-                    *(
-                        "FRAGMENT_COLOR",
-                        "FRAGMENT_PLACE",
-                        "TILE_COUNTS",
-                        "TILE_OFFSETS",
-                    ),
-                    *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
-                    textures={"ATLAS": self.gpu.atlas("kernels", 1)},
-                    frame_size_px=self.size,
-                    tile_grid=self.grid,
-                    blur_px_per_dpt=self.layers.blur_px_per_dpt,
-                    **band,
-                    defines=self._splat_variant(),
-                )
+        self.reserve_lists()
+        self._reserve(COLOR_OUT=16 * self.pixel_count)
+        for first_bin, bin_count, _ in self.bands:
+            self.make_lists(first_bin, bin_count)
+            self._splat(first_bin, bin_count)
+
+    def make_lists(self, first_bin: int, bin_count: int) -> None:
+        """Scatter and sort the lists of a band."""
+        with self.timer.stage("bin_ms"):
+            self._run(
+                "scatter_fragments",
+                (bin_count, 1),
+                *("FRAGMENT_PLACE", "BLOCKS", "BIN_OFFSETS", "ENTRIES"),
+                **self._walk,
+                bin_columns=self.bin_grid[0],
+                first_bin=first_bin,
+                defines=self._list_threads,
+            )
+        with self.timer.stage("sort_ms"):
+            self._sort(first_bin, bin_count)
+
+    def _splat(self, first_bin: int, bin_count: int) -> None:
+        with self.timer.stage("splat_ms"):
+            self._run(
+                "splat_tiles",
+                (TILES_PER_BIN, bin_count),
+                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
+                *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
+                textures={"ATLAS": self.gpu.atlas("kernels", 1)},
+                frame_size_px=self.size,
+                tile_grid=self.grid,
+                bin_columns=self.bin_grid[0],
+                first_bin=first_bin,
+                blur_px_per_dpt=self.layers.blur_px_per_dpt,
+                defines=self._splat_variant(),
+            )
+
+    def _sort(self, first_bin: int, bin_count: int) -> None:
+        """Sort the lists of a band, a size class at a time.
+
+        A frame of one bin meets every class, so that a warm-up compiles them all.
+        """
+        key_bits = PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
+        longest_before = 1
+        for capacity in (*SORT_CAPACITIES, 0):
+            if self.lists.longest <= longest_before and bin_count > 1:
+                return
+            spare = () if capacity else ("ENTRIES_SPARE",)
+            self._run(
+                "sort_bins",
+                (bin_count, 1),
+                *("FRAGMENT_COLOR", "BIN_COUNTS", "BIN_OFFSETS", "ENTRIES", *spare),
+                longest_before=longest_before,
+                first_bin=first_bin,
+                defines={
+                    **self._list_threads,
+                    **self._rule,
+                    "CAPACITY": capacity,
+                    "KEY_BITS": key_bits,
+                },
+            )
+            longest_before = capacity
+
+    @property
+    def _rule(self) -> dict[str, int]:
+        return {"PAPER_RULE": 1} if self.paper_rule else {}
 
     @property
     def _list_threads(self) -> dict[str, int]:
@@ -352,8 +385,7 @@ class FramePasses:
     def _splat_variant(self) -> dict[str, int]:
         pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
         rows = TILE_SIZE_PX // pixels
-        rule = {"PAPER_RULE": 1} if self.paper_rule else {}
-        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **rule}
+        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **self._rule}
 
     def read_back(self, output: str) -> NDArray:
         """Fetch the filtered picture, encoded as asked."""
@@ -392,7 +424,8 @@ class FramePasses:
         return {
             "fragment_count": fragment_count,
             "merged_count": merged_count,
-            "entry_count": self.entry_count,
+            "entry_count": self.lists.entry_count,
+            "overflow_count": self.lists.overflow_count,
             "kernel_count": self.kernel_count,
             "kernel_texel_count": self.kernel_texel_count,
         }
@@ -401,17 +434,3 @@ class FramePasses:
         """Fragments after merging, and pixels that went into merged ones."""
         blocks = self.gpu.read(self.buffers["BLOCKS"], (self.block_count, 4), np.uint32)
         return int(blocks[:, 0].sum()), int(blocks[:, 3].sum())
-
-
-def _split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray, list]:
-    """Offsets relative to each band's start, and bands of at most ``limit`` entries."""
-    bands, offsets = [], np.zeros(len(counts) + 2, dtype=np.int64)
-    first = 0
-    while first < len(counts):
-        sums = np.cumsum(counts[first:])
-        tiles = max(int(np.searchsorted(sums, limit, side="right")), 1)
-        tiles = min(tiles, MAX_GROUPS)
-        offsets[first : first + tiles] = sums[:tiles] - counts[first : first + tiles]
-        bands.append((first, tiles, 0, int(sums[tiles - 1])))
-        first += tiles
-    return offsets, bands

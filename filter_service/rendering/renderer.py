@@ -8,7 +8,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import STORE_SIDE, TILE_SIZE_PX
+from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
 from filter_service.gl.gpu import Gpu, StageTimer
 from filter_service.psfs.camera_match import serves
@@ -67,11 +67,11 @@ class Rendered:
     gaze_deg : (h, v)
         As used.
     fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and tile list entries; rows that two strips
-        of a very large frame share count twice, and with a hidden layer the repeated
-        border counts.
+        Fragments, pixels merged into some, and entries of the bins' lists; rows that
+        two strips of a very large frame share count twice, and with a hidden layer the
+        repeated border counts.
     overflow_count : int
-        Tile list entries that could not be kept; the lists are sized by need.
+        Entries that could not be kept, for want of room; their light is missing.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -350,16 +350,16 @@ class _Strip:
 def _strips(view: View, reach_px: int, max_block_bytes: int) -> list[_Strip]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
-    Strips start on tile rows, so that tiles and merged quads are those of the whole.
+    Strips start on rows of bins, so that lists and merged squares are the whole's.
     """
-    halo = -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
-    rows = rows // TILE_SIZE_PX * TILE_SIZE_PX
+    rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
         return [_Strip(view, 0, slice(None), slice(None))]
     step = rows - 2 * halo
-    if step < TILE_SIZE_PX:
+    if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
             f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
             f"a storage block of {max_block_bytes / 1e6:.0f} MB"

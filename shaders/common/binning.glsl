@@ -1,45 +1,66 @@
-// Walk over the fragments whose light reaches a tile.  Thread t takes the blocks
-// t, t + GROUP_THREADS, ... around the tile and their fragments in order: a fixed order, so
-// the same frame gives the same list.  Surface after surface.
+// Walk over the fragments whose light reaches a bin, in scan order: blocks row by row
+// through the window around the bin, surface after surface, and the fragments of each in
+// order.  Each thread takes one stretch of that line; so the list is the same for any
+// number of threads, and for every run.
 // Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks`,
 // `surface_count` in scope.
 
 struct Walk {
-    ivec2 tile;
-    int next;                     // next block of this thread within the window
-    int width;                    // blocks along one side of the window
+    ivec2 bin;
+    int next;                     // next block of this thread in the line
+    int end;
 };
 
-Walk start_walk(ivec2 tile) {
-    int width = 2 * search_blocks + 1;
-    return Walk(tile, int(gl_LocalInvocationIndex), width);
+// Blocks along one side of the window.
+int window_width() { return 2 * search_blocks + BIN_TILES; }
+
+Walk start_walk(ivec2 bin) {
+    int length = surface_count * window_width() * window_width();
+    int share = (length + GROUP_THREADS - 1) / GROUP_THREADS;
+    int first = int(gl_LocalInvocationIndex) * share;
+    return Walk(bin, first, min(first + share, length));
 }
 
 // Next block in reach, or -1.
 int next_block(inout Walk walk) {
-    int area = walk.width * walk.width;
-    while (walk.next < surface_count * area) {
-        int place = walk.next % area;
-        int surface = walk.next / area;
-        ivec2 at = walk.tile - search_blocks
-                 + ivec2(place % walk.width, place / walk.width);
-        walk.next += GROUP_THREADS;
+    int width = window_width();
+    ivec2 bin_first = walk.bin * BIN_SIZE_PX;
+    while (walk.next < walk.end) {
+        int row = walk.next / width;
+        ivec2 at = walk.bin * BIN_TILES - search_blocks
+                 + ivec2(walk.next - row * width, row % width);
+        ++walk.next;
         if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, tile_grid))) continue;
-        int block = (surface * tile_grid.y + at.y) * tile_grid.x + at.x;
+        int block = (row / width * tile_grid.y + at.y) * tile_grid.x + at.x;
         float reach = uintBitsToFloat(blocks[block].y);
-        if (distance_squared_between_tiles(at, walk.tile) <= reach * reach) return block;
+        ivec2 first = at * TILE_SIZE_PX;
+        float gap_squared = distance_squared_between(first, first + TILE_SIZE_PX - 1,
+                                                     bin_first, bin_first + BIN_SIZE_PX - 1);
+        if (gap_squared <= reach * reach) return block;
     }
     return -1;
 }
 
-bool reaches_tile(uvec4 place, ivec2 tile) {
+// A bit for each tile of the bin that the fragment lights: within the box of its kernel
+// and within the discs about the pixels of its square.
+uint tiles_in_reach(uvec4 place, ivec2 bin) {
     Reach reach = unpack_reach(place.w);
     ivec2 first = place_origin_px(place);
     ivec2 last = first + place_extent_px(place);
-    ivec2 tile_first = tile * TILE_SIZE_PX;
-    ivec2 tile_last = tile_first + TILE_SIZE_PX - 1;
-    if (any(lessThan(last + ivec2(reach.right, reach.down), tile_first))
-        || any(greaterThan(first - ivec2(reach.left, reach.up), tile_last))) return false;
+    ivec2 box_first = first - ivec2(reach.left, reach.up);
+    ivec2 box_last = last + ivec2(reach.right, reach.down);
     float radius = place_reach_px(place);
-    return distance_squared_to_tile(vec2(first), tile_first) <= radius * radius;
+    uint tiles = 0u;
+    for (int i = 0; i < TILES_PER_BIN; ++i) {
+        ivec2 tile_first = (bin * BIN_TILES + ivec2(i % BIN_TILES, i / BIN_TILES)) * TILE_SIZE_PX;
+        ivec2 tile_last = tile_first + TILE_SIZE_PX - 1;
+        bool in_box = all(lessThanEqual(box_first, tile_last))
+                   && all(greaterThanEqual(box_last, tile_first));
+        float gap_squared = distance_squared_between(first, last, tile_first, tile_last);
+        if (in_box && gap_squared <= radius * radius) tiles |= 1u << uint(i);
+    }
+    return tiles;
 }
+
+// An entry of a list: slot of the fragment, and which tiles of the bin it lights.
+uint pack_entry(uint slot, uint tiles) { return (slot << uint(TILES_PER_BIN)) | tiles; }

@@ -38,7 +38,5 @@ int place_level(uvec4 place) { return int((place.y >> LEVEL_SHIFT) & LEVEL_MASK)
 // Pixels of its square beyond the first, to the right and down.
 int place_extent_px(uvec4 place) { return (1 << place_level(place)) - 1; }
 
-// Largest distance at which the fragment lights a pixel, from its first pixel.
-float place_reach_px(uvec4 place) {
-    return float(place.z >> PLACE_BITS) + 0.5 + sqrt(2.0) * float(place_extent_px(place));
-}
+// Largest distance at which the fragment lights a pixel, from the nearest of its own.
+float place_reach_px(uvec4 place) { return float(place.z >> PLACE_BITS) + 0.5; }

@@ -25,7 +25,6 @@ layout(std430, binding = BINDING_BLOCKS) buffer Blocks { uvec4 blocks[]; };
 #include "common/kernels.glsl"
 #include "common/reach.glsl"
 #include "common/fragments.glsl"
-#include "common/tiles.glsl"
 
 uniform ivec2 frame_size_px;
 uniform int layer_count;
@@ -100,7 +99,8 @@ void find_edge(ivec2 block, ivec2 grid, uint thread) {
         if (any(lessThan(other, ivec2(0))) || any(greaterThanEqual(other, grid))) continue;
         uvec4 seen = blocks[other.y * grid.x + other.x];
         float reach = uintBitsToFloat(seen.y) + largest_reach_px;
-        if (seen.z != 0u && distance_squared_between_tiles(block, other) <= reach * reach)
+        ivec2 gap = max(abs(other - block) * TILE_SIZE_PX - (TILE_SIZE_PX - 1), 0);
+        if (seen.z != 0u && float(gap.x * gap.x + gap.y * gap.y) <= reach * reach)
             atomicOr(edge_in_reach, 1u);
     }
 }

@@ -1,7 +1,7 @@
-// Writes each tile's list of fragment slots, in the order of the walk.
-// In:  FRAGMENT_PLACE, BLOCKS, TILE_OFFSETS.   Out: ENTRIES.
-// Dispatch: one group of GROUP_THREADS a tile of the band.
-// Twin: tests/numerical/test_renderer_passes.py (lists by comparing all pairs).
+// Writes each bin's list: slots of fragments, and the tiles that they light, in scan order.
+// In:  FRAGMENT_PLACE, BLOCKS, BIN_OFFSETS.   Out: ENTRIES.
+// Dispatch: one group of GROUP_THREADS a bin of the band.
+// Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
 
 #include "common/tiles.glsl"
 #include "common/reach.glsl"
@@ -11,39 +11,45 @@ layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };
-layout(std430, binding = BINDING_TILE_OFFSETS) readonly buffer Offsets { uint offsets[]; };
+layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint offsets[]; };
 layout(std430, binding = BINDING_ENTRIES) writeonly buffer Entries { uint entries[]; };
 
 uniform ivec2 tile_grid;
 uniform int search_blocks;
 uniform int surface_count;
-uniform int first_tile;           // of the band
-uniform uint first_entry;
+uniform uint list_capacity;
+uniform int bin_columns;
+uniform int first_bin;            // of the band
 
 #include "common/binning.glsl"
 
 shared uint counts[GROUP_THREADS];
 
 void main() {
-    int index = first_tile + int(gl_WorkGroupID.x);
-    ivec2 tile = ivec2(index % tile_grid.x, index / tile_grid.x);
+    int index = first_bin + int(gl_WorkGroupID.x);
+    ivec2 bin = ivec2(index % bin_columns, index / bin_columns);
     uint count = 0u;
-    Walk walk = start_walk(tile);
+    Walk walk = start_walk(bin);
     for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
         uint first = uint(block * THREADS);
         uint end = first + blocks[block].x;
         for (uint slot = first; slot < end; ++slot)
-            if (reaches_tile(places[slot], tile)) ++count;
+            count += tiles_in_reach(places[slot], bin) != 0u ? 1u : 0u;
     }
     counts[gl_LocalInvocationIndex] = count;
     barrier();  // each thread's share of the list is known
-    uint at = offsets[index] - first_entry;
+    uint at = offsets[index];
+    uint last = at + list_capacity;
     for (uint other = 0u; other < gl_LocalInvocationIndex; ++other) at += counts[other];
-    walk = start_walk(tile);
+    walk = start_walk(bin);
     for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
         uint first = uint(block * THREADS);
         uint end = first + blocks[block].x;
-        for (uint slot = first; slot < end; ++slot)
-            if (reaches_tile(places[slot], tile)) entries[at++] = slot;
+        for (uint slot = first; slot < end; ++slot) {
+            uint tiles = tiles_in_reach(places[slot], bin);
+            if (tiles == 0u) continue;
+            if (at < last) entries[at] = pack_entry(slot, tiles);
+            ++at;
+        }
     }
 }

@@ -1,10 +1,11 @@
-// Adds up the light that a tile's fragments send to each of its pixels.
-// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, TILE_COUNTS, TILE_OFFSETS, ENTRIES, KERNELS,
+// Adds up the light that a tile's fragments send to each of its pixels: walks the list of
+// the tile's bin, stages what reaches the tile, and evaluates that.
+// In:  FRAGMENT_COLOR, FRAGMENT_PLACE, BIN_COUNTS, BIN_OFFSETS, ENTRIES, KERNELS,
 //      the kernel atlas, PIXELS (own colour where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
-// Dispatch: one group a tile of the band; a thread serves PIXELS_PER_THREAD pixels of a
-//      column (8 on a software renderer, where a staged fragment is then read once by
-//      one vector of threads; 1 on hardware).
+// Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD
+//      pixels of a column (8 on a software renderer, where a staged fragment is then read
+//      once by one vector of threads; 1 on hardware).
 // Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
 //      fragments of one depth (to DISCONTINUITY_PX of blur), front to back, each of which
 //      shares what the nearer ones leave free: of a surface that another hides in part,
@@ -19,8 +20,8 @@ layout(local_size_x = TILE_SIZE_PX, local_size_y = GROUP_ROWS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_COLOR) readonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
-layout(std430, binding = BINDING_TILE_COUNTS) readonly buffer Counts { uvec2 counts[]; };
-layout(std430, binding = BINDING_TILE_OFFSETS) readonly buffer Offsets { uint offsets[]; };
+layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
+layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint offsets[]; };
 layout(std430, binding = BINDING_ENTRIES) readonly buffer Entries { uint entries[]; };
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_PIXELS) readonly buffer Pixels { vec4 pixels[]; };
@@ -30,35 +31,100 @@ layout(std430, binding = BINDING_COLOR_OUT) writeonly buffer ColorOut { vec4 col
 
 uniform ivec2 frame_size_px;
 uniform ivec2 tile_grid;
-uniform int first_tile;           // of the band
-uniform uint first_entry;
+uniform int bin_columns;
+uniform int first_bin;            // of the band
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
+const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
-// Staged fragments: what the pixel loop needs, ready to use.
-shared vec4 staged_color[THREADS];    // linear RGB, layer fraction
-shared ivec4 staged_box[THREADS];     // first and last pixel that it lights
-shared ivec4 staged_kernel[THREADS];  // first texel, row length, scale bits, depth bits
+// Staged fragments: what the pixel loop needs, ready to use, in as few words as may be: on
+// a software renderer each word that it reads costs a tenth of an evaluation.
+shared vec4 staged_color[BATCH];      // linear RGB, layer fraction
+shared uint staged_shape[BATCH];      // columns and rows of the tile that it lights, a
+                                      // bit each; level; length of its kernel's rows
+shared int staged_texel[BATCH];       // of the tile's first pixel, were it lit
+shared float staged_scale[BATCH];     // of the weights
+shared float staged_depth[BATCH];     // read where order matters
+shared uint staged_slot[BATCH];
+shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
-void stage(uint slot, uint at) {
+const int ROWS_SHIFT = TILE_SIZE_PX;
+const int SHAPE_LEVEL_SHIFT = 2 * TILE_SIZE_PX;
+const int WIDTH_SHIFT = SHAPE_LEVEL_SHIFT + 2;
+
+// Bits first to last, cut to those of a tile.
+uint bits_between(int first, int last) {
+    uint until = (2u << uint(min(last, TILE_SIZE_PX - 1))) - 1u;
+    return until & ~((1u << uint(max(first, 0))) - 1u);
+}
+
+// Stages a fragment whose box meets the tile.
+void stage(uint slot, int at, ivec2 tile_first) {
     vec4 color = colors[slot];
     uvec4 place = places[slot];
     uint kernel = place.y & KERNEL_MASK;
     int level = place_level(place);
     int extent = place_extent_px(place);
     Reach reach = unpack_reach(place.w);
-    float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
-    ivec2 origin = place_origin_px(place);
+    int width = reach_width(reach) + extent;
+    ivec2 origin = place_origin_px(place) - tile_first;
     ivec2 first = origin - ivec2(reach.left, reach.up);
+    ivec2 last = origin + ivec2(reach.right, reach.down) + extent;
+    uint columns = bits_between(first.x, last.x);
+    uint rows = bits_between(first.y, last.y);
     staged_color[at] = vec4(color.rgb, place_fraction(place));
-    staged_box[at] = ivec4(first, origin + ivec2(reach.right, reach.down) + extent);
-    staged_kernel[at] = ivec4(kernel_offset(kernel, level), reach_width(reach) + extent,
-                              floatBitsToInt(scale), floatBitsToInt(color.a));
-#ifdef PAPER_RULE
-    staged_kernel[at].w = level;
-#endif
+    staged_shape[at] = columns | (rows << uint(ROWS_SHIFT))
+                     | (uint(level) << uint(SHAPE_LEVEL_SHIFT))
+                     | (uint(width) << uint(WIDTH_SHIFT));
+    staged_texel[at] = int(kernel_offset(kernel, level)) - first.y * width - first.x;
+    staged_scale[at] = kernel_scale(kernel, level) / WEIGHT_MAX;
+    staged_depth[at] = color.a;
+}
+
+// Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
+uint find_hits(uint first, uint end, uint tile_bit) {
+    uint found = 0u;
+    for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i) {
+        bool hit = first + i < end && (entries[first + i] & tile_bit) != 0u;
+        found |= hit ? 1u << i : 0u;
+    }
+    return found;
+}
+
+// Fragments of the batch before this one of its entries.
+uint rank_of(uint entry) {
+    uint word = entry / uint(BITS_PER_WORD);
+    uint rank = bitCount(hits[word] & ((1u << (entry % uint(BITS_PER_WORD))) - 1u));
+    for (uint before = 0u; before < word; ++before) rank += bitCount(hits[before]);
+    return rank;
+}
+
+int hit_count() {
+    int count = 0;
+    for (int word = 0; word < HIT_WORDS; ++word) count += bitCount(hits[word]);
+    return count;
+}
+
+// Stages the fragments of a batch that reach the tile, in order; returns how many.
+int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
+    uint mine = gl_LocalInvocationIndex * uint(ENTRIES_PER_THREAD);
+    uint found = find_hits(batch + mine, end, tile_bit);
+    if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
+    barrier();  // the last batch is used up, and the bits are clear
+    atomicOr(hits[mine / uint(BITS_PER_WORD)], found << (mine % uint(BITS_PER_WORD)));
+    barrier();  // all hits are known
+    uint at = rank_of(mine);
+    for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i)
+        if ((found & (1u << i)) != 0u)
+            staged_slot[at++] = entries[batch + mine + i] >> uint(TILES_PER_BIN);
+    int count = hit_count();
+    barrier();  // the fragments of the new batch are known
+    for (int i = int(gl_LocalInvocationIndex); i < count; i += GROUP_THREADS)
+        stage(staged_slot[i], i, tile_first);
+    barrier();  // and staged
+    return count;
 }
 
 // The light of a pixel: of the fragments at one depth, and of those before them.
@@ -74,6 +140,11 @@ void close_depth(inout Sum sum) {
     sum.coverage = vec3(0.0);
 }
 
+// Whether a fragment is behind the depth that is being added up.
+bool is_beyond(float depth, float group_depth) {
+    return (depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX;
+}
+
 #ifdef PAPER_RULE
 // What the paper's rule leaves of a weight; it merges once: four pixels.
 vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
@@ -87,48 +158,60 @@ vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
 #endif
 
 void main() {
-    int index = first_tile + int(gl_WorkGroupID.x);
-    ivec2 tile = ivec2(index % tile_grid.x, index / tile_grid.x);
-    ivec2 at = tile * TILE_SIZE_PX
-             + ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
-    uint thread = gl_LocalInvocationIndex;
-    bool ordered = counts[index].y != 0u;
-    uint first = offsets[index] - first_entry;
-    uint end = first + counts[index].x;
-    float group_depth = ordered && end > first ? colors[entries[first]].a : 0.0;
+    int bin = first_bin + int(gl_WorkGroupID.y);
+    int in_bin = int(gl_WorkGroupID.x);
+    ivec2 tile = ivec2(bin % bin_columns, bin / bin_columns) * BIN_TILES
+               + ivec2(in_bin % BIN_TILES, in_bin / BIN_TILES);
+    if (any(greaterThanEqual(tile, tile_grid))) return;  // the whole group
+    ivec2 in_tile = ivec2(gl_LocalInvocationID.xy) * ivec2(1, PIXELS_PER_THREAD);
+    ivec2 at = tile * TILE_SIZE_PX + in_tile;
+    uint tile_bit = 1u << uint(in_bin);
+    bool ordered = (counts[bin].y & tile_bit) != 0u;
+    uint first = offsets[bin];
+    uint end = first + counts[bin].x;
+    // The nearest of the bin: the tile's own nearest closes an empty depth, or joins it.
+    float group_depth = ordered && end > first
+                      ? colors[entries[first] >> uint(TILES_PER_BIN)].a : 0.0;
     Sum sums[PIXELS_PER_THREAD];
     for (int p = 0; p < PIXELS_PER_THREAD; ++p)
         sums[p] = Sum(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
-    for (uint batch = first; batch < end; batch += uint(THREADS)) {
-        barrier();  // the last batch is used up
-        for (uint i = thread; i < uint(THREADS); i += uint(GROUP_THREADS))
-            if (batch + i < end) stage(entries[batch + i], i);
-        barrier();  // the new batch is staged
-        int staged = int(min(end - batch, uint(THREADS)));
-        for (int i = 0; i < staged; ++i) {
-            ivec4 box = staged_box[i];
-            ivec4 kernel = staged_kernel[i];
-            vec4 color = staged_color[i];
-            bool in_columns = at.x >= box.x && at.x <= box.z;
+    for (uint batch = first; batch < end; batch += uint(BATCH)) {
+        int staged = stage_batch(batch, end, tile_bit, tile * TILE_SIZE_PX);
+        for (int i = 0; i < staged;) {
+            // Without a branch for each fragment: those of one depth in a loop of their own.
+            int run_end = staged;
 #ifndef PAPER_RULE
-            float depth = intBitsToFloat(kernel.w);
-            if (ordered && (depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX) {
-                for (int p = 0; p < PIXELS_PER_THREAD; ++p) close_depth(sums[p]);
-                group_depth = depth;
+            if (ordered) {
+                if (is_beyond(staged_depth[i], group_depth)) {
+                    for (int p = 0; p < PIXELS_PER_THREAD; ++p) close_depth(sums[p]);
+                    group_depth = staged_depth[i];
+                }
+                run_end = i + 1;
+                while (run_end < staged && !is_beyond(staged_depth[run_end], group_depth))
+                    ++run_end;
             }
 #endif
-            int texel = kernel.x + (at.y - box.y) * kernel.y + at.x - box.x;
-            for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
-                bool lit = in_columns && at.y + p >= box.y && at.y + p <= box.w;
-                uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
-                vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
-                weight *= lit ? intBitsToFloat(kernel.z) : 0.0;
+            for (; i < run_end; ++i) {
+                vec4 color = staged_color[i];
+                uint shape = staged_shape[i];
+                float scale = staged_scale[i];
+                int width = int(shape >> uint(WIDTH_SHIFT));
+                int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
+                uint column = (shape >> uint(in_tile.x)) & 1u;
+                uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
+                int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
+                for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
+                    bool lit = (rows & (1u << uint(p))) != 0u;
+                    uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
+                    vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
+                    weight *= lit ? scale : 0.0;
 #ifdef PAPER_RULE
-                weight = paper_weight(weight, sums[p].coverage, kernel.w);
+                    weight = paper_weight(weight, sums[p].coverage, level);
 #endif
-                sums[p].light += weight * color.rgb;
-                sums[p].coverage += weight;
-                texel += kernel.y;
+                    sums[p].light += weight * color.rgb;
+                    sums[p].coverage += weight;
+                    texel += width;
+                }
             }
         }
     }

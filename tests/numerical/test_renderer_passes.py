@@ -7,7 +7,6 @@ from filter_service import constants
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.rendering import (
     frame_kernels,
-    frame_passes,
     kernel_passes,
     reference,
 )
@@ -154,44 +153,6 @@ def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
     assert merged[0] == merged[1] > 0
 
 
-def test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view):
-    bench.render(view)
-    alive, x, y, reach, radius, edges = fragments(bench)
-    columns, rows = tile_grid()
-    n_tiles, size = columns * rows, constants.TILE_SIZE_PX
-    offsets = read(bench, "TILE_OFFSETS", (n_tiles + 1,), np.uint32)
-    counts = read(bench, "TILE_COUNTS", (n_tiles, 2), np.uint32)
-    assert np.array_equal(offsets, np.concatenate([[0], np.cumsum(counts[:, 0])]))
-    entries = read(bench, "ENTRIES", (int(offsets[-1]),), np.uint32)
-    depth = read(bench, "FRAGMENT_COLOR", (n_tiles * constants.THREADS, 4), np.float32)
-    sorted_tiles = 0
-    for tile in range(n_tiles):
-        left, top = (tile % columns) * size, (tile // columns) * size
-        dx = np.clip(x[alive], left, left + size - 1) - x[alive]
-        dy = np.clip(y[alive], top, top + size - 1) - y[alive]
-        # the box of the kernel, and the disc that it lies in
-        extent = edges[alive] - 1
-        far = radius[alive] + 0.5 + np.sqrt(2.0) * extent
-        to_left, to_right, to_top, to_bottom = reach[alive].T
-        lit = (
-            (x[alive] + to_right + extent >= left)
-            & (x[alive] - to_left <= left + size - 1)
-            & (y[alive] + to_bottom + extent >= top)
-            & (y[alive] - to_top <= top + size - 1)
-        )
-        expected = alive[lit & (dx**2 + dy**2 <= far**2)]
-        listed = entries[offsets[tile] : offsets[tile + 1]]
-        assert np.array_equal(np.sort(listed), expected)
-        if counts[tile, 1]:
-            keys = depth[listed, 3]
-            span = max(float(keys.max() - keys.min()), 1e-12)
-            assert np.all(
-                np.diff(keys) >= -2.0 * span / (2**constants.SORT_KEY_BITS - 1)
-            )
-            sorted_tiles += 1
-    assert 0 < sorted_tiles < n_tiles
-
-
 def test_eight_bit_output_is_the_encoded_linear_output(bench, rng):
     color = rng.integers(0, 256, (101, 150, 3), dtype=np.uint8)
     view = bench.view(color, depth_scene())
@@ -210,26 +171,16 @@ def test_same_input_gives_the_same_bytes(bench, view, accumulation):
     assert first.tobytes() == again.tobytes()
 
 
-@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_GROUPS"])
-def test_bands_change_nothing(bench, view, monkeypatch, limit):
-    whole = bench.render(view)
-    some = whole.entry_count // 7 if limit == "MAX_BAND_ENTRIES" else 50
-    monkeypatch.setattr(frame_passes, limit, some)
-    banded = bench.render(view)
-    assert banded.entry_count == whole.entry_count
-    assert whole.color.tobytes() == banded.color.tobytes()
-
-
 @pytest.mark.parametrize("accumulation", ["coverage", "paper"])
 def test_strips_change_nothing(bench, view, monkeypatch, accumulation):
     whole = bench.render(view, accumulation=accumulation)
-    rows = 56  # two halos of 16 px and three tile rows
+    rows = 80  # two halos of 32 px and a row of bins
     monkeypatch.setattr(bench.gpu, "max_block_bytes", 16 * 152 * rows)
     # named buffers are larger already; only the cutting into strips sees the limit
     cut = bench.render(view, accumulation=accumulation)
     assert cut.fragment_count > whole.fragment_count
-    assert np.abs(cut.color - whole.color).max() < 1e-3
-    assert psnr_db(cut.color, whole.color.astype(float)) >= 80.0
+    # the same lists and sums; only object distances round otherwise
+    assert np.abs(cut.color - whole.color).max() < 1e-5
 
 
 def test_a_new_store_is_not_mistaken_for_the_last(gpu, rng):
@@ -330,14 +281,3 @@ def test_stage_times_name_every_pass(bench, view):
     )
     assert {"sort_ms", "splat_ms", "encode_ms", "readback_ms"} <= set(times_ms)
     assert all(value >= 0.0 for value in times_ms.values())
-
-
-def test_hardware_group_sizes_make_the_same_lists(bench, view, monkeypatch):
-    software = bench.render(view)
-    monkeypatch.setattr(bench.gpu, "is_software", not bench.gpu.is_software)
-    other = bench.render(view)
-    assert other.entry_count == software.entry_count
-    test_tile_lists_hold_exactly_the_fragments_in_reach(bench, view)
-    # Equal depths keep the order of the list, which differs, and where a near surface
-    # leaves part of the coverage free that decides which far fragment fills it.
-    assert psnr_db(other.color, software.color.astype(float)) >= 50.0

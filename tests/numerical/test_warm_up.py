@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.renderer import FilterRenderer
 from filter_service.rendering.warm_up import warm_up
@@ -12,6 +13,8 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
     gpu = Gpu()
     warm_up(FilterRenderer(gpu))
     compiled = gpu.program_count
+    sorts = sum(name == "sort_bins" for name, *_ in gpu._programs)
+    assert sorts == 2 * (len(SORT_CAPACITIES) + 1)
     bench = Bench(
         gpu,
         {"kind": "preset", "name": "myopia"},

@@ -1,0 +1,62 @@
+// Exclusive sum of the bins' counts: where each list starts.
+// In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
+//      as float bits, by which a caller notices a 32-bit overflow, entries that were not
+//      kept, and the length of the longest list).
+// Dispatch: one group.
+// Twin: tests/numerical/tile_lists.py (numpy.cumsum).
+
+layout(local_size_x = SCAN_THREADS) in;
+
+layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
+layout(std430, binding = BINDING_BIN_OFFSETS) writeonly buffer Offsets { uint offsets[]; };
+
+uniform int bin_count;
+
+shared uint sums[SCAN_THREADS];
+shared float float_sums[SCAN_THREADS];
+shared uint lost_count;
+shared uint longest;
+
+void main() {
+    int thread = int(gl_LocalInvocationIndex);
+    if (thread == 0) {
+        lost_count = 0u;
+        longest = 0u;
+    }
+    int share = (bin_count + SCAN_THREADS - 1) / SCAN_THREADS;
+    int first = min(thread * share, bin_count);
+    int end = min(first + share, bin_count);
+    uint sum = 0u;
+    uint lost = 0u;
+    uint most = 0u;
+    float float_sum = 0.0;
+    for (int bin = first; bin < end; ++bin) {
+        uvec4 count = counts[bin];
+        sum += count.x;
+        float_sum += float(count.x);
+        lost += count.z;
+        most = max(most, count.x);
+    }
+    sums[thread] = sum;
+    float_sums[thread] = float_sum;
+    barrier();  // every thread's share is known, and the totals are clear
+    atomicMax(longest, most);
+    atomicAdd(lost_count, lost);
+    uint start = 0u;
+    float float_start = 0.0;
+    for (int other = 0; other < thread; ++other) {
+        start += sums[other];
+        float_start += float_sums[other];
+    }
+    for (int bin = first; bin < end; ++bin) {
+        offsets[bin] = start;
+        start += counts[bin].x;
+    }
+    barrier();  // all threads have added to the totals
+    if (thread == SCAN_THREADS - 1) {
+        offsets[bin_count + TOTAL_ENTRIES] = start;
+        offsets[bin_count + TOTAL_ENTRIES_FLOAT] = floatBitsToUint(float_start + float_sum);
+        offsets[bin_count + TOTAL_LOST] = lost_count;
+        offsets[bin_count + TOTAL_LONGEST] = longest;
+    }
+}

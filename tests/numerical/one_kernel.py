@@ -1,0 +1,87 @@
+"""Stores in which every PSF is one given kernel: filtering has a closed form then."""
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.profiles import parse_profile
+from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
+from filter_service.psfs.store import PsfStore
+from filter_service.rendering.frame import View
+from filter_service.rendering.renderer import FilterRenderer
+
+PUPIL_MM = 3.0
+PITCH_RAD = 1e-3
+
+
+def disc(radius_px):
+    """Kernel (2 r + 1, 2 r + 1) of unit sum: even light within a circle."""
+    y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
+    lit = x * x + y * y <= (radius_px + 0.5) ** 2
+    return lit / lit.sum()
+
+
+class OneKernelBench:
+    """A camera of 1 mrad a pixel before an eye with one square kernel."""
+
+    def __init__(self, gpu, kernel, *, width_px, height_px, spread_px=0.0):
+        right, up = PITCH_RAD * width_px / 2, PITCH_RAD * height_px / 2
+        self.tangents = (-right, right, up, -up)
+        self.size = (height_px, width_px)
+        self.kernel = kernel
+        self.store = _store(kernel, self.tangents, width_px, height_px, spread_px)
+        self.gpu = gpu
+        self.renderer = FilterRenderer(gpu)
+        self.handle = self.renderer.load(self.store)
+
+    def render(self, color, depth_m=1.0, **options):
+        depth_m = np.broadcast_to(np.float32(depth_m), self.size)
+        view = View(color, depth_m.astype(np.float32), self.tangents, "radial")
+        return self.renderer.render(
+            view, self.handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0, **options
+        )
+
+    def plane_truth(self, color):
+        """One surface at one distance: the convolution over what arrives, float64."""
+        kernel = self.kernel[:, :, None]
+        ones = np.ones((*self.size, 1))
+        light = fftconvolve(color.astype(float), kernel, mode="same", axes=(0, 1))
+        return light / fftconvolve(ones, kernel, mode="same", axes=(0, 1))
+
+
+def _store(kernel, tangents, width_px, height_px, spread_px):
+    spec = GridSpec.for_camera(
+        width_px=width_px,
+        height_px=height_px,
+        tangents=tangents,
+        pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+        focus_range_dpt=(0.0, 0.0),
+        object_range_dpt=(0.0, 2.0),
+    )
+    eye = MeasuredWavefront.from_profile(
+        parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
+    )
+    radius_px = kernel.shape[0] // 2
+    one = np.ones(RGB)
+    return PsfStore(
+        spec=spec,
+        eye=eye,
+        plan=CachePlan(
+            h_deg=np.zeros(1),
+            v_deg=np.zeros(1),
+            pupils_mm=np.array([PUPIL_MM]),
+            accommodations_dpt=eye.accommodation_nodes_dpt(spec.focus_range_dpt),
+            defocus=RaggedNodes.of([np.zeros(1)]),
+            channel_shift_dpt=np.zeros((1, RGB)),
+            prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
+        ),
+        kernels=np.round(kernel / kernel.max() * WEIGHT_MAX).astype(np.uint16).ravel(),
+        offsets=np.zeros(RGB, np.int64),
+        reach_px=np.full((RGB, 4), radius_px),
+        radius_px=np.full(RGB, radius_px),
+        blur_px=radius_px * one,
+        spread_px=spread_px * one,
+        peak_ratio=kernel.max() * one,
+    )
