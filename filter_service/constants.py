@@ -187,6 +187,8 @@ BINDINGS = {
     "BINDING_LAYER_DPT": 13,
     "BINDING_USED": 14,
     "BINDING_COLOR_OUT": 15,
+    # The passes that make lists have no use for the input's colour.
+    "BINDING_WINDOWS": 0,
     # The passes that build PSFs share no dispatch with those of a frame; core OpenGL
     # promises eight bindings.
     "BINDING_PSF_RECORDS": 0,

@@ -249,13 +249,14 @@ class FramePasses:
         """Lengths and offsets of the lists, and the bands they are made in."""
         self._reserve(
             BIN_COUNTS=16 * self.bin_count,
+            WINDOWS=16 * self.bin_count,
             BIN_OFFSETS=4 * (self.bin_count + TOTAL_WORDS),
         )
         with self.timer.stage("bin_ms"):
             self._run(
                 "count_bins",
                 self.bin_grid,
-                *("FRAGMENT_PLACE", "BLOCKS", "BIN_COUNTS"),
+                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS"),
                 **self._walk,
                 order_always=int(self.paper_rule),
                 defines=self._list_threads,
@@ -322,7 +323,7 @@ class FramePasses:
             self._run(
                 "scatter_fragments",
                 (bin_count, 1),
-                *("FRAGMENT_PLACE", "BLOCKS", "BIN_OFFSETS", "ENTRIES"),
+                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_OFFSETS", "ENTRIES"),
                 **self._walk,
                 bin_columns=self.bin_grid[0],
                 first_bin=first_bin,

@@ -1,42 +1,45 @@
 // Walk over the fragments whose light reaches a bin, in scan order: blocks row by row
-// through the window around the bin, surface after surface, and the fragments of each in
-// order.  Each thread takes one stretch of that line; so the list is the same for any
-// number of threads, and for every run.
-// Needs buffers `blocks`, `places` and uniforms `tile_grid`, `search_blocks`,
-// `surface_count` in scope.
+// through the bin's window, surface after surface, and the fragments of each in order.
+// Each thread takes one stretch of that line; so the list is the same for any number of
+// threads, and for every run.
+// A window (first column and row of blocks, last ones plus one) holds every block that
+// reaches the bin, and no row or column without one.
+// Needs buffers `blocks`, `places` and uniforms `tile_grid`, `surface_count` in scope.
 
 struct Walk {
     ivec2 bin;
+    ivec2 first;                  // block of the window
+    ivec2 size;                   // of the window in blocks
     int next;                     // next block of this thread in the line
     int end;
 };
 
-// Blocks along one side of the window.
-int window_width() { return 2 * search_blocks + BIN_TILES; }
-
-Walk start_walk(ivec2 bin) {
-    int length = surface_count * window_width() * window_width();
+Walk start_walk(ivec2 bin, ivec4 window) {
+    ivec2 size = max(window.zw - window.xy, 0);
+    int length = surface_count * size.x * size.y;
     int share = (length + GROUP_THREADS - 1) / GROUP_THREADS;
-    int first = int(gl_LocalInvocationIndex) * share;
-    return Walk(bin, first, min(first + share, length));
+    int start = int(gl_LocalInvocationIndex) * share;
+    return Walk(bin, window.xy, size, start, min(start + share, length));
+}
+
+// Whether a block at `at`, of any surface, has a fragment that may reach the bin.
+bool block_reaches(int block, ivec2 at, ivec2 bin) {
+    float reach = uintBitsToFloat(blocks[block].y);
+    ivec2 first = at * TILE_SIZE_PX;
+    ivec2 bin_first = bin * BIN_SIZE_PX;
+    float gap_squared = distance_squared_between(first, first + TILE_SIZE_PX - 1, bin_first,
+                                                 bin_first + BIN_SIZE_PX - 1);
+    return blocks[block].x != 0u && gap_squared <= reach * reach;
 }
 
 // Next block in reach, or -1.
 int next_block(inout Walk walk) {
-    int width = window_width();
-    ivec2 bin_first = walk.bin * BIN_SIZE_PX;
     while (walk.next < walk.end) {
-        int row = walk.next / width;
-        ivec2 at = walk.bin * BIN_TILES - search_blocks
-                 + ivec2(walk.next - row * width, row % width);
+        int row = walk.next / walk.size.x;
+        ivec2 at = walk.first + ivec2(walk.next - row * walk.size.x, row % walk.size.y);
+        int block = (row / walk.size.y * tile_grid.y + at.y) * tile_grid.x + at.x;
         ++walk.next;
-        if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, tile_grid))) continue;
-        int block = (row / width * tile_grid.y + at.y) * tile_grid.x + at.x;
-        float reach = uintBitsToFloat(blocks[block].y);
-        ivec2 first = at * TILE_SIZE_PX;
-        float gap_squared = distance_squared_between(first, first + TILE_SIZE_PX - 1,
-                                                     bin_first, bin_first + BIN_SIZE_PX - 1);
-        if (gap_squared <= reach * reach) return block;
+        if (block_reaches(block, at, walk.bin)) return block;
     }
     return -1;
 }

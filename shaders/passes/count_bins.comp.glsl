@@ -1,7 +1,7 @@
 // Counts the fragments whose light reaches each bin, and notes in which of its tiles two
 // surfaces meet, so that their order matters.
 // In:  FRAGMENT_PLACE, BLOCKS.   Out: BIN_COUNTS (kept, a bit for each tile whose order
-//      matters, entries beyond the capacity of a list).
+//      matters, entries beyond the capacity of a list), WINDOWS (blocks that reach a bin).
 // Dispatch: one group of GROUP_THREADS a bin: 8 on a software renderer, whose vectors
 //      then all have work, THREADS on hardware.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
@@ -14,10 +14,11 @@ layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };
+layout(std430, binding = BINDING_WINDOWS) writeonly buffer Windows { ivec4 windows[]; };
 layout(std430, binding = BINDING_BIN_COUNTS) writeonly buffer Counts { uvec4 counts[]; };
 
 uniform ivec2 tile_grid;
-uniform int search_blocks;
+uniform int search_blocks;        // as far as the widest blur of the frame goes
 uniform int surface_count;
 uniform uint list_capacity;
 uniform int order_always;
@@ -26,15 +27,47 @@ uniform int order_always;
 
 shared uint total;
 shared uint ordered_tiles;
+shared int window_low[2];
+shared int window_high[2];
+
+// Looks for blocks in reach as far as any may lie.  One wide blur thus widens the windows
+// that it falls into, and only this look of the others.
+ivec4 find_window(ivec2 bin) {
+    ivec2 from = max(bin * BIN_TILES - search_blocks, 0);
+    ivec2 size = min((bin + 1) * BIN_TILES + search_blocks, tile_grid) - from;
+    ivec2 low = tile_grid;
+    ivec2 high = ivec2(0);
+    for (int i = int(gl_LocalInvocationIndex); i < size.x * size.y; i += GROUP_THREADS) {
+        ivec2 at = from + ivec2(i % size.x, i / size.x);
+        for (int surface = 0; surface < surface_count; ++surface) {
+            int block = (surface * tile_grid.y + at.y) * tile_grid.x + at.x;
+            bool reaches = block_reaches(block, at, bin);
+            low = min(low, reaches ? at : low);
+            high = max(high, reaches ? at + 1 : high);
+        }
+    }
+    for (int axis = 0; axis < 2; ++axis) {
+        atomicMin(window_low[axis], low[axis]);
+        atomicMax(window_high[axis], high[axis]);
+    }
+    barrier();  // every thread has told what it found
+    return ivec4(window_low[0], window_low[1], window_high[0], window_high[1]);
+}
 
 void main() {
     if (gl_LocalInvocationIndex == 0u) {
         total = 0u;
         ordered_tiles = order_always != 0 ? uint(ALL_TILES) : 0u;
+        for (int axis = 0; axis < 2; ++axis) {
+            window_low[axis] = tile_grid[axis];
+            window_high[axis] = 0;
+        }
     }
-    barrier();  // sums start from zero
+    barrier();  // sums start from zero, and windows from nothing
     ivec2 bin = ivec2(gl_WorkGroupID.xy);
-    Walk walk = start_walk(bin);
+    int index = bin.y * int(gl_NumWorkGroups.x) + bin.x;
+    ivec4 window = find_window(bin);
+    Walk walk = start_walk(bin, window);
     uint count = 0u;
     uint edges = 0u;
     for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
@@ -54,7 +87,7 @@ void main() {
     barrier();  // all threads have added
     if (gl_LocalInvocationIndex == 0u) {
         uint kept = min(total, list_capacity);
-        counts[bin.y * int(gl_NumWorkGroups.x) + bin.x] =
-            uvec4(kept, ordered_tiles, total - kept, 0u);
+        windows[index] = window;
+        counts[index] = uvec4(kept, ordered_tiles, total - kept, 0u);
     }
 }

@@ -1,5 +1,5 @@
 // Writes each bin's list: slots of fragments, and the tiles that they light, in scan order.
-// In:  FRAGMENT_PLACE, BLOCKS, BIN_OFFSETS.   Out: ENTRIES.
+// In:  FRAGMENT_PLACE, BLOCKS, WINDOWS, BIN_OFFSETS.   Out: ENTRIES.
 // Dispatch: one group of GROUP_THREADS a bin of the band.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
 
@@ -11,11 +11,11 @@ layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };
+layout(std430, binding = BINDING_WINDOWS) readonly buffer Windows { ivec4 windows[]; };
 layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint offsets[]; };
 layout(std430, binding = BINDING_ENTRIES) writeonly buffer Entries { uint entries[]; };
 
 uniform ivec2 tile_grid;
-uniform int search_blocks;
 uniform int surface_count;
 uniform uint list_capacity;
 uniform int bin_columns;
@@ -29,7 +29,7 @@ void main() {
     int index = first_bin + int(gl_WorkGroupID.x);
     ivec2 bin = ivec2(index % bin_columns, index / bin_columns);
     uint count = 0u;
-    Walk walk = start_walk(bin);
+    Walk walk = start_walk(bin, windows[index]);
     for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
         uint first = uint(block * THREADS);
         uint end = first + blocks[block].x;
@@ -41,7 +41,7 @@ void main() {
     uint at = offsets[index];
     uint last = at + list_capacity;
     for (uint other = 0u; other < gl_LocalInvocationIndex; ++other) at += counts[other];
-    walk = start_walk(bin);
+    walk = start_walk(bin, windows[index]);
     for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
         uint first = uint(block * THREADS);
         uint end = first + blocks[block].x;

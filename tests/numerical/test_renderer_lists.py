@@ -252,3 +252,24 @@ def frame_lists(bench):
     entries = read(bench, "ENTRIES", (int(starts[-1] + counts[-1]),), np.uint32)
     pairs = zip(starts, counts, strict=True)
     return np.concatenate([entries[start : start + n] for start, n in pairs])
+
+
+@pytest.mark.parametrize("surface_count", [1, 2])
+@pytest.mark.parametrize("share", [0.0, 0.01, 1.0])
+def test_windows_hold_the_blocks_in_reach_and_no_more(bench, rng, surface_count, share):
+    """A share of the blocks reaches far; those of ``share`` 0 leave bins empty."""
+    passes = list_passes(bench, surface_count=surface_count)
+    reach_px = 90
+    blocks, *others = random_buffers(
+        rng, passes.tile_count, passes.grid[0], surface_count, reach_px=reach_px
+    )
+    n_blocks = len(blocks)
+    far = rng.random(n_blocks) < share
+    reaches = np.where(far, rng.uniform(30, reach_px, n_blocks), 0.5)
+    blocks[:, 1] = reaches.astype(np.float32).view(np.uint32)
+    if share == 0.0:
+        blocks[:, 0] *= rng.random(n_blocks) < 0.1
+    made_lists(passes, blocks, *others, reach_px=reach_px)
+    windows = read(bench, "WINDOWS", (n_bins(), 4), np.int32)
+    expected = tile_lists.expected_windows(blocks, passes.grid, surface_count)
+    assert np.array_equal(windows, expected)

@@ -102,6 +102,31 @@ def expected_lists(fragments, size_px, *, hidden_from, order_always=False):
     )
 
 
+def expected_windows(blocks, tile_grid, surface_count):
+    """First column and row of the blocks that reach a bin, last ones plus one."""
+    columns, rows = tile_grid
+    reach = blocks[:, 1].view(np.float32).reshape(surface_count, rows, columns)
+    reach = np.where(blocks[:, 0].reshape(reach.shape) > 0, reach, -1.0).max(axis=0)
+    y, x = np.mgrid[0:rows, 0:columns] * TILE_SIZE_PX
+    windows = []
+    for bin_y in range(0, rows, BIN_TILES):
+        for bin_x in range(0, columns, BIN_TILES):
+            last = BIN_TILES * TILE_SIZE_PX - 1
+            gaps = [
+                np.maximum(first - at - TILE_SIZE_PX + 1, 0)
+                + np.maximum(at - first - last, 0)
+                for at, first in ((x, bin_x * TILE_SIZE_PX), (y, bin_y * TILE_SIZE_PX))
+            ]
+            near = (reach >= 0) & (gaps[0] ** 2 + gaps[1] ** 2 <= reach**2)
+            if near.any():
+                in_y, in_x = np.nonzero(near)
+                ends = [in_x.min(), in_y.min(), in_x.max() + 1, in_y.max() + 1]
+                windows.append(ends)
+            else:
+                windows.append([columns, rows, 0, 0])
+    return np.array(windows)
+
+
 def entry_depths(entries, color):
     """Sort depths (n,) of a list."""
     return color[entries >> TILES_PER_BIN, 3]
