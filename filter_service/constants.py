@@ -17,8 +17,8 @@ ALL_TILES = (1 << TILES_PER_BIN) - 1
 """Lists are made and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An
 entry is a word: a bit for each tile of the bin that the fragment lights, and above them
 its slot, so a strip may have 2**28 slots (a storage block of 2 GiB holds 2**27).  Bins
-of 4 x 4 tiles halve the work on the lists again, but a tile then reads four times as
-many entries for each one that it evaluates, which costs more."""
+of 4 x 4 tiles save some more on the lists, but a tile then reads more entries for each
+that it evaluates, which costs more (measured at 320 x 180 on a software renderer)."""
 
 BATCH = 128
 HIT_WORDS = BATCH // 32
