@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
-from filter_service.errors import GridTooLarge, OutOfGpuMemory
+from filter_service.errors import GridTooLarge
 from filter_service.gl.gpu import Buffer, Gpu, Pages, StageTimer
 from filter_service.psfs.pack import box_sizes
 from filter_service.psfs.store import FrameLayers, PsfStore
@@ -31,7 +31,7 @@ MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
 
 
-class KernelsTooLarge(OutOfGpuMemory):
+class KernelsTooLarge(Exception):
     """A frame's kernels take too much memory; those of larger cells take less."""
 
 

@@ -76,6 +76,7 @@ def _store(kernel, tangents, width_px, height_px, spread_px):
             defocus=RaggedNodes.of([np.zeros(1)]),
             channel_shift_dpt=np.zeros((1, RGB)),
             prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
+            is_limited=np.zeros(1, bool),
         ),
         kernels=np.round(kernel / kernel.max() * WEIGHT_MAX).astype(np.uint16).ravel(),
         offsets=np.zeros(RGB, np.int64),
