@@ -1,0 +1,174 @@
+"""Layers over the field, mapped kernels, and kernels that would grow too large."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimator.profiles import parse_profile
+from estimator.psf_survey import survey_pupils
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.plan import plan_cache
+from filter_service.planning.slopes import PupilStates, state_frames
+from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.eye_model import prepare_eye
+from filter_service.psfs.field_defocus import field_defocus
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering import kernel_passes
+from filter_service.rendering.frame import View
+from filter_service.rendering.renderer import FilterRenderer
+from tests.numerical.plan_cases import spec_for, traced_eye
+from tests.numerical.synthetic import psnr_db, tangents, texture
+from tests.numerical.test_renderer_field import FieldBench, splat_exactly
+
+STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
+STILL = {"pupil_range_mm": (5.0, 5.0), "focus_range_dpt": (0.5, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed_dpt"), [("emmetropia", 0.004), ("keratoconus", 0.015)]
+)
+def test_defocus_between_asked_directions_is_the_eyes(rng, name, allowed_dpt):
+    spec = spec_for(640, 360, mode="dynamic", **STILL)
+    eye = traced_eye(name, spec)
+    state = {
+        "pupil_diameter_mm": 5.0,
+        "accommodation_dpt": eye.accommodation_dpt(0.5),
+    }
+    found = field_defocus(eye, spec, **state)
+    h_deg, v_deg = (rng.uniform(*ends, 400) for ends in spec.field_range_deg)
+    exact_dpt = eye.total_defocus_dpt(
+        h_deg=np.append(h_deg, 0.0),
+        v_deg=np.append(v_deg, 0.0),
+        wavelength_nm=spec.channel_wavelengths_nm[1],
+        **state,
+    )
+    change_dpt = exact_dpt[:-1] - exact_dpt[-1]
+    assert np.ptp(change_dpt) > 0.5
+    np.testing.assert_allclose(found.at(h_deg, v_deg), change_dpt, atol=allowed_dpt)
+
+
+def test_the_papers_grid_is_read_at_the_distance_of_the_object():
+    spec = spec_for(64, 36, mode="dynamic", grid="paper", **STILL)
+    eye = traced_eye("emmetropia", spec)
+    found = field_defocus(eye, spec, pupil_diameter_mm=5.0, accommodation_dpt=0.0)
+    assert found.range_dpt == (0.0, 0.0)
+
+
+GAZE_RANGE_DEG = (14.0, 8.0)
+
+
+@pytest.mark.parametrize("gaze_deg", [(0.0, 0.0), (14.0, -8.0), (-9.0, 4.0)])
+def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, gaze_deg):
+    """Kernels are mapped to pixels that differ by a third from those stored."""
+    width, height = 96, 72
+    bench = FieldBench(
+        gpu,
+        "emmetropia",
+        tangents(width, height, 55.0),
+        size=(width, height),
+        gaze_range_deg=GAZE_RANGE_DEG,
+    )
+    color = texture(rng, height, width, cell_px=3)
+    depth_m = np.broadcast_to(np.float32(1.5), (height, width))
+    result = bench.renderer.render(
+        View(color, depth_m.copy(), bench.spec.camera.tangents),
+        bench.handle,
+        gaze_deg=gaze_deg,
+        **STATE,
+    )
+    bench.spec = replace(bench.spec, gaze_deg=gaze_deg, gaze_range_deg=(0.0, 0.0))
+    truth = splat_exactly(bench, color, depth_m)
+    assert psnr_db(result.color, truth) >= 43.5
+
+
+def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
+    width, height = 128, 72
+    spec = GridSpec.for_camera(
+        width_px=width,
+        height_px=height,
+        tangents=tangents(width, height, 70.0),
+        pupil_range_mm=(3.0, 3.0),
+        focus_range_dpt=(0.0, 0.0),
+        object_range_dpt=(0.0, 0.0),
+        mode="quality",
+        diffraction=False,
+        chromatic=False,
+        gaze_range_deg=(15.0, 8.0),
+    )
+    profile = parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
+    eye, _ = prepare_eye(profile, spec, eye_model="wavefront")
+    renderer = FilterRenderer(gpu)
+    handle = renderer.load(build_psf_store(eye, spec))
+    image = texture(rng, height, width, cell_px=1)
+    far_m = np.full(image.shape[:2], np.inf, np.float32)
+    for gaze_deg in ((0.0, 0.0), (15.0, 8.0), (-15.0, 0.0)):
+        seen = renderer.render(
+            View(image, far_m, spec.camera.tangents),
+            handle,
+            pupil_diameter_mm=3.0,
+            focus_dpt=0.0,
+            gaze_deg=gaze_deg,
+        ).color
+        assert psnr_db(seen, image) >= 60.0
+
+
+def test_larger_cells_serve_where_kernels_take_too_much_memory(gpu, rng, monkeypatch):
+    width, height = 96, 72
+    bench = FieldBench(gpu, "myopia", tangents(width, height, 40.0), (width, height))
+    color = texture(rng, height, width, cell_px=3)
+    depth_m = np.full((height, width), 2.0, np.float32)
+    usual = bench.render(color, depth_m)
+    monkeypatch.setattr(
+        kernel_passes, "MAX_KERNEL_TEXELS", usual.kernel_texel_count // 5
+    )
+    bench.renderer = FilterRenderer(gpu)
+    smaller = bench.render(color, depth_m)
+    assert smaller.kernel_texel_count <= usual.kernel_texel_count // 5
+    assert psnr_db(smaller.color, usual.color) >= 40.0
+    # Where cells cannot grow any more, memory decides alone.
+    monkeypatch.setattr(kernel_passes, "MAX_KERNEL_TEXELS", 1)
+    bench.renderer = FilterRenderer(gpu)
+    assert np.isfinite(bench.render(color, depth_m).color).all()
+
+
+def test_plans_end_where_kernels_may_not_grow():
+    """At the edge of its field the cataract's defocus goes on to -40 dpt."""
+    spec = spec_for(
+        1280,
+        720,
+        mode="dynamic",
+        object_range_dpt=(0.0, 1.0),
+        focus_range_dpt=(0.0, 6.0),
+        pupil_range_mm=(6.0, 7.0),
+    )
+    eye = traced_eye("cataract", spec)
+    plan = plan_cache(eye, spec)
+    assert plan.is_limited.any()
+    v, h, pupil, used = np.unravel_index(plan.defocus.group_of_node, plan.group_shape)
+    states = PupilStates.of(
+        h_deg=plan.h_deg[h],
+        v_deg=plan.v_deg[v],
+        pupil_diameter_mm=plan.pupils_mm[pupil],
+        accommodation_dpt=plan.accommodations_dpt[used],
+        wavelength_nm=spec.channel_wavelengths_nm[2],
+        total_defocus_dpt=plan.defocus.values_dpt,
+    )
+    survey = survey_pupils(state_frames(eye, spec, states))
+    assert survey.blur_radius_px.max() <= spec.max_blur_radius_px
+
+
+def test_a_frame_says_where_its_blur_is_limited():
+    spec = spec_for(
+        160,
+        90,
+        mode="dynamic",
+        tolerance="loose",
+        max_blur_radius_px=6,
+        object_range_dpt=(0.0, 40.0),
+        **STILL,
+    )
+    eye = traced_eye("emmetropia", spec)
+    store = build_psf_store(eye, spec)
+    assert "blur beyond 6 px" in " ".join(frame_layers(store, **STATE).notes)
+    assert store.radius_px.max() <= 6
