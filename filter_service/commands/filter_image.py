@@ -133,7 +133,7 @@ def filter_image(
     ] = Grid.PLANNED,
     tolerance: Annotated[
         Tolerance,
-        typer.Option(help="Interpolation of a planned grid at about 40, 46 or 52 dB."),
+        typer.Option(help="Interpolation of a planned grid at about 43, 49 or 55 dB."),
     ] = Tolerance.NORMAL,
     gaze_h_deg: Annotated[
         float, typer.Option(help="Gaze from the image's axis to the right, deg.")

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from filter_service.gl.gpu import Pages, StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.image_cells import ImageCells, image_cells
@@ -33,6 +36,7 @@ class FrameStates:
         self._cell_px: int | None = None
         self._layers: tuple[tuple[float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
+        self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
 
     def _forget_others(self, handle: LoadedStore) -> None:
         if self._handle is not handle:
@@ -78,6 +82,17 @@ class FrameStates:
                     ),
                 )
         return self._image[1]
+
+    def corner_change_dpt(
+        self, timer: StageTimer, layers: FrameLayers, image: ImageCells
+    ) -> NDArray[np.float32]:
+        """Change of defocus at the corners of cells, see `FieldDefocus.at`."""
+        last = self._change
+        if last is None or last[0] is not layers or last[1] is not image:
+            with timer.wall("psf_plan_ms"):
+                change_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
+            self._change = layers, image, change_dpt.astype(np.float32)
+        return self._change[2]
 
     def coarsen(self, image: ImageCells) -> None:
         """Take cells twice as wide from now on."""

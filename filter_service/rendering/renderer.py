@@ -224,6 +224,7 @@ class FilterRenderer:
         border_px = _border_px(view, reach_px)
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
+        change_dpt = self._states.corner_change_dpt(timer, layers, image)
         picture = np.empty(whole.color.shape, OUTPUT_DTYPES[options.output])
         counts: Counter[str] = Counter()
         for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
@@ -233,6 +234,7 @@ class FilterRenderer:
                 timer,
                 layers=layers,
                 image=image,
+                corner_change_dpt=change_dpt,
                 paper_rule=options.paper_rule,
                 merge=options.merge,
                 first_row=strip.first_row,

@@ -48,6 +48,7 @@ def list_passes(bench, *, paper_rule=False, surface_count=1):
         StageTimer(bench.gpu),
         layers=bench.layers(),
         image=image_cells(bench.spec, bench.store.plan),
+        corner_change_dpt=np.zeros((2, 2), np.float32),
         paper_rule=paper_rule,
         merge=True,
         surface_count=surface_count,
