@@ -24,12 +24,6 @@ from filter_service.psfs.pack import box_sizes, pack_reach
 from filter_service.psfs.store import FrameLayers, PsfStore, neighbours
 from filter_service.rendering.image_cells import ImageCells
 
-UNMOVED_PX = 0.5
-"""Light that a map would move by less stays where it is stored."""
-
-MAX_REACH_PX = 255
-"""A byte a side; light that a map takes beyond it is cut."""
-
 
 @dataclass(frozen=True)
 class NodeKernels:
@@ -130,53 +124,26 @@ def frame_kernels(
     parts = parts.reshape(wanted.shape)
     nodes = _node_kernels(store, layers, *np.divmod(pairs, n_intervals))
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
-    maps = _part_maps(image.node_from_cell[cells], nodes.radius_px[parts])
-    area = np.abs(np.linalg.det(maps))
+    is_moved = image.maps.is_moved(cells, nodes.radius_px[parts])
+    area = np.where(is_moved, image.maps.area_ratio[cells], 1.0)
     in_use = weights > 0.0
-    reach_px, radius_px = _mapped_sizes(
-        nodes.reach_px[parts], nodes.radius_px[parts], maps
+    reach_px, radius_px = image.maps.mapped_sizes(
+        cells, is_moved, nodes.reach_px[parts], nodes.radius_px[parts]
     )
     return FrameKernels(
         nodes=nodes,
         cells=cells,
         intervals=intervals,
         parts=parts,
-        weight_ratio=weights * area / np.abs(maps[..., 0, 0] * maps[..., 1, 1]),
-        maps=maps,
+        weight_ratio=weights * np.where(is_moved, image.maps.box_ratio[cells], 1.0),
+        maps=np.where(
+            is_moved[..., None, None], image.maps.node_from_cell[cells], np.eye(2)
+        ),
         reach_px=np.where(in_use[..., None], reach_px, 0).max(axis=1),
         radius_px=np.where(in_use, radius_px, 0).max(axis=1),
         peak_ratio=(nodes.peak_ratio[parts] * weights * area).sum(axis=1),
         spread_px=(spread_px[parts] * (weights / np.sqrt(area))[..., None]).sum(axis=1),
     )
-
-
-def _part_maps(maps: NDArray, radius_px: NDArray) -> NDArray[np.float64]:
-    """Return maps (n, 4, 2, 2) of parts: the identity where little light moves."""
-    moved_px = np.linalg.norm(maps - np.eye(2), axis=(-2, -1)) * radius_px
-    still = (moved_px <= UNMOVED_PX)[..., None, None]
-    return np.where(still, np.eye(2), maps)
-
-
-def _mapped_sizes(
-    reach_px: NDArray, radius_px: NDArray, maps: NDArray
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Reaches (n, 4, 4) and radii (n, 4) of parts in the image's pixels.
-
-    Light that is interpolated ends one stored pixel beyond the last one.
-    """
-    out = np.linalg.inv(maps)
-    left, right, up, down = np.moveaxis(reach_px + 1.0, -1, 0)
-    sides = []
-    for row in range(2):
-        a, b = out[..., row, 0], out[..., row, 1]
-        low = np.minimum(-a * left, a * right) + np.minimum(-b * up, b * down)
-        high = np.maximum(-a * left, a * right) + np.maximum(-b * up, b * down)
-        sides += [-low, high]
-    mapped_px = np.clip(np.ceil(np.stack(sides, axis=-1) - 1e-9) - 1, 0, MAX_REACH_PX)
-    moved = np.any(maps != np.eye(2), axis=(-2, -1))
-    stretch = np.linalg.norm(out, ord=2, axis=(-2, -1))
-    wider_px = np.minimum(np.ceil(stretch * (radius_px + 1.0)), MAX_REACH_PX)
-    return mapped_px.astype(np.int64), np.where(moved, wider_px, radius_px).astype(int)
 
 
 def _node_kernels(

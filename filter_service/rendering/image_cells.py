@@ -18,6 +18,7 @@ from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.plan import CachePlan
+from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 """Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
@@ -45,9 +46,8 @@ class ImageCells:
         Field nodes around a cell's middle, index into [v, h] in C order.
     weight_ratio : (n_cells, 4)
         Of the nodes; sum 1.
-    node_from_cell : (n_cells, 4, 2, 2)
-        From offsets in the cell's pixels (x right, y down) to those of the pixels that
-        a node's kernels are stored in.
+    maps : CellMaps
+        To the pixels that the nodes' kernels are stored in.
     corner_h_deg, corner_v_deg : (rows + 1, columns + 1)
         Field directions of the cells' corners.
     """
@@ -56,15 +56,9 @@ class ImageCells:
     grid: tuple[int, int]
     nodes: NDArray[np.int64]
     weight_ratio: NDArray[np.float64]
-    node_from_cell: NDArray[np.float64]
+    maps: CellMaps
     corner_h_deg: NDArray[np.float64]
     corner_v_deg: NDArray[np.float64]
-
-    @property
-    def largest_stretch_ratio(self) -> float:
-        """How much larger a kernel can be in the image than as stored."""
-        smallest = np.linalg.svd(self.node_from_cell, compute_uv=False).min()
-        return float(max(1.0, 1.0 / smallest))
 
     @property
     def count(self) -> int:
@@ -99,7 +93,7 @@ def image_cells(
             grid=(1, 1),
             nodes=np.zeros((1, CORNERS), np.int64),
             weight_ratio=np.array([[1.0, 0.0, 0.0, 0.0]]),
-            node_from_cell=np.broadcast_to(np.eye(2), (1, CORNERS, 2, 2)),
+            maps=CellMaps(np.broadcast_to(np.eye(2), (1, CORNERS, 2, 2))),
             corner_h_deg=np.zeros((2, 2)),
             corner_v_deg=np.zeros((2, 2)),
         )
@@ -136,7 +130,7 @@ def image_cells(
         grid=grid,
         nodes=nodes,
         weight_ratio=np.stack(weights, axis=-1),
-        node_from_cell=_node_from_cell(spec, plan, nodes, scale),
+        maps=CellMaps(_node_from_cell(spec, plan, nodes, scale)),
         corner_h_deg=corner_h_deg,
         corner_v_deg=corner_v_deg,
     )

@@ -220,7 +220,7 @@ class FilterRenderer:
     def _in_strips(
         self, timer, view, handle, layers, image: ImageCells, options: "_Options"
     ) -> tuple[NDArray, dict[str, int]]:
-        reach_px = ceil(image.largest_stretch_ratio * layers.max_radius_px) + 2
+        reach_px = ceil(image.maps.largest_stretch_ratio * layers.max_radius_px) + 2
         border_px = _border_px(view, reach_px)
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
