@@ -24,7 +24,9 @@ from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
 from filter_service.planning.use import Use, axis_error, moved
 
 TOLERANCE_DB = {"loose": 43.0, "normal": 49.0, "fine": 55.0}
-"""PSNR that interpolation may cost down to; frames lie within 3 dB of it."""
+"""PSNR that interpolation may cost down to.  Frames planned for 49 dB, unmerged,
+have 46.8 to 50.1 dB at 640x360 (six eyes) and 44.8 to 47.1 dB at 320x180 (four eyes),
+where a pixel holds more contrast than those that the law was fitted to."""
 
 QUALITY_GAIN_DB = 3.0
 """What the mode for still eyes gives on top of it."""

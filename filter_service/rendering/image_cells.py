@@ -22,9 +22,8 @@ from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 """Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
-of 8, 16 and 32 px (1.2, 2.4 and 4.8 degrees) leave 46.6, 46.4, 46.0 dB of myopia, 47.7,
-46.8, 44.6 dB of keratoconus and 50.8, 49.7, 46.9 dB of cataract, whose kernels then
-take 611, 268 and 127 MB."""
+of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 47.4 dB
+of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256

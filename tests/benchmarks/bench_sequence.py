@@ -63,8 +63,8 @@ STILL_DB = 100.0
 """Plots end here."""
 
 MIN_FLICKER_DB = {"on-axis": 52.0, "dynamic": 46.0}
-"""Bounds on the worst change: 46 dB is half a per cent of white, about the least
-flicker of a whole field that anybody sees; on the axis half of that."""
+"""Bounds on the worst change, chosen: 46 dB is half a per cent of white; on the axis
+half of that."""
 
 MAX_POPPING_RATIO = 2.0
 """Bound on a change against its neighbours', where it could be seen at all."""

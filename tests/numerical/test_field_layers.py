@@ -79,7 +79,7 @@ def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, gaze_
     )
     bench.spec = replace(bench.spec, gaze_deg=gaze_deg, gaze_range_deg=(0.0, 0.0))
     truth = splat_exactly(bench, color, depth_m)
-    assert psnr_db(result.color, truth) >= 43.5
+    assert psnr_db(result.color, truth) >= 44.0
 
 
 def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
