@@ -117,7 +117,8 @@ bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
     return spread >= MERGE_MIN_SPREAD_PX
         && floor(place.z) - floor(place.y) <= 1.0
         && largest <= white_level * MERGE_CONTRAST * pow(spread, MERGE_CONTRAST_POWER)
-        && (most.a - least.a) * blur_px_per_dpt <= MERGE_MAX_BLUR_STEP_PX
+        && (most.a - least.a) * blur_px_per_dpt
+           <= max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
         && kernel_has_level(kernel, level);
 }
 
