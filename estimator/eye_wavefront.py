@@ -15,7 +15,7 @@ from estimator.media import refractive_index
 from estimator.prescription import C20
 from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.wavefront import eyes_aberrations, on_axis_zernike
-from estimator.wavefront_kernels import magnification
+from estimator.wavefront_kernels import magnifications
 from estimator.zernike import N_TERMS, rescale_pupil
 
 MEDIA_INWARDS = ("air", "cornea", "aqueous", "lens", "vitreous")
@@ -51,7 +51,7 @@ def zernike_of_vectors(
         zernike_um, _ = on_axis_zernike(packed, indices, zernike_radius_mm=radius_mm)
         return zernike_um
     reference = eye_indices(REFERENCE_WAVELENGTH_NM)
-    ratios = np.array([magnification(eye, reference) for eye in packed])
+    ratios = magnifications(packed, reference)
     zernike_um = np.full((len(vectors), N_TERMS), np.nan)
     usable = ratios > 0.0
     found = eyes_aberrations(

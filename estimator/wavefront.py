@@ -299,12 +299,14 @@ def eyes_aberrations(
     indices: NDArray[np.float64],
     *,
     stop_diameters_mm: ArrayLike,
-    h_deg: float = 0.0,
-    v_deg: float = 0.0,
+    h_deg: ArrayLike = 0.0,
+    v_deg: ArrayLike = 0.0,
     fit: str = "opd",
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
     n_threads: int = N_THREADS,
 ) -> FieldResults:
-    """Aberrations of many eyes at one field; leading axis (n_eyes,).
+    """Aberrations of many eyes, each at one field; leading axis (n_eyes,).
 
     Parameters
     ----------
@@ -312,22 +314,26 @@ def eyes_aberrations(
         Stacked `surfaces.pack_eye`.
     indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
         From `surfaces.media_indices`, at the wavelength of the wavefront.
-    stop_diameters_mm : scalar or (n_eyes,)
+    stop_diameters_mm, h_deg, v_deg : scalar or (n_eyes,)
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront_nodes`.
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes, n_rows = packed.shape[:2]
     indices = np.ascontiguousarray(np.broadcast_to(indices, (n_eyes, n_rows)))
     stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
-    _check_view(np.array([h_deg, v_deg]), 0.0, fit)
+    fields_deg = np.empty((n_eyes, 2))
+    fields_deg[:, 0], fields_deg[:, 1] = h_deg, v_deg
+    _check_view(fields_deg, 0.0, fit)
     rows, stop_radii = np.empty((n_eyes, bundle.N_RESULT)), stops_mm / 2.0
-    field_rad = (math.radians(h_deg), math.radians(v_deg))
-    viewed, nodes = (0.0, 0.0, fit == "slope"), stop_nodes()
+    fields_rad = np.radians(fields_deg)
+    viewed, nodes = (0.0, 0.0, fit == "slope"), stop_nodes(n_rings, n_azimuths)
 
     def work(part: slice) -> None:
         bundle.analyse_eyes(
             packed[part],
             indices[part],
-            field_rad,
+            fields_rad[part],
             stop_radii[part],
             viewed,
             nodes,
@@ -342,12 +348,12 @@ def on_axis_zernike(
     packed: NDArray[np.float64],
     indices: NDArray[np.float64],
     *,
-    zernike_radius_mm: float,
+    zernike_radius_mm: ArrayLike,
     h_deg: float = 0.0,
     v_deg: float = 0.0,
     n_threads: int = N_THREADS,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Coefficients of many eyes on one given circle outside the eye.
+    """Coefficients of many eyes on given circles outside the eye.
 
     The circle is filled, whatever the stop; for measurements, whose circle is half
     the pupil diameter they were taken at.
@@ -358,7 +364,7 @@ def on_axis_zernike(
         Stacked `surfaces.pack_eye`.
     indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
         From `surfaces.media_indices`, at the wavelength of the measurement.
-    zernike_radius_mm : float
+    zernike_radius_mm : scalar or (n_eyes,)
     h_deg, v_deg : float
         Field; off axis a real pupil fills its circle only in part.
     n_threads : int
@@ -375,6 +381,8 @@ def on_axis_zernike(
     indices = np.ascontiguousarray(np.broadcast_to(indices, (n_eyes, n_rows)))
     zernike_um, status = np.empty((n_eyes, N_TERMS)), np.empty(n_eyes, np.int64)
     field_rad = (math.radians(h_deg), math.radians(v_deg))
+    radii_mm = np.empty(n_eyes)
+    radii_mm[:] = zernike_radius_mm
     nodes = circle_nodes()
 
     def work(part: slice) -> None:
@@ -382,7 +390,7 @@ def on_axis_zernike(
             packed[part],
             indices[part],
             field_rad,
-            float(zernike_radius_mm),
+            radii_mm[part],
             nodes,
             zernike_um[part],
             status[part],

@@ -291,12 +291,13 @@ def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, resul
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyse_eyes(packed, indices, field_rad, stop_radii, viewed, nodes, results):
-    """`analyse_field` over eyes, each with a stop of its own.
+def analyse_eyes(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+    """`analyse_field` over eyes, each with a field and a stop of its own.
 
-    ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``stop_radii``
-    (E,), ``results`` (E, N_RESULT).
+    ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
+    (E, 2), ``stop_radii`` (E,), ``results`` (E, N_RESULT).
     """
     for e in range(packed.shape[0]):
+        field_rad = (fields_rad[e, 0], fields_rad[e, 1])
         stop, result = stop_radii[e : e + 1], results[e : e + 1]
         analyse_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)

@@ -122,15 +122,15 @@ def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def circle_zernike(packed, indices, field_rad, radius_mm, nodes, zernike_um, status):
-    """Coefficients of many eyes on one circle about the chief ray of one field.
+def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, status):
+    """Coefficients of many eyes, each on its circle about the chief ray of one field.
 
     Parameters
     ----------
     packed : (n_eyes, n_surfaces + 1, 48)
     indices : (n_eyes, n_surfaces + 1)
     field_rad : (h, v)
-    radius_mm : float
+    radii_mm : (n_eyes,)
     nodes : (rings (n_rings,), weights (n_rings,), azimuths (n_azimuths, 2),
         projection (28, n_azimuths * n_rings))
     zernike_um : (n_eyes, 28) out
@@ -164,7 +164,9 @@ def circle_zernike(packed, indices, field_rad, radius_mm, nodes, zernike_um, sta
         for k in range(n_azimuths):
             weights[k] = ring_weights / n_azimuths
         light = (packed[e], indices[e], chief, frame, axes, path)
-        code = _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag)
+        code = _circle_samples(
+            light, radii_mm[e], rings, azimuths, samples, weights, sag
+        )
         status[e] = code
         if code == TRACED:
             for j in range(1, N_TERMS):
@@ -174,4 +176,4 @@ def circle_zernike(packed, indices, field_rad, radius_mm, nodes, zernike_um, sta
                 zernike_um[e, j] = total
             zernike_um[e, 0] = 0.0
         elif np.sum(weights.ravel() > 0.0) >= _FEWEST_RAYS:
-            fit_zernike(flat, weights.ravel(), radius_mm, False, zernike_um[e])
+            fit_zernike(flat, weights.ravel(), radii_mm[e], False, zernike_um[e])

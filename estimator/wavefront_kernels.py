@@ -179,6 +179,15 @@ def magnification(packed, indices):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def magnifications(packed, indices):
+    """`magnification` (n_eyes,) of eyes (n_eyes, n_surfaces + 1, 48)."""
+    found = np.empty(packed.shape[0])
+    for e in range(packed.shape[0]):
+        found[e] = magnification(packed[e], indices)
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def across(direction, frame):
     """Rows of ``frame`` (2, 3): two unit vectors that complete a right-handed basis."""
     dx, dy, dz = direction[0], direction[1], direction[2]

@@ -1,0 +1,146 @@
+"""Data sets: the same rows whatever makes them, labelled by the tracer itself."""
+
+import numpy as np
+import pytest
+
+from estimator.accommodation import AccommodatingEye
+from estimator.eye import eye_surfaces
+from estimator.eye_parameters import EyeParameters
+from estimator.wavefront import wavefront_aberrations
+from training.datasets import (
+    DataError,
+    Recipe,
+    draw,
+    label,
+    load,
+    read_manifest,
+    shard_file,
+    split,
+    write_manifest,
+)
+from training.generate import generate
+from training.tasks import DOMAINS, ellipse_matrix
+
+SMALL = Recipe("on_axis", 96, rows_per_shard=32, seed=5)
+
+
+@pytest.mark.parametrize("sampling", ["random", "sobol"])
+def test_rows_do_not_depend_on_the_order_of_shards(sampling):
+    recipe = Recipe("on_axis", 96, rows_per_shard=32, seed=5, sampling=sampling)
+    last_first = [draw(recipe, k) for k in (2, 1, 0)][::-1]
+    in_order = [draw(recipe, k) for k in range(3)]
+    np.testing.assert_array_equal(np.concatenate(last_first), np.concatenate(in_order))
+    assert len(np.unique(np.concatenate(in_order), axis=0)) == 96
+
+
+def test_a_sequence_fills_the_box_more_evenly_than_chance():
+    low, high = DOMAINS["on_axis"].ranges.T
+    worst = {}
+    for sampling in ("random", "sobol"):
+        rows = draw(Recipe("on_axis", 256, 256, seed=1, sampling=sampling), 0)
+        unit = np.sort((rows - low) / (high - low), axis=0)
+        even = (np.arange(256) + 0.5)[:, None] / 256
+        worst[sampling] = np.abs(unit - even).max()
+    assert np.all((rows >= low) & (rows <= high))
+    assert worst["sobol"] < 0.005 < 0.05 < worst["random"]
+
+
+def test_the_focus_set_is_a_product_of_eyes_and_distances():
+    recipe = Recipe("focus", 120, rows_per_shard=80)
+    rows = np.concatenate([draw(recipe, 0), draw(recipe, 1)])
+    eyes = rows[:, :-1].reshape(3, 40, -1)
+    assert np.all(eyes == eyes[:, :1])
+    assert len(np.unique(eyes[:, 0], axis=0)) == 3
+    np.testing.assert_allclose(rows[:40, -1], np.linspace(0.125, 8.125, 40))
+
+
+def test_a_shard_of_a_product_holds_whole_eyes():
+    with pytest.raises(DataError, match="multiple of 40"):
+        Recipe("focus", 120, rows_per_shard=50)
+
+
+@pytest.mark.parametrize("bad", [{"domain": "moon"}, {"sampling": "dice"}])
+def test_a_recipe_names_what_is_allowed(bad):
+    with pytest.raises(DataError, match="allowed are"):
+        Recipe(**({"domain": "on_axis", "n_rows": 10} | bad))
+
+
+def test_an_interrupted_set_goes_on_and_ends_the_same(tmp_path, capsys):
+    generate(SMALL, tmp_path / "whole")
+    generate(SMALL, tmp_path / "resumed")
+    shard_file(tmp_path / "resumed", 1).unlink()
+    with pytest.raises(DataError, match=r"shard-00001.npz of 3 is missing"):
+        load(tmp_path / "resumed")
+    generate(SMALL, tmp_path / "resumed")
+    generate(SMALL, tmp_path / "shared", rank=1, n_ranks=2)
+    generate(SMALL, tmp_path / "shared", rank=0, n_ranks=2)
+    whole = load(tmp_path / "whole")
+    for other in ("resumed", "shared"):
+        found = load(tmp_path / other)
+        np.testing.assert_array_equal(found.inputs, whole.inputs)
+        np.testing.assert_array_equal(found.targets, whole.targets)
+    manifest = read_manifest(tmp_path / "whole")
+    assert manifest["n_rows_kept"] + manifest["n_rows_rejected"] == 96
+    assert manifest["inputs"][46] == {"name": "wavelength_nm", "low": 450, "high": 900}
+    assert "n=1,2 (paper)" in capsys.readouterr().out
+
+
+def test_a_folder_of_another_set_is_refused(tmp_path):
+    write_manifest(tmp_path, SMALL, commit="none")
+    with pytest.raises(DataError, match="another data set"):
+        generate(Recipe("on_axis", 96, rows_per_shard=32, seed=6), tmp_path)
+
+
+def test_rows_that_light_does_not_pass_are_counted():
+    domain = DOMAINS["field"]
+    rows = draw(Recipe("field", 8, 8), 0)
+    rows[0, domain.inputs.index("cornea_anterior_radius_mm")] = 2.0
+    rows[0, domain.inputs.index("pupil_diameter_mm")] = 7.0
+    found = label(domain, rows)
+    assert found.n_rejected == 1
+    np.testing.assert_array_equal(found.inputs, rows[1:].astype(np.float32))
+
+
+def test_field_labels_are_single_traces():
+    rows = draw(Recipe("field", 4, 4, seed=3), 0)
+    found = DOMAINS["field"].label(rows)
+    for row, values in zip(rows, found, strict=True):
+        pupil_mm, wavelength_nm, h_deg, v_deg = row[45:].tolist()
+        traced = wavefront_aberrations(
+            eye_surfaces(EyeParameters.from_vector(row[:45])),
+            pupil_diameter_mm=pupil_mm,
+            wavelength_nm=wavelength_nm,
+            h_deg=h_deg,
+            v_deg=v_deg,
+        )
+        np.testing.assert_allclose(values[:27], traced.zernike_um[1:], atol=1e-9)
+        assert values[27] == pytest.approx(traced.zernike_radius_mm, abs=1e-9)
+        ellipse = traced.pupil_ellipse
+        matrix = [[values[30], values[31]], [values[31], values[32]]]
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(matrix), (ellipse.semi_minor_mm, ellipse.semi_major_mm)
+        )
+
+
+def test_the_ellipse_does_not_jump_where_its_axes_are_equal():
+    nearly_round = np.array([[0.0, 0.0, 2.0 + 1e-9, 2.0, a] for a in (0.0, 1.5)])
+    first, second = ellipse_matrix(nearly_round)
+    np.testing.assert_allclose(first, second, atol=1e-8)
+
+
+def test_focus_labels_are_those_of_the_accommodating_eye():
+    rows = draw(Recipe("focus", 80, 80, seed=9), 0)
+    found = DOMAINS["focus"].label(rows)
+    for k in (0, 17, 39, 40, 79):
+        eye = AccommodatingEye(
+            EyeParameters.from_vector(rows[k, :45]), pupil_diameter_mm=rows[k, 45]
+        )
+        state = eye.focused(rows[k, 46])
+        wanted = (state.lens_diameter_change_mm, state.aqueous_thickness_change_mm)
+        np.testing.assert_allclose(found[k], wanted, atol=1e-6)
+
+
+def test_the_split_is_a_partition():
+    training, validation = split(1000, share=0.15, seed=3)
+    assert 100 < len(validation) < 200
+    assert sorted([*training, *validation]) == list(range(1000))

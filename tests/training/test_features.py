@@ -1,0 +1,105 @@
+"""What features claim: eyes that are the same to light look the same to a network."""
+
+import numpy as np
+import pytest
+import torch
+
+from estimator.eye_parameters import column
+from estimator.zernike import zernike_values
+from training.datasets import Recipe, draw
+from training.features import FieldFeatures, OnAxisFeatures, Turn
+from training.tasks import DOMAINS, ZERNIKE_NAMES
+
+N_EYES = 24
+
+
+def _turned(rows: np.ndarray) -> np.ndarray:
+    """Rows (n, 49) turned about the eye's axis until their field lies on +x."""
+    h_rad, v_rad = np.radians(rows[:, 47]), np.radians(rows[:, 48])
+    ux, uy = np.sin(h_rad) * np.cos(v_rad), np.sin(v_rad)
+    angle_rad, turned = np.arctan2(uy, ux), rows.copy()
+    for side in ("anterior", "posterior"):
+        turned[:, column(f"cornea_{side}_rotation_deg")] -= np.degrees(angle_rad)
+    names = ("lens_decentration_x_mm", "lens_decentration_y_mm")
+    x, y = (rows[:, column(name)] for name in names)
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turned[:, column(names[0])], turned[:, column(names[1])] = (
+        c * x + s * y,
+        c * y - s * x,
+    )
+    about_x = np.radians(rows[:, column("lens_tilt_about_x_deg")])
+    about_y = np.radians(rows[:, column("lens_tilt_about_y_deg")])
+    x, y = np.sin(about_y) * np.cos(about_x), -np.sin(about_x)
+    x, y = c * x + s * y, c * y - s * x
+    about_x = np.arcsin(-y)
+    turned[:, column("lens_tilt_about_x_deg")] = np.degrees(about_x)
+    turned[:, column("lens_tilt_about_y_deg")] = np.degrees(
+        np.arcsin(x / np.cos(about_x))
+    )
+    turned[:, 47], turned[:, 48] = np.degrees(np.arcsin(np.hypot(ux, uy))), 0.0
+    return turned
+
+
+@pytest.fixture(scope="module")
+def field_rows():
+    rows = draw(Recipe("field", N_EYES, N_EYES, seed=2), 0)
+    return rows, _turned(rows)
+
+
+def test_a_turned_eye_has_the_same_features(field_rows):
+    features = FieldFeatures()
+    rows, turned = (features(torch.from_numpy(part)) for part in field_rows)
+    assert torch.max(torch.abs(rows - turned)) < 1e-12
+
+
+def test_a_turned_eye_has_the_same_encoded_light(field_rows):
+    features, encoded = FieldFeatures(), []
+    for rows in field_rows:
+        labels = torch.from_numpy(DOMAINS["field"].label(rows))
+        encoded.append(features.encode(torch.from_numpy(rows), labels).numpy())
+    good = np.all(np.isfinite(encoded[0] + encoded[1]), axis=1)
+    assert good.sum() > N_EYES / 2
+    # Both are traced with rays at fixed azimuths, which turn against the eye.
+    np.testing.assert_allclose(encoded[0][good], encoded[1][good], atol=2e-5)
+    assert np.abs(encoded[0][good]).max() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "domain"), [(FieldFeatures, "field"), (OnAxisFeatures, "on_axis")]
+)
+def test_decoding_undoes_encoding(kind, domain):
+    rows = torch.from_numpy(draw(Recipe(domain, 64, 64), 0))
+    values = torch.randn(64, len(DOMAINS[domain].targets), dtype=torch.float64)
+    features = kind()
+    found = features.decode(rows, features.encode(rows, values))
+    assert torch.max(torch.abs(found - values)) < 1e-12
+
+
+def test_encoded_coefficients_hardly_depend_on_the_pupil():
+    rows = np.repeat(draw(Recipe("on_axis", 8, 8, seed=4), 0), 2, axis=0)
+    rows[0::2, 45], rows[1::2, 45] = 3.0, 6.0
+    labels = DOMAINS["on_axis"].label(rows)
+    encoded = OnAxisFeatures().encode(torch.from_numpy(rows), torch.from_numpy(labels))
+    astigmatism = encoded[:, [ZERNIKE_NAMES.index(f"zernike_j{j}_um") for j in (3, 5)]]
+    raw = torch.from_numpy(labels[:, [2, 4]])
+    spread = [
+        torch.mean(torch.abs(v[0::2] - v[1::2])) / v.abs().mean()
+        for v in (astigmatism, raw)
+    ]
+    assert spread[0] < 0.4 < 0.9 < spread[1]
+
+
+def test_turning_terms_turns_the_surface():
+    rng = np.random.default_rng(0)
+    terms, angle_rad = rng.normal(size=(1, 27)), 0.7
+    cosine, sine = (torch.tensor([f(angle_rad)]) for f in (np.cos, np.sin))
+    turned = Turn()(torch.from_numpy(terms), cosine, sine).numpy()
+    radius, theta = rng.uniform(0, 1, 50), rng.uniform(0, 6, 50)
+
+    def surface(values, at):
+        x, y = radius * np.cos(at), radius * np.sin(at)
+        return zernike_values(x, y)[:, 1:] @ values[0]
+
+    np.testing.assert_allclose(
+        surface(turned, theta), surface(terms, theta - angle_rad), atol=1e-12
+    )

@@ -1,0 +1,78 @@
+"""Networks: their sizes are the paper's, their layers stand where they should."""
+
+import pytest
+import torch
+from torch import nn
+
+from training.models import ModelSettings, Network
+from training.run_file import RunFileError, read_run
+
+
+def _network(kind, *, width, n_inputs=47, n_outputs=27, task="discriminator"):
+    settings = ModelSettings(kind=kind, width=width)
+    return Network(task, n_inputs=n_inputs, n_outputs=n_outputs, settings=settings)
+
+
+@pytest.mark.parametrize("kind", ["ours", "resnet", "ffn"])
+@pytest.mark.parametrize(
+    ("task", "n_in", "n_out", "width", "millions"),
+    [("discriminator", 47, 27, 2000, 72), ("eye", 29, 45, 3500, 221)],
+)
+def test_parameter_counts_are_those_of_table_3(
+    kind, task, n_in, n_out, width, millions
+):
+    with torch.device("meta"):
+        network = _network(kind, width=width, n_inputs=n_in, n_outputs=n_out, task=task)
+    assert network.n_parameters / 1e6 == pytest.approx(millions, rel=0.01)
+
+
+def test_norm_follows_the_activation_and_precedes_the_shortcut():
+    block = _network("ours", width=8).layers[0]
+    kinds = [type(layer) for layer in block.body]
+    assert kinds == [nn.Linear, nn.Mish, nn.LayerNorm] * 2 + [nn.Linear, nn.LayerNorm]
+    assert [type(layer) for layer in block.shortcut] == [nn.Linear, nn.LayerNorm]
+    assert [type(layer) for layer in block.head] == [nn.Mish, nn.LayerNorm]
+    shortcuts = [type(b.shortcut) for b in _network("ours", width=8).layers[:6]]
+    assert shortcuts == [nn.Sequential, nn.Identity, nn.Identity] * 2
+
+
+def test_scaling_is_part_of_the_network():
+    network = _network("ours", width=8).eval()
+    x, y = torch.rand(5, 47), torch.rand(5, 27)
+    network.set_scaling(([3.0] * 47, [2.0] * 47), ([1.0] * 27, [4.0] * 27))
+    plain = network.layers((x - 3.0) / 2.0)
+    torch.testing.assert_close(network(x), plain * 4.0 + 1.0)
+    torch.testing.assert_close(network.to_standard(x, y), (y - 1.0) / 4.0)
+
+
+def test_a_bounded_network_keeps_to_its_range():
+    settings = ModelSettings(width=8)
+    network = Network(
+        "eye", n_inputs=27, n_outputs=45, settings=settings, is_bounded=True
+    )
+    network.set_scaling(([0.0] * 27, [1e-3] * 27), ([5.0] * 45, [2.0] * 45))
+    found = network(1e3 * torch.randn(64, 27))
+    assert 3.0 <= found.min() < 3.5 < 6.5 < found.max() <= 7.0
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('task = "moon"', "allowed are discriminator"),
+        ('task = "eye"\n[training]\nloss = "physical"', "allowed are parameters"),
+        (
+            'task = "focus"\n[model]\nwidth = "wide"',
+            "model.width 'wide': must be of type int",
+        ),
+        ('task = "focus"\n[model]\ndepth = 3', "model.depth: allowed are kind"),
+        ('task = "focus"\n[model]\nkind = "svm"', "kind 'svm': allowed are ours"),
+        ('task = "focus"\n[data]\nn_rows = 0', "must be positive"),
+        ('task = "focus"\n[data]', "n_rows"),
+        ("task = ", "Invalid value"),
+    ],
+)
+def test_a_run_file_that_is_wrong_says_where(tmp_path, text, says):
+    file = tmp_path / "run.toml"
+    file.write_text(text)
+    with pytest.raises(RunFileError, match=says.replace("[", r"\[")):
+        read_run(file)

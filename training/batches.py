@@ -1,0 +1,141 @@
+"""Rows of a data set as a task's inputs and targets, and the batches of a training."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from estimator.eye_parameters import sampled_ranges
+from training.datasets import Recipe, Shard, draw, label, load, split
+from training.features import moments
+from training.models import Network
+from training.run_file import Run
+from training.tasks import DOMAINS, N_EYE, TASKS
+
+SCALING_ROWS = 200_000
+"""Rows from which means and deviations are taken."""
+
+FRESH_SEED = 7919
+"""Added to the run's seed, so that fresh rows are never those of the shards."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Inputs (n, n_inputs) and targets (n, n_targets) of a task, and their split.
+
+    The eye estimator's targets are the eye (45) and its coefficients (27).
+    """
+
+    task: str
+    x: Tensor
+    y: Tensor
+    training_index: NDArray[np.int64]
+    validation_index: NDArray[np.int64]
+
+    def scaling(self, network: Network) -> tuple[tuple, tuple]:
+        """Moments of the network's features and of its encoded targets."""
+        chosen = torch.as_tensor(self.training_index[:SCALING_ROWS])
+        x, y = self.x[chosen], self.y[chosen]
+        with torch.no_grad():
+            features = moments(network.features(x).numpy())
+            if self.task == "eye":
+                low, high = sampled_ranges().T
+                return features, ((low + high) / 2.0, (high - low) / 2.0)
+            return features, moments(network.features.encode(x, y).numpy())
+
+    @property
+    def validation(self) -> tuple[Tensor, Tensor]:
+        """Inputs and targets that training does not see."""
+        chosen = torch.as_tensor(self.validation_index)
+        return self.x[chosen], self.y[chosen]
+
+
+def task_rows(task: str, shard: Shard) -> tuple[Tensor, Tensor]:
+    """Return inputs and targets of a task, from labelled rows of its domain."""
+    inputs, targets = torch.from_numpy(shard.inputs), torch.from_numpy(shard.targets)
+    if task != "eye":
+        return inputs, targets
+    measured = torch.cat([targets[:, 2:], inputs[:, N_EYE:]], dim=1)
+    return measured, torch.cat([inputs[:, :N_EYE], targets], dim=1)
+
+
+def load_rows(run: Run, folder: Path) -> Rows:
+    """Read the data set of a run and split it.
+
+    Raises
+    ------
+    DataError
+        It is not there or not whole.
+    """
+    x, y = task_rows(run.task, load(folder))
+    share = run.training.validation_share
+    return Rows(run.task, x, y, *split(len(x), share=share, seed=run.seed))
+
+
+class Batches:
+    """The batch of every step, a function of the run's seed and the step alone.
+
+    Parameters
+    ----------
+    rows : Rows
+    run : Run
+    rank, n_ranks : int
+        This process takes every n-th batch.
+    device : torch.device
+    """
+
+    def __init__(self, rows: Rows, run: Run, *, rank: int, n_ranks: int, device):
+        settings = run.training
+        self._rows, self._run, self._device = rows, run, device
+        self._rank, self._n_ranks = rank, n_ranks
+        self._size = settings.batch_size
+        self.rows_per_step = self._size * n_ranks
+        self.steps_per_epoch = max(1, len(rows.training_index) // self.rows_per_step)
+        self.n_steps = max(1, round(settings.n_epochs * self.steps_per_epoch))
+        self._order = (-1, rows.training_index)
+        self._pool = ThreadPoolExecutor(1) if settings.is_fresh else None
+        self._coming: dict = {}
+
+    def at(self, step: int) -> tuple[Tensor, Tensor]:
+        """Return inputs and targets of a step, on the device."""
+        if self._pool is None:
+            x, y = self._kept(step)
+        else:
+            x, y = self._fresh(step)
+        return x.to(self._device), y.to(self._device)
+
+    def _kept(self, step: int) -> tuple[Tensor, Tensor]:
+        epoch, place = divmod(step, self.steps_per_epoch)
+        if self._order[0] != epoch:
+            rng = np.random.default_rng([self._run.seed, epoch])
+            self._order = (epoch, rng.permutation(self._rows.training_index))
+        first = (place * self._n_ranks + self._rank) * self._size
+        chosen = torch.from_numpy(self._order[1][first : first + self._size])
+        return self._rows.x[chosen], self._rows.y[chosen]
+
+    def _fresh(self, step: int) -> tuple[Tensor, Tensor]:
+        """Rows traced for this step, the next one's begun in a thread."""
+        now = self._coming.pop(step, None) or self._pool.submit(self._trace, step)
+        self._coming = {step + 1: self._pool.submit(self._trace, step + 1)}
+        return now.result()
+
+    def _trace(self, step: int) -> tuple[Tensor, Tensor]:
+        domain = TASKS[self._run.task].domain
+        recipe = self._fresh_recipe(domain.n_repeats)
+        block = draw(recipe, step * self._n_ranks + self._rank)
+        return task_rows(self._run.task, label(DOMAINS[recipe.domain], block))
+
+    def _fresh_recipe(self, n_repeats: int) -> Recipe:
+        per_shard = -(-self._size // n_repeats) * n_repeats
+        n_rows = per_shard * self._n_ranks * (self.n_steps + 1)
+        return replace(
+            self._run.recipe,
+            n_rows=n_rows,
+            rows_per_shard=per_shard,
+            seed=self._run.seed + FRESH_SEED,
+            sampling="random",
+        )

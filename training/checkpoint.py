@@ -1,0 +1,54 @@
+"""A network with its settings in one file, and how to make it again."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from training.datasets import DataError
+from training.models import ModelSettings, Network
+from training.run_file import Run
+from training.tasks import TASKS
+
+
+def make_network(task: str, settings: ModelSettings) -> Network:
+    """Return an untrained network for a task."""
+    wanted = TASKS[task]
+    return Network(
+        task,
+        n_inputs=len(wanted.inputs),
+        n_outputs=len(wanted.outputs),
+        settings=settings,
+        is_bounded=task == "eye",
+    )
+
+
+def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None:
+    """Write a network and everything needed to go on; whole, whatever interrupts."""
+    partial = file.with_suffix(".partial")
+    torch.save(
+        {
+            "task": run.task,
+            "model": asdict(run.model),
+            "weights": network.state_dict(),
+            **state,
+        },
+        partial,
+    )
+    partial.replace(file)
+
+
+def load_checkpoint(file: Path) -> tuple[Network, dict]:
+    """Network and the rest of a checkpoint, on the CPU.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    if not file.exists():
+        raise DataError(f"checkpoint {file}: not there")
+    state = torch.load(file, map_location="cpu", weights_only=True)
+    network = make_network(state["task"], ModelSettings(**state["model"]))
+    network.load_state_dict(state["weights"])
+    return network, state

@@ -1,0 +1,232 @@
+"""Samples of a domain: drawn by seed, labelled, kept in shards with a manifest.
+
+Row i of a data set depends on the domain, the sampling and the seed alone, so shards
+can be made in any order, by several processes, and made again.
+"""
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, Domain
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+SAMPLINGS = ("random", "sobol")
+
+
+class DataError(ValueError):
+    """A data set that cannot be made or read as asked."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a data set is made of.
+
+    Attributes
+    ----------
+    domain : str
+        Name in `tasks.DOMAINS`.
+    n_rows : int
+        Rows drawn; those that light does not pass are left out of the shards.
+    rows_per_shard : int
+    seed : int
+    sampling : {"random", "sobol"}
+        Uniform and independent, or a scrambled low-discrepancy sequence.
+    """
+
+    domain: str
+    n_rows: int
+    rows_per_shard: int = 20_480
+    seed: int = 132
+    sampling: str = "sobol"
+
+    def __post_init__(self):
+        if self.domain not in DOMAINS:
+            raise DataError(f"domain '{self.domain}': allowed are {', '.join(DOMAINS)}")
+        if self.sampling not in SAMPLINGS:
+            raise DataError(
+                f"sampling '{self.sampling}': allowed are {', '.join(SAMPLINGS)}"
+            )
+        repeats = DOMAINS[self.domain].n_repeats
+        if self.n_rows < 1 or self.rows_per_shard < 1 or self.rows_per_shard % repeats:
+            raise DataError(
+                f"{self.n_rows} rows in shards of {self.rows_per_shard}: both must be "
+                f"positive, and a shard of '{self.domain}' a multiple of {repeats}"
+            )
+
+    @property
+    def n_shards(self) -> int:
+        """Number of shards; the last one may be shorter."""
+        return -(-self.n_rows // self.rows_per_shard)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Rows that were labelled; float32, as networks read them.
+
+    ``inputs`` (n, n_inputs), ``targets`` (n, n_targets), ``n_rejected`` rows left out.
+    """
+
+    inputs: NDArray[np.float32]
+    targets: NDArray[np.float32]
+    n_rejected: int
+
+
+def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
+    """Draw the inputs (n, n_inputs) of one shard.
+
+    In a Cartesian product every eye comes with all ``n_repeats`` values of the last
+    input, evenly spread over its range (the paper's focus set).
+    """
+    domain = DOMAINS[recipe.domain]
+    first = shard * recipe.rows_per_shard
+    n = min(recipe.rows_per_shard, recipe.n_rows - first)
+    if n < 1:
+        raise DataError(f"shard {shard}: the data set has {recipe.n_shards}")
+    low, high = domain.ranges.T
+    if domain.n_repeats == 1:
+        return low + (high - low) * _unit_points(recipe, first, n, len(low))
+    n_eyes = -(-n // domain.n_repeats)
+    unit = _unit_points(recipe, first // domain.n_repeats, n_eyes, len(low) - 1)
+    eyes = low[:-1] + (high - low)[:-1] * unit
+    last = np.linspace(low[-1], high[-1], domain.n_repeats)
+    rows = np.repeat(eyes, domain.n_repeats, axis=0)
+    return np.column_stack([rows, np.tile(last, n_eyes)])[:n]
+
+
+def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray:
+    if recipe.sampling == "random":
+        # One stream per block of rows: any shard can be drawn without the others.
+        rng = np.random.default_rng(np.random.SeedSequence([recipe.seed, first]))
+        return rng.random((n, n_axes))
+    sequence = qmc.Sobol(n_axes, scramble=True, rng=recipe.seed)
+    if first:
+        sequence.fast_forward(first)
+    with warnings.catch_warnings():
+        # A shard is one part of the sequence, which as a whole is balanced.
+        warnings.filterwarnings("ignore", message="The balance properties")
+        return sequence.random(n)
+
+
+def label(domain: Domain, inputs: NDArray[np.float64]) -> Shard:
+    """Trace a block of inputs; rows that light does not pass are left out."""
+    targets = domain.label(inputs)
+    with np.errstate(invalid="ignore"):
+        good = np.all(np.abs(targets) <= MAX_COEFFICIENT_UM, axis=1)
+    return Shard(
+        inputs[good].astype(np.float32),
+        targets[good].astype(np.float32),
+        int(np.sum(~good)),
+    )
+
+
+def shard_file(folder: Path, shard: int) -> Path:
+    """Where a shard lies."""
+    return folder / f"shard-{shard:05d}.npz"
+
+
+def write_shard(folder: Path, number: int, shard: Shard) -> None:
+    """Write one shard; a file of that name is whole, whatever interrupts."""
+    target = shard_file(folder, number)
+    partial = target.with_suffix(".partial")
+    with partial.open("wb") as file:
+        np.savez(
+            file,
+            inputs=shard.inputs,
+            targets=shard.targets,
+            n_rejected=np.int64(shard.n_rejected),
+        )
+    partial.replace(target)
+
+
+def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
+    """Write what is in a folder: settings, ranges, counts of what was rejected."""
+    domain = DOMAINS[recipe.domain]
+    done = [k for k in range(recipe.n_shards) if shard_file(folder, k).exists()]
+    counts = []
+    for number in done:
+        with np.load(shard_file(folder, number)) as data:
+            counts.append((len(data["inputs"]), int(data["n_rejected"])))
+    manifest = {
+        "format": FORMAT,
+        **asdict(recipe),
+        "commit": commit,
+        "inputs": [
+            {"name": name, "low": float(low), "high": float(high)}
+            for name, (low, high) in zip(domain.inputs, domain.ranges, strict=True)
+        ],
+        "targets": list(domain.targets),
+        "n_shards_done": len(done),
+        "n_rows_kept": sum(kept for kept, _ in counts),
+        "n_rows_rejected": sum(rejected for _, rejected in counts),
+    }
+    text = json.dumps(manifest, indent=1)
+    partial = folder / (MANIFEST + ".partial")
+    partial.write_text(text + "\n", encoding="utf-8")
+    partial.replace(folder / MANIFEST)
+    return manifest
+
+
+def read_manifest(folder: Path) -> dict:
+    """Read the manifest of a data set.
+
+    Raises
+    ------
+    DataError
+        There is none, or it is of another format.
+    """
+    file = folder / MANIFEST
+    if not file.exists():
+        raise DataError(f"{folder} holds no data set: `python -m training.generate`")
+    manifest = json.loads(file.read_text(encoding="utf-8"))
+    if manifest.get("format") != FORMAT:
+        raise DataError(f"{file}: format {manifest.get('format')}, needed is {FORMAT}")
+    return manifest
+
+
+def recipe_of(manifest: dict) -> Recipe:
+    """Return the recipe that a manifest was written for."""
+    return Recipe(**{name: manifest[name] for name in Recipe.__dataclass_fields__})
+
+
+def load_shards(folder: Path) -> Iterator[Shard]:
+    """Shards of a folder, in order.
+
+    Raises
+    ------
+    DataError
+        A shard is missing.
+    """
+    recipe = recipe_of(read_manifest(folder))
+    for number in range(recipe.n_shards):
+        file = shard_file(folder, number)
+        if not file.exists():
+            raise DataError(
+                f"{file.name} of {recipe.n_shards} is missing in {folder}: "
+                "`python -m training.generate` goes on where it stopped"
+            )
+        with np.load(file) as data:
+            yield Shard(data["inputs"], data["targets"], int(data["n_rejected"]))
+
+
+def load(folder: Path) -> Shard:
+    """All rows of a data set."""
+    shards = list(load_shards(folder))
+    return Shard(
+        np.concatenate([s.inputs for s in shards]),
+        np.concatenate([s.targets for s in shards]),
+        sum(s.n_rejected for s in shards),
+    )
+
+
+def split(n_rows: int, *, share: float, seed: int) -> tuple[NDArray, NDArray]:
+    """Return indices of training and validation rows, drawn with ``share``."""
+    chosen = np.random.default_rng(seed).random(n_rows) < share
+    return np.flatnonzero(~chosen), np.flatnonzero(chosen)

@@ -1,0 +1,234 @@
+"""Write a trained network as ONNX, with a card that says what it is worth.
+
+    python -m training.export RUN.toml [--out DIR] [--half]
+
+Reads the run's checkpoint.  Physical units go in and out; scaling and optics are part
+of the graph.  ``--half`` stores the weights in 16 bits; arithmetic stays in 32.  The
+card, JSON beside the file, holds settings, ranges, data, parity with the checkpoint on
+1,000 samples, and the error of the *written* file on samples that are traced anew.
+"""
+
+import argparse
+import json
+import sys
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from training.batches import task_rows
+from training.checkpoint import load_checkpoint
+from training.datasets import DataError, Recipe, Shard, draw, label, read_manifest
+from training.models import Network
+from training.run_file import Run, RunFileError, read_run
+from training.tasks import TASKS, Task
+from training.train import CHECKPOINT
+from training.validation import error_columns, misfit_of_eyes, summary
+from training.versions import commit_id
+
+WEIGHTS = Path(__file__).parents[1] / "estimator" / "weights"
+CARD_FORMAT = 1
+PARITY_ROWS = 1_000
+JUDGED_ROWS = 20_000
+JUDGE_SEED = 20_001
+"""Fresh rows: no data set has this seed."""
+
+SMALLEST_HALVED = 256
+"""Smaller tensors, scalings among them, stay in 32 bits."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.export",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN.toml")
+    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    parser.add_argument("--half", action="store_true", help="weights in 16 bits")
+    parser.add_argument("--rows", type=int, default=JUDGED_ROWS, help="traced anew")
+    options = parser.parse_args(arguments)
+    try:
+        run = read_run(options.run)
+        card = export(run, options.out, is_half=options.half, n_rows=options.rows)
+    except (DataError, RunFileError) as error:
+        print(f"export: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps({k: card[k] for k in ("network", "bytes", "parity", "error")}))
+    return 0
+
+
+def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) -> dict:
+    """Write ``<task>.onnx`` and its card; the card.
+
+    Raises
+    ------
+    DataError
+        There is no checkpoint.
+    """
+    network, state = load_checkpoint(run.output_folder / CHECKPOINT)
+    task = TASKS[run.task]
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{task.name}.onnx"
+    file.write_bytes(to_onnx(network.eval(), n_inputs=len(task.inputs), half=is_half))
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    x, y = fresh_rows(task, n_rows)
+    card = {
+        "network": task.name,
+        "format": CARD_FORMAT,
+        "inputs": input_ranges(task, x),
+        "outputs": list(task.outputs),
+        "architecture": asdict(run.model),
+        "settings": asdict(run.training) | {"seed": run.seed},
+        "data": _data(run),
+        "trained": {
+            "steps": state["step"],
+            "seconds": round(state["seconds"]),
+            "validation": state["log"],
+        },
+        "commit": commit_id(),
+        "n_parameters": network.n_parameters,
+        "precision": "float16" if is_half else "float32",
+        "bytes": file.stat().st_size,
+        "parity": _parity(task, network, session, x[:PARITY_ROWS]),
+        "error": judged(task, evaluate(session, x), x, y),
+    }
+    text = json.dumps(card, indent=1)
+    file.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    return card
+
+
+def fresh_rows(task: Task, n_rows: int) -> tuple[NDArray, NDArray]:
+    """Return inputs and targets, float32, that no training saw."""
+    repeats = task.domain.n_repeats
+    n_rows = -(-n_rows // repeats) * repeats
+    recipe = Recipe(task.domain.name, n_rows, n_rows, JUDGE_SEED, "random")
+    shard: Shard = label(task.domain, draw(recipe, 0))
+    x, y = task_rows(task.name, shard)
+    return x.numpy(), y.numpy()
+
+
+def input_ranges(task: Task, x: NDArray) -> list[dict]:
+    """Range of every input: as sampled or, for coefficients, as they came out."""
+    sampled = dict(zip(task.domain.inputs, task.domain.ranges.tolist(), strict=True))
+    seen = zip(x.min(axis=0).tolist(), x.max(axis=0).tolist(), strict=True)
+    rows = []
+    for name, extremes in zip(task.inputs, seen, strict=True):
+        low, high = sampled.get(name, extremes)
+        rows.append({"name": name, "low": low, "high": high})
+    return rows
+
+
+def _data(run: Run) -> dict:
+    try:
+        manifest = read_manifest(run.data_folder)
+    except DataError:
+        return asdict(run.recipe)
+    kept = ("n_rows_kept", "n_rows_rejected", "commit")
+    return asdict(run.recipe) | {name: manifest[name] for name in kept}
+
+
+def evaluate(session, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return outputs of a written network, in physical units."""
+    return session.run(None, {"features": x})[0]
+
+
+def _parity(task: Task, network: Network, session, x: NDArray) -> dict:
+    """Largest difference of the written network from the trained one."""
+    with torch.no_grad():
+        wanted = network(torch.from_numpy(x)).numpy()
+    gap = np.abs(evaluate(session, x) - wanted).max(axis=0)
+    units: dict[str, float] = {}
+    for name, value in zip(task.outputs, gap.tolist(), strict=True):
+        unit = name.rsplit("_", 1)[-1]
+        units[unit] = max(units.get(unit, 0.0), value)
+    return {"n_samples": len(x), "max_abs": units}
+
+
+def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
+    """Errors against ray tracing, as a card holds them."""
+    if task.name == "eye":
+        error = misfit_of_eyes(found.astype(np.float64), x.astype(np.float64))
+    else:
+        error = found.astype(np.float64) - y
+    names = error_columns(task.name)
+    n_main = sum(name.endswith(f"_{task.unit}") for name in names)
+    good = np.all(np.isfinite(error), axis=1)
+    found_means = summary(task.name, error)
+    per_row = np.abs(error[good][:, :n_main]).mean(axis=1)
+    report = {
+        "judge": "ray tracing",
+        "n_samples": len(error),
+        "n_failed": int(np.sum(~good)),
+        "unit": task.unit,
+        "mean_abs": found_means["error"],
+        "median_abs": float(np.median(per_row)),
+        "p95_abs": float(np.percentile(per_row, 95)),
+        "by_radial_order": {
+            key.removeprefix("error_n"): value
+            for key, value in found_means.items()
+            if key.startswith("error_n")
+        },
+    }
+    if "error_rim_mm" in found_means:
+        report["rim_mean_abs_mm"] = found_means["error_rim_mm"]
+    return report
+
+
+def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
+    """Serialise a network; one input ``features``, one output ``values``."""
+    example = torch.rand(4, n_inputs)
+    rows = torch.export.Dim("rows", min=1)
+    with warnings.catch_warnings():
+        # torch's exporter warns of what torch itself does
+        warnings.simplefilter("ignore", FutureWarning)
+        warnings.simplefilter("ignore", DeprecationWarning)
+        program = torch.onnx.export(
+            network,
+            (example,),
+            dynamo=True,
+            input_names=["features"],
+            output_names=["values"],
+            dynamic_shapes=({0: rows},),
+            verbose=False,
+        )
+    model = program.model_proto
+    # Where a layer was made is nobody's business, and half of the file's text.
+    for node in model.graph.node:
+        node.ClearField("metadata_props")
+        node.ClearField("doc_string")
+    for value in (*model.graph.value_info, *model.graph.initializer):
+        value.ClearField("metadata_props")
+    if half:
+        _halve_weights(model.graph)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def _halve_weights(graph) -> None:
+    """Store large float32 tensors in 16 bits, cast back when the file is loaded."""
+    casts = []
+    for tensor in graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.size < SMALLEST_HALVED:
+            continue
+        name = tensor.name
+        stored = numpy_helper.from_array(values.astype(np.float16), f"{name}_half")
+        tensor.CopyFrom(stored)
+        casts.append(
+            helper.make_node("Cast", [stored.name], [name], to=TensorProto.FLOAT)
+        )
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

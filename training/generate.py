@@ -1,0 +1,128 @@
+"""Ray-trace a data set into shards.
+
+    python -m training.generate RUN.toml [--folder DIR]
+    torchrun --nproc-per-node 2 -m training.generate RUN.toml
+
+Reads the table ``[data]`` of the run file.  What is already there is kept, so that an
+interrupted run goes on; under `torchrun` each process makes its share of the shards.
+Prints the statistics of the paper's Table 11 at the end.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from training.datasets import (
+    MANIFEST,
+    DataError,
+    Recipe,
+    draw,
+    label,
+    load,
+    read_manifest,
+    recipe_of,
+    shard_file,
+    write_manifest,
+    write_shard,
+)
+from training.run_file import RunFileError, read_run
+from training.statistics import format_statistics, group_statistics
+from training.tasks import DOMAINS
+from training.versions import commit_id
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.generate",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN.toml")
+    parser.add_argument("--folder", type=Path, help="instead of the run file's")
+    options = parser.parse_args(arguments)
+    try:
+        run = read_run(options.run)
+        folder = options.folder or run.data_folder
+        generate(run.recipe, folder, rank=_rank(), n_ranks=_n_ranks())
+    except (DataError, RunFileError) as error:
+        print(f"generate: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _rank() -> int:
+    return int(os.environ.get("RANK", "0"))
+
+
+def _n_ranks() -> int:
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -> None:
+    """Make the shards ``rank``, ``rank + n_ranks``, ... that are not there yet.
+
+    Raises
+    ------
+    DataError
+        The folder holds a data set of another recipe.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / MANIFEST).exists() and recipe_of(read_manifest(folder)) != recipe:
+        raise DataError(
+            f"{folder} holds another data set ({recipe_of(read_manifest(folder))}); "
+            "choose another folder or remove it"
+        )
+    if rank == 0:
+        write_manifest(folder, recipe, commit=commit_id())
+    mine = range(rank, recipe.n_shards, n_ranks)
+    wanted = [k for k in mine if not shard_file(folder, k).exists()]
+    domain, started_s = DOMAINS[recipe.domain], time.perf_counter()
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=rank != 0) as bar:
+        task = bar.add_task(f"{recipe.domain}: shards", total=len(wanted))
+        for number in wanted:
+            write_shard(folder, number, label(domain, draw(recipe, number)))
+            bar.advance(task)
+    if rank == 0:
+        _finish(recipe, folder, console, started_s, n_ranks)
+
+
+def _finish(recipe, folder, console, started_s, n_ranks) -> None:
+    _await_others(recipe, folder, n_ranks)
+    manifest = write_manifest(folder, recipe, commit=commit_id())
+    console.print(
+        f"{manifest['n_rows_kept']} rows, {manifest['n_rows_rejected']} rejected, "
+        f"{time.perf_counter() - started_s:.0f} s, in {folder}"
+    )
+    data, domain = load(folder), DOMAINS[recipe.domain]
+    print(format_statistics(recipe.domain, group_statistics(domain, data.targets)))
+
+
+def _await_others(recipe: Recipe, folder: Path, n_ranks: int) -> None:
+    """Wait for the shards of the other processes."""
+    while n_ranks > 1 and not all(
+        shard_file(folder, k).exists() for k in range(recipe.n_shards)
+    ):
+        time.sleep(0.2)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""Rectified Adam with decoupled weight decay, looking ahead; and its schedule."""
+
+import torch
+from torch.optim import Optimizer, RAdam
+
+LOOK_AHEAD_STEPS = 5
+LOOK_AHEAD_SHARE = 0.8
+BETAS = (0.95, 0.999)
+EPSILON = 1e-12
+
+
+class Lookahead:
+    """Slow weights that follow the fast ones every few steps (Zhang et al. 2019).
+
+    Parameters
+    ----------
+    fast : torch.optim.Optimizer
+    n_steps : int
+        Fast steps between slow ones.
+    share : float
+        How far the slow weights move towards the fast ones; these start there again.
+    """
+
+    def __init__(
+        self,
+        fast: Optimizer,
+        *,
+        n_steps: int = LOOK_AHEAD_STEPS,
+        share: float = LOOK_AHEAD_SHARE,
+    ):
+        self.fast, self.n_steps, self.share, self.n_done = fast, n_steps, share, 0
+        self._parameters = [p for g in fast.param_groups for p in g["params"]]
+        self._slow = [p.detach().clone() for p in self._parameters]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        self.fast.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Take one fast step and, when it is time, a slow one."""
+        self.fast.step()
+        self.n_done += 1
+        if self.n_done % self.n_steps == 0:
+            torch._foreach_lerp_(self._slow, self._parameters, self.share)
+            torch._foreach_copy_(self._parameters, self._slow)
+
+    def set_pace(self, *, learning_rate: float, weight_decay: float) -> None:
+        """Set both for the steps to come."""
+        for group in self.fast.param_groups:
+            group["lr"], group["weight_decay"] = learning_rate, weight_decay
+
+    def state_dict(self) -> dict:
+        """Everything needed to go on exactly."""
+        return {
+            "fast": self.fast.state_dict(),
+            "slow": self._slow,
+            "n_done": self.n_done,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from `state_dict`."""
+        self.fast.load_state_dict(state["fast"])
+        for mine, saved in zip(self._slow, state["slow"], strict=True):
+            mine.copy_(saved)
+        self.n_done = state["n_done"]
+
+
+def make_optimiser(parameters, *, learning_rate: float, weight_decay: float):
+    """RAdam (Liu et al. 2020) in a `Lookahead`, as in the paper's section 7.1.2."""
+    fast = RAdam(
+        list(parameters),
+        lr=learning_rate,
+        betas=BETAS,
+        eps=EPSILON,
+        weight_decay=weight_decay,
+        decoupled_weight_decay=True,
+    )
+    return Lookahead(fast)
+
+
+def pace(
+    progress: float, *, n_epochs: float, decay_per_epoch: float, final_share: float
+) -> float:
+    """Share of the first learning rate at ``progress`` (0 to 1) of the training.
+
+    Falls by a factor per epoch, smoothly, and over the last ``final_share`` of the
+    training straight to zero.
+    """
+    value = decay_per_epoch ** (progress * n_epochs)
+    if progress > 1.0 - final_share:
+        value *= max(1.0 - progress, 0.0) / final_share
+    return value

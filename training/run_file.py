@@ -1,0 +1,137 @@
+"""Run files: one TOML per network, everything that decides how it is trained."""
+
+import tomllib
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from training.datasets import Recipe
+from training.models import ModelSettings
+from training.tasks import TASKS
+
+LOSSES = ("standard", "physical")
+EYE_LOSSES = ("parameters", "discriminator", "tracer")
+DEFAULT_FOLDER = Path("out/training")
+
+
+class RunFileError(ValueError):
+    """A run file that cannot be used; names the key and what is allowed."""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a network is trained.
+
+    Attributes
+    ----------
+    loss : str
+        ``standard``: mean absolute error of standardised targets; ``physical``: of um
+        or mm.  For the eye: ``parameters``, ``discriminator`` or ``tracer``.
+    n_epochs : float
+        Of the training rows; may be a fraction.
+    decay_per_epoch : float
+        Factor of learning rate and weight decay.
+    final_share : float
+        Last part of the training in which both fall to zero.
+    validation_share : float
+    is_mixed : bool
+        bfloat16 products on a GPU.
+    is_fresh : bool
+        Draw and trace new rows for every step instead of reading shards.
+    discriminator : str
+        Checkpoint, for the eye's loss ``discriminator``.
+    start_from : str
+        Checkpoint of whose weights the network starts.
+    """
+
+    loss: str = "standard"
+    batch_size: int = 1024
+    n_epochs: float = 30.0
+    learning_rate: float = 0.01
+    weight_decay: float = 0.1
+    decay_per_epoch: float = 0.8
+    final_share: float = 0.0
+    validation_share: float = 0.15
+    is_mixed: bool = True
+    is_fresh: bool = False
+    discriminator: str = ""
+    start_from: str = ""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run file that was read; see the dataclasses of its tables."""
+
+    name: str
+    task: str
+    seed: int = 548
+    recipe: Recipe = None
+    data_folder: Path = None
+    output_folder: Path = None
+    model: ModelSettings = field(default_factory=ModelSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+    text: str = ""
+
+
+def read_run(file: Path) -> Run:
+    """Read and check a run file.
+
+    Raises
+    ------
+    RunFileError
+        Names the table, the key and what is allowed.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+        body = tomllib.loads(text)
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise RunFileError(f"{file}: {error}") from error
+    _only(body, ("task", "seed", "output_folder", "data", "model", "training"), "")
+    task = body.get("task")
+    if task not in TASKS:
+        raise RunFileError(f"task '{task}': allowed are {', '.join(TASKS)}")
+    data = dict(body.get("data", {}))
+    folder = data.pop("folder", None)
+    data.setdefault("domain", TASKS[task].domain.name)
+    training = _table(TrainingSettings, body.get("training", {}), "training")
+    allowed = EYE_LOSSES if task == "eye" else LOSSES
+    if training.loss not in allowed:
+        raise RunFileError(
+            f"training.loss '{training.loss}': allowed are {', '.join(allowed)}"
+        )
+    model = _table(ModelSettings, body.get("model", {}), "model")
+    if "n_rows" not in data:
+        raise RunFileError("data.n_rows: missing; say how many rows are to be drawn")
+    recipe = _table(Recipe, data, "data")
+    return Run(
+        name=file.stem,
+        task=task,
+        seed=body.get("seed", 548),
+        recipe=recipe,
+        data_folder=Path(folder or DEFAULT_FOLDER / "data" / recipe.domain),
+        output_folder=Path(body.get("output_folder", DEFAULT_FOLDER / file.stem)),
+        model=model,
+        training=training,
+        text=text,
+    )
+
+
+def _only(body: dict, allowed: tuple[str, ...], table: str) -> None:
+    for key in body:
+        if key not in allowed:
+            raise RunFileError(f"{table}{key}: allowed are {', '.join(allowed)}")
+
+
+def _table(kind, body: dict, table: str):
+    known = {f.name: f for f in fields(kind)}
+    _only(body, tuple(known), f"{table}.")
+    for key, value in body.items():
+        wanted = known[key].type
+        good = (int, float) if wanted is float else wanted
+        if not isinstance(value, good) or (wanted is not bool and value is True):
+            raise RunFileError(
+                f"{table}.{key} {value!r}: must be of type {wanted.__name__}"
+            )
+    try:
+        return kind(**body)
+    except ValueError as error:
+        raise RunFileError(f"{table}: {error}") from error

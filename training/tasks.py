@@ -1,0 +1,241 @@
+"""What is sampled and what each network learns: columns, ranges, labels.
+
+A *domain* is a box of inputs and the ray tracing that labels them; a *task* is a
+network, which takes its columns from one domain.  Ranges are those of the paper's
+Table 2.  Labels come from the service's own tracer, on the CPU, in float64.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.accommodation import AccommodatingEye
+from estimator.eye import pack_eyes
+from estimator.eye_parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
+from estimator.eye_wavefront import MEDIA_INWARDS, TraceFailed, eye_indices
+from estimator.media import refractive_index
+from estimator.units import REFERENCE_WAVELENGTH_NM
+from estimator.wavefront import eyes_aberrations, on_axis_zernike
+from estimator.wavefront_kernels import magnifications
+from estimator.zernike import N_TERMS
+
+N_EYE = len(PARAMETER_NAMES)
+ZERNIKE_NAMES = tuple(f"zernike_j{j}_um" for j in range(1, N_TERMS))
+COMPARED_NAMES = ZERNIKE_NAMES[2:]
+"""Without tilt: the chief ray's zero slope ties it to coma."""
+
+RIM_NAMES = (
+    "zernike_radius_mm",
+    "ellipse_centre_x_mm",
+    "ellipse_centre_y_mm",
+    "ellipse_xx_mm",
+    "ellipse_xy_mm",
+    "ellipse_yy_mm",
+)
+"""The circle and, as centre and symmetric matrix of its semi-axes, the ellipse."""
+
+CHANGE_NAMES = ("lens_diameter_change_mm", "aqueous_thickness_change_mm")
+
+MAX_COEFFICIENT_UM = 200.0
+"""Coefficients beyond it belong to eyes that form no image; the published data, too,
+end at 115 um."""
+
+Labels = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A box of inputs and its labels.
+
+    Attributes
+    ----------
+    inputs, targets : tuple of str
+        Names of columns; the first 45 inputs are the eye.
+    ranges : (n_inputs, 2)
+    label : callable
+        Inputs (n, n_inputs) to targets (n, n_targets); a row is nan where light does
+        not pass.
+    n_repeats : int
+        How many values the last input takes for each eye: 1, or the length of a
+        Cartesian product.
+    """
+
+    name: str
+    inputs: tuple[str, ...]
+    ranges: NDArray[np.float64]
+    targets: tuple[str, ...]
+    label: Labels
+    n_repeats: int = 1
+
+
+def _indices(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Refractive indices (n, 5), one wavelength per row."""
+    media = [refractive_index(medium, wavelength_nm) for medium in MEDIA_INWARDS]
+    return np.stack(np.broadcast_arrays(*media), axis=-1)
+
+
+def label_on_axis(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients (n, 27), um, on the filled circle of the pupil."""
+    eyes, pupil_mm, wavelength_nm = inputs[:, :N_EYE], inputs[:, -2], inputs[:, -1]
+    zernike_um, _ = on_axis_zernike(
+        pack_eyes(eyes), _indices(wavelength_nm), zernike_radius_mm=pupil_mm / 2.0
+    )
+    return zernike_um[:, 1:]
+
+
+def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients (n, 27), um, of whole pupils off the axis, and their rim (n, 6)."""
+    packed = pack_eyes(inputs[:, :N_EYE])
+    pupil_mm, wavelength_nm, h_deg, v_deg = inputs[:, N_EYE:].T
+    ratios = magnifications(packed, eye_indices(REFERENCE_WAVELENGTH_NM))
+    usable = ratios > 0.0
+    found = eyes_aberrations(
+        packed,
+        _indices(wavelength_nm),
+        stop_diameters_mm=np.where(usable, pupil_mm / ratios, 1.0),
+        h_deg=h_deg,
+        v_deg=v_deg,
+    )
+    targets = np.concatenate(
+        [
+            found.zernike_um[:, 1:],
+            found.zernike_radius_mm[:, None],
+            ellipse_matrix(found.ellipse_mm),
+        ],
+        axis=1,
+    )
+    # A vignetted pupil has a kinked rim, which no smooth function follows.
+    targets[~usable | (found.open_ratio < 1.0 - 1e-9)] = np.nan
+    return targets
+
+
+def ellipse_matrix(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Centre and symmetric matrix (n, 5): x, y, xx, xy, yy; smooth at equal axes.
+
+    From `wavefront.FieldResults.ellipse_mm` (n, 5): centre, semi-axes, angle (rad).
+    """
+    x, y, major, minor, angle_rad = ellipse_mm.T
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.stack(
+        [
+            x,
+            y,
+            major * cosine**2 + minor * sine**2,
+            (major - minor) * cosine * sine,
+            major * sine**2 + minor * cosine**2,
+        ],
+        axis=-1,
+    )
+
+
+def label_focus(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change (n, 2), mm, of lens diameter and aqueous thickness at the focus asked.
+
+    Rows of one eye and pupil must follow each other.
+    """
+    eyes = inputs[:, : N_EYE + 1]
+    starts = np.flatnonzero(np.r_[True, np.any(eyes[1:] != eyes[:-1], axis=1)])
+    parts = []
+    for start, stop in zip(starts, np.r_[starts[1:], len(inputs)], strict=True):
+        parts.append(_focus_of_one(eyes[start], inputs[start:stop, -1]))
+    return np.concatenate(parts)
+
+
+def _focus_of_one(
+    eye_and_pupil: NDArray[np.float64], focuses_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    try:
+        eye = AccommodatingEye(
+            EyeParameters.from_vector(eye_and_pupil[:N_EYE]),
+            pupil_diameter_mm=float(eye_and_pupil[N_EYE]),
+        )
+    except TraceFailed:
+        return np.full((len(focuses_dpt), 2), np.nan)
+    used_dpt = [eye.accommodation_dpt(focus) for focus in focuses_dpt.tolist()]
+    return eye.changes_mm(used_dpt)
+
+
+def _ranges(*others: tuple[float, float], lens_mm=None) -> NDArray[np.float64]:
+    eye = sampled_ranges()
+    if lens_mm is not None:
+        eye[PARAMETER_NAMES.index("lens_diameter_mm")] = lens_mm
+    return np.concatenate([eye, np.array(others)])
+
+
+DOMAINS = {
+    domain.name: domain
+    for domain in (
+        Domain(
+            "on_axis",
+            (*PARAMETER_NAMES, "pupil_diameter_mm", "wavelength_nm"),
+            _ranges((3.0, 6.0), (450.0, 900.0)),
+            ZERNIKE_NAMES,
+            label_on_axis,
+        ),
+        Domain(
+            "field",
+            (*PARAMETER_NAMES, "pupil_diameter_mm", "wavelength_nm", "h_deg", "v_deg"),
+            _ranges(
+                (2.0, 7.0),
+                (450.0, 700.0),
+                (-45.0, 45.0),
+                (-26.0, 26.0),
+                lens_mm=(8.4, 9.75),  # accommodated lenses, too
+            ),
+            (*ZERNIKE_NAMES, *RIM_NAMES),
+            label_field,
+        ),
+        Domain(
+            "focus",
+            (*PARAMETER_NAMES, "pupil_diameter_mm", "focus_dpt"),
+            _ranges((2.0, 7.0), (0.125, 8.125)),
+            CHANGE_NAMES,
+            label_focus,
+            n_repeats=40,
+        ),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A network: columns in, columns out, and the domain they are drawn from."""
+
+    name: str
+    domain: Domain
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    unit: str
+
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task(
+            "discriminator",
+            DOMAINS["on_axis"],
+            DOMAINS["on_axis"].inputs,
+            ZERNIKE_NAMES,
+            "um",
+        ),
+        Task(
+            "eye",
+            DOMAINS["on_axis"],
+            (*COMPARED_NAMES, "pupil_diameter_mm", "wavelength_nm"),
+            PARAMETER_NAMES,
+            "um",
+        ),
+        Task("focus", DOMAINS["focus"], DOMAINS["focus"].inputs, CHANGE_NAMES, "mm"),
+        Task(
+            "aberration",
+            DOMAINS["field"],
+            DOMAINS["field"].inputs,
+            (*ZERNIKE_NAMES, *RIM_NAMES),
+            "um",
+        ),
+    )
+}
+"""The paper's four networks (Table 1); the aberration estimator also says on which
+circle its coefficients are, without which they mean nothing."""

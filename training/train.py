@@ -1,0 +1,227 @@
+"""Train one network.
+
+    python -m training.train RUN.toml [--folder DIR]
+    torchrun --nproc-per-node 2 -m training.train RUN.toml
+
+Writes ``checkpoint.pt`` and ``log.jsonl`` into the run's folder; started again, it goes
+on exactly where the last checkpoint stands.  The loop is all here, in `train`.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from rich.console import Console
+from rich.progress import Progress
+from torch.nn.parallel import DistributedDataParallel
+
+from training.batches import Batches, Rows, load_rows
+from training.checkpoint import load_checkpoint, make_network, save_checkpoint
+from training.datasets import DataError
+from training.losses import (
+    DiscriminatorLoss,
+    TracerLoss,
+    parameter_loss,
+    physical_loss,
+    standard_loss,
+)
+from training.optimiser import make_optimiser, pace
+from training.run_file import Run, RunFileError, read_run
+from training.validation import validation_error
+
+CHECKPOINT = "checkpoint.pt"
+LOG = "log.jsonl"
+CHECKPOINT_SECONDS = 120.0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.train",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN.toml")
+    parser.add_argument("--folder", type=Path, help="of the data, not the run file's")
+    options = parser.parse_args(arguments)
+    try:
+        run = read_run(options.run)
+        train(run, data_folder=options.folder)
+    except (DataError, RunFileError) as error:
+        print(f"train: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _loss(run: Run, device: torch.device):
+    named = {
+        "standard": lambda: standard_loss,
+        "physical": lambda: physical_loss,
+        "parameters": lambda: parameter_loss,
+        "tracer": TracerLoss,
+    }
+    if run.training.loss in named:
+        return named[run.training.loss]()
+    if not run.training.discriminator:
+        raise RunFileError("training.discriminator: name a checkpoint")
+    judge, _ = load_checkpoint(Path(run.training.discriminator))
+    return DiscriminatorLoss(judge.to(device))
+
+
+def train(run: Run, *, data_folder: Path | None = None) -> dict:
+    """Train the network of a run to the end; the last line of its log.
+
+    Raises
+    ------
+    DataError
+        The data set is not there or not whole.
+    RunFileError
+        The run cannot be done as it stands.
+    """
+    settings, started_s = run.training, time.perf_counter()
+    rank, n_ranks, device = _join()
+    torch.manual_seed(run.seed)
+    rows: Rows = load_rows(run, data_folder or run.data_folder)
+    batches = Batches(rows, run, rank=rank, n_ranks=n_ranks, device=device)
+    network = make_network(run.task, run.model)
+    network.set_scaling(*rows.scaling(network))
+    if settings.start_from:
+        network.load_state_dict(
+            load_checkpoint(Path(settings.start_from))[0].state_dict()
+        )
+    network.to(device)
+    optimiser = make_optimiser(
+        network.parameters(),
+        learning_rate=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+    )
+    loss_of = _loss(run, device)
+    folder, step, spent_s = run.output_folder, 0, 0.0
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / CHECKPOINT).exists():
+        saved, state = load_checkpoint(folder / CHECKPOINT)
+        if state["run"] != run.text:
+            raise RunFileError(
+                f"{folder / CHECKPOINT} is of another run file; remove it to start anew"
+            )
+        network.load_state_dict(saved.state_dict())
+        optimiser.load_state_dict(state["optimiser"])
+        step, spent_s = state["step"], state["seconds"]
+    model = (
+        DistributedDataParallel(_Whole(network, loss_of))
+        if n_ranks > 1
+        else _Whole(network, loss_of)
+    )
+    n_steps, per_epoch = batches.n_steps, batches.steps_per_epoch
+    saved_s, smooth, entry = time.perf_counter(), None, {}
+    console = Console(stderr=True)
+    with Progress(console=console, disable=rank != 0) as bar:
+        task = bar.add_task(run.name, total=n_steps, completed=step)
+        while step < n_steps:
+            x, y = batches.at(step)
+            share = pace(
+                step / n_steps,
+                n_epochs=settings.n_epochs,
+                decay_per_epoch=settings.decay_per_epoch,
+                final_share=settings.final_share,
+            )
+            optimiser.set_pace(
+                learning_rate=settings.learning_rate * share,
+                weight_decay=settings.weight_decay * share,
+            )
+            network.train()
+            with torch.autocast(
+                device.type,
+                torch.bfloat16,
+                enabled=settings.is_mixed and device.type == "cuda",
+            ):
+                loss = model(x, y)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            step += 1
+            value = float(loss.detach())
+            smooth = value if smooth is None else 0.98 * smooth + 0.02 * value
+            bar.update(task, advance=1, description=f"{run.name} loss {smooth:.5f}")
+            is_last = step == n_steps
+            if step % per_epoch == 0 or is_last:
+                entry = {
+                    "step": step,
+                    "epoch": step / per_epoch,
+                    "rows": step * batches.rows_per_step,
+                    "loss": smooth,
+                    "learning_rate": settings.learning_rate * share,
+                    "seconds": spent_s + time.perf_counter() - started_s,
+                    **validation_error(network, run, rows, device),
+                }
+                if rank == 0:
+                    with (folder / LOG).open("a", encoding="utf-8") as log:
+                        log.write(json.dumps(entry) + "\n")
+                    console.print(_line(entry))
+            is_due = time.perf_counter() - saved_s > CHECKPOINT_SECONDS
+            if rank == 0 and (is_due or is_last):
+                save_checkpoint(
+                    folder / CHECKPOINT,
+                    network,
+                    run,
+                    {
+                        "optimiser": optimiser.state_dict(),
+                        "step": step,
+                        "seconds": spent_s + time.perf_counter() - started_s,
+                        "run": run.text,
+                        "log": entry,
+                    },
+                )
+                saved_s = time.perf_counter()
+    if n_ranks > 1:
+        dist.destroy_process_group()
+    return entry
+
+
+class _Whole(torch.nn.Module):
+    """Network and loss as one module, so that gradients are shared among processes."""
+
+    def __init__(self, network, loss_of):
+        super().__init__()
+        self.network, self.loss_of = network, loss_of
+
+    def forward(self, x, y):
+        return self.loss_of(self.network, x, y)
+
+
+def _join() -> tuple[int, int, torch.device]:
+    """Rank, number of processes and device of this one."""
+    rank, n_ranks = (
+        int(os.environ.get("RANK", "0")),
+        int(os.environ.get("WORLD_SIZE", "1")),
+    )
+    has_gpu = torch.cuda.is_available()
+    if n_ranks > 1 and not dist.is_initialized():
+        dist.init_process_group("nccl" if has_gpu else "gloo")
+    if has_gpu:
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(device)
+    else:
+        device = torch.device("cpu")
+    return rank, n_ranks, device
+
+
+def _line(entry: dict) -> str:
+    errors = ", ".join(
+        f"{name} {value:.5f}"
+        for name, value in entry.items()
+        if isinstance(value, float) and name.startswith("error")
+    )
+    return (
+        f"epoch {entry['epoch']:.1f}  {entry['seconds']:.0f} s  "
+        f"loss {entry['loss']:.5f}  {errors}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

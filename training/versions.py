@@ -1,0 +1,27 @@
+"""Which code made a file."""
+
+import subprocess
+from pathlib import Path
+
+
+def commit_id() -> str:
+    """Short hash of the checkout, with "+" where files differ; "none" without git."""
+    root = Path(__file__).parents[1]
+
+    def git(*arguments: str) -> str | None:
+        try:
+            answer = subprocess.run(
+                ("git", *arguments),
+                cwd=root,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+        except FileNotFoundError:
+            return None
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    head = git("rev-parse", "--short", "HEAD")
+    if head is None:
+        return "none"
+    return head + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
