@@ -1,0 +1,1 @@
+"""The ray tracer of `estimator` over batches of eyes, differentiable, on any device."""
