@@ -133,3 +133,17 @@ def test_an_eye_that_light_does_not_pass_spoils_no_other(rng):
     assert bool(torch.isfinite(given.grad).all())
     assert given.grad[1].abs().max() == 0.0
     assert given.grad[0].abs().max() > 0.0
+
+
+def test_what_inference_has_made_may_be_trained_through(rng):
+    vectors, *view = tensors(*random_eyes(rng, 2))
+    with torch.inference_mode():
+        judged_um, _ = zernike_of_eyes(vectors, *view)
+    narrow = vectors.float().requires_grad_(True)
+    zernike_um, ok = zernike_of_eyes(narrow, *(part.float() for part in view))
+    assert zernike_um.dtype == torch.float32
+    np.testing.assert_allclose(
+        zernike_um.detach().numpy(), judged_um.numpy(), atol=2e-4
+    )
+    zernike_um[ok].square().sum().backward()
+    assert bool(torch.isfinite(narrow.grad).all())

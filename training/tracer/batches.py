@@ -1,11 +1,20 @@
 """Large batches in parts that fit the caches of a processor or a GPU's memory."""
 
 from collections.abc import Callable
+from functools import cache
 
 import torch
 from torch import Tensor
 
-CPU_CHUNK, GPU_CHUNK = 128, 8192
+CPU_CHUNK, GPU_CHUNK = 512, 8192
+
+
+def constant(function: Callable) -> Callable:
+    """Keep what a function returns, as tensors that any later graph may hold.
+
+    Made within ``torch.inference_mode`` they could not be.
+    """
+    return cache(torch.inference_mode(False)(function))
 
 
 def in_chunks(

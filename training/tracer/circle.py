@@ -6,8 +6,6 @@ stop.  Here rays start at the nodes of that circle and are aimed at the retinal 
 what they miss it by hardly matters (see `paths`).
 """
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
@@ -17,7 +15,7 @@ from estimator.zernike import N_TERMS, index_from_nm
 from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
 from training.tracer.aim import broyden
-from training.tracer.batches import in_chunks
+from training.tracer.batches import constant, in_chunks
 from training.tracer.bundle import (
     ORDER_TOLERANCE_MM,
     across,
@@ -41,7 +39,7 @@ _DIFFERENCE_COSINE = 1e-3
 _C20 = index_from_nm(2, 0)
 
 
-@cache
+@constant
 def _nodes(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Points (2, R) of the unit circle, and the projection (R, 28) without piston."""
     rings, _, azimuths, projection = (torch.tensor(a) for a in circle_nodes())
@@ -81,6 +79,11 @@ def zernike_of_eyes(
     Notes
     -----
     Differentiable once, in all three arguments; rows that are not ok get no gradient.
+
+    Against the compiled tracer (512 eyes of Table 2, pupils of 3 to 6 mm, 450 to
+    900 nm) float64 differs by 1e-9 um at most and float32 by 5e-5 um, 5e-6 um in the
+    root mean square.  Gradients differ from its central differences by 3e-6 of a
+    parameter's largest; in float32 by 2e-4 um over the whole range of a parameter.
     """
     dtype = ray_dtype or vectors.dtype
     return in_chunks(

@@ -6,7 +6,6 @@ cornea, the stop (axes of the eye, origin at its centre), the two surfaces of th
 the retina (axes of the eye, origin at its pole).
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +14,10 @@ from torch import Tensor
 
 from estimator import eye_parameters as parameters
 from estimator import lens_shape as rule
-from estimator.surfaces import offset_monomials
+from estimator.surfaces import horner_order, offset_monomials
 from estimator.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
+from training.tracer.batches import constant
 from training.tracer.media import refractive_indices
-
-CORNEA_ANTERIOR, CORNEA_POSTERIOR, LENS_ANTERIOR, LENS_POSTERIOR, RETINA = range(5)
 
 _N_POWERS = MAX_RADIAL_ORDER + 1
 
@@ -28,7 +26,7 @@ class Shape(NamedTuple):
     """One surface of every eye, z(x, y) about its vertex.
 
     ``curvature_x``, ``curvature_y`` (1/mm) and ``conic`` are (B, 1); ``offset``
-    (B, 21, 7) maps the powers of x to z, dz/dx and dz/dy as polynomials in y.
+    (B, 14, 7) maps the powers of x to z and dz/dx as polynomials in y.
     """
 
     curvature_x: Tensor
@@ -70,26 +68,16 @@ def mapped(function, tree):
     return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
-@cache
+@constant
 def _offset_map(device: torch.device) -> Tensor:
-    """(27, 147): offsets in mm to the flattened ``Shape.offset``."""
+    """(27, 98): offsets in mm to the flattened ``Shape.offset``."""
     terms = np.eye(N_TERMS)[1:]
-    by_monomial = np.zeros((N_TERMS - 1, _N_POWERS + 1, _N_POWERS + 1))
+    by_monomial = np.zeros((N_TERMS - 1, _N_POWERS, _N_POWERS + 1))
     horner = offset_monomials(terms, offset_radius_mm=parameters.OFFSET_RADIUS_MM)
-    order = [
-        (a, b)
-        for b in range(MAX_RADIAL_ORDER, -1, -1)
-        for a in range(MAX_RADIAL_ORDER - b, -1, -1)
-    ]
-    assert len(order) == len(EXPONENTS)
-    for column, (a, b) in enumerate(order):
+    for column, (a, b) in enumerate(EXPONENTS[horner_order()].tolist()):
         by_monomial[:, b, a] = horner[:, column]
     power = np.arange(1, _N_POWERS + 1)
-    rows = [
-        by_monomial[:, :-1, :-1],
-        by_monomial[:, :-1, 1:] * power,
-        by_monomial[:, 1:, :-1] * power[:, None],
-    ]
+    rows = [by_monomial[:, :, :-1], by_monomial[:, :, 1:] * power]
     return torch.from_numpy(np.stack(rows, 1).reshape(N_TERMS - 1, -1)).to(device)
 
 
@@ -183,7 +171,7 @@ def _shapes(given, vectors, lens_anterior_mm, lens_posterior_mm) -> tuple[Shape,
             front_mm,
             front_mm,
             given["cornea_anterior_conic_constant"],
-            offset.unflatten(-1, (3 * _N_POWERS, _N_POWERS)),
+            offset.unflatten(-1, (2 * _N_POWERS, _N_POWERS)),
         ),
         shape(back_mm, across_mm, given["cornea_posterior_conic_constant"]),
         shape(
@@ -196,12 +184,19 @@ def _shapes(given, vectors, lens_anterior_mm, lens_posterior_mm) -> tuple[Shape,
     )
 
 
+def turned(turn: Tensor, vector: Tensor) -> Tensor:
+    """Product of (B, 3, 3) and (B, 3, R); faster than small matrix products."""
+    x, y, z = vector.split(1, dim=1)
+    first = turn[:, :, :1] * x
+    return torch.addcmul(torch.addcmul(first, turn[:, :, 1:2], y), turn[:, :, 2:], z)
+
+
 def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     """Take a point, and then directions, (B, 3, R) into the next frame."""
     point, *directions = vectors
     if step.turn is not None:
-        point = torch.bmm(step.turn, point)
-        directions = [torch.bmm(step.turn, d) for d in directions]
+        point = turned(step.turn, point)
+        directions = [turned(step.turn, d) for d in directions]
     if step.shift is not None:
         point = point + step.shift
     return point, *directions
@@ -213,6 +208,6 @@ def outwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     if step.shift is not None:
         point = point - step.shift
     if step.turn is not None:
-        point = torch.bmm(step.turn.mT, point)
-        directions = [torch.bmm(step.turn.mT, d) for d in directions]
+        point = turned(step.turn.mT, point)
+        directions = [turned(step.turn.mT, d) for d in directions]
     return point, *directions

@@ -1,18 +1,17 @@
 """Refractive indices of the ocular media for wavelengths in a batch."""
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
 from estimator import media
 from estimator.eye_wavefront import MEDIA_INWARDS
 from estimator.units import NM_PER_UM
+from training.tracer.batches import constant
 
 _POLE_UM2 = 0.028
 
 
-@cache
+@constant
 def _dispersion(device: torch.device) -> Tensor:
     """(4, 5): from 1, L², 1/(L² - 0.028) and its square to the media, air first."""
     # The formula is linear in these four terms: solve for them from four wavelengths,

@@ -37,11 +37,13 @@ def sag(shape: Shape, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     zx = px * (2.0 * below + common * cx)
     zy = py * (2.0 * below + common * cy)
     if shape.offset is not None:
-        by_y = torch.bmm(shape.offset, _powers(x)).unflatten(1, (3, -1))
-        total, up = by_y[:, :, -1], y[:, None]
+        by_y = torch.bmm(shape.offset, _powers(x)).unflatten(1, (2, -1))
+        total, up, slope = by_y[:, :, -1], y[:, None], None
         for power in range(by_y.shape[2] - 2, -1, -1):
+            so_far = total[:, 0]
+            slope = so_far if slope is None else torch.addcmul(so_far, slope, y)
             total = torch.addcmul(by_y[:, :, power], total, up)
-        z, zx, zy = z + total[:, 0], zx + total[:, 1], zy + total[:, 2]
+        z, zx, zy = z + total[:, 0], zx + total[:, 1], zy + slope
     return z, zx, zy, radicand
 
 
