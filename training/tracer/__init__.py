@@ -1,0 +1,11 @@
+"""The ray tracer of `estimator` over batches of eyes, differentiable, on any device.
+
+- `circle.zernike_of_eyes`, `circle.refraction_of_eyes`: on axis, on a given circle
+- `field.field_aberrations_of_eyes`: any field, through the stop
+- `accommodation.focus_of_eyes`: the accommodated state for a distance
+
+The eye and its chief ray are float64 always; ``ray_dtype`` is that of the bundle.
+Rays are solved for without a graph.  Gradients come from Fermat's principle on axis,
+from one Newton step through the graph elsewhere; second derivatives are not there.
+Automatic mixed precision must be off around all of it.
+"""

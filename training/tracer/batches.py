@@ -1,0 +1,43 @@
+"""Large batches in parts that fit the caches of a processor or a GPU's memory."""
+
+from collections.abc import Callable
+from functools import cache
+
+import torch
+from torch import Tensor
+
+CPU_CHUNK, GPU_CHUNK = 512, 8192
+
+
+def constant(function: Callable) -> Callable:
+    """Keep what a function returns, as tensors that any later graph may hold.
+
+    Made within ``torch.inference_mode`` they could not be.
+    """
+    return cache(torch.inference_mode(False)(function))
+
+
+def in_chunks(
+    work: Callable[..., tuple[Tensor, ...]],
+    arguments: tuple[Tensor, ...],
+    chunk: int | None,
+) -> tuple[Tensor, ...]:
+    """Run ``work`` over parts of the first axis and join what it returns.
+
+    Raises
+    ------
+    ValueError
+        Arguments of different lengths.
+    """
+    count, device = len(arguments[0]), arguments[0].device
+    if any(len(argument) != count for argument in arguments):
+        raise ValueError(f"batches of {[len(a) for a in arguments]}: must be equal")
+    if chunk is None:
+        chunk = CPU_CHUNK if device.type == "cpu" else GPU_CHUNK
+    if count <= chunk:
+        return work(*arguments)
+    parts = [
+        work(*(argument[i : i + chunk] for argument in arguments))
+        for i in range(0, count, chunk)
+    ]
+    return tuple(torch.cat(pieces) for pieces in zip(*parts, strict=True))

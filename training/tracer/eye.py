@@ -1,0 +1,213 @@
+"""From the 45 parameters to surfaces, as tensors over a batch of eyes.
+
+Rays live in the axes of the surface they are at, so that coordinates stay small and
+float32 keeps its digits.  The frames, from the air inwards: the two surfaces of the
+cornea, the stop (axes of the eye, origin at its centre), the two surfaces of the lens,
+the retina (axes of the eye, origin at its pole).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from estimator import eye_parameters as parameters
+from estimator import lens_shape as rule
+from estimator.surfaces import horner_order, offset_monomials
+from estimator.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
+from training.tracer.batches import constant
+from training.tracer.media import refractive_indices
+
+_N_POWERS = MAX_RADIAL_ORDER + 1
+
+
+class Shape(NamedTuple):
+    """One surface of every eye, z(x, y) about its vertex.
+
+    ``curvature_x``, ``curvature_y`` (1/mm) and ``conic`` are (B, 1); ``offset``
+    (B, 14, 7) maps the powers of x to z and dz/dx as polynomials in y.
+    """
+
+    curvature_x: Tensor
+    curvature_y: Tensor
+    conic: Tensor
+    offset: Tensor | None
+
+
+class Step(NamedTuple):
+    """Into the next frame: p' = turn p + shift; (B, 3, 3), or None, and (B, 3, 1)."""
+
+    turn: Tensor | None
+    shift: Tensor | None
+
+
+class Eye(NamedTuple):
+    """A batch of eyes, each at one wavelength.
+
+    ``shapes`` are the four surfaces and the retina.  ``to_cornea`` leads from the eye's
+    frame into the anterior cornea's, the others one frame inwards each.  ``indices``
+    are (B, 5), air first.
+    """
+
+    shapes: tuple[Shape, ...]
+    to_cornea: Step
+    to_posterior: Step
+    to_stop: Step
+    to_lens: Step
+    to_lens_posterior: Step
+    to_retina: Step
+    indices: Tensor
+
+
+def mapped(function, tree):
+    """Apply ``function`` to every tensor of a nest of tuples."""
+    if tree is None or isinstance(tree, Tensor):
+        return None if tree is None else function(tree)
+    parts = [mapped(function, part) for part in tree]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+
+
+@constant
+def _offset_map(device: torch.device) -> Tensor:
+    """(27, 98): offsets in mm to the flattened ``Shape.offset``."""
+    terms = np.eye(N_TERMS)[1:]
+    by_monomial = np.zeros((N_TERMS - 1, _N_POWERS, _N_POWERS + 1))
+    horner = offset_monomials(terms, offset_radius_mm=parameters.OFFSET_RADIUS_MM)
+    for column, (a, b) in enumerate(EXPONENTS[horner_order()].tolist()):
+        by_monomial[:, b, a] = horner[:, column]
+    power = np.arange(1, _N_POWERS + 1)
+    rows = [by_monomial[:, :, :-1], by_monomial[:, :, 1:] * power]
+    return torch.from_numpy(np.stack(rows, 1).reshape(N_TERMS - 1, -1)).to(device)
+
+
+def lens_shape(diameter_mm: Tensor, volume_mm3: Tensor) -> tuple[Tensor, ...]:
+    """Rule C of `estimator.lens_shape`: radii anterior, posterior and thickness, mm."""
+    cap_mm3 = rule.CAP_VOLUME_RATIO * volume_mm3
+    heights_mm = 8.0 * cap_mm3 / (torch.pi * diameter_mm**2)
+    posterior_mm = (
+        -torch.pi * diameter_mm**4 * (1.0 + rule.HEIGHT_RATIO) / (64.0 * cap_mm3)
+    )
+    thickness_mm = rule.RIM_THICKNESS_MM + heights_mm
+    return -posterior_mm / rule.HEIGHT_RATIO, posterior_mm, thickness_mm
+
+
+def _turn_about_z(angle_deg: Tensor) -> Tensor:
+    angle_rad = torch.deg2rad(angle_deg)
+    cosine, sine = angle_rad.cos(), angle_rad.sin()
+    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
+    rows = (cosine, -sine, zero, sine, cosine, zero, zero, zero, one)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def _lens_turn(about_x_deg: Tensor, about_y_deg: Tensor) -> Tensor:
+    x_rad, y_rad = torch.deg2rad(about_x_deg), torch.deg2rad(about_y_deg)
+    cx, sx, cy, sy = x_rad.cos(), x_rad.sin(), y_rad.cos(), y_rad.sin()
+    rows = (cy, sy * sx, sy * cx, 0.0 * cx, cx, -sx, -sy, cy * sx, cy * cx)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def _shift(*parts: Tensor) -> Tensor:
+    return torch.stack(parts, dim=-1)[..., None]
+
+
+def pack_eyes(vectors: Tensor, wavelength_nm: Tensor) -> Eye:
+    """Surfaces of eyes (B, 45) at wavelengths (B,) nm; float64, differentiable.
+
+    The retina is the sphere of radius eye length / 2, the lens follows rule C.
+    """
+    vectors = vectors.to(torch.float64)
+    given = dict(zip(parameters.PARAMETER_NAMES, vectors.unbind(-1), strict=True))
+    zero = torch.zeros_like(vectors[:, 0])
+    anterior_mm, posterior_mm, depth_mm = lens_shape(
+        given["lens_diameter_mm"], given["lens_volume_mm3"]
+    )
+    cornea_turn = _turn_about_z(given["cornea_anterior_rotation_deg"])
+    posterior_turn = _turn_about_z(given["cornea_posterior_rotation_deg"])
+    lens_turn = _lens_turn(
+        given["lens_tilt_about_x_deg"], given["lens_tilt_about_y_deg"]
+    )
+    pole_mm = _shift(
+        given["lens_decentration_x_mm"], given["lens_decentration_y_mm"], zero
+    )
+    # The retina's pole as the lens sees it, on the undisplaced axis of the eye.
+    behind_stop_mm = (
+        given["eye_length_mm"]
+        - given["cornea_thickness_mm"]
+        - given["aqueous_thickness_mm"]
+    )
+    depth = _shift(zero, zero, depth_mm)
+    rear_mm = pole_mm + lens_turn @ depth
+    return Eye(
+        shapes=_shapes(given, vectors, anterior_mm, posterior_mm),
+        to_cornea=Step(cornea_turn.mT, None),
+        to_posterior=Step(
+            posterior_turn.mT @ cornea_turn,
+            -_shift(zero, zero, given["cornea_thickness_mm"]),
+        ),
+        to_stop=Step(
+            posterior_turn, -_shift(zero, zero, given["aqueous_thickness_mm"])
+        ),
+        to_lens=Step(lens_turn.mT, -lens_turn.mT @ pole_mm),
+        to_lens_posterior=Step(None, -depth),
+        to_retina=Step(lens_turn, rear_mm - _shift(zero, zero, behind_stop_mm)),
+        indices=refractive_indices(wavelength_nm),
+    )
+
+
+def _shapes(given, vectors, lens_anterior_mm, lens_posterior_mm) -> tuple[Shape, ...]:
+    def shape(radius_x_mm, radius_y_mm, conic, offset=None):
+        columns = (1.0 / radius_x_mm, 1.0 / radius_y_mm, conic)
+        return Shape(*(c[:, None] for c in columns), offset)
+
+    front_mm = given["cornea_anterior_radius_mm"]
+    back_mm = front_mm * given["cornea_posterior_radius_ratio"]
+    across_mm = back_mm * given["cornea_posterior_astigmatism_ratio"]
+    retina_mm = -given["eye_length_mm"] / 2.0
+    offsets_mm = vectors[:, parameters.OFFSET_SLICE]
+    offset = offsets_mm @ _offset_map(vectors.device)
+    return (
+        shape(
+            front_mm,
+            front_mm,
+            given["cornea_anterior_conic_constant"],
+            offset.unflatten(-1, (2 * _N_POWERS, _N_POWERS)),
+        ),
+        shape(back_mm, across_mm, given["cornea_posterior_conic_constant"]),
+        shape(
+            lens_anterior_mm, lens_anterior_mm, given["lens_anterior_conic_constant"]
+        ),
+        shape(
+            lens_posterior_mm, lens_posterior_mm, given["lens_posterior_conic_constant"]
+        ),
+        shape(retina_mm, retina_mm, torch.zeros_like(retina_mm)),
+    )
+
+
+def turned(turn: Tensor, vector: Tensor) -> Tensor:
+    """Product of (B, 3, 3) and (B, 3, R); faster than small matrix products."""
+    x, y, z = vector.split(1, dim=1)
+    first = turn[:, :, :1] * x
+    return torch.addcmul(torch.addcmul(first, turn[:, :, 1:2], y), turn[:, :, 2:], z)
+
+
+def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
+    """Take a point, and then directions, (B, 3, R) into the next frame."""
+    point, *directions = vectors
+    if step.turn is not None:
+        point = turned(step.turn, point)
+        directions = [turned(step.turn, d) for d in directions]
+    if step.shift is not None:
+        point = point + step.shift
+    return point, *directions
+
+
+def outwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
+    """Take a point, and then directions, (B, 3, R) back from the next frame."""
+    point, *directions = vectors
+    if step.shift is not None:
+        point = point - step.shift
+    if step.turn is not None:
+        point = turned(step.turn.mT, point)
+        directions = [turned(step.turn.mT, d) for d in directions]
+    return point, *directions
