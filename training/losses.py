@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from training.models import Network
 from training.tasks import N_EYE, ZERNIKE_NAMES
+from training.tracer.circle import zernike_of_eyes
 
 N_ZERNIKE = len(ZERNIKE_NAMES)
 RIM_WEIGHT = 0.1
@@ -50,15 +51,17 @@ class DiscriminatorLoss(nn.Module):
 
 
 class TracerLoss(nn.Module):
-    """The estimated eye's coefficients by ray tracing."""
+    """The estimated eye's coefficients by ray tracing, to 1e-4 um (float32 rays)."""
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
         """Mean absolute error (um) of the 25 terms; eyes that fail are left out."""
-        from training.tracer import zernike_of_eyes
-
-        eyes = model(x).double()
-        found_um, is_traced = zernike_of_eyes(
-            eyes, x[:, -2].double(), x[:, -1].double()
-        )
+        eyes = model(x)
+        with torch.autocast(x.device.type, enabled=False):
+            found_um, is_traced = zernike_of_eyes(
+                eyes.double(),
+                x[:, -2].double(),
+                x[:, -1].double(),
+                ray_dtype=torch.float32,
+            )
         misfit_um = torch.abs(found_um[is_traced, 3:] - x[is_traced, :-2])
         return torch.clamp(misfit_um, max=LARGEST_MISFIT_UM).mean()
