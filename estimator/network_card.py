@@ -194,15 +194,16 @@ def read_card(name: str) -> Card:
         return parse_card(name, json.loads(path.read_text(encoding="utf-8")))
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedWeights(
-            f"{path} is no card of the network '{name}' ({error!r}): restore it, or "
-            "make it anew with python -m training.export"
+            f"{path.name} is no card of the network '{name}' ({error!r}): restore it "
+            "from the repository, or make it anew with python -m training.export"
         ) from error
 
 
 def missing_text(path: Path) -> str:
     """Say which file is missing and what to do."""
+    name = path.relative_to(WEIGHTS_FOLDER.parents[1]).as_posix()
     return (
-        f"{path} is missing: restore it from the repository, or make it anew with "
+        f"{name} is missing: restore it from the repository, or make it anew with "
         "python -m training.export"
     )
 

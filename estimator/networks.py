@@ -104,8 +104,8 @@ def load_network(name: str) -> Network:
         )
     except Exception as error:  # its errors have no common class
         raise DamagedWeights(
-            f"{path} cannot be loaded ({type(error).__name__}): restore it from the "
-            "repository, or make it anew with python -m training.export"
+            f"{path.name} cannot be loaded ({type(error).__name__}): restore it "
+            "from the repository, or make it anew with python -m training.export"
         ) from error
     return Network(card, session)
 

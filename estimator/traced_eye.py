@@ -47,6 +47,9 @@ LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
 FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
 """Rays per wavefront over the field: 70, 1e-3 um from many at 7 mm, 0.013 at worst."""
 
+TRACED_ERROR_UM = 1e-3
+"""What a reply states of them."""
+
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
 """Step by which the traced field is made smaller until light passes all of it."""
