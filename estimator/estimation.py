@@ -26,6 +26,7 @@ from estimator.measured_wavefront import accommodation_amplitude_dpt
 from estimator.network_card import (
     DamagedWeights,
     NetworkUnavailable,
+    NetworkUnfit,
     WeightsMissing,
 )
 from estimator.network_guess import network_guess
@@ -296,7 +297,7 @@ def _guessed(problem: EstimationProblem, start_s: float) -> EstimatedEye:
     vector = network_guess(problem.profile)
     values_um = problem.compared_um(vector[None])[0]
     if not np.all(np.isfinite(values_um)):
-        raise NetworkUnavailable("light does not pass the network's eye")
+        raise NetworkUnfit("light does not pass the network's eye")
     return _answer(
         problem,
         "network",

@@ -58,7 +58,8 @@ class GridSource:
     uses : list of GridUse
         One for each grid, in the order they were made.
     focus_by_network : bool
-        Whether the last grid's eye was focused by network.
+        Whether the last grid's eye was focused by network: it need not be if it only
+        ever stays relaxed.
     focus_reason : str
         Why it was not, where it should have been.
     """
@@ -113,7 +114,7 @@ class GridSource:
             except NetworkUnavailable as error:
                 self.focus_reason = str(error)
             else:
-                self.focus_by_network = True
+                self.focus_by_network = bool(np.any(np.greater(used_dpt, 0.0)))
                 return states
         return eye.accommodating.focused_at(np.asarray(used_dpt) - eye.refraction_dpt)
 

@@ -53,6 +53,12 @@ MARGIN_RATIO = 1e-6
 """Share of a range beyond its ends that still counts as inside: rounding."""
 
 
+LARGEST_ERROR_RATIO = 3.0
+"""Error that tracing shows in one eye, over the stated 95th percentile, above which a
+network is not used for it.  Ranges of single columns do not make a domain: a wavefront
+may be like no eye's though each of its terms is small."""
+
+
 class NetworkUnavailable(ValueError):
     """A network cannot answer: no weights, or an input that it was not trained for."""
 
@@ -63,6 +69,10 @@ class WeightsMissing(NetworkUnavailable):
 
 class DamagedWeights(NetworkUnavailable):
     """The weights or their card are not what this version evaluates."""
+
+
+class NetworkUnfit(NetworkUnavailable):
+    """A network is not good for this eye, though its inputs are in their ranges."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +177,19 @@ class Card:
         """
         if excesses := self.outside(features):
             raise OutOfDomain(self.network, excesses)
+
+    def check_error(self, traced_error: float, where: str) -> None:
+        """Refuse what tracing has shown to be far above the expected error.
+
+        Raises
+        ------
+        NetworkUnfit
+        """
+        if not traced_error <= LARGEST_ERROR_RATIO * self.error.p95_abs:
+            raise NetworkUnfit(
+                f"error of {traced_error:.2g} {self.error.unit} {where} (95 % should "
+                f"be below {self.error.p95_abs:.2g})"
+            )
 
 
 def card_path(name: str) -> Path:

@@ -18,20 +18,12 @@ from estimator.chief_rays import chief_shift_mrad
 from estimator.estimation import EstimatedEye
 from estimator.field_interpolation import OPEN_RATIO
 from estimator.field_wavefronts import ellipse_from_rim
-from estimator.network_card import NetworkUnavailable
+from estimator.network_card import NetworkUnfit
 from estimator.networks import load_network, network_aberrations, network_focus
 from estimator.wavefront import wavefront_grid
 
 CHECK_RINGS, CHECK_AZIMUTHS = 5, 14
 """Rays of a check, as over the field of a traced grid: far below the error sought."""
-
-LARGEST_ERROR_RATIO = 3.0
-"""Mean error at the corners, over the network's stated 95th percentile, above which a
-grid is refused.  Corners are where a network is worst; three times is no chance."""
-
-
-class NetworkUnfit(NetworkUnavailable):
-    """A network is not good for this eye, though its inputs are in their ranges."""
 
 
 @dataclass(frozen=True)
@@ -132,12 +124,8 @@ def network_grid(
         chief_shift_mrad=_chief_shifts_mrad(states, h_deg, v_deg, wavelengths_nm),
     )
     errors_um = _corner_errors_um(grid, states)
-    error_um, stated = float(errors_um.mean()), load_network("aberration").card.error
-    if not error_um <= LARGEST_ERROR_RATIO * stated.p95_abs:
-        raise NetworkUnfit(
-            f"error of {error_um:.2g} um at the corners of the field (95 % should be "
-            f"below {stated.p95_abs:.2g})"
-        )
+    error_um = float(errors_um.mean())
+    load_network("aberration").card.check_error(error_um, "at the corners of the field")
     return NetworkGrid(grid, error_um, errors_um.size)
 
 

@@ -7,6 +7,7 @@ from estimator.estimation import EstimatedEye, estimate_eye
 from estimator.grid_source import GridSource
 from estimator.measured_wavefront import MeasuredWavefront
 from estimator.network_card import NetworkUnavailable
+from estimator.networks import load_network
 from estimator.profiles import EyeProfile
 from estimator.traced_eye import MAX_PUPIL_MM, TracedEye
 from filter_service.errors import BuildCancelled
@@ -109,6 +110,10 @@ def prepare_eye(
 def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:
     """Return the eye, and why there is no network for it where one was wanted."""
     try:
-        return estimate_eye(profile, method=way.method, starts=way.starts), ""
+        found = estimate_eye(profile, method=way.method, starts=way.starts)
+        if found.method == "network":
+            error_um = found.mean_abs_error_um
+            load_network("eye").card.check_error(error_um, "in its eye")
+        return found, ""
     except NetworkUnavailable as error:
         return estimate_eye(profile, starts=("table",)), str(error)

@@ -13,8 +13,8 @@ from estimator.aberration_grid import aberration_grid
 from estimator.estimation import estimate_eye
 from estimator.eye_parameters import RetinaShape
 from estimator.grid_source import GridSource, network_pays
-from estimator.network_card import OutOfDomain
-from estimator.network_grid import NetworkUnfit, network_focused, network_grid
+from estimator.network_card import NetworkUnfit, OutOfDomain
+from estimator.network_grid import network_focused, network_grid
 from estimator.profiles import parse_profile
 from estimator.traced_eye import TracedEye
 from tests.numerical.traced_networks import (
@@ -76,6 +76,10 @@ def test_a_perfect_network_focuses_as_tracing_does(monkeypatch, eye):
         )
         assert ours.focus_dpt == pytest.approx(theirs.focus_dpt)
     assert found[0].lens_diameter_change_mm == 0.0
+    source = GridSource(focus="network")
+    for used, asked in (([0.0, 3.0], True), ([0.0], False)):
+        source(eye, accommodations_dpt=used, pupil_diameters_mm=4, wavelengths_nm=549)
+        assert source.focus_by_network == asked
 
 
 def test_through_a_worn_correction_the_bare_eye_is_focused(monkeypatch):
