@@ -216,9 +216,7 @@ def plot(rows: list[Row]) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("time, s")
     axes.set_ylabel("mean absolute error, um")
-    axes.set_title(
-        "o refined, ^ network, squares search; published: x search, + network"
-    )
+    axes.set_title("o refined, ^ network, squares search; published: x and + network")
     axes.legend(fontsize=8)
     RESULTS.mkdir(parents=True, exist_ok=True)
     figure.savefig(RESULTS / "estimate.png", dpi=120)
