@@ -28,7 +28,7 @@ from estimator.zernike import N_TERMS
 N_THREADS = 2
 """Threads of one evaluation, as in `wavefront`; they sleep between calls."""
 
-BATCH = 4096
+BATCH = 2048
 """Rows at a time: what lies between the layers then stays in the cache."""
 
 ERRORS_ONLY = 3

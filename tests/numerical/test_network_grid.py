@@ -174,15 +174,17 @@ def test_an_eye_with_a_retina_of_its_own_is_traced(monkeypatch, eye):
 
 
 def test_a_network_pays_for_many_nodes_and_few_weights():
-    assert network_pays(5000, n_weights=100_000)
-    assert not network_pays(20, n_weights=100_000)
-    assert not network_pays(5000, n_weights=10**9)
+    assert network_pays(5000, n_rays=70, n_weights=100_000)
+    assert not network_pays(20, n_rays=70, n_weights=100_000)
+    assert not network_pays(5000, n_rays=70, n_weights=10**8)
+    few = [network_pays(500, n_rays=n, n_weights=100_000) for n in (70, 192)]
+    assert few == [False, True]
 
 
 def test_cheaper_traces_few_nodes_and_asks_the_network_for_many(monkeypatch, eye):
     put_in_place(monkeypatch, aberration(p95_um=0.01))
     monkeypatch.setattr(
-        "estimator.grid_source.network_pays", lambda n_nodes, n_weights: n_nodes > 50
+        "estimator.grid_source.network_pays", lambda n_nodes, **sizes: n_nodes > 50
     )
     source = GridSource(aberrations="cheaper")
     traced_eye(eye, source)
