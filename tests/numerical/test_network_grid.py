@@ -193,3 +193,10 @@ def test_cheaper_traces_few_nodes_and_asks_the_network_for_many(monkeypatch, eye
         (True, True),
     ]
     assert not any(use.reason for use in source.uses)
+    # one that would be seen does not count as cheap, though it is within its card
+    put_in_place(monkeypatch, aberration(p95_um=0.1, offset_um=0.1))
+    for aberrations, by_network in (("cheaper", False), ("network", True)):
+        source = GridSource(aberrations=aberrations)
+        traced_eye(eye, source)
+        assert source.uses[1].by_network == by_network
+        assert ("error of 0.1 um" in source.uses[1].reason) != by_network
