@@ -1,11 +1,12 @@
 """Wavefronts of an estimated eye over field, pupil, accommodation and wavelength."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.accommodation import FocusedEye
 from estimator.chief_rays import chief_shift_mrad
 from estimator.estimation import EstimatedEye
 from estimator.wavefront import wavefront_grid
@@ -14,7 +15,7 @@ from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
 
 @dataclass(frozen=True)
 class AberrationGrid:
-    """Exactly traced aberrations for an object at infinity; no worn correction.
+    """Aberrations for an object at infinity, traced or by network; no worn correction.
 
     Attributes
     ----------
@@ -51,6 +52,7 @@ def aberration_grid(
     v_deg: ArrayLike = (0.0,),
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
+    states: Sequence[FocusedEye] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> AberrationGrid:
     """Trace every combination of the axes.
@@ -61,6 +63,8 @@ def aberration_grid(
         Within the eye's amplitude.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront_nodes`.
+    states : (n_accommodations,), optional
+        The eye at each accommodation, where that is known already.
     progress : callable, optional
         Called with a fraction after each accommodation; may raise to cancel.
 
@@ -80,9 +84,9 @@ def aberration_grid(
     )
     fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
     parts, shifts = [], []
-    for k, state in enumerate(
-        eye.accommodating.focused_at(used_dpt - eye.refraction_dpt)
-    ):
+    if states is None:
+        states = eye.accommodating.focused_at(used_dpt - eye.refraction_dpt)
+    for k, state in enumerate(states):
         found = wavefront_grid(
             state.surfaces,
             fields_deg=fields_deg.reshape(-1, 2),

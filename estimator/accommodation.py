@@ -99,6 +99,8 @@ class AccommodatingEye:
     refraction_dpt : float
         M of the relaxed eye at 555 nm and ``pupil_diameter_mm``, as seen through the
         worn correction: its far point is at -M.
+    bare_refraction_dpt : float
+        The same without the correction.
     lens_range_dpt : float
         Accommodation that the lens model itself can reach.
     amplitude_dpt : float
@@ -120,10 +122,10 @@ class AccommodatingEye:
         self._vector = parameters.to_vector()
         diameters_mm, refractions_dpt = self._refraction_table()
         correction_dpt = rx.power_vector(correction)[0] if correction else 0.0
-        self._relaxed_dpt = float(refractions_dpt[0])
-        self.refraction_dpt = self._relaxed_dpt - correction_dpt
+        self.bare_refraction_dpt = float(refractions_dpt[0])
+        self.refraction_dpt = self.bare_refraction_dpt - correction_dpt
         self._diameters_mm = diameters_mm
-        self._accommodations_dpt = self._relaxed_dpt - refractions_dpt
+        self._accommodations_dpt = self.bare_refraction_dpt - refractions_dpt
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
         self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
 
@@ -179,7 +181,7 @@ class AccommodatingEye:
         slope_mm_dpt = np.interp(wanted_dpt, known_dpt, slopes)
         for _ in range(MAX_REFINEMENTS):
             vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
-            reached_dpt = self._relaxed_dpt - self._refractions_dpt(vectors)
+            reached_dpt = self.bare_refraction_dpt - self._refractions_dpt(vectors)
             error_dpt = wanted_dpt - reached_dpt
             if np.max(np.abs(error_dpt)) < REFRACTION_TOLERANCE_DPT:
                 break
@@ -211,12 +213,14 @@ class AccommodatingEye:
             raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
         used_dpt = np.array([self.accommodation_dpt(f) for f in focuses_dpt.tolist()])
         diameters_mm = self.lens_diameters_mm(used_dpt)
-        return [
-            self._state(float(focus), float(used), float(diameter))
-            for focus, used, diameter in zip(
-                focuses_dpt, used_dpt, diameters_mm, strict=True
-            )
-        ]
+        return self.with_diameters(focuses_dpt, used_dpt, diameters_mm)
+
+    def with_diameters(
+        self, focuses_dpt: ArrayLike, used_dpt: ArrayLike, diameters_mm: ArrayLike
+    ) -> list[FocusedEye]:
+        """States (P,) with the lens diameters that a focus and accommodation need."""
+        states = zip(*map(np.ravel, (focuses_dpt, used_dpt, diameters_mm)), strict=True)
+        return [self._state(*map(float, state)) for state in states]
 
     def _state(
         self, focus_dpt: float, accommodation_dpt: float, diameter_mm: float

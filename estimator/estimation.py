@@ -1,29 +1,20 @@
 """Which eye has this wavefront: 45 parameters from one or several measurements.
 
 ``refined``: bounded least squares on exactly ray-traced coefficients, with a weak prior
-towards the mean eye of the measured refraction.  ``search``: the pattern search of the
-earlier work, for comparison.  Coefficients are compared on the measured circle, with
-the model's entrance pupil equal to the measured pupil, without piston and tilt: the
-chief ray's zero slope ties tilt to coma, so a measured tilt says nothing of the eye.
+towards the mean eye of the measured refraction, from the nearest of a table of eyes and
+the eye network's guess.  ``network``: that guess alone, judged by one trace.
+``search``: the pattern search of the earlier work.
 """
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator import prescription as rx
 from estimator.accommodation import AccommodatingEye, FocusedEye
-from estimator.bounded_fit import (
-    BoundedFit,
-    FitFailed,
-    difference_jacobian_um,
-    fit_bounded,
-)
-from estimator.estimation_prior import Prior, prior_for_refraction
+from estimator.estimation_problem import EstimationProblem
 from estimator.eye_parameters import (
     PARAMETER_NAMES,
     EyeParameters,
@@ -31,26 +22,21 @@ from estimator.eye_parameters import (
     allowed_ranges,
 )
 from estimator.eye_table import table_vectors
-from estimator.eye_wavefront import zernike_of_vectors
 from estimator.measured_wavefront import accommodation_amplitude_dpt
+from estimator.network_card import (
+    DamagedWeights,
+    NetworkUnavailable,
+    NetworkUnfit,
+    WeightsMissing,
+)
+from estimator.network_guess import network_guess
 from estimator.pattern_search import pattern_search
-from estimator.profiles import EyeProfile, Measurement
+from estimator.profiles import EyeProfile
 from estimator.zernike import N_TERMS, remove_central_tilt
 
-METHODS = ("refined", "search")
-
-FIRST_COMPARED = 3
-"""Index of the first coefficient that is compared: no piston, no tilt."""
-
-FIT_NOISE_UM = 1e-4
-"""Weight of a coefficient against the prior: small, so that the prior decides only what
-the measurement leaves open."""
-
-INSTRUMENT_NOISE_UM = 0.01
-"""Repeatability of an aberrometer's coefficient, for how well determined an eye is."""
-
-ON_BOUND_RATIO = 1e-6
-"""Distance from a bound, in prior deviations, that counts as on it."""
+METHODS = ("network", "refined", "search")
+STARTS = ("table", "network")
+"""Where ``refined`` may start: the built-in eyes, the network's guess."""
 
 POOR_FIT_UM = 0.01
 """Mean error above which the answer says that the model does not reach the data."""
@@ -72,6 +58,12 @@ class EstimatedEye:
         slope.
     mean_abs_error_um : float
         Over the 25 terms without piston and tilt, and over all measurements.
+    method : str
+        How the eye was found in the end: ``network`` falls back to ``refined``.
+    start : str
+        Where ``refined`` started, of `STARTS` or ``given``; empty for other methods.
+    network_reason : str
+        Why the network did not answer where it was asked; empty where it did.
     on_bound : tuple of str
         Parameters that sit on a bound of their allowed range.
     """
@@ -90,6 +82,8 @@ class EstimatedEye:
     n_evaluations: int
     on_bound: tuple[str, ...]
     notes: tuple[str, ...]
+    start: str = ""
+    network_reason: str = ""
 
     @property
     def retina(self) -> RetinaShape | None:
@@ -105,9 +99,8 @@ class EstimatedEye:
         """
         if self.profile.eye is not None:
             return dict.fromkeys(PARAMETER_NAMES, 1.0)
-        problem = _Problem(self.profile)
-        unit = problem.prior.to_unit(self.parameters.to_vector())
-        return _determined_ratio(problem.jacobian_um(unit))
+        problem = EstimationProblem(self.profile)
+        return problem.determined_ratio(self.parameters.to_vector())
 
     @cached_property
     def accommodating(self) -> AccommodatingEye:
@@ -153,6 +146,7 @@ def estimate_eye(
     *,
     method: str = "refined",
     max_time_s: float = SEARCH_TIME_S,
+    starts: tuple[str, ...] = STARTS,
     start_vectors: NDArray[np.float64] | None = None,
 ) -> EstimatedEye:
     """Estimate the eye behind a profile.
@@ -161,173 +155,170 @@ def estimate_eye(
     ----------
     profile : EyeProfile
         A profile that is an eye already is returned as it is, with method ``given``.
-    method : {"refined", "search"}
+    method : {"network", "refined", "search"}
+        Where the wavefront is out of the network's training ranges, or light does not
+        pass its eye, ``network`` becomes ``refined`` from the table, with a note.
     max_time_s : float
         For ``search`` only.
+    starts : of {"table", "network"}
+        Eyes of which ``refined`` starts at the one whose traced wavefront is nearest.
+        A network that cannot answer is left out.
     start_vectors : (P, 45), optional
-        Eyes of which ``refined`` starts at the nearest; the built-in table otherwise.
+        Instead of those.
 
     Raises
     ------
     ValueError
-        An unknown method.
+        An unknown method or start.
+    WeightsMissing, DamagedWeights
+        For ``network``.
     """
     if method not in METHODS:
         raise ValueError(f"method '{method}': allowed are {', '.join(METHODS)}")
+    if not starts or not set(starts) <= set(STARTS):
+        raise ValueError(f"starts {starts}: allowed are {', '.join(STARTS)}")
     start_s = time.perf_counter()
     if profile.eye is not None:
         return _given(profile, start_s)
-    problem = _Problem(profile)
-    if start_vectors is None:
-        start_vectors = table_vectors()
+    problem = EstimationProblem(profile)
     if method == "search":
         return _searched(problem, start_s, max_time_s)
-    fit = problem.refine(start_vectors)
-    return problem.answer(
+    reason = ""
+    if method == "network":
+        try:
+            return _guessed(problem, start_s)
+        except (WeightsMissing, DamagedWeights):
+            raise
+        except NetworkUnavailable as error:
+            starts, reason = ("table",), str(error)
+    if start_vectors is None:
+        start_vectors, labels, why = _start_vectors(profile, starts)
+        reason = reason or why
+    else:
+        labels = ("given",) * len(start_vectors)
+    found = _refined(problem, start_s, start_vectors, labels, reason)
+    if method == "network":
+        found = replace(found, notes=(f"not by network: {reason}", *found.notes))
+    return found
+
+
+def _answer(
+    problem: EstimationProblem,
+    method: str,
+    *,
+    vector: NDArray[np.float64],
+    values_um: NDArray[np.float64],
+    start_s: float,
+    counts: tuple[int, int],
+    start: str = "",
+    network_reason: str = "",
+) -> EstimatedEye:
+    error_um = float(np.mean(np.abs(values_um - problem.target_um)))
+    on_bound = problem.on_bound(vector)
+    vector = np.clip(vector, *allowed_ranges().T)  # rounding may overstep a bound
+    zernike_um = problem.zernike_of(problem.measurements[0])(vector[None])[0]
+    zernike_um[0] = 0.0
+    measured_um = remove_central_tilt(problem.profile.zernike_um)
+    residual_um = zernike_um - measured_um
+    residual_um[0] = 0.0
+    return EstimatedEye(
+        name=problem.profile.name,
+        method=method,
+        parameters=EyeParameters.from_vector(vector),
+        profile=problem.profile,
+        zernike_um=zernike_um,
+        residual_um=residual_um,
+        zernike_radius_mm=problem.profile.pupil_diameter_mm / 2.0,
+        wavelength_nm=problem.profile.wavelength_nm,
+        mean_abs_error_um=error_um,
+        time_ms=1000.0 * (time.perf_counter() - start_s),
+        n_iterations=counts[0],
+        n_evaluations=counts[1],
+        on_bound=on_bound,
+        notes=_notes(error_um, method),
+        start=start,
+        network_reason=network_reason,
+    )
+
+
+def _notes(error_um: float, method: str) -> tuple[str, ...]:
+    if error_um <= POOR_FIT_UM:
+        return ()
+    which = "network's eye" if method == "network" else "eye model"
+    return (f"the {which} reaches this wavefront only to {error_um:.2g} um on average",)
+
+
+def _start_vectors(
+    profile: EyeProfile, starts: tuple[str, ...]
+) -> tuple[NDArray[np.float64], tuple[str, ...], str]:
+    """Eyes (P, 45), where each comes from, and why the network has none."""
+    vectors, labels, reason = np.empty((0, len(PARAMETER_NAMES))), (), ""
+    if "network" in starts:
+        try:
+            vectors, labels = network_guess(profile)[None], ("network",)
+        except NetworkUnavailable as error:
+            reason = str(error)
+    if "table" in starts or not labels:
+        table = table_vectors()
+        vectors = np.concatenate([vectors, table])
+        labels += ("table",) * len(table)
+    return vectors, labels, reason
+
+
+def _refined(
+    problem: EstimationProblem,
+    start_s: float,
+    start_vectors: NDArray[np.float64],
+    labels: tuple[str, ...],
+    reason: str,
+) -> EstimatedEye:
+    nearest = problem.nearest(start_vectors)
+    fit = problem.refine(start_vectors[nearest])
+    return _answer(
+        problem,
         "refined",
         vector=problem.prior.from_unit(fit.position_ratio),
         values_um=fit.values_um,
         start_s=start_s,
         counts=(fit.n_iterations, fit.n_evaluations),
+        start=labels[nearest],
+        network_reason=reason,
     )
 
 
-def compared_terms(zernike_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (..., 25) that an estimation compares."""
-    return zernike_um[..., FIRST_COMPARED:]
+def _guessed(problem: EstimationProblem, start_s: float) -> EstimatedEye:
+    """Give the network's eye, with the error that tracing it shows.
 
-
-class _Problem:
-    """Measurements of one profile, and the model that answers for many eyes."""
-
-    def __init__(self, profile: EyeProfile):
-        self.profile = profile
-        self.measurements = profile.measurements or (
-            Measurement(
-                profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
-            ),
-        )
-        self.target_um = np.concatenate(
-            [compared_terms(m.zernike_um) for m in self.measurements]
-        )
-        refraction_dpt, _, _ = rx.power_vector_from_zernike(
-            profile.zernike_um, zernike_radius_mm=profile.pupil_diameter_mm / 2.0
-        )
-        self.prior: Prior = prior_for_refraction(refraction_dpt)
-
-    def zernike_of(self, measurement: Measurement) -> Callable:
-        def coefficients(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-            return zernike_of_vectors(
-                vectors,
-                retina=self.profile.retina,
-                pupil_diameter_mm=measurement.pupil_diameter_mm,
-                wavelength_nm=measurement.wavelength_nm,
-                h_deg=measurement.h_deg,
-                v_deg=measurement.v_deg,
-            )
-
-        return coefficients
-
-    def compared_um(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate(
-            [compared_terms(self.zernike_of(m)(vectors)) for m in self.measurements],
-            axis=-1,
-        )
-
-    def nearest(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Vector of the eye whose coefficients lie nearest."""
-        misfit_um = self.compared_um(vectors) - self.target_um
-        distance = np.sum(misfit_um**2, axis=-1)
-        if np.all(np.isnan(distance)):
-            raise FitFailed("light passes none of the start eyes at this pupil")
-        return vectors[np.nanargmin(distance)]
-
-    def _model(self, units: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.compared_um(self.prior.from_unit(units))
-
-    def jacobian_um(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        value_um = self._model(unit[None])[0]
-        return difference_jacobian_um(
-            self._model, unit, value_um, high=self.prior.unit_bounds()[1]
-        )
-
-    def refine(self, start_vectors: NDArray[np.float64]) -> BoundedFit:
-        return fit_bounded(
-            self._model,
-            target_um=self.target_um,
-            start=self.prior.to_unit(self.nearest(start_vectors)),
-            bounds=self.prior.unit_bounds(),
-            noise_um=FIT_NOISE_UM,
-        )
-
-    def answer(
-        self,
-        method: str,
-        *,
-        vector: NDArray[np.float64],
-        values_um: NDArray[np.float64],
-        start_s: float,
-        counts: tuple[int, int],
-    ) -> EstimatedEye:
-        error_um = float(np.mean(np.abs(values_um - self.target_um)))
-        on_bound = self._on_bound(vector)
-        vector = np.clip(vector, *allowed_ranges().T)  # rounding may overstep a bound
-        zernike_um = self.zernike_of(self.measurements[0])(vector[None])[0]
-        zernike_um[0] = 0.0
-        measured_um = remove_central_tilt(self.profile.zernike_um)
-        residual_um = zernike_um - measured_um
-        residual_um[0] = 0.0
-        return EstimatedEye(
-            name=self.profile.name,
-            method=method,
-            parameters=EyeParameters.from_vector(vector),
-            profile=self.profile,
-            zernike_um=zernike_um,
-            residual_um=residual_um,
-            zernike_radius_mm=self.profile.pupil_diameter_mm / 2.0,
-            wavelength_nm=self.profile.wavelength_nm,
-            mean_abs_error_um=error_um,
-            time_ms=1000.0 * (time.perf_counter() - start_s),
-            n_iterations=counts[0],
-            n_evaluations=counts[1],
-            on_bound=on_bound,
-            notes=_notes(error_um),
-        )
-
-    def _on_bound(self, vector: NDArray[np.float64]) -> tuple[str, ...]:
-        unit = self.prior.to_unit(vector)
-        low, high = self.prior.unit_bounds()
-        room = np.minimum(unit - low, high - unit)
-        return tuple(
-            name
-            for name, left in zip(PARAMETER_NAMES, room, strict=True)
-            if left < ON_BOUND_RATIO
-        )
-
-
-def _notes(error_um: float) -> tuple[str, ...]:
-    if error_um <= POOR_FIT_UM:
-        return ()
-    return (
-        f"the eye model reaches this wavefront only to {error_um:.2g} um on average",
+    Raises
+    ------
+    NetworkUnavailable
+        The network's, or light does not pass its eye.
+    """
+    vector = network_guess(problem.profile)
+    values_um = problem.compared_um(vector[None])[0]
+    if not np.all(np.isfinite(values_um)):
+        raise NetworkUnfit("light does not pass the network's eye")
+    return _answer(
+        problem,
+        "network",
+        vector=vector,
+        values_um=values_um,
+        start_s=start_s,
+        counts=(0, 1),
     )
 
 
-def _determined_ratio(jacobian_um: NDArray[np.float64]) -> dict[str, float]:
-    n = jacobian_um.shape[1]
-    information = jacobian_um.T @ jacobian_um / INSTRUMENT_NOISE_UM**2 + np.eye(n)
-    left = np.diag(np.linalg.inv(information))
-    return dict(zip(PARAMETER_NAMES, (1.0 - left).tolist(), strict=True))
-
-
-def _searched(problem: _Problem, start_s: float, max_time_s: float) -> EstimatedEye:
+def _searched(
+    problem: EstimationProblem, start_s: float, max_time_s: float
+) -> EstimatedEye:
     first = problem.measurements[0]
     zernike_of = problem.zernike_of(first)
     found = pattern_search(
         zernike_of, target_um=first.zernike_um, max_time_s=max_time_s
     )
     vector = found.parameters.to_vector()
-    return problem.answer(
+    return _answer(
+        problem,
         "search",
         vector=vector,
         values_um=problem.compared_um(vector[None])[0],

@@ -2,7 +2,8 @@
 
 Answers the same questions as `measured_wavefront.MeasuredWavefront`, without its
 limits: pupils larger than the measured one are traced, not extrapolated, accommodation
-changes the lens and with it all aberrations, and every field has its own.
+changes the lens and with it all aberrations, and every field has its own.  Its grids
+may be made by network instead, see `grid_source`.
 """
 
 from collections.abc import Callable
@@ -45,6 +46,9 @@ LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
 
 FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
 """Rays per wavefront over the field: 70, 1e-3 um from many at 7 mm, 0.013 at worst."""
+
+TRACED_ERROR_UM = 1e-3
+"""What a reply states of them."""
 
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
@@ -116,6 +120,7 @@ class TracedEye(FocusingEye):
         focus_range_dpt: tuple[float, float],
         wavelengths_nm: ArrayLike,
         field_range_deg: FieldRange = ON_AXIS_DEG,
+        make_grid: Callable[..., AberrationGrid] = aberration_grid,
         progress: Callable[[float], None] | None = None,
     ) -> "TracedEye":
         """Trace what a range of pupils, foci and fields needs.
@@ -127,6 +132,8 @@ class TracedEye(FocusingEye):
             smaller, from which all others follow.
         field_range_deg : ((h_low, h_high), (v_low, v_high))
             Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
+        make_grid : callable, optional
+            What fills the grids, where it is not tracing: a `grid_source.GridSource`.
         progress : callable, optional
             Called with a fraction; may raise to cancel.
 
@@ -145,7 +152,7 @@ class TracedEye(FocusingEye):
         }
         on_axis_only = not np.any(field_range_deg)
         axis_share = 1.0 if on_axis_only else AXIS_PROGRESS
-        axis_grid = aberration_grid(
+        axis_grid = make_grid(
             eye,
             pupil_diameters_mm=np.unique(pupil_diameters_mm),
             **states,
@@ -158,6 +165,7 @@ class TracedEye(FocusingEye):
             eye,
             axis,
             field_range_deg,
+            make_grid,
             pupil_diameters_mm=field_pupils_mm(
                 axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
             ),
@@ -324,7 +332,11 @@ def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
 
 
 def _trace_field(
-    eye: EstimatedEye, axis: FieldInterpolation, field_range_deg: FieldRange, **axes
+    eye: EstimatedEye,
+    axis: FieldInterpolation,
+    field_range_deg: FieldRange,
+    make_grid: Callable[..., AberrationGrid],
+    **axes,
 ) -> tuple[FieldInterpolation, FieldRange]:
     """Trace a range of fields, drawn in towards the axis until light passes it all."""
     limited = np.clip(field_range_deg, -FIELD_LIMIT_DEG, FIELD_LIMIT_DEG)
@@ -332,7 +344,7 @@ def _trace_field(
     while share > SMALLEST_SHARE:
         (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
         field = FieldInterpolation(
-            aberration_grid(
+            make_grid(
                 eye,
                 h_deg=field_nodes_deg(h_low, h_high),
                 v_deg=field_nodes_deg(v_low, v_high),

@@ -22,6 +22,7 @@ SERVICE_PACKAGES = (
     "msgpack",
     "pillow",
     "OpenEXR",
+    "onnxruntime",
     "typer",
 )
 CLIENT_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg")
@@ -34,6 +35,7 @@ PROBE_TIMEOUT_S = 60.0
 
 FIX_PACKAGES = "make demo, or: sh setup.sh"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
+FIX_WEIGHTS = "git checkout -- estimator/weights"
 FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
 
@@ -58,10 +60,11 @@ def examine() -> dict:
     report : dict
         Plain JSON: ``ok`` (the service can run), ``works`` by purpose, ``checks``,
         ``install`` (commands), ``machine``, ``gl``, ``threading_layer``,
-        ``packages``.
+        ``networks`` (each with its weights' size and expected error), ``packages``.
     """
     gl = run_probe("gl")
     threads = run_probe("threads")
+    networks = run_probe("networks")
     packages = package_versions()
     checks = [
         check_python(),
@@ -70,6 +73,7 @@ def examine() -> dict:
         check_gl(gl),
         check_compute(gl),
         check_threads(threads),
+        check_networks(networks),
         check_packages("client packages", CLIENT_PACKAGES, packages),
         check_packages("window packages", WINDOW_PACKAGES, packages),
         check_display(),
@@ -83,6 +87,7 @@ def examine() -> dict:
         "machine": machine(),
         "gl": gl.get("info", {}) | {"limits": gl.get("limits", {})},
         "threading_layer": threads.get("layer"),
+        "networks": networks.get("cards", {}),
         "packages": packages,
     }
 
@@ -197,6 +202,18 @@ def check_threads(threads: dict) -> Check:
         fix = f"{APT_INSTALL} libgomp1"
         return Check("threads", False, f"{layer}: not safe for the service", fix)
     return Check("threads", threads["sum_correct"], layer)
+
+
+def check_networks(networks: dict) -> Check:
+    """Report the trained networks; without them everything is ray-traced."""
+    if "error" in networks:
+        return Check("networks", False, networks["error"], FIX_PACKAGES)
+    if networks["missing"]:
+        detail = "; ".join(networks["missing"].values())
+        return Check("networks", False, detail, FIX_WEIGHTS)
+    found = networks["cards"].items()
+    detail = ", ".join(f"{name} {card['expected_error']}" for name, card in found)
+    return Check("networks", True, detail)
 
 
 def check_display() -> Check:

@@ -2,7 +2,7 @@
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
-    python -m filter_service.commands.doctor_probes gl|threads
+    python -m filter_service.commands.doctor_probes gl|threads|networks
 """
 
 import json
@@ -69,7 +69,32 @@ def probe_threads() -> dict:
     return {"layer": threading_layer(), "sum_correct": bool(total == expected)}
 
 
-PROBES = {"gl": probe_gl, "threads": probe_threads}
+def probe_networks() -> dict:
+    """Load every trained network and evaluate it once."""
+    from estimator.network_card import NETWORK_NAMES, NetworkUnavailable
+    from estimator.networks import load_network
+
+    cards, missing = {}, {}
+    for name in NETWORK_NAMES:
+        try:
+            network = load_network(name)
+        except NetworkUnavailable as error:
+            missing[name] = str(error)
+            continue
+        middle = 0.5 * (network.card.low + network.card.high)
+        if not np.all(np.isfinite(network(middle[None]))):
+            missing[name] = f"{name}.onnx answers with numbers that are not finite"
+            continue
+        cards[name] = {
+            "n_parameters": network.card.n_parameters,
+            "precision": network.card.precision,
+            "commit": network.card.commit,
+            "expected_error": str(network.card.error),
+        }
+    return {"cards": cards, "missing": missing}
+
+
+PROBES = {"gl": probe_gl, "threads": probe_threads, "networks": probe_networks}
 
 if __name__ == "__main__":
     sys.stdout.write(json.dumps(PROBES[sys.argv[1]](), default=str) + "\n")

@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from filter_service.commands.console import Json, check_range, print_json, say
+from filter_service.commands.console import (
+    CommandFailed,
+    Json,
+    check_range,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from estimator.estimation import EstimatedEye
@@ -17,6 +23,7 @@ TIME_LIMITS_S = (0.1, 86400.0)
 class Method(StrEnum):
     """How the eye is found."""
 
+    NETWORK = "network"
     REFINED = "refined"
     SEARCH = "search"
 
@@ -28,7 +35,11 @@ def estimate(
     ],
     method: Annotated[
         Method,
-        typer.Option(help="search is the pattern search of the earlier work."),
+        typer.Option(
+            help="network: the eye network alone, judged by tracing; refined: least "
+            "squares on traced coefficients, from its guess or a table's; search: the "
+            "pattern search of the earlier work."
+        ),
     ] = Method.REFINED,
     max_time_s: Annotated[
         float, typer.Option(help="Time given to --method search, s.")
@@ -49,13 +60,17 @@ def estimate(
     check_range("--max-time-s", max_time_s, TIME_LIMITS_S)
 
     from estimator.estimation import estimate_eye
+    from estimator.network_card import DamagedWeights, WeightsMissing
     from estimator.profile_files import load_profile
     from filter_service.commands.image_files import check_output
 
     if plot is not None:
         check_output(plot, (".png",))
     eye = load_profile(profile)
-    found = estimate_eye(eye, method=method.value, max_time_s=max_time_s)
+    try:
+        found = estimate_eye(eye, method=method.value, max_time_s=max_time_s)
+    except (WeightsMissing, DamagedWeights) as error:  # no fault of the input
+        raise CommandFailed(str(error)) from error
     if plot is not None:
         from estimator.eye_plot import plot_eye
 
@@ -72,6 +87,7 @@ def _summary(found: "EstimatedEye") -> dict:
     return {
         "profile": found.name,
         "method": found.method,
+        "start": found.start,
         "parameters": found.parameters.to_mapping(),
         "zernike_um": found.zernike_um.tolist(),
         "residual_um": found.residual_um.tolist(),

@@ -14,6 +14,7 @@ from filter_service.commands.console import (
     say,
 )
 from filter_service.commands.plan_text import plan_summary, say_plan
+from filter_service.wire.profiles import DEFAULT_ACCURACY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,6 +64,17 @@ class EyeModel(StrEnum):
 
     TRACED = "traced"
     WAVEFRONT = "wavefront"
+
+
+class Accuracy(StrEnum):
+    """What of a traced eye may come from trained networks."""
+
+    FAST = "fast"
+    BALANCED = "balanced"
+    EXACT = "exact"
+
+
+BY_DEFAULT = Accuracy(DEFAULT_ACCURACY)
 
 
 class DepthKind(StrEnum):
@@ -150,6 +162,13 @@ def filter_image(
             "an estimated eye, ray-traced at any pupil and focus."
         ),
     ] = EyeModel.WAVEFRONT,
+    accuracy: Annotated[
+        Accuracy,
+        typer.Option(
+            help="Of a traced eye.  fast: networks; balanced: a refined eye, networks "
+            "where they save time; exact: everything ray-traced."
+        ),
+    ] = BY_DEFAULT,
     depth_kind: Annotated[
         DepthKind, typer.Option(help="planar: view-space z; radial: distance.")
     ] = DepthKind.PLANAR,
@@ -219,6 +238,7 @@ def filter_image(
         merge=not no_merge,
         output=("linear16" if half else "linear") if linear else "srgb8",
         eye_model=eye_model.value,
+        accuracy=accuracy.value,
         mode=mode.value,
         grid=grid.value,
         tolerance=tolerance.value,

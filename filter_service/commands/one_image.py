@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator.profiles import EyeProfile
 from filter_service.gl.gpu import Gpu
+from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import plan_cache
@@ -16,6 +17,7 @@ from filter_service.psfs.build import build_psf_store
 from filter_service.psfs.eye_model import prepare_eye
 from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
 from filter_service.rendering.renderer import FilterRenderer, Rendered
+from filter_service.wire.profiles import DEFAULT_ACCURACY
 
 NEAREST_OBJECT_DPT = 20.0
 """Nearest object distance given PSFs of its own; nearer pixels count as clamped."""
@@ -37,6 +39,7 @@ class ImageSettings:
     merge: bool = True
     output: str = "linear"
     eye_model: str = "wavefront"
+    accuracy: str = DEFAULT_ACCURACY
     mode: str = "on-axis"
     grid: str = "planned"
     tolerance: str = "normal"
@@ -103,6 +106,14 @@ def grid_spec(view: View, settings: ImageSettings) -> GridSpec:
     )
 
 
+def _prepare(
+    eye: EyeProfile, grid: GridSpec, settings: ImageSettings
+) -> tuple[Eye, tuple[str, ...]]:
+    return prepare_eye(
+        eye, grid, eye_model=settings.eye_model, accuracy=settings.accuracy
+    )
+
+
 def plan_one_image(view: View, eye: EyeProfile, settings: ImageSettings) -> CachePlan:
     """Decide which PSFs one view needs, and compute none.
 
@@ -112,7 +123,7 @@ def plan_one_image(view: View, eye: EyeProfile, settings: ImageSettings) -> Cach
         A setting out of range; a plan beyond the memory budget.
     """
     grid = grid_spec(view, settings)
-    prepared, _ = prepare_eye(eye, grid, eye_model=settings.eye_model)
+    prepared, _ = _prepare(eye, grid, settings)
     return plan_cache(prepared, grid)
 
 
@@ -135,7 +146,7 @@ def filter_one_image(
     """
     grid = grid_spec(view, settings)
     clock_s = [time.perf_counter()]
-    prepared, eye_notes = prepare_eye(eye, grid, eye_model=settings.eye_model)
+    prepared, eye_notes = _prepare(eye, grid, settings)
     store = build_psf_store(prepared, grid, progress=progress)
     clock_s.append(time.perf_counter())
     gpu = Gpu()

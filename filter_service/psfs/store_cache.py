@@ -73,7 +73,9 @@ def code_version() -> str:
     return digest.hexdigest()
 
 
-def store_key(profile: EyeProfile, spec: GridSpec, *, eye_model: str) -> str:
+def store_key(
+    profile: EyeProfile, spec: GridSpec, *, eye_model: str, accuracy: str
+) -> str:
     """Return the name under which the store of an eye and a grid is kept."""
     spec_tree, _ = pack(spec)
     if not spec.follows_field:
@@ -81,7 +83,7 @@ def store_key(profile: EyeProfile, spec: GridSpec, *, eye_model: str) -> str:
     profile_tree, arrays = pack(profile)
     digest = hashlib.blake2b(digest_size=16)
     text = json.dumps(
-        [code_version(), eye_model, spec_tree, profile_tree], sort_keys=True
+        [code_version(), eye_model, accuracy, spec_tree, profile_tree], sort_keys=True
     )
     digest.update(text.encode())
     for array in arrays.values():

@@ -119,8 +119,9 @@ def _built(
 
     profile = check_profile(job.body, job.settings)
     spec, eye_model = grid_spec(job), job.settings.eye_model
+    accuracy = job.settings.accuracy
     cache = StoreCache(job.limits.store_cache_dir, max_mb=job.limits.store_cache_max_mb)
-    key = store_key(profile, spec, eye_model=eye_model)
+    key = store_key(profile, spec, eye_model=eye_model, accuracy=accuracy)
     stored = cache.load(key, go_on=go_on)
     if stored is not None:
         notes = (*stored.notes, "PSFs from the disk cache")
@@ -130,6 +131,7 @@ def _built(
         profile,
         spec,
         eye_model=eye_model,
+        accuracy=accuracy,
         progress=progress,
         cancelled=cancelled,
     )

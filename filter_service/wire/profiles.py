@@ -32,6 +32,8 @@ from filter_service.wire.images import (
 from filter_service.wire.text import clip, clip_notes, take_notes
 
 EYE_MODELS = ("traced", "wavefront")
+ACCURACIES = ("fast", "balanced", "exact")
+DEFAULT_ACCURACY = "balanced"
 MODES = ("on-axis", "quality", "dynamic")
 GRIDS = ("planned", "paper")
 TOLERANCES = ("loose", "normal", "fine")
@@ -53,6 +55,7 @@ class ProfileSettings:
     chromatic: bool = True
     lateral_color: bool = False
     eye_model: str = "traced"
+    accuracy: str = DEFAULT_ACCURACY
     age_years: float | None = None
 
     @property
@@ -121,6 +124,7 @@ class ProfileSettings:
                 ("grid", GRIDS),
                 ("tolerance", TOLERANCES),
                 ("eye_model", EYE_MODELS),
+                ("accuracy", ACCURACIES),
             )
         }
         return cls(**choices, **ranges, **gazes, **switches, age_years=age_years)

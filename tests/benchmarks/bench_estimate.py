@@ -1,4 +1,4 @@
-"""Time to estimate an eye against the error it leaves: refined and pattern search.
+"""Time to estimate an eye against the error it leaves: network, refined, search.
 
     python -m tests.benchmarks.bench_estimate [--quick] [--json]
 
@@ -40,6 +40,13 @@ ERROR_NAME = "mean_abs_um"
 PERIPHERAL_REFERENCE = "at 30 deg: myopes +0.80, emmetropes -0.41 (Mutti 2000)"
 SEARCH_TIMES_S = (1.0, 8.0)
 QUICK_SEARCH_TIMES_S = (1.0,)
+WAYS = (
+    # method, where a refined eye may start
+    ("refined", ("table", "network")),
+    ("refined", ("table",)),
+    ("refined", ("network",)),
+    ("network", ("table",)),
+)
 FOCUSES_DPT = np.linspace(0.125, 8.125, 7)
 TRACED_EYES = 2000
 
@@ -68,15 +75,23 @@ def _preset(name):
 
 
 def preset_rows(repeats: int, search_times_s) -> list[Row]:
-    """Every condition by both methods."""
+    """Every condition by every method."""
     rows = []
     for name in preset_names():
         profile = _preset(name)
-        found = estimate_eye(profile)
-        times_ms = time_calls(lambda p=profile: estimate_eye(p), repeats=repeats)
-        setting = f"{found.n_evaluations} eyes traced"
-        error_um = found.mean_abs_error_um
-        rows.append(_row("refined", name, setting, repeats, times_ms, error_um))
+        for method, starts in WAYS:
+            way = {"method": method, "starts": starts}
+            found = estimate_eye(profile, **way)
+            times_ms = time_calls(
+                lambda p=profile, w=way: estimate_eye(p, **w), repeats=repeats
+            )
+            setting = f"{found.n_evaluations} eyes traced"
+            if method == "refined":
+                setting += ", from " + (" or ".join(starts))
+            if found.method != method:
+                setting = f"{found.method}: {found.network_reason}"
+            error_um = found.mean_abs_error_um
+            rows.append(_row(method, name, setting, repeats, times_ms, error_um))
         for limit_s in search_times_s:
             found = estimate_eye(profile, method="search", max_time_s=limit_s)
             setting = f"{found.n_evaluations} eyes traced"
@@ -184,7 +199,7 @@ def plot(rows: list[Row]) -> None:
     axes = figure.subplots()
     colors = {name: f"C{i}" for i, name in enumerate(PUBLISHED)}
     for name, color in colors.items():
-        for method, marker in (("refined", "o"), ("search", "s")):
+        for method, marker in (("refined", "o"), ("search", "s"), ("network", "^")):
             chosen = [r for r in rows if r.case == name and r.method == method]
             axes.plot(
                 [r.median_ms / 1000.0 for r in chosen],
@@ -201,7 +216,7 @@ def plot(rows: list[Row]) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("time, s")
     axes.set_ylabel("mean absolute error, um")
-    axes.set_title("o refined, squares search; published: x search, + network")
+    axes.set_title("o refined, ^ network, squares search; published: x and + network")
     axes.legend(fontsize=8)
     RESULTS.mkdir(parents=True, exist_ok=True)
     figure.savefig(RESULTS / "estimate.png", dpi=120)

@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from estimator.network_card import NETWORK_NAMES
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 120
@@ -76,7 +77,9 @@ def test_doctor_reports_a_machine_that_can_serve():
     assert report["gl"]["renderer"]
     assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
     checks = {check["name"]: check["ok"] for check in report["checks"]}
-    assert checks["compute"]
+    assert checks["compute"] and checks["networks"]
+    assert set(report["networks"]) == set(NETWORK_NAMES)
+    assert all(card["n_parameters"] > 0 for card in report["networks"].values())
 
 
 def test_doctor_without_opengl_says_what_to_install_and_fails():
@@ -163,6 +166,17 @@ def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
     finished = run(*filter_arguments(folder, "--pupil-mm", 7, profile="cataract"))
     assert finished.returncode == 0, finished.stderr
     assert "capped" in finished.stdout
+
+
+def test_a_traced_eye_is_as_accurate_as_asked(scene):
+    folder, _ = scene
+    traced = filter_arguments(folder, "--eye-model", "traced")
+    notes = run_json(*traced, "--accuracy", "exact")["notes"]
+    assert "refined from a table's eye" in notes[0]
+    assert not any("network" in note for note in notes)
+    notes = run_json(*traced, "--accuracy", "fast")["notes"]
+    assert "network" in notes[0]
+    assert "fast" in refusal(*traced, "--accuracy", "high")
 
 
 @pytest.mark.parametrize(

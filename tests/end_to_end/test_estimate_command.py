@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from estimator.eye_parameters import PARAMETER_NAMES
@@ -43,6 +44,26 @@ def test_plot_is_a_picture_with_a_report(tmp_path):
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 10
 
 
+def test_the_network_answers_and_is_judged_by_tracing():
+    found = run_json("estimate", "myopia", "--method", "network")
+    assert found["method"] == "network"
+    assert found["n_evaluations"] == 1
+    error_um = np.mean(np.abs(found["residual_um"][3:]))
+    assert found["mean_abs_error_um"] == pytest.approx(error_um, rel=1e-9)
+    refined = run_json("estimate", "myopia", "--method", "refined")
+    assert refined["start"] in ("table", "network")
+    assert refined["mean_abs_error_um"] < found["mean_abs_error_um"]
+
+
+def test_beyond_the_network_s_training_the_eye_is_refined_with_a_note(tmp_path):
+    path = tmp_path / "far.json"
+    path.write_text(json.dumps({"kind": "prescription", "sphere_dpt": -25}))
+    found = run_json("estimate", path, "--method", "network")
+    assert found["method"] == "refined"
+    assert found["start"] == "table"
+    assert any("zernike_j4_um" in note for note in found["notes"])
+
+
 def test_search_stops_when_told():
     found = run_json("estimate", "myopia", "--method", "search", "--max-time-s", "0.5")
     assert found["method"] == "search"
@@ -51,6 +72,6 @@ def test_search_stops_when_told():
 
 def test_estimate_refuses_what_it_does_not_know(tmp_path):
     assert "kerataconus" in refusal("estimate", "kerataconus")
-    assert "network" in refusal("estimate", "myopia", "--method", "network")
+    assert "network" in refusal("estimate", "myopia", "--method", "guess")
     assert "--max-time-s" in refusal("estimate", "myopia", "--max-time-s", "0")
     assert "png" in refusal("estimate", "myopia", "--plot", tmp_path / "eye.pdf")

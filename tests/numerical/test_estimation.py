@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from estimator.bounded_fit import FitFailed, box_minimum, fit_bounded
-from estimator.estimation import POOR_FIT_UM, compared_terms, estimate_eye
+from estimator.estimation import POOR_FIT_UM, estimate_eye
 from estimator.estimation_prior import prior_for_refraction
+from estimator.estimation_problem import compared_terms
 from estimator.eye_parameters import (
     PARAMETER_NAMES,
     PARAMETERS,

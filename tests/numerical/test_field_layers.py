@@ -97,7 +97,7 @@ def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
         gaze_range_deg=(15.0, 8.0),
     )
     profile = parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
-    eye, _ = prepare_eye(profile, spec, eye_model="wavefront")
+    eye, _ = prepare_eye(profile, spec, eye_model="wavefront", accuracy="exact")
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))
     image = texture(rng, height, width, cell_px=1)

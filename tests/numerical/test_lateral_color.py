@@ -189,7 +189,9 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
         kept_energy_ratio=0.998,
         lateral_color=lateral_color,
     )
-    eye, notes = prepare_eye(parse_profile(profile), spec, eye_model=eye_model)
+    eye, notes = prepare_eye(
+        parse_profile(profile), spec, eye_model=eye_model, accuracy="exact"
+    )
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))
     color = np.zeros((SIZE, SIZE, 3), np.float32)

@@ -46,6 +46,7 @@ class FieldBench:
             profile,
             self.spec,
             eye_model="traced",
+            accuracy="exact",
         )
         self.store = build_psf_store(self.eye, self.spec)
         self.renderer = FilterRenderer(gpu)
@@ -175,6 +176,7 @@ def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
         parse_profile({"kind": "prescription", "sphere_dpt": 0.0}),
         spec,
         eye_model="wavefront",
+        accuracy="exact",
     )
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))

@@ -120,7 +120,9 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     )
     from filter_service.psfs.eye_model import prepare_eye
 
-    eye, notes = prepare_eye(parse_profile(body), spec, eye_model="traced")
+    eye, notes = prepare_eye(
+        parse_profile(body), spec, eye_model="traced", accuracy="exact"
+    )
     assert "estimated" in notes[0]
     store = build_psf_store(eye, spec)
     pupil_mm, focus_dpt, object_dpt = 4.5, 3.37, 4.2

@@ -278,6 +278,7 @@ def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):
         ({"object_range_dpt": [-1, 3]}, "settings.object_range_dpt[0]"),
         ({"diffraction": "no"}, "settings.diffraction"),
         ({"lateral_color": 1}, "settings.lateral_color"),
+        ({"accuracy": "high"}, "settings.accuracy"),
         ({"gaze_deg": [61, 0]}, "settings.gaze_deg[0]"),
         ({"gaze_range_deg": [5, -1]}, "settings.gaze_range_deg[1]"),
         ({"gaze_range_deg": 5}, "settings.gaze_range_deg"),

@@ -60,6 +60,13 @@ def test_an_example_is_read_and_shows_every_field(name):
     assert again == msgpack.unpackb(msgpack.packb(header))
 
 
+def test_the_settings_shown_are_the_defaults():
+    shown = dict(EXAMPLES["profile"]["settings"])
+    shown.pop("age_years")
+    defaults = messages.ProfileSettings().fields()
+    assert json.loads(json.dumps(defaults)) == shown
+
+
 def test_the_stage_times_of_the_example_are_of_the_stated_form():
     result = decode(EXAMPLES["result"])
     assert {"decode_ms", "queue_ms", "other_ms"} <= set(result.stage_times_ms)

@@ -237,8 +237,8 @@ def test_two_processes_share_a_folder(tmp_path, caplog):
 
 
 def test_the_key_tells_apart_what_changes_a_store():
-    def key(profile=PROFILE, spec=SPEC, eye_model="traced"):
-        return store_key(profile, spec, eye_model=eye_model)
+    def key(profile=PROFILE, spec=SPEC, eye_model="traced", accuracy="balanced"):
+        return store_key(profile, spec, eye_model=eye_model, accuracy=accuracy)
 
     same_again = parse_profile({"sphere_dpt": -1, "kind": "prescription"})
     assert key(profile=same_again) == key()
@@ -248,6 +248,8 @@ def test_the_key_tells_apart_what_changes_a_store():
     others = [
         key(profile=parse_profile({"kind": "prescription", "sphere_dpt": -1.25})),
         key(eye_model="wavefront"),
+        key(accuracy="fast"),
+        key(accuracy="exact"),
         key(spec=replace(SPEC, tolerance="fine")),
         key(spec=replace(SPEC, pupil_range_mm=(4.0, 4.5))),
         key(spec=field),
@@ -260,9 +262,10 @@ def test_the_key_tells_apart_what_changes_a_store():
 
 
 def test_other_code_means_other_keys(monkeypatch):
-    before = store_key(PROFILE, SPEC, eye_model="traced")
+    made = {"eye_model": "traced", "accuracy": "balanced"}
+    before = store_key(PROFILE, SPEC, **made)
     monkeypatch.setattr(store_cache, "code_version", lambda: "another")
-    assert store_key(PROFILE, SPEC, eye_model="traced") != before
+    assert store_key(PROFILE, SPEC, **made) != before
 
 
 def test_the_code_version_follows_every_file(tmp_path, monkeypatch):

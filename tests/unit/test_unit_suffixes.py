@@ -31,6 +31,11 @@ DIMENSIONLESS = {
     "filter_weights": "shares of angular samples in a pixel",
     "pupil_samples": "samples across the pupil, a count that need not be whole",
     "max_repeat_difference": "in units of the output it compares",
+    "low": "in the unit of a network's input column",
+    "high": "in the unit of a network's input column",
+    "value": "in the unit of a network's input column",
+    "mean_abs": "in the unit that a network's card names",
+    "p95_abs": "in the unit that a network's card names",
     "t": "the sender's own clock, echoed unread",
 }
 """Float fields without a unit, each with what it is instead."""
