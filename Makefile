@@ -7,16 +7,20 @@ RESULTS := tests/benchmarks/results
 BENCHES := estimate plan psf build layers render field occlusion sequence cost switch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test validate check clean help setup setup-test
+.PHONY: demo test test-training validate check clean help setup setup-test \
+        setup-training
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
 
 test: setup-test  ## all tests but the slow ones and those for a hardware GPU
-	$(PYTHON) -m pytest -m "not slow and not gpu" $(ARGS)
+	$(PYTHON) -m pytest -m "not slow and not gpu" --ignore tests/training $(ARGS)
+
+test-training: setup-training  ## the tests of the training, with torch, and a short run
+	$(PYTHON) -m pytest tests/training $(ARGS)
 
 validate: setup-test  ## the slow tests, and every benchmark table as JSON
-	$(PYTHON) -m pytest -m "slow and not gpu" $(ARGS)
+	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)
 	mkdir -p $(RESULTS) out
 	for bench in $(BENCHES); do \
 	    $(PYTHON) -m filter_service bench $$bench --json > out/$$bench.json && \
@@ -40,3 +44,6 @@ setup:
 
 setup-test:
 	@sh setup.sh test
+
+setup-training:
+	@sh setup.sh training

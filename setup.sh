@@ -3,6 +3,7 @@
 #
 #   sh setup.sh         the Python environment in .venv and the system libraries
 #   sh setup.sh test    the same, and a virtual screen for the window test
+#   sh setup.sh training  the first, and what training the networks needs (torch)
 #
 # Running it again costs a fraction of a second: the environment is installed anew
 # only when this file, pyproject.toml, constraints.txt or the folder has changed.
@@ -13,6 +14,7 @@ SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 TEST_PACKAGES="xvfb"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
+TRAINING_STAMP=$VENV/.ocufilter-training-installed
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
@@ -101,7 +103,7 @@ install_packages() {
     wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
-    rm -f $STAMP
+    rm -f $STAMP $TRAINING_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
     $pip install -c constraints.txt setuptools
@@ -111,6 +113,15 @@ install_packages() {
     echo "$wanted" >$STAMP
 }
 
+install_training_packages() { # on top of the others; the service never needs them
+    if [ "$(cat $TRAINING_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
+    say "installing torch and what exports networks (a few minutes)"
+    $VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt --no-build-isolation -e '.[training]'
+    cp $STAMP $TRAINING_STAMP
+}
+
 install_system_libraries
 install_packages
+if [ "${1:-}" = training ]; then install_training_packages; fi
 if [ "${1:-}" = test ]; then install_test_packages; fi

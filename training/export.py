@@ -9,6 +9,7 @@ card, JSON beside the file, holds settings, ranges, data, parity with the checkp
 """
 
 import argparse
+import copy
 import json
 import sys
 import warnings
@@ -21,6 +22,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
 
 from training.batches import task_rows
 from training.checkpoint import load_checkpoint
@@ -185,6 +187,7 @@ def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
 def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
     """Serialise a network; one input ``features``, one output ``values``."""
     example = torch.rand(4, n_inputs)
+    network = with_one_exponential(network)
     rows = torch.export.Dim("rows", min=1)
     with warnings.catch_warnings():
         # torch's exporter warns of what torch itself does
@@ -210,6 +213,33 @@ def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
         _halve_weights(model.graph)
     onnx.checker.check_model(model)
     return model.SerializeToString()
+
+
+class OneExponential(nn.Module):
+    """Mish, x tanh(log(1 + e^x)), as x n / (n + 2) with n = e^x (e^x + 2).
+
+    onnxruntime evaluates its own Mish and Softplus one number at a time, which takes
+    three quarters of a network's time.
+    """
+
+    LARGEST = 20.0
+    """Beyond it, Mish is x in float32."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply it to values of any shape."""
+        power = torch.exp(torch.clamp(x, max=self.LARGEST))
+        ratio = power * (power + 2.0)
+        return x * ratio / (ratio + 2.0)
+
+
+def with_one_exponential(network: Network) -> Network:
+    """Return a copy of a network whose Mish layers are `OneExponential`."""
+    network = copy.deepcopy(network)
+    for module in list(network.modules()):
+        for name, child in list(module.named_children()):
+            if isinstance(child, nn.Mish):
+                setattr(module, name, OneExponential())
+    return network
 
 
 def _halve_weights(graph) -> None:

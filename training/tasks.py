@@ -38,6 +38,10 @@ RIM_NAMES = (
 
 CHANGE_NAMES = ("lens_diameter_change_mm", "aqueous_thickness_change_mm")
 
+FOCUS_RANGE_DPT = (-4.0, 8.125)
+"""The paper's begins at 0.125; a hyperope that accommodates by less than the refraction
+is focused behind infinity."""
+
 MAX_COEFFICIENT_UM = 200.0
 """Coefficients beyond it belong to eyes that form no image; the published data, too,
 end at 115 um."""
@@ -190,7 +194,7 @@ DOMAINS = {
         Domain(
             "focus",
             (*PARAMETER_NAMES, "pupil_diameter_mm", "focus_dpt"),
-            _ranges((2.0, 7.0), (0.125, 8.125)),
+            _ranges((2.0, 7.0), FOCUS_RANGE_DPT),
             CHANGE_NAMES,
             label_focus,
             n_repeats=40,

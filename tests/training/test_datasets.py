@@ -51,7 +51,7 @@ def test_the_focus_set_is_a_product_of_eyes_and_distances():
     eyes = rows[:, :-1].reshape(3, 40, -1)
     assert np.all(eyes == eyes[:, :1])
     assert len(np.unique(eyes[:, 0], axis=0)) == 3
-    np.testing.assert_allclose(rows[:40, -1], np.linspace(0.125, 8.125, 40))
+    np.testing.assert_allclose(rows[:40, -1], np.linspace(-4.0, 8.125, 40))
 
 
 def test_a_shard_of_a_product_holds_whole_eyes():
