@@ -16,27 +16,14 @@ from estimator.eye import pack_eyes
 from estimator.eye_parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
 from estimator.eye_wavefront import MEDIA_INWARDS, TraceFailed, eye_indices
 from estimator.media import refractive_index
+from estimator.network_card import INPUTS, OUTPUTS, ZERNIKE_NAMES
 from estimator.units import REFERENCE_WAVELENGTH_NM
 from estimator.wavefront import eyes_aberrations, on_axis_zernike
 from estimator.wavefront_kernels import magnifications
-from estimator.zernike import N_TERMS
 
 N_EYE = len(PARAMETER_NAMES)
-ZERNIKE_NAMES = tuple(f"zernike_j{j}_um" for j in range(1, N_TERMS))
 COMPARED_NAMES = ZERNIKE_NAMES[2:]
 """Without tilt: the chief ray's zero slope ties it to coma."""
-
-RIM_NAMES = (
-    "zernike_radius_mm",
-    "ellipse_centre_x_mm",
-    "ellipse_centre_y_mm",
-    "ellipse_xx_mm",
-    "ellipse_xy_mm",
-    "ellipse_yy_mm",
-)
-"""The circle and, as centre and symmetric matrix of its semi-axes, the ellipse."""
-
-CHANGE_NAMES = ("lens_diameter_change_mm", "aqueous_thickness_change_mm")
 
 FOCUS_RANGE_DPT = (-4.0, 8.125)
 """The paper's begins at 0.125; a hyperope that accommodates by less than the refraction
@@ -173,14 +160,14 @@ DOMAINS = {
     for domain in (
         Domain(
             "on_axis",
-            (*PARAMETER_NAMES, "pupil_diameter_mm", "wavelength_nm"),
+            INPUTS["discriminator"],
             _ranges((3.0, 6.0), (450.0, 900.0)),
             ZERNIKE_NAMES,
             label_on_axis,
         ),
         Domain(
             "field",
-            (*PARAMETER_NAMES, "pupil_diameter_mm", "wavelength_nm", "h_deg", "v_deg"),
+            INPUTS["aberration"],
             _ranges(
                 (2.0, 7.0),
                 (450.0, 700.0),
@@ -188,14 +175,14 @@ DOMAINS = {
                 (-26.0, 26.0),
                 lens_mm=(8.4, 9.75),  # accommodated lenses, too
             ),
-            (*ZERNIKE_NAMES, *RIM_NAMES),
+            OUTPUTS["aberration"],
             label_field,
         ),
         Domain(
             "focus",
-            (*PARAMETER_NAMES, "pupil_diameter_mm", "focus_dpt"),
+            INPUTS["focus"],
             _ranges((2.0, 7.0), FOCUS_RANGE_DPT),
-            CHANGE_NAMES,
+            OUTPUTS["focus"],
             label_focus,
             n_repeats=40,
         ),
@@ -215,31 +202,14 @@ class Task:
 
 
 TASKS = {
-    task.name: task
-    for task in (
-        Task(
-            "discriminator",
-            DOMAINS["on_axis"],
-            DOMAINS["on_axis"].inputs,
-            ZERNIKE_NAMES,
-            "um",
-        ),
-        Task(
-            "eye",
-            DOMAINS["on_axis"],
-            (*COMPARED_NAMES, "pupil_diameter_mm", "wavelength_nm"),
-            PARAMETER_NAMES,
-            "um",
-        ),
-        Task("focus", DOMAINS["focus"], DOMAINS["focus"].inputs, CHANGE_NAMES, "mm"),
-        Task(
-            "aberration",
-            DOMAINS["field"],
-            DOMAINS["field"].inputs,
-            (*ZERNIKE_NAMES, *RIM_NAMES),
-            "um",
-        ),
+    name: Task(name, DOMAINS[domain], INPUTS[name], OUTPUTS[name], unit)
+    for name, domain, unit in (
+        ("discriminator", "on_axis", "um"),
+        ("eye", "on_axis", "um"),
+        ("focus", "focus", "mm"),
+        ("aberration", "field", "um"),
     )
 }
-"""The paper's four networks (Table 1); the aberration estimator also says on which
-circle its coefficients are, without which they mean nothing."""
+"""The paper's four networks (Table 1).  The aberration estimator also says on which
+circle its coefficients are, without which they mean nothing; ``unit`` is that of the
+error a network is judged by."""
