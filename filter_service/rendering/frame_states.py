@@ -32,7 +32,10 @@ class FrameStates:
     """
 
     def __init__(self):
-        self._handle: LoadedStore | None = None
+        self._start_anew(None)
+
+    def _start_anew(self, handle: LoadedStore | None) -> None:
+        self._handle = handle
         self._cell_px: int | None = None
         self._layers: tuple[tuple[float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
@@ -40,8 +43,7 @@ class FrameStates:
 
     def _forget_others(self, handle: LoadedStore) -> None:
         if self._handle is not handle:
-            self.__init__()
-            self._handle = handle
+            self._start_anew(handle)
 
     def layers(
         self,
