@@ -61,7 +61,7 @@ class Domain:
     n_repeats: int = 1
 
 
-def _indices(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+def media_indices_of(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Refractive indices (n, 5), one wavelength per row."""
     media = [refractive_index(medium, wavelength_nm) for medium in MEDIA_INWARDS]
     return np.stack(np.broadcast_arrays(*media), axis=-1)
@@ -71,7 +71,9 @@ def label_on_axis(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients (n, 27), um, on the filled circle of the pupil."""
     eyes, pupil_mm, wavelength_nm = inputs[:, :N_EYE], inputs[:, -2], inputs[:, -1]
     zernike_um, _ = on_axis_zernike(
-        pack_eyes(eyes), _indices(wavelength_nm), zernike_radius_mm=pupil_mm / 2.0
+        pack_eyes(eyes),
+        media_indices_of(wavelength_nm),
+        zernike_radius_mm=pupil_mm / 2.0,
     )
     return zernike_um[:, 1:]
 
@@ -84,7 +86,7 @@ def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     usable = ratios > 0.0
     found = eyes_aberrations(
         packed,
-        _indices(wavelength_nm),
+        media_indices_of(wavelength_nm),
         stop_diameters_mm=np.where(usable, pupil_mm / ratios, 1.0),
         h_deg=h_deg,
         v_deg=v_deg,

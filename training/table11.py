@@ -1,0 +1,120 @@
+"""The paper's Table 11: our data, the published figures, and what stands between them.
+
+    python -m training.table11 [--rows N] [--json OUT.json]
+
+Draws N eyes of Table 2 and labels them several times: as our data sets are, and with
+the known properties of the published chain put back one after the other
+(`published_chain`).  Where the last row of a group meets the paper's, those properties
+explain the difference.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.datasets import Recipe, draw
+from training.published_chain import (
+    FIELD_STEPS,
+    ON_AXIS_STEPS,
+    label_field_as_published,
+    label_on_axis_as_published,
+    lens_search_as_published,
+    narrow_posterior_conic,
+)
+from training.statistics import PUBLISHED, ROWS, group_statistics
+from training.tasks import DOMAINS
+from training.versions import commit_id
+
+ROWS_DRAWN = 6_000
+SEED = 132
+FIRST_FOCUS_DPT = 0.125
+"""The published distances begin here; ours also hold those behind infinity."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Statistics of one group under one chain, in the order of `statistics.ROWS`."""
+
+    domain: str
+    chain: str
+    group: str
+    values: tuple[float, ...]
+
+
+def _lines(name: str, chain: str, targets: NDArray) -> list[Line]:
+    good = targets[np.all(np.isfinite(targets), axis=1)]
+    found = group_statistics(DOMAINS[name], good)
+    return [Line(name, chain, group, values) for group, values in found.items()]
+
+
+def _published(name: str) -> list[Line]:
+    return [Line(name, "paper", *item) for item in PUBLISHED[name].items()]
+
+
+def aberration_lines(name: str, n_rows: int) -> list[Line]:
+    """Our labels, the published chain step by step, and the paper's figures."""
+    inputs = draw(Recipe(name, n_rows, n_rows, SEED), 0)
+    lines = _lines(name, "ours", DOMAINS[name].label(inputs))
+    steps, label = (
+        (ON_AXIS_STEPS, label_on_axis_as_published)
+        if name == "on_axis"
+        else (FIELD_STEPS, label_field_as_published)
+    )
+    narrow = narrow_posterior_conic(inputs)
+    for count in range(1, len(steps) + 1):
+        targets = label(narrow, steps[:count])
+        lines += _lines(name, f"+ {steps[count - 1]}", targets)
+    return lines + _published(name)
+
+
+def focus_lines(n_rows: int) -> list[Line]:
+    """Our changes of the lens, and with the bound of the published search."""
+    repeats = DOMAINS["focus"].n_repeats
+    n_rows = -(-n_rows // repeats) * repeats
+    inputs = draw(Recipe("focus", n_rows, n_rows, SEED), 0)
+    targets = DOMAINS["focus"].label(inputs)
+    far = inputs[:, -1] >= FIRST_FOCUS_DPT
+    bound = lens_search_as_published(inputs[far], targets[far])
+    return [
+        *_lines("focus", "ours", targets),
+        *_lines("focus", f"from {FIRST_FOCUS_DPT} dpt on", targets[far]),
+        *_lines("focus", "+ lens diameter within 9 %", bound),
+        *_published("focus"),
+    ]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.table11",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--rows", type=int, default=ROWS_DRAWN)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    lines = []
+    for name in ("on_axis", "field"):
+        lines += aberration_lines(name, options.rows)
+    lines += focus_lines(options.rows)
+    print(f"{'':10s}{'':38s}" + "".join(f"{row:>10s}" for row in ROWS))
+    for line in sorted(lines, key=lambda line: (line.domain, line.group)):
+        label = f"{line.group.removesuffix('_mm'):28s}{line.chain:28s}"
+        print(label + "".join(f"{value:10.4f}" for value in line.values))
+    if options.json:
+        rows = [
+            vars(line) | {"values": dict(zip(ROWS, line.values, strict=True))}
+            for line in lines
+        ]
+        table = {"commit": commit_id(), "n_rows": options.rows, "rows": rows}
+        options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
