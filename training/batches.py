@@ -11,7 +11,6 @@ from torch import Tensor
 
 from estimator.eye_parameters import sampled_ranges
 from training.datasets import Recipe, Shard, draw, label, load, split
-from training.features import moments
 from training.models import Network
 from training.run_file import Run
 from training.tasks import DOMAINS, N_EYE, TASKS
@@ -36,16 +35,18 @@ class Rows:
     training_index: NDArray[np.int64]
     validation_index: NDArray[np.int64]
 
-    def scaling(self, network: Network) -> tuple[tuple, tuple]:
-        """Moments of the network's features and of its encoded targets."""
+    def fit_scaling(self, network: Network) -> None:
+        """Take scales, and a baseline, from training rows.
+
+        The eye estimator's outputs are scaled to the ranges of Table 2.
+        """
         chosen = torch.as_tensor(self.training_index[:SCALING_ROWS])
         x, y = self.x[chosen], self.y[chosen]
-        with torch.no_grad():
-            features = moments(network.features(x).numpy())
-            if self.task == "eye":
-                low, high = sampled_ranges().T
-                return features, ((low + high) / 2.0, (high - low) / 2.0)
-            return features, moments(network.features.encode(x, y).numpy())
+        if self.task == "eye":
+            network.fit_scaling(x, y[:, :N_EYE])
+            network.set_output_range(*torch.from_numpy(sampled_ranges().T))
+        else:
+            network.fit_scaling(x, y)
 
     @property
     def validation(self) -> tuple[Tensor, Tensor]:

@@ -7,136 +7,26 @@ turned.  All four are closed forms.  Layers here apply them, so that the network
 the rest; they are part of the exported graph.
 """
 
-import math
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from estimator.eye_parameters import OFFSET_SLICE, column
-from estimator.lens_shape import CAP_VOLUME_RATIO, HEIGHT_RATIO, RIM_THICKNESS_MM
-from estimator.zernike import N_TERMS, nm_from_index
+from estimator.accommodation import SMALLEST_DIAMETER_RATIO
+from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO
+from estimator.units import REFERENCE_WAVELENGTH_NM
+from training.eye_features import (
+    EyeFeatures,
+    PupilPowers,
+    Turn,
+    lens_thickness_mm,
+    named,
+    turned_pair,
+)
 
-PUPIL_MM = 6.0
-"""Pupil to which coefficients are scaled; any constant would do."""
+BOUND_MARGIN_MM = 1e-4
+"""Changes of the lens nearer to a bound than this count as bounded."""
 
 SMALLEST_SINE = 1e-6
 """Nearer to the axis than this the direction of the field means nothing."""
-
-
-def _orders(first: int = 1) -> list[tuple[int, int]]:
-    return [nm_from_index(j) for j in range(first, N_TERMS)]
-
-
-class Turn(nn.Module):
-    """Turn Zernike coefficients j = 1 to 27 about the axis.
-
-    A term (n, m) at an angle phi mixes with (n, -m) by cos and sin of m phi; both share
-    their norm, so the rule is the same for normalised and for plain polynomials.
-    """
-
-    def __init__(self):
-        super().__init__()
-        orders = _orders()
-        partner = [orders.index((n, -m)) for n, m in orders]
-        self.register_buffer("partner", torch.tensor(partner), persistent=False)
-        self.register_buffer(
-            "order_m", torch.tensor([abs(m) for _, m in orders]), persistent=False
-        )
-        # cosine term: c cos - s sin; sine term: s cos + c sin
-        signs = [-1.0 if m > 0 else 1.0 if m < 0 else 0.0 for _, m in orders]
-        self.register_buffer("sign", torch.tensor(signs), persistent=False)
-
-    def forward(self, terms: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-        """Terms (N, 27) turned by the angle whose cosine and sine (N,) are given."""
-        cosines, sines = [torch.ones_like(cosine)], [torch.zeros_like(sine)]
-        for _ in range(6):
-            c, s = cosines[-1], sines[-1]
-            cosines.append(c * cosine - s * sine)
-            sines.append(s * cosine + c * sine)
-        c = torch.stack(cosines, dim=1)[:, self.order_m]
-        s = torch.stack(sines, dim=1)[:, self.order_m]
-        return terms * c + terms[:, self.partner] * (self.sign * s)
-
-
-def _turned_pair(x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor):
-    return x * cosine - y * sine, x * sine + y * cosine
-
-
-class EyeFeatures(nn.Module):
-    """The eye as optics sees it, (N, 46), in axes turned by minus a given angle.
-
-    Curvatures, thicknesses, fourth-order terms of the conics, offsets and posterior
-    astigmatism turned to the eye's axes, lens position.
-    """
-
-    N_FEATURES = 46
-
-    def __init__(self):
-        super().__init__()
-        self.turn = Turn()
-
-    def forward(self, eye: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-        """Eyes (N, 45); ``cosine``, ``sine`` (N,) of the angle of the new x axis."""
-
-        def of(name: str) -> Tensor:
-            return eye[:, column(name)]
-
-        columns = self._cornea(of, cosine, sine) + self._lens(of, cosine, sine)
-        anterior_rad = torch.deg2rad(of("cornea_anterior_rotation_deg"))
-        c, s = torch.cos(anterior_rad), torch.sin(anterior_rad)
-        c, s = c * cosine + s * sine, s * cosine - c * sine
-        offsets = self.turn(eye[:, OFFSET_SLICE], c, s)
-        return torch.cat([torch.stack(columns, dim=1), offsets], dim=1)
-
-    @staticmethod
-    def _cornea(of, cosine: Tensor, sine: Tensor) -> list[Tensor]:
-        front = 1.0 / of("cornea_anterior_radius_mm")
-        back_x = front / of("cornea_posterior_radius_ratio")
-        back_y = back_x / of("cornea_posterior_astigmatism_ratio")
-        back, half = 0.5 * (back_x + back_y), 0.5 * (back_x - back_y)
-        angle_rad = 2.0 * torch.deg2rad(of("cornea_posterior_rotation_deg"))
-        oblique = half * torch.cos(angle_rad), half * torch.sin(angle_rad)
-        twice_c, twice_s = cosine * cosine - sine * sine, 2.0 * cosine * sine
-        along, across = _turned_pair(*oblique, twice_c, -twice_s)
-        return [
-            of("eye_length_mm"),
-            of("cornea_thickness_mm"),
-            front,
-            back,
-            along,
-            across,
-            of("cornea_anterior_conic_constant") * front**3,
-            of("cornea_posterior_conic_constant") * back**3,
-        ]
-
-    @staticmethod
-    def _lens(of, cosine: Tensor, sine: Tensor) -> list[Tensor]:
-        diameter_mm = of("lens_diameter_mm")
-        caps_mm3 = CAP_VOLUME_RATIO * of("lens_volume_mm3")
-        thickness_mm = RIM_THICKNESS_MM + 8.0 * caps_mm3 / (math.pi * diameter_mm**2)
-        rear = 64.0 * caps_mm3 / (math.pi * diameter_mm**4 * (1.0 + HEIGHT_RATIO))
-        front = rear * HEIGHT_RATIO
-        aqueous_mm = of("aqueous_thickness_mm")
-        vitreous_mm = (
-            of("eye_length_mm") - of("cornea_thickness_mm") - aqueous_mm - thickness_mm
-        )
-        shift = (of("lens_decentration_x_mm"), of("lens_decentration_y_mm"))
-        about_x = torch.deg2rad(of("lens_tilt_about_x_deg"))
-        about_y = torch.deg2rad(of("lens_tilt_about_y_deg"))
-        # of the lens' axis; degrees do not turn as a vector does
-        lean = (torch.sin(about_y) * torch.cos(about_x), -torch.sin(about_x))
-        return [
-            aqueous_mm,
-            thickness_mm,
-            vitreous_mm,
-            front,
-            rear,
-            of("lens_anterior_conic_constant") * front**3,
-            of("lens_posterior_conic_constant") * rear**3,
-            *_turned_pair(*shift, cosine, -sine),
-            *_turned_pair(*lean, cosine, -sine),
-        ]
 
 
 def _size_and_color(pupil_mm: Tensor, wavelength_nm: Tensor) -> list[Tensor]:
@@ -148,17 +38,18 @@ class OnAxisFeatures(nn.Module):
     """Inputs (N, 47) of the discriminator to features; coefficients by pupil."""
 
     n_features = EyeFeatures.N_FEATURES + 4
+    n_encoded = 27
 
     def __init__(self):
         super().__init__()
-        self.eye = EyeFeatures()
-        self.scale = PupilPowers()
+        self.eye, self.scale = EyeFeatures(), PupilPowers()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 50)."""
+        """Return features (N, 53)."""
         one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
+        eye = self.eye(x[:, :45], x[:, 45], x[:, 46], one, zero, zero)
         more = torch.stack(_size_and_color(x[:, 45], x[:, 46]), dim=1)
-        return torch.cat([self.eye(x[:, :45], one, zero), more], dim=1)
+        return torch.cat([eye, more], dim=1)
 
     def decode(self, x: Tensor, y: Tensor) -> Tensor:
         """From scaled coefficients (N, 27) to those of the pupil."""
@@ -167,23 +58,6 @@ class OnAxisFeatures(nn.Module):
     def encode(self, x: Tensor, y: Tensor) -> Tensor:
         """Undo `decode`."""
         return y / self.scale(x[:, 45])
-
-
-class PupilPowers(nn.Module):
-    """(pupil / 6 mm)^n, (N, 27), for every coefficient."""
-
-    def __init__(self, first: int = 1):
-        super().__init__()
-        orders = torch.tensor([n for n, _ in _orders(first)])
-        self.register_buffer("order_n", orders, persistent=False)
-
-    def forward(self, pupil_mm: Tensor) -> Tensor:
-        """Powers for pupils (N,)."""
-        ratio = pupil_mm / PUPIL_MM
-        powers = [torch.ones_like(ratio)]
-        for _ in range(6):
-            powers.append(powers[-1] * ratio)
-        return torch.stack(powers, dim=1)[:, self.order_n]
 
 
 class FieldFeatures(nn.Module):
@@ -195,12 +69,11 @@ class FieldFeatures(nn.Module):
     """
 
     n_features = EyeFeatures.N_FEATURES + 4 + 3
+    n_encoded = 33
 
     def __init__(self):
         super().__init__()
-        self.eye = EyeFeatures()
-        self.turn = Turn()
-        self.scale = PupilPowers()
+        self.eye, self.turn, self.scale = EyeFeatures(), Turn(), PupilPowers()
 
     @staticmethod
     def _field(x: Tensor):
@@ -219,10 +92,12 @@ class FieldFeatures(nn.Module):
         return cos_alpha / length, cosine * sin_alpha / length
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 53)."""
+        """Return features (N, 56)."""
         sine, cosine, cos_alpha, sin_alpha = self._field(x)
         more = [*_size_and_color(x[:, 45], x[:, 46]), sine, sine**2, cosine]
-        eye = self.eye(x[:, :45], cos_alpha, sin_alpha)
+        eye = self.eye(
+            x[:, :45], x[:, 45], x[:, 46], cos_alpha, sin_alpha, sine / cosine
+        )
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
     def decode(self, x: Tensor, y: Tensor) -> Tensor:
@@ -243,40 +118,60 @@ class FieldFeatures(nn.Module):
     def _rim(rim: Tensor, c: Tensor, s: Tensor) -> Tensor:
         """Turn radius, centre and symmetric matrix (N, 6)."""
         radius, x, y, xx, xy, yy = rim.unbind(dim=1)
-        x, y = _turned_pair(x, y, c, s)
+        x, y = turned_pair(x, y, c, s)
         mean, along, across = 0.5 * (xx + yy), 0.5 * (xx - yy), xy
-        along, across = _turned_pair(along, across, c * c - s * s, 2.0 * c * s)
+        along, across = turned_pair(along, across, c * c - s * s, 2.0 * c * s)
         return torch.stack([radius, x, y, mean + along, across, mean - along], dim=1)
 
 
 class FocusFeatures(nn.Module):
-    """Inputs (N, 47) of the focused-eye estimator."""
+    """Inputs (N, 47) of the focused-eye estimator.
+
+    The network says the change of the lens' diameter alone, and may leave what a lens
+    can do: it is bounded here, and the aqueous follows from the lens.
+    """
 
     n_features = EyeFeatures.N_FEATURES + 3
+    n_encoded = 1
 
     def __init__(self):
         super().__init__()
         self.eye = EyeFeatures()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 49)."""
+        """Return features (N, 52)."""
         one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
-        more = [x[:, 45], x[:, 45] ** 2, x[:, 46]]
-        return torch.cat(
-            [self.eye(x[:, :45], one, zero), torch.stack(more, dim=1)], dim=1
-        )
+        color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
+        eye = self.eye(x[:, :45], x[:, 45], color_nm, one, zero, zero)
+        more = torch.stack([x[:, 45], x[:, 45] ** 2, x[:, 46]], dim=1)
+        return torch.cat([eye, more], dim=1)
 
     def decode(self, x: Tensor, y: Tensor) -> Tensor:
-        """Nothing to undo."""
-        return y
+        """From an unbounded change (N, 1) to those of lens and aqueous (N, 2)."""
+        relaxed_mm = named(x, "lens_diameter_mm")
+        lowest_mm = (SMALLEST_DIAMETER_RATIO - 1.0) * relaxed_mm
+        change_mm = torch.minimum(torch.maximum(y[:, 0], lowest_mm), 0.0 * lowest_mm)
+        volume_mm3 = named(x, "lens_volume_mm3")
+        growth_mm = lens_thickness_mm(
+            relaxed_mm + change_mm, volume_mm3
+        ) - lens_thickness_mm(relaxed_mm, volume_mm3)
+        return torch.stack([change_mm, -ANTERIOR_THICKNESS_RATIO * growth_mm], dim=1)
 
-    encode = decode
+    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+        """Undo `decode` where the change is not at a bound."""
+        return y[:, :1]
+
+    def is_free(self, x: Tensor, y: Tensor) -> Tensor:
+        """Rows (N,) whose change is not at a bound."""
+        lowest_mm = (SMALLEST_DIAMETER_RATIO - 1.0) * named(x, "lens_diameter_mm")
+        return (y[:, 0] < -BOUND_MARGIN_MM) & (y[:, 0] > lowest_mm + BOUND_MARGIN_MM)
 
 
 class MeasurementFeatures(nn.Module):
     """Inputs (N, 27) of the eye estimator: coefficients over their powers of pupil."""
 
     n_features = 25 + 25 + 4
+    n_encoded = 45
 
     def __init__(self):
         super().__init__()
@@ -298,9 +193,9 @@ class MeasurementFeatures(nn.Module):
 class RawFeatures(nn.Module):
     """The inputs as they come, as in the paper."""
 
-    def __init__(self, n_inputs: int):
+    def __init__(self, n_inputs: int, n_outputs: int):
         super().__init__()
-        self.n_features = n_inputs
+        self.n_features, self.n_encoded = n_inputs, n_outputs
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the inputs."""
@@ -321,17 +216,10 @@ PHYSICAL = {
 }
 
 
-def make_features(kind: str, *, task: str, n_inputs: int) -> nn.Module:
+def make_features(kind: str, *, task: str, n_inputs: int, n_outputs: int) -> nn.Module:
     """Layers of a task; ``kind`` is ``raw`` or ``physical``."""
     if kind == "raw":
-        return RawFeatures(n_inputs)
+        return RawFeatures(n_inputs, n_outputs)
     if kind == "physical":
         return PHYSICAL[task]()
     raise ValueError(f"features '{kind}': allowed are raw and physical")
-
-
-def moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (n,) of columns; 1 where a column is constant."""
-    mean = values.mean(axis=0, dtype=np.float64)
-    deviation = values.std(axis=0, dtype=np.float64)
-    return mean, np.where(deviation > 0.0, deviation, 1.0)

@@ -16,6 +16,10 @@ BLOCKS_PER_STACK = 3
 LAYERS_PER_BLOCK = 3
 LAYER_NORM_EPSILON = 1e-3
 
+FIT_CHUNK = 8192
+FIT_RIDGE = 1e-7
+"""Of the quadratic form, against features that nearly repeat each other."""
+
 
 @dataclass(frozen=True)
 class ModelSettings:
@@ -32,12 +36,15 @@ class ModelSettings:
         Of one dense and two identity blocks each; a plain network has as many layers.
     features : {"raw", "physical"}
         See `features`.
+    baseline : {"none", "quadratic"}
+        Whether the layers learn what a quadratic form of the features leaves.
     """
 
     kind: str = "ours"
     width: int = 256
     n_stacks: int = 2
     features: str = "raw"
+    baseline: str = "none"
 
     def __post_init__(self):
         if self.kind not in KINDS:
@@ -46,10 +53,14 @@ class ModelSettings:
             raise ValueError(
                 f"width {self.width}, n_stacks {self.n_stacks}: both at least 1"
             )
-        if self.features not in ("raw", "physical"):
-            raise ValueError(
-                f"features '{self.features}': allowed are raw and physical"
-            )
+        for name, allowed in (
+            ("features", ("raw", "physical")),
+            ("baseline", ("none", "quadratic")),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"{name} '{getattr(self, name)}': allowed are {allowed}"
+                )
 
 
 def _dense(n_in: int, n_out: int) -> nn.Linear:
@@ -126,6 +137,44 @@ def _plain(n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
     return layers
 
 
+class Quadratic(nn.Module):
+    """A quadratic form of standardised features, fitted by least squares.
+
+    It is not trained further: 27 outputs of 53 features take 40,000 weights, which a
+    training would move slowly and least squares find at once.
+    """
+
+    def __init__(self, n_features: int, n_outputs: int):
+        super().__init__()
+        first, second = torch.triu_indices(n_features, n_features)
+        self.register_buffer("first", first, persistent=False)
+        self.register_buffer("second", second, persistent=False)
+        n_terms = 1 + n_features + len(first)
+        self.register_buffer("weight", torch.zeros(n_terms, n_outputs))
+
+    def terms(self, x: Tensor) -> Tensor:
+        """Return one, features and their products (N, n_terms)."""
+        products = x[:, self.first] * x[:, self.second]
+        return torch.cat([torch.ones_like(x[:, :1]), x, products], dim=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return outputs (N, n_outputs) of standardised features (N, n_features)."""
+        return self.terms(x) @ self.weight
+
+    @torch.no_grad()
+    def fit(self, x: Tensor, y: Tensor) -> None:
+        """Least squares on rows (N, n_features), (N, n_outputs)."""
+        n_terms = len(self.weight)
+        square = torch.zeros(n_terms, n_terms, dtype=torch.float64)
+        right = torch.zeros(n_terms, y.shape[1], dtype=torch.float64)
+        for part, wanted in zip(x.split(FIT_CHUNK), y.split(FIT_CHUNK), strict=True):
+            terms = self.terms(part)
+            square += (terms.T @ terms).double()
+            right += (terms.T @ wanted).double()
+        ridge = FIT_RIDGE * len(x) * torch.eye(n_terms, dtype=torch.float64)
+        self.weight.copy_(torch.linalg.solve(square + ridge, right))
+
+
 class Network(nn.Module):
     """A network in physical units: features, standardised, layers, scaled outputs.
 
@@ -149,41 +198,80 @@ class Network(nn.Module):
         is_bounded: bool = False,
     ):
         super().__init__()
-        self.features = make_features(settings.features, task=task, n_inputs=n_inputs)
-        n_features, width = self.features.n_features, settings.width
+        self.features = make_features(
+            settings.features, task=task, n_inputs=n_inputs, n_outputs=n_outputs
+        )
+        n_features, n_encoded = self.features.n_features, self.features.n_encoded
+        width = settings.width
         if settings.kind == "ffn":
             layers = _plain(n_features, width, settings.n_stacks)
         else:
             block = MishBlock if settings.kind == "ours" else ReluBlock
             layers = _residual(block, n_features, width, settings.n_stacks)
-        self.layers = nn.Sequential(*layers, _dense(width, n_outputs))
+        self.layers = nn.Sequential(*layers, _dense(width, n_encoded))
         self.bound = nn.Tanh() if is_bounded else nn.Identity()
-        for name, size in (("input", n_features), ("output", n_outputs)):
+        is_quadratic = settings.baseline == "quadratic"
+        self.baseline = Quadratic(n_features, n_encoded) if is_quadratic else None
+        for name, size in (("input", n_features), ("output", n_encoded)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
 
-    def set_scaling(self, inputs: tuple, outputs: tuple) -> None:
-        """Take mean and scale, arrays (n,), of features and of encoded outputs."""
-        for name, values in (("input", inputs), ("output", outputs)):
-            for part, array in zip(("mean", "scale"), values, strict=True):
-                buffer = getattr(self, f"{name}_{part}")
-                buffer.copy_(torch.as_tensor(array, dtype=buffer.dtype))
+    @torch.no_grad()
+    def fit_scaling(self, x: Tensor, y: Tensor) -> None:
+        """Take scales, and the baseline, from rows (N, n_inputs), (N, n_outputs)."""
+        self.input_mean.copy_(torch.zeros(()))
+        self.input_scale.copy_(torch.ones(()))
+        features, encoded = self.features(x), self.features.encode(x, y)
+        _take(self.input_mean, self.input_scale, features)
+        if self.baseline is not None:
+            free = getattr(self.features, "is_free", None)
+            rows = slice(None) if free is None else free(x, y)
+            standard = (features[rows] - self.input_mean) / self.input_scale
+            self.baseline.fit(standard, encoded[rows])
+            encoded = encoded[rows] - self.baseline(standard)
+        _take(self.output_mean, self.output_scale, encoded)
+
+    @torch.no_grad()
+    def set_output_range(self, low: Tensor, high: Tensor) -> None:
+        """Let -1 and 1 be these outputs (n_outputs,): for a bounded network."""
+        self.output_mean.copy_((low + high) / 2.0)
+        self.output_scale.copy_((high - low) / 2.0)
+
+    def _standard_features(self, x: Tensor) -> Tensor:
+        return (self.features(x) - self.input_mean) / self.input_scale
+
+    def _start(self, features: Tensor) -> Tensor:
+        """Return what the layers' outputs are added to, encoded."""
+        if self.baseline is None:
+            return self.output_mean
+        return self.output_mean + self.baseline(features)
 
     def standard(self, x: Tensor) -> Tensor:
-        """Return outputs (N, n_outputs) in standard units."""
-        features = (self.features(x) - self.input_mean) / self.input_scale
-        return self.bound(self.layers(features))
+        """Return outputs (N, n_encoded) in standard units."""
+        return self.bound(self.layers(self._standard_features(x)))
 
     def to_standard(self, x: Tensor, y: Tensor) -> Tensor:
         """Targets in the units of `standard`."""
-        return (self.features.encode(x, y) - self.output_mean) / self.output_scale
+        with torch.no_grad():
+            start = self._start(self._standard_features(x))
+            return (self.features.encode(x, y) - start) / self.output_scale
 
     def forward(self, x: Tensor) -> Tensor:
         """Physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""
-        y = self.standard(x) * self.output_scale + self.output_mean
-        return self.features.decode(x, y)
+        features = self._standard_features(x)
+        y = self.bound(self.layers(features)) * self.output_scale
+        return self.features.decode(x, y + self._start(features))
 
     @property
     def n_parameters(self) -> int:
-        """Number of trained parameters."""
-        return sum(p.numel() for p in self.parameters())
+        """Number of fitted weights, those of the baseline included."""
+        fitted = 0 if self.baseline is None else self.baseline.weight.numel()
+        return fitted + sum(p.numel() for p in self.parameters())
+
+
+def _take(mean: Tensor, scale: Tensor, rows: Tensor) -> None:
+    """Mean and deviation of columns; 1 for a column that is constant."""
+    rows = rows.double()
+    deviation = rows.std(dim=0, correction=0)
+    mean.copy_(rows.mean(dim=0))
+    scale.copy_(torch.where(deviation > 1e-12, deviation, 1.0))

@@ -89,7 +89,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
     rows: Rows = load_rows(run, data_folder or run.data_folder)
     batches = Batches(rows, run, rank=rank, n_ranks=n_ranks, device=device)
     network = make_network(run.task, run.model)
-    network.set_scaling(*rows.scaling(network))
+    rows.fit_scaling(network)
     if settings.start_from:
         network.load_state_dict(
             load_checkpoint(Path(settings.start_from))[0].state_dict()

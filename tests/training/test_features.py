@@ -5,12 +5,15 @@ import pytest
 import torch
 
 from estimator.eye_parameters import column
-from estimator.zernike import zernike_values
+from estimator.zernike import nm_from_index, zernike_values
 from training.datasets import Recipe, draw
-from training.features import FieldFeatures, OnAxisFeatures, Turn
+from training.eye_features import Shift, Turn
+from training.features import FieldFeatures, FocusFeatures, OnAxisFeatures
 from training.tasks import DOMAINS, ZERNIKE_NAMES
 
 N_EYES = 24
+VERGENCE = slice(19, 22)
+"""Columns of the paraxial vergence: mean, along, across."""
 
 
 def _turned(rows: np.ndarray) -> np.ndarray:
@@ -47,13 +50,13 @@ def field_rows():
 
 
 def test_a_turned_eye_has_the_same_features(field_rows):
-    features = FieldFeatures()
+    features = FieldFeatures().double()
     rows, turned = (features(torch.from_numpy(part)) for part in field_rows)
     assert torch.max(torch.abs(rows - turned)) < 1e-12
 
 
 def test_a_turned_eye_has_the_same_encoded_light(field_rows):
-    features, encoded = FieldFeatures(), []
+    features, encoded = FieldFeatures().double(), []
     for rows in field_rows:
         labels = torch.from_numpy(DOMAINS["field"].label(rows))
         encoded.append(features.encode(torch.from_numpy(rows), labels).numpy())
@@ -70,7 +73,7 @@ def test_a_turned_eye_has_the_same_encoded_light(field_rows):
 def test_decoding_undoes_encoding(kind, domain):
     rows = torch.from_numpy(draw(Recipe(domain, 64, 64), 0))
     values = torch.randn(64, len(DOMAINS[domain].targets), dtype=torch.float64)
-    features = kind()
+    features = kind().double()
     found = features.decode(rows, features.encode(rows, values))
     assert torch.max(torch.abs(found - values)) < 1e-12
 
@@ -103,3 +106,51 @@ def test_turning_terms_turns_the_surface():
     np.testing.assert_allclose(
         surface(turned, theta), surface(terms, theta - angle_rad), atol=1e-12
     )
+
+
+def test_a_shifted_surface_is_the_surface_elsewhere():
+    rng = np.random.default_rng(1)
+    terms, shift = rng.normal(size=27), (-0.3, 0.4, 0.5)
+    met = Shift().double()(
+        torch.from_numpy(terms[None]), *(torch.tensor([v]).double() for v in shift)
+    )
+    radius, theta = rng.uniform(0, 1, 50), rng.uniform(0, 6, 50)
+    u, v = radius * np.cos(theta), radius * np.sin(theta)
+    orders = [nm_from_index(j) for j in range(1, 28)]
+    norms = np.sqrt([(2 - (m == 0)) * (n + 1) for n, m in orders])
+    x, a, b = shift
+    wanted = zernike_values(x + a * u, b * v)[:, 1:] @ (terms / norms)
+    shown = zernike_values(u, v)[:, 1:] @ met.numpy()[0]
+    np.testing.assert_allclose(shown - shown[0], wanted - wanted[0], atol=1e-5)
+
+
+def test_the_vergence_is_the_refraction_of_a_small_pupil():
+    rows = draw(Recipe("on_axis", 16, 16, seed=8), 0)
+    odd = [j for j in range(1, 28) if nm_from_index(j)[0] % 2]
+    for name in [f"cornea_offset_j{j}_mm" for j in odd]:
+        rows[:, column(name)] = 0.0
+    for name in ("decentration_x_mm", "decentration_y_mm"):
+        rows[:, column(f"lens_{name}")] = 0.0
+    for name in ("tilt_about_x_deg", "tilt_about_y_deg"):
+        rows[:, column(f"lens_{name}")] = 0.0
+    rows[:, 45] = 0.2
+    c = DOMAINS["on_axis"].label(rows)
+    traced_dpt = np.stack(
+        [4 * np.sqrt(3) * c[:, 3], 2 * np.sqrt(6) * c[:, 4], 2 * np.sqrt(6) * c[:, 2]]
+    ) / (0.1**2)
+    features = OnAxisFeatures().double()(torch.from_numpy(rows)).numpy()
+    vergence_dpt = 1e3 * features[:, VERGENCE].T
+    np.testing.assert_allclose(vergence_dpt, traced_dpt, atol=0.02)
+    assert np.ptp(traced_dpt[0]) > 5.0
+
+
+def test_a_bounded_lens_is_bounded_by_the_features():
+    rows = torch.from_numpy(draw(Recipe("focus", 400, 400), 0))
+    labels = torch.from_numpy(DOMAINS["focus"].label(rows.numpy()))
+    features = FocusFeatures().double()
+    # where a bound holds, whatever lies beyond it is answered by it
+    relaxed = labels[:, 0] == 0.0
+    assert relaxed.any() and not features.is_free(rows, labels)[relaxed].any()
+    change = labels[:, :1] + torch.where(relaxed, 0.3, 0.0)[:, None]
+    answered = features.decode(rows, change)
+    torch.testing.assert_close(answered, labels, atol=1e-9, rtol=0)

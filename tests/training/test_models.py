@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from training.models import ModelSettings, Network
+from training.models import ModelSettings, Network, Quadratic
 from training.run_file import RunFileError, read_run
 
 
@@ -37,12 +37,41 @@ def test_norm_follows_the_activation_and_precedes_the_shortcut():
 
 
 def test_scaling_is_part_of_the_network():
-    network = _network("ours", width=8).eval()
-    x, y = torch.rand(5, 47), torch.rand(5, 27)
-    network.set_scaling(([3.0] * 47, [2.0] * 47), ([1.0] * 27, [4.0] * 27))
-    plain = network.layers((x - 3.0) / 2.0)
-    torch.testing.assert_close(network(x), plain * 4.0 + 1.0)
-    torch.testing.assert_close(network.to_standard(x, y), (y - 1.0) / 4.0)
+    network = _network("ours", width=8).eval().double()
+    x, y = (torch.randn(500, n, dtype=torch.float64) for n in (47, 27))
+    x, y = 3.0 + 2.0 * x, 1.0 + 4.0 * y
+    network.fit_scaling(x, y)
+    x_mean, x_scale = x.mean(dim=0), x.std(dim=0, correction=0)
+    y_mean, y_scale = y.mean(dim=0), y.std(dim=0, correction=0)
+    plain = network.layers((x - x_mean) / x_scale)
+    torch.testing.assert_close(network(x), plain * y_scale + y_mean)
+    wanted = (y - y_mean) / y_scale
+    torch.testing.assert_close(network.to_standard(x, y), wanted)
+
+
+def test_a_quadratic_form_is_found_at_once():
+    x = torch.randn(2000, 6)
+    y = torch.stack([1.0 + x[:, 0] * x[:, 1], x[:, 2] ** 2 - x[:, 3]], dim=1)
+    form = Quadratic(6, 2)
+    form.fit(x, y)
+    fresh = torch.randn(50, 6)
+    wanted = torch.stack(
+        [1.0 + fresh[:, 0] * fresh[:, 1], fresh[:, 2] ** 2 - fresh[:, 3]], dim=1
+    )
+    torch.testing.assert_close(form(fresh), wanted, atol=1e-4, rtol=1e-4)
+
+
+def test_layers_learn_what_the_quadratic_form_leaves():
+    settings = ModelSettings(width=8, baseline="quadratic")
+    network = Network("focus", n_inputs=4, n_outputs=1, settings=settings).eval()
+    x = torch.randn(3000, 4)
+    y = x[:, :1] * x[:, 1:2] + 0.01 * torch.sin(5.0 * x[:, 2:3])
+    network.fit_scaling(x, y)
+    left = network.to_standard(x, y) * network.output_scale
+    assert left.abs().max() < 0.03
+    for parameter in network.layers[-1].parameters():
+        torch.nn.init.zeros_(parameter)
+    assert (network(x) - y).abs().max() < 0.03
 
 
 def test_a_bounded_network_keeps_to_its_range():
@@ -50,7 +79,8 @@ def test_a_bounded_network_keeps_to_its_range():
     network = Network(
         "eye", n_inputs=27, n_outputs=45, settings=settings, is_bounded=True
     )
-    network.set_scaling(([0.0] * 27, [1e-3] * 27), ([5.0] * 45, [2.0] * 45))
+    network.fit_scaling(1e-3 * torch.randn(100, 27), torch.randn(100, 45))
+    network.set_output_range(torch.full((45,), 3.0), torch.full((45,), 7.0))
     found = network(1e3 * torch.randn(64, 27))
     assert 3.0 <= found.min() < 3.5 < 6.5 < found.max() <= 7.0
 

@@ -1,0 +1,323 @@
+"""The eye as optics sees it: closed forms of the 45 parameters, as a layer.
+
+Turned and shifted offsets, curvatures, paraxial vergence.  Used by `features`.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from estimator.eye_parameters import OFFSET_RADIUS_MM, OFFSET_SLICE, column
+from estimator.lens_shape import (
+    CAP_VOLUME_RATIO,
+    HEIGHT_RATIO,
+    RIM_THICKNESS_MM,
+)
+from estimator.media import refractive_index
+from estimator.surfaces import horner_order, offset_monomials
+from estimator.zernike import (
+    EXPONENTS,
+    MAX_RADIAL_ORDER,
+    N_TERMS,
+    monomial_matrix,
+    nm_from_index,
+)
+
+PUPIL_MM = 6.0
+"""Pupil to which coefficients are scaled; any constant would do."""
+
+ENTRANCE_PUPIL_RATIO = 0.86
+"""Depth of the entrance pupil over that of the stop, about."""
+
+INDEX_RANGE_NM = (450.0, 900.0)
+
+
+def _orders(first: int = 1) -> list[tuple[int, int]]:
+    return [nm_from_index(j) for j in range(first, N_TERMS)]
+
+
+class Turn(nn.Module):
+    """Turn Zernike coefficients j = 1 to 27 about the axis.
+
+    A term (n, m) at an angle phi mixes with (n, -m) by cos and sin of m phi; both share
+    their norm, so the rule is the same for normalised and for plain polynomials.
+    """
+
+    def __init__(self):
+        super().__init__()
+        orders = _orders()
+        partner = [orders.index((n, -m)) for n, m in orders]
+        self.register_buffer("partner", torch.tensor(partner), persistent=False)
+        self.register_buffer(
+            "order_m", torch.tensor([abs(m) for _, m in orders]), persistent=False
+        )
+        # cosine term: c cos - s sin; sine term: s cos + c sin
+        signs = [-1.0 if m > 0 else 1.0 if m < 0 else 0.0 for _, m in orders]
+        self.register_buffer("sign", torch.tensor(signs), persistent=False)
+
+    def forward(self, terms: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+        """Terms (N, 27) turned by the angle whose cosine and sine (N,) are given."""
+        cosines, sines = [torch.ones_like(cosine)], [torch.zeros_like(sine)]
+        for _ in range(6):
+            c, s = cosines[-1], sines[-1]
+            cosines.append(c * cosine - s * sine)
+            sines.append(s * cosine + c * sine)
+        c = torch.stack(cosines, dim=1)[:, self.order_m]
+        s = torch.stack(sines, dim=1)[:, self.order_m]
+        return terms * c + terms[:, self.partner] * (self.sign * s)
+
+
+def turned_pair(
+    x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Turn vectors (N,), (N,) by the angle whose cosine and sine are given."""
+    return x * cosine - y * sine, x * sine + y * cosine
+
+
+class Shift(nn.Module):
+    """The corneal offsets as the light of one field meets them.
+
+    On the pupil's circle, at (x + a u, b v) of the disc on which the offsets are given,
+    their sum is again a polynomial of degree 6 in (u, v): coefficients (N, 27) of it.
+    """
+
+    DEGREE = MAX_RADIAL_ORDER
+
+    def __init__(self):
+        super().__init__()
+        n, n_terms = self.DEGREE + 1, len(EXPONENTS)
+        powers_of = torch.as_tensor(EXPONENTS)
+        place = torch.zeros(n_terms, n * n, dtype=torch.float64)
+        place[torch.arange(n_terms), powers_of[:, 0] * n + powers_of[:, 1]] = 1.0
+        offsets = [
+            offset_monomials(row, offset_radius_mm=1.0) for row in np.eye(N_TERMS)
+        ]
+        order = np.argsort(horner_order())
+        to_monomials = torch.as_tensor(np.array(offsets)[1:, order])
+        to_zernike = torch.as_tensor(np.linalg.inv(monomial_matrix()))[:, 1:]
+        k, p = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+        binomials = torch.tensor(
+            [[float(math.comb(j, i)) for j in range(n)] for i in range(n)]
+        )
+        for name, values in (
+            ("to_grid", (to_monomials @ place).float()),
+            ("from_grid", (place.T @ to_zernike).float()),
+            ("binomials", binomials),
+            ("gap", torch.clamp(p - k, min=0)),
+        ):
+            self.register_buffer(name, values, persistent=False)
+
+    def forward(self, offsets: Tensor, x: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Terms (N, 27), un-normalised in, normalised out; ``x``, ``a``, ``b`` (N,)."""
+        n = self.DEGREE + 1
+        grid = (offsets @ self.to_grid).reshape(-1, n, n)
+        moved = self.binomials * _powers(x)[:, self.gap] * _powers(a)[:, :, None]
+        grid = torch.bmm(moved, grid) * _powers(b)[:, None, :]
+        return grid.reshape(-1, n * n) @ self.from_grid
+
+
+def _powers(x: Tensor) -> Tensor:
+    """Powers 0 to 6 (N, 7)."""
+    powers = [torch.ones_like(x)]
+    for _ in range(MAX_RADIAL_ORDER):
+        powers.append(powers[-1] * x)
+    return torch.stack(powers, dim=1)
+
+
+class EyeFeatures(nn.Module):
+    """The eye as optics sees it, (N, 49), in axes turned by minus a given angle.
+
+    Curvatures, thicknesses, fourth-order terms of the conics, posterior astigmatism and
+    lens position turned to the eye's axes, the paraxial vergence of light from the
+    retina (mean, along, across), and the offsets where the pupil's light meets them.
+    """
+
+    N_FEATURES = 8 + 11 + 3 + 27
+
+    def __init__(self):
+        super().__init__()
+        self.turn, self.shift, self.scale = Turn(), Shift(), PupilPowers()
+
+    def forward(
+        self,
+        eye: Tensor,
+        pupil_mm: Tensor,
+        wavelength_nm: Tensor,
+        cosine: Tensor,
+        sine: Tensor,
+        tangent: Tensor,
+    ) -> Tensor:
+        """Eyes (N, 45); ``cosine``, ``sine`` (N,) of the angle of the new x axis.
+
+        ``tangent`` (N,) of the field's eccentricity, towards the new x axis.
+        """
+        cornea, lens = _cornea(eye, cosine, sine), _lens(eye, cosine, sine)
+        offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, cosine, sine))
+        vergence = _vergence(cornea, lens, offsets, wavelength_nm)
+        x, a = _footprint(cornea, lens, tangent)
+        half = 0.5 * pupil_mm / OFFSET_RADIUS_MM
+        met = self.shift(offsets, x / OFFSET_RADIUS_MM, half * a, half)
+        columns = torch.stack([*cornea.values(), *lens.values(), *vergence], dim=1)
+        return torch.cat([columns, met / self.scale(pupil_mm)], dim=1)
+
+
+def named(eye: Tensor, name: str) -> Tensor:
+    """Return one parameter (N,) of eyes (N, 45 or more)."""
+    return eye[:, column(name)]
+
+
+def _turn_of_offsets(eye: Tensor, cosine: Tensor, sine: Tensor):
+    angle_rad = torch.deg2rad(named(eye, "cornea_anterior_rotation_deg"))
+    c, s = torch.cos(angle_rad), torch.sin(angle_rad)
+    return c * cosine + s * sine, s * cosine - c * sine
+
+
+def _cornea(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
+    front = 1.0 / named(eye, "cornea_anterior_radius_mm")
+    back_x = front / named(eye, "cornea_posterior_radius_ratio")
+    back_y = back_x / named(eye, "cornea_posterior_astigmatism_ratio")
+    back, half = 0.5 * (back_x + back_y), 0.5 * (back_x - back_y)
+    angle_rad = 2.0 * torch.deg2rad(named(eye, "cornea_posterior_rotation_deg"))
+    oblique = half * torch.cos(angle_rad), half * torch.sin(angle_rad)
+    twice_c, twice_s = cosine * cosine - sine * sine, 2.0 * cosine * sine
+    along, across = turned_pair(*oblique, twice_c, -twice_s)
+    return {
+        "length": named(eye, "eye_length_mm"),
+        "thickness": named(eye, "cornea_thickness_mm"),
+        "front": front,
+        "back": back,
+        "along": along,
+        "across": across,
+        "front_conic": named(eye, "cornea_anterior_conic_constant") * front**3,
+        "back_conic": named(eye, "cornea_posterior_conic_constant") * back**3,
+    }
+
+
+def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
+    diameter_mm = named(eye, "lens_diameter_mm")
+    thickness_mm = lens_thickness_mm(diameter_mm, named(eye, "lens_volume_mm3"))
+    caps_mm3 = CAP_VOLUME_RATIO * named(eye, "lens_volume_mm3")
+    rear = 64.0 * caps_mm3 / (math.pi * diameter_mm**4 * (1.0 + HEIGHT_RATIO))
+    front = rear * HEIGHT_RATIO
+    aqueous_mm = named(eye, "aqueous_thickness_mm")
+    before_mm = named(eye, "cornea_thickness_mm") + aqueous_mm + thickness_mm
+    about_x = torch.deg2rad(named(eye, "lens_tilt_about_x_deg"))
+    about_y = torch.deg2rad(named(eye, "lens_tilt_about_y_deg"))
+    shift = (named(eye, "lens_decentration_x_mm"), named(eye, "lens_decentration_y_mm"))
+    # of the lens' axis; degrees do not turn as a vector does
+    lean = (torch.sin(about_y) * torch.cos(about_x), -torch.sin(about_x))
+    x, y = turned_pair(*shift, cosine, -sine)
+    lean_x, lean_y = turned_pair(*lean, cosine, -sine)
+    return {
+        "aqueous": aqueous_mm,
+        "thickness": thickness_mm,
+        "vitreous": named(eye, "eye_length_mm") - before_mm,
+        "front": front,
+        "rear": rear,
+        "front_conic": named(eye, "lens_anterior_conic_constant") * front**3,
+        "rear_conic": named(eye, "lens_posterior_conic_constant") * rear**3,
+        "x": x,
+        "y": y,
+        "lean_x": lean_x,
+        "lean_y": lean_y,
+    }
+
+
+def lens_thickness_mm(diameter_mm: Tensor, volume_mm3: Tensor) -> Tensor:
+    """Thickness (N,) of the lens, as `estimator.lens_shape.lens_shape` has it."""
+    caps_mm3 = CAP_VOLUME_RATIO * volume_mm3
+    return RIM_THICKNESS_MM + 8.0 * caps_mm3 / (math.pi * diameter_mm**2)
+
+
+Tensor3 = tuple[Tensor, Tensor, Tensor]
+
+
+def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
+    """Vergence (mean, along, across) after a way of ``reduced_mm``: V / (1 - d V)."""
+    mean, along, across = vergence
+    square = along**2 + across**2
+    scale = 1.0 / ((1.0 - reduced_mm * mean) ** 2 - reduced_mm**2 * square)
+    kept = mean - reduced_mm * (mean**2 - square)
+    return kept * scale, along * scale, across * scale
+
+
+def _vergence(cornea: dict, lens: dict, offsets: Tensor, wavelength_nm) -> Tensor3:
+    """Paraxial vergence, 1/mm, of the light from the retina outside the eye."""
+    n_cornea, n_aqueous, n_lens, n_vitreous = _indices(wavelength_nm)
+    zero = torch.zeros_like(n_lens)
+    rear = (n_lens - n_vitreous) * lens["rear"] - n_vitreous / lens["vitreous"]
+    light = _transferred((rear, zero, zero), lens["thickness"] / n_lens)
+    power = (n_lens - n_aqueous) * lens["front"]
+    light = _transferred((light[0] + power, *light[1:]), lens["aqueous"] / n_aqueous)
+    step = n_aqueous - n_cornea
+    back = (cornea["back"], cornea["along"], cornea["across"])
+    light = tuple(v + step * c for v, c in zip(light, back, strict=True))
+    mean, along, across, height_mm = _apex(offsets)
+    light = _transferred(light, (cornea["thickness"] - height_mm) / n_cornea)
+    front = (cornea["front"] + mean, along, across)
+    return tuple(v + (n_cornea - 1.0) * c for v, c in zip(light, front, strict=True))
+
+
+def _apex(offsets: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Curvature, 1/mm, of the offsets at the apex (mean, along, across); height, mm."""
+    matrix = torch.as_tensor(_apex_matrix(), dtype=offsets.dtype)
+    return tuple((offsets @ matrix.to(offsets.device)).unbind(dim=1))
+
+
+@cache
+def _apex_matrix() -> np.ndarray:
+    """From offsets (27) to the apex: mean curvature, along, across, height."""
+    terms = offset_monomials(np.eye(N_TERMS), offset_radius_mm=OFFSET_RADIUS_MM)
+    terms = terms[1:, np.argsort(horner_order())]
+    place = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
+    xx, xy, yy, one = (terms[:, place[e]] for e in ((2, 0), (1, 1), (0, 2), (0, 0)))
+    return np.stack([xx + yy, xx - yy, xy, one], axis=1)
+
+
+def _indices(wavelength_nm: Tensor) -> list[Tensor]:
+    """Refractive indices (N,) of cornea, aqueous, lens and vitreous: a cubic fit."""
+    t = (500.0 / wavelength_nm) ** 2
+    return [((c[0] * t + c[1]) * t + c[2]) * t + c[3] for c in _index_coefficients()]
+
+
+@cache
+def _index_coefficients() -> list[list[float]]:
+    grid_nm = np.linspace(*INDEX_RANGE_NM, 200)
+    media = ("cornea", "aqueous", "lens", "vitreous")
+    return [
+        np.polyfit((500.0 / grid_nm) ** 2, refractive_index(m, grid_nm), 3).tolist()
+        for m in media
+    ]
+
+
+def _footprint(cornea: dict, lens: dict, tangent: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the chief ray of a field meets the cornea, mm, and the pupil's stretch.
+
+    The ray aims at the entrance pupil; where the cornea leans, the light of a pupil
+    covers more of it along the field.
+    """
+    depth_mm = ENTRANCE_PUPIL_RATIO * (cornea["thickness"] + lens["aqueous"])
+    x = torch.zeros_like(tangent)
+    for _ in range(3):
+        x = (depth_mm - 0.5 * x * x * cornea["front"]) * tangent
+    sine = x * cornea["front"]
+    cosine = torch.sqrt(1.0 - torch.clamp(sine * sine, max=0.99))
+    # cos(lean) / cos(eccentricity - lean)
+    stretch = cosine * torch.sqrt(1.0 + tangent**2) / (cosine + sine * tangent)
+    return x, stretch
+
+
+class PupilPowers(nn.Module):
+    """(pupil / 6 mm)^n, (N, 27), for every coefficient."""
+
+    def __init__(self, first: int = 1):
+        super().__init__()
+        orders = torch.tensor([n for n, _ in _orders(first)])
+        self.register_buffer("order_n", orders, persistent=False)
+
+    def forward(self, pupil_mm: Tensor) -> Tensor:
+        """Powers for pupils (N,)."""
+        return _powers(pupil_mm / PUPIL_MM)[:, self.order_n]
