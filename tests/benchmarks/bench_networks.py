@@ -100,7 +100,7 @@ def print_steps(rows: Sequence[StepRow]) -> None:
             paper = f"{figures['median_ms']:>11.0f}{figures['error']:>8.4f}"
         print(
             f"{row.step:<10}{row.method:<19}{row.case:<13}{row.n_nodes:>5}"
-            f"{row.median_ms:>10.2f}{row.error:>10.2g} {row.error_name:<12}"
+            f"{row.median_ms:>10.2f}{row.error:>10.3g} {row.error_name:<12}"
             f"{row.target:>8.4f}{paper}  {row.setting}"
         )
 
