@@ -208,8 +208,12 @@ def network_aberrations(nodes: NDArray[np.float64]) -> networks.PupilAberrations
 
 
 def in_domain(step: str, nodes: NDArray[np.float64]) -> tuple[NDArray[np.bool_], str]:
-    """Which rows (n,) a step's network was trained for, and why not the others."""
+    """Which rows (n,) a step's network was trained for, and what the others lack.
+
+    The reason is that of the row that lacks least: what all the others lack, too.
+    """
     card = networks.load_network(NETWORK_OF[step]).card
-    inside = np.array([not card.outside(row[None]) for row in nodes])
-    excesses = card.outside(nodes)
-    return inside, str(excesses[0]) if excesses else ""
+    excesses = [card.outside(row[None]) for row in nodes]
+    inside = np.array([not found for found in excesses])
+    lacking = [found for found in excesses if found]
+    return inside, str(min(lacking, key=len)[0]) if lacking else ""

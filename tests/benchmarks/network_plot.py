@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.network_steps import N_OUTSIDE, OWN_EYE, StepRow
+from tests.benchmarks.network_steps import FEWER_RAYS, N_OUTSIDE, OWN_EYE, StepRow
 from tests.benchmarks.published_networks import (
     ERRORS,
     HARDWARE,
@@ -17,7 +17,7 @@ from tests.benchmarks.published_networks import (
 
 LOOKS = {  # method: marker, colour
     "exact": ("o", "C0"),
-    "fewer rays": ("v", "C2"),
+    FEWER_RAYS: ("v", "C2"),
     "network + refined": ("D", "C4"),
     "search": ("s", "C7"),
     OWN_EYE: ("P", "C1"),

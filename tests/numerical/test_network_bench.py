@@ -204,6 +204,15 @@ def test_the_verdict_weighs_time_at_the_same_nodes_against_error():
     assert verdict.is_worth and verdict.text.endswith("2 of 3: worth it")
 
 
+def test_time_is_saved_against_fewer_rays_if_those_are_good_enough():
+    for error_um, saved_ms in ((1e-4, 110.0), (0.1, 390.0)):
+        fewer = row("off-axis", "fewer rays", "myopia", ms=120.0, error=error_um)
+        by_network, by_fewer = step_verdicts([*ROWS[:2], fewer])
+        assert by_network.time_ratio == 40.0
+        assert by_network.saved_ms == pytest.approx(saved_ms)
+        assert by_fewer.saved_ms == pytest.approx(280.0)
+
+
 @pytest.mark.parametrize(
     ("pair", "reasons"),
     [
