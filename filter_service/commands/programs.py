@@ -19,6 +19,7 @@ class Bench(StrEnum):
     """Benchmarks by what they time."""
 
     ESTIMATE = "estimate"
+    NETWORKS = "networks"
     PLAN = "plan"
     PSF = "psf"
     BUILD = "build"
@@ -34,6 +35,7 @@ class Bench(StrEnum):
 
 BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
+    Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",
     Bench.PSF: "tests.benchmarks.bench_psf",
     Bench.BUILD: "tests.benchmarks.bench_psf_build",

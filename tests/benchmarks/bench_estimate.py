@@ -17,7 +17,15 @@ from estimator.accommodation import AccommodatingEye
 from estimator.estimation import estimate_eye
 from estimator.eye_parameters import random_vectors
 from estimator.eye_wavefront import zernike_of_vectors
-from estimator.profiles import parse_profile, preset_names
+from estimator.profiles import preset_names
+from tests.benchmarks.eye_ways import (
+    ERROR_NAME,
+    REFERENCE,
+    TimedEye,
+    preset_profile,
+    timed_eye,
+    timed_search,
+)
 from tests.benchmarks.harness import (
     RESULTS,
     Row,
@@ -27,6 +35,9 @@ from tests.benchmarks.harness import (
     time_calls,
     write_report,
 )
+from tests.benchmarks.network_nodes import FOCUSES_DPT
+from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.published_networks import published_step
 from tests.numerical.eye_cases import population_profiles, random_eye_profiles
 from tests.numerical.test_peripheral_refraction import (
     ANGLES_DEG,
@@ -35,8 +46,6 @@ from tests.numerical.test_peripheral_refraction import (
     retina_of_refraction,
 )
 
-REFERENCE = "exact ray trace, 25 terms"
-ERROR_NAME = "mean_abs_um"
 PERIPHERAL_REFERENCE = "at 30 deg: myopes +0.80, emmetropes -0.41 (Mutti 2000)"
 SEARCH_TIMES_S = (1.0, 8.0)
 QUICK_SEARCH_TIMES_S = (1.0,)
@@ -47,19 +56,7 @@ WAYS = (
     ("refined", ("network",)),
     ("network", ("table",)),
 )
-FOCUSES_DPT = np.linspace(0.125, 8.125, 7)
 TRACED_EYES = 2000
-
-PUBLISHED = {
-    # condition: (previous s, previous um, proposed s, proposed um), all 27 terms; the
-    # paper's Tables 4 and 5, on its authors' machine
-    "emmetropia": (3521, 0.0008, 0.079, 0.0044),
-    "myopia": (6270, 0.0010, 0.088, 0.0047),
-    "astigmatism": (7306, 0.0011, 0.064, 0.0038),
-    "keratoconus": (10642, 0.0076, 0.061, 0.0083),
-    "cataract": (4582, 0.0361, 0.073, 0.0048),
-    "post_lasik": (4696, 0.0029, 0.085, 0.0024),
-}
 
 
 def _row(method, case, setting, n, times_ms, error, *, name=ERROR_NAME) -> Row:
@@ -70,34 +67,29 @@ def _row(method, case, setting, n, times_ms, error, *, name=ERROR_NAME) -> Row:
     )
 
 
-def _preset(name):
-    return parse_profile({"kind": "preset", "name": name})
+def _eye_row(method, case, setting, timed: TimedEye) -> Row:
+    error_um = timed.found.mean_abs_error_um
+    return _row(method, case, setting, timed.n, timed.times_ms, error_um)
 
 
 def preset_rows(repeats: int, search_times_s) -> list[Row]:
     """Every condition by every method."""
     rows = []
     for name in preset_names():
-        profile = _preset(name)
+        profile = preset_profile(name)
         for method, starts in WAYS:
-            way = {"method": method, "starts": starts}
-            found = estimate_eye(profile, **way)
-            times_ms = time_calls(
-                lambda p=profile, w=way: estimate_eye(p, **w), repeats=repeats
-            )
+            timed = timed_eye(profile, repeats=repeats, method=method, starts=starts)
+            found = timed.found
             setting = f"{found.n_evaluations} eyes traced"
             if method == "refined":
                 setting += ", from " + (" or ".join(starts))
             if found.method != method:
                 setting = f"{found.method}: {found.network_reason}"
-            error_um = found.mean_abs_error_um
-            rows.append(_row(method, name, setting, repeats, times_ms, error_um))
+            rows.append(_eye_row(method, name, setting, timed))
         for limit_s in search_times_s:
-            found = estimate_eye(profile, method="search", max_time_s=limit_s)
-            setting = f"{found.n_evaluations} eyes traced"
-            times_ms = (found.time_ms, found.time_ms)
-            error_um = found.mean_abs_error_um
-            rows.append(_row("search", name, setting, 1, times_ms, error_um))
+            timed = timed_search(profile, max_time_s=limit_s)
+            setting = f"{timed.found.n_evaluations} eyes traced"
+            rows.append(_eye_row("search", name, setting, timed))
     return rows
 
 
@@ -127,7 +119,7 @@ def focus_rows(repeats: int) -> list[Row]:
     """Seven focus states of each of three conditions, in one batch."""
     rows = []
     for name in ("emmetropia", "myopia", "keratoconus"):
-        found = estimate_eye(_preset(name))
+        found = estimate_eye(preset_profile(name))
         eye = AccommodatingEye(found.parameters, pupil_diameter_mm=4.0)
 
         def focus_all(parameters=found.parameters):
@@ -197,7 +189,7 @@ def plot(rows: list[Row]) -> None:
 
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
-    colors = {name: f"C{i}" for i, name in enumerate(PUBLISHED)}
+    colors = {name: f"C{i}" for i, name in enumerate(CONDITIONS)}
     for name, color in colors.items():
         for method, marker in (("refined", "o"), ("search", "s"), ("network", "^")):
             chosen = [r for r in rows if r.case == name and r.method == method]
@@ -209,9 +201,9 @@ def plot(rows: list[Row]) -> None:
                 lw=0.8,
                 label=name if method == "refined" else None,
             )
-        previous_s, previous_um, proposed_s, proposed_um = PUBLISHED[name]
-        axes.plot(previous_s, previous_um, "x", color=color)
-        axes.plot(proposed_s, proposed_um, "+", color=color)
+        for method, marker in (("search", "x"), ("network", "+")):
+            theirs = published_step("eye", name, method)
+            axes.plot(theirs.median_ms / 1e3, theirs.error, marker, color=color)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("time, s")

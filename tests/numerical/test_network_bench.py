@@ -1,0 +1,310 @@
+"""The network benchmark's own parts: nodes, references, errors, domains, the verdict.
+
+Networks here trace each row, see `traced_networks`: their answers are perfect, or off
+by a known amount, whatever weights there are.
+"""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from estimator.estimation import estimate_eye
+from estimator.eye import eye_surfaces
+from estimator.eye_parameters import EyeParameters, mean_vector
+from estimator.network_card import WeightsMissing
+from estimator.profiles import parse_profile
+from estimator.traced_eye import TracedEye
+from estimator.wavefront import wavefront_grid
+from filter_service.planning.grid import pupil_nodes_mm
+from filter_service.wire.images import Camera
+from tests.benchmarks import bench_networks, network_nodes, network_steps
+from tests.benchmarks.accuracy_rows import (
+    asked_states,
+    dynamic_spec,
+    mean_difference_um,
+)
+from tests.benchmarks.bench_networks import print_all
+from tests.benchmarks.first_guess import guess_row
+from tests.benchmarks.network_plot import plot_steps
+from tests.benchmarks.network_verdict import (
+    LARGEST_CHEAP_DPT,
+    Pair,
+    judge,
+    step_verdicts,
+    verdicts,
+)
+from tests.benchmarks.published_networks import ERRORS, SECONDS, published_step
+from tests.numerical.traced_networks import (
+    TracedNetwork,
+    put_in_place,
+    trace_aberrations,
+    trace_focus,
+)
+
+OFF_UM = 0.1
+FOCUSES_DPT = np.array([0.125, 4.125])
+PUPILS_MM = np.array([3.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def vector():
+    """Give a myope of 1.5 dpt on average."""
+    body = {"kind": "prescription", "sphere_dpt": -1.0, "cylinder_dpt": -1.0}
+    profile = parse_profile(body | {"axis_deg": 30})
+    return estimate_eye(profile, starts=("table",)).parameters.to_vector()
+
+
+@pytest.fixture
+def few_nodes(monkeypatch):
+    """Cut the axes, and with them the time: 4 foci, 12 nodes on the axis, 4 off it."""
+    for name, values in (
+        ("PUPILS_MM", PUPILS_MM),
+        ("FOCUSES_DPT", FOCUSES_DPT),
+        ("H_DEG", np.array([-45.0, 20.0])),
+        ("V_DEG", np.array([-10.0, 25.0])),
+    ):
+        monkeypatch.setattr(network_nodes, name, values)
+
+
+def test_steps_have_the_nodes_of_the_paper():
+    vector = mean_vector()
+    counts = {step: len(make(vector)) for step, make in network_nodes.NODES.items()}
+    assert counts == {"focus": 42, "on-axis": 126, "off-axis": 627}
+    for make in network_nodes.NODES.values():
+        nodes = make(vector)
+        assert len(np.unique(nodes, axis=0)) == len(nodes)
+    fields_deg = network_nodes.off_axis_nodes(vector)[:, -2:]
+    assert np.abs(fields_deg).max(axis=0) == pytest.approx([45.0, 25.0])
+
+
+def test_traced_nodes_are_those_of_a_grid_of_the_same_eye(vector):
+    nodes = network_nodes.off_axis_nodes(vector)[::37]
+    found = network_nodes.traced_aberrations(nodes)
+    for row, zernike_um in zip(nodes, found.zernike_um, strict=True):
+        grid = wavefront_grid(
+            eye_surfaces(EyeParameters.from_vector(row[:45])),
+            fields_deg=[row[-2:]],
+            wavelengths_nm=[row[-3]],
+            pupil_diameters_mm=[row[-4]],
+        )
+        np.testing.assert_allclose(
+            zernike_um[1:], grid.zernike_um[0, 0, 0, 1:], 0, 1e-9
+        )
+
+
+def test_the_reference_of_focus_is_focused_or_out_of_reach(vector):
+    nodes = network_nodes.focus_nodes(vector)
+    changes_mm = network_nodes.reference_focus(nodes)
+    reached_dpt = network_nodes.reached_dpt(nodes, changes_mm)
+    is_relaxed = changes_mm[:, 0] == 0.0
+    np.testing.assert_allclose(
+        reached_dpt[~is_relaxed], nodes[~is_relaxed, -1], 0, 1e-8
+    )
+    # its far point is at 1.5 dpt: beyond it lie two of the seven distances
+    assert is_relaxed.sum() == 2 * 6
+    assert np.all(reached_dpt[is_relaxed] >= nodes[is_relaxed, -1])
+    np.testing.assert_allclose(network_nodes.traced_focus(nodes), changes_mm, 0, 1e-7)
+
+
+def aberration(**more):
+    return TracedNetwork("aberration", trace_aberrations, **more)
+
+
+@pytest.mark.parametrize("step", ["on-axis", "off-axis"])
+def test_errors_of_wavefronts_are_the_networks_own(
+    monkeypatch, few_nodes, vector, step
+):
+    for offset_um in (0.0, OFF_UM):
+        put_in_place(monkeypatch, aberration(offset_um=offset_um))
+        rows = network_steps.aberration_rows(
+            step, "myopia", vector, repeats=2, own_eye=vector
+        )
+        found = {row.method: row for row in rows}
+        assert found["network"].n_nodes == found["exact"].n_nodes == 12
+        for method in ("network", network_steps.OWN_EYE):
+            assert found[method].error == pytest.approx(offset_um, abs=1e-6)
+        assert found["exact"].error < 1e-6 < found["fewer rays"].error * 1e3
+        assert found["exact"].error < found["fewer rays"].error < 1e-2
+        assert found["exact"].target > 0.05
+
+
+def test_errors_of_focus_are_the_networks_own(monkeypatch, few_nodes, vector):
+    found = {}
+    for offset_mm in (0.0, -0.01):
+        put_in_place(
+            monkeypatch, TracedNetwork("focus", trace_focus, offset_um=offset_mm)
+        )
+        rows = network_steps.focus_rows("myopia", vector, repeats=2, with_search=False)
+        for row in rows:
+            found[row.method, row.error_name, offset_mm] = row.error
+    assert found["network", "mean_abs_mm", 0.0] < 1e-6
+    assert found["network", "mean_abs_dpt", 0.0] < 1e-5
+    assert found["exact", "mean_abs_dpt", 0.0] < 1e-6
+    assert found["network", "mean_abs_mm", -0.01] == pytest.approx(0.01, abs=1e-6)
+    (nearer,) = np.flatnonzero(PUPILS_MM == 5.0) * 2 + 1
+    nodes = network_nodes.focus_nodes(vector)[[nearer]]
+    change_mm = network_nodes.reference_focus(nodes)
+    gain_dpt = nodes[0, -1] - network_nodes.reached_dpt(nodes, np.zeros((1, 2)))[0]
+    dpt_per_mm = gain_dpt / -change_mm[0, 0]
+    assert found["network", "mean_abs_dpt", -0.01] == pytest.approx(
+        0.01 * dpt_per_mm, rel=0.15
+    )
+
+
+def test_nodes_outside_of_the_training_are_counted(monkeypatch, few_nodes, vector):
+    put_in_place(monkeypatch, aberration(ranges={"h_deg": (-30.0, 30.0)}))
+    some, *_ = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
+    assert (some.n_nodes, some.n_outside, some.error_name) == (6, 6, "mean_abs_um")
+    assert "h_deg -45" in some.setting and some.error < 1e-6
+    put_in_place(monkeypatch, aberration(ranges={"eye_length_mm": (30.0, 31.0)}))
+    rows = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
+    none = rows[0]
+    assert (none.n_nodes, none.error_name, none.error) == (0, "n_outside", 12.0)
+    assert none.median_ms == 0.0 and "eye_length_mm" in none.setting
+    verdict = step_verdicts(rows)[0]
+    assert (verdict.method, verdict.n_answered, verdict.n_cases) == ("network", 0, 1)
+    assert not verdict.is_worth
+
+
+def row(step, method, case, *, ms, error, n_nodes=10, **more):
+    return network_steps.step_row(
+        *(step, case, method, ""),
+        times_ms=(ms, ms),
+        n=1,
+        error_name=more.pop("error_name", "mean_abs_um"),
+        error=error,
+        n_nodes=n_nodes,
+        n_outside=10 - n_nodes,
+        target=1.0,
+        reference="",
+    )
+
+
+ROWS = [
+    row("off-axis", "exact", "myopia", ms=400.0, error=1e-9),
+    row("off-axis", "network", "myopia", ms=10.0, error=0.01),
+    row("off-axis", "exact", "cataract", ms=600.0, error=1e-9),
+    row("off-axis", "network", "cataract", ms=10.0, error=0.03, n_nodes=5),
+    row("off-axis", "exact", "keratoconus", ms=700.0, error=1e-9),
+    row("off-axis", "network", "keratoconus", ms=0.0, error=10, n_nodes=0),
+]
+ROWS[-1] = replace(ROWS[-1], error_name=network_steps.N_OUTSIDE)
+
+
+def test_the_verdict_weighs_time_at_the_same_nodes_against_error():
+    (verdict,) = step_verdicts(ROWS)
+    assert (verdict.step, verdict.method) == ("off-axis", "network")
+    assert (verdict.n_answered, verdict.n_cases) == (2, 3)
+    assert verdict.time_ratio == pytest.approx((400 / 10 + 300 / 10) / 2)
+    assert verdict.saved_ms == pytest.approx((390 + 290) / 2)
+    assert (verdict.error, verdict.worst_error) == pytest.approx((0.02, 0.03))
+    assert verdict.is_worth and verdict.text.endswith("2 of 3: worth it")
+
+
+def test_time_is_saved_against_fewer_rays_if_those_are_good_enough():
+    for error_um, saved_ms in ((1e-4, 110.0), (0.1, 390.0)):
+        fewer = row("off-axis", "fewer rays", "myopia", ms=120.0, error=error_um)
+        by_network, by_fewer = step_verdicts([*ROWS[:2], fewer])
+        assert by_network.time_ratio == 40.0
+        assert by_network.saved_ms == pytest.approx(saved_ms)
+        assert by_fewer.saved_ms == pytest.approx(280.0)
+
+
+@pytest.mark.parametrize(
+    ("pair", "reasons"),
+    [
+        (Pair(10.0, 200.0, 0.01), ()),
+        (Pair(10.0, 100.0, 0.01), ("saves less than 100 ms",)),
+        (Pair(10.0, 200.0, 0.1), ("error above 0.05",)),
+        (Pair(10.0, 5.0, 0.1), ("saves less than 100 ms", "error above 0.05")),
+    ],
+)
+def test_what_saves_little_or_is_seen_is_not_worth_it(pair, reasons):
+    bounds = {"error_name": "mean_abs_um", "largest_error": 0.05}
+    verdict = judge("eye", "network", [pair], n_cases=1, **bounds)
+    assert verdict.is_worth == (not reasons)
+    for reason in ("saves less than 100 ms", "error above 0.05"):
+        assert (reason in verdict.text) == (reason in reasons)
+
+
+def test_the_bound_of_focus_is_a_blur_as_wide_as_that_of_wavefronts():
+    # all 27 terms at 0.05 um: an RMS of 0.26 um, which is M = 4 sqrt(3) C / r^2
+    assert pytest.approx(0.147, abs=1e-3) == LARGEST_CHEAP_DPT
+
+
+def test_published_figures_stand_beside_their_methods():
+    # tables 4 and 5 of the paper
+    theirs = published_step("eye", "keratoconus", "search")
+    assert (theirs.median_ms, theirs.error, theirs.target) == (10642e3, 0.0076, 0.2894)
+    theirs = published_step("off-axis", "cataract", "network")
+    assert (theirs.median_ms, theirs.error, theirs.target) == (583.0, 0.0208, 0.4156)
+    assert "Ryzen 7 1700" in theirs.hardware
+    assert published_step("eye", "myopia", "network + refined") is None
+    assert {len(rows) for rows in (*SECONDS.values(), *ERRORS.values())} == {6}
+
+
+def test_our_conditions_are_theirs_by_their_mean_target():
+    for case in ("emmetropia", "myopia", "astigmatism", "post_lasik"):
+        theirs = published_step("eye", case, "network").target
+        zernike_um = parse_profile({"kind": "preset", "name": case}).zernike_um
+        assert np.abs(zernike_um[1:]).mean() == pytest.approx(theirs, abs=1e-3), case
+
+
+def test_a_refinement_that_ends_badly_or_not_at_all_has_failed():
+    common = {"time_ms": 8.0, "n_iterations": 3, "n_evaluations": 99}
+    eyes = [
+        SimpleNamespace(
+            mean_abs_error_um=error_um, start=start, network_reason="", **common
+        )
+        for error_um, start in ((1e-5, "network"), (2e-5, "table"), (0.02, "table"))
+    ]
+    found = guess_row(("table", "network"), [*eyes, None])
+    assert (found.n, found.n_failed, found.n_from_network) == (4, 2, 1)
+    assert (found.error, found.median_iterations) == (2e-5, 3.0)
+    assert found.setting == "from table or network"
+
+
+def traced(sphere_dpt, spec):
+    body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
+    return TracedEye.trace(
+        estimate_eye(parse_profile(body), starts=("table",)),
+        pupil_diameters_mm=pupil_nodes_mm(spec.pupil_range_mm),
+        focus_range_dpt=spec.focus_range_dpt,
+        wavelengths_nm=spec.wavelengths_nm,
+        field_range_deg=spec.field_range_deg,
+    )
+
+
+def test_eyes_of_other_power_differ_by_their_defocus():
+    spec = dynamic_spec(pupil_range_mm=(4.0, 5.0), focus_range_dpt=(0.0, 0.5))
+    spec = replace(spec, camera=Camera(64, 36, (-0.02, 0.02, 0.01, -0.01)))
+    exact, other = traced(-2.0, spec), traced(-2.25, spec)
+    assert mean_difference_um(exact, exact, spec)[0] == 0.0
+    found_um, n_states = mean_difference_um(other, exact, spec)
+    states = asked_states(spec, max_pupil_mm=5.0)
+    assert n_states == len(states) == 7 * 5 * 4 * 4 * 3
+    # both stay relaxed; other terms of the two eyes are hardly different
+    defocus_um = 0.25 * (states[:, 2] / 2.0) ** 2 / (4.0 * np.sqrt(3.0))
+    assert found_um == pytest.approx(defocus_um.mean() / 27, rel=0.1)
+
+
+def test_tables_verdict_and_plot_show_every_method(capsys, tmp_path):
+    print_all(ROWS, verdicts(ROWS))
+    text = capsys.readouterr().out
+    assert "Ryzen 7 1700" in text and "n_outside" in text and "worth it" in text
+    plot_steps(ROWS, tmp_path / "networks.png")
+    with Image.open(tmp_path / "networks.png") as picture:
+        assert picture.size[0] > 300
+
+
+def test_without_weights_the_bench_says_what_to_do(monkeypatch):
+    def missing(name):
+        raise WeightsMissing(f"weights of {name} are missing")
+
+    monkeypatch.setattr(bench_networks, "load_network", missing)
+    monkeypatch.setattr("sys.argv", ["bench_networks", "--quick"])
+    with pytest.raises(SystemExit, match="weights of eye are missing"):
+        bench_networks.main()
