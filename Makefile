@@ -7,8 +7,7 @@ RESULTS := tests/benchmarks/results
 BENCHES := estimate networks plan psf build layers render field occlusion sequence cost switch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training validate check clean help setup setup-test \
-        setup-training
+.PHONY: demo test test-training validate check clean help setup setup-test setup-training
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)

@@ -73,7 +73,7 @@ def load_rows(run: Run, folder: Path) -> Rows:
         It is not there or not whole.
     """
     x, y = task_rows(run.task, load(folder))
-    share = run.training.validation_share
+    share = run.training.validation_ratio
     return Rows(run.task, x, y, *split(len(x), share=share, seed=run.seed))
 
 

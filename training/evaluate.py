@@ -56,9 +56,9 @@ class Judged:
     width: int
     n_parameters: int
     rows_seen: int
-    seconds: float
+    time_s: float
     error: dict
-    published: float | None
+    published_mae: str
 
 
 def judge(run: Run, x, y) -> Judged:
@@ -81,10 +81,15 @@ def judge(run: Run, x, y) -> Judged:
         width=run.model.width,
         n_parameters=network.n_parameters,
         rows_seen=state["log"]["rows"],
-        seconds=round(state["seconds"]),
+        time_s=round(state["seconds"]),
         error=judged(TASKS[run.task], found, x, y),
-        published=PUBLISHED.get((run.task, run.model.kind, loss)),
+        published_mae=_published(run.task, run.model.kind, loss),
     )
+
+
+def _published(task: str, kind: str, loss: str) -> str:
+    value = PUBLISHED.get((task, kind, loss))
+    return "" if value is None else f"{value:.6f} {TASKS[task].unit}"
 
 
 def format_row(row: Judged) -> str:
@@ -92,11 +97,11 @@ def format_row(row: Judged) -> str:
     orders = "  ".join(
         f"n{n} {value:.4f}" for n, value in row.error["by_radial_order"].items()
     )
-    paper = "" if row.published is None else f"  (paper {row.published:.4f})"
+    paper = f"  (paper {row.published_mae})" if row.published_mae else ""
     return (
         f"{row.run:28s} {row.kind:7s} {row.features:9s} {row.loss:14s}"
         f"{row.n_parameters / 1e6:7.2f} M {row.rows_seen / 1e6:7.1f} M rows "
-        f"{row.seconds:6.0f} s  {row.error['mean_abs']:.5f} {row.error['unit']}"
+        f"{row.time_s:6.0f} s  {row.error['mean_abs']:.5f} {row.error['unit']}"
         f"{paper}  {orders}"
     )
 

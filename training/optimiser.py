@@ -80,14 +80,14 @@ def make_optimiser(parameters, *, learning_rate: float, weight_decay: float):
 
 
 def pace(
-    progress: float, *, n_epochs: float, decay_per_epoch: float, final_share: float
+    progress: float, *, n_epochs: float, decay_per_epoch: float, final_ratio: float
 ) -> float:
     """Share of the first learning rate at ``progress`` (0 to 1) of the training.
 
-    Falls by a factor per epoch, smoothly, and over the last ``final_share`` of the
+    Falls by a factor per epoch, smoothly, and over the last ``final_ratio`` of the
     training straight to zero.
     """
     value = decay_per_epoch ** (progress * n_epochs)
-    if progress > 1.0 - final_share:
-        value *= max(1.0 - progress, 0.0) / final_share
+    if progress > 1.0 - final_ratio:
+        value *= max(1.0 - progress, 0.0) / final_ratio
     return value

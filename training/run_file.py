@@ -30,9 +30,9 @@ class TrainingSettings:
         Of the training rows; may be a fraction.
     decay_per_epoch : float
         Factor of learning rate and weight decay.
-    final_share : float
+    final_ratio : float
         Last part of the training in which both fall to zero.
-    validation_share : float
+    validation_ratio : float
     is_mixed : bool
         bfloat16 products on a GPU.
     is_fresh : bool
@@ -49,8 +49,8 @@ class TrainingSettings:
     learning_rate: float = 0.01
     weight_decay: float = 0.1
     decay_per_epoch: float = 0.8
-    final_share: float = 0.0
-    validation_share: float = 0.15
+    final_ratio: float = 0.0
+    validation_ratio: float = 0.15
     is_mixed: bool = True
     is_fresh: bool = False
     discriminator: str = ""

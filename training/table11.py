@@ -11,7 +11,7 @@ explain the difference.
 import argparse
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -38,22 +38,26 @@ FIRST_FOCUS_DPT = 0.125
 
 @dataclass(frozen=True)
 class Line:
-    """Statistics of one group under one chain, in the order of `statistics.ROWS`."""
+    """Statistics of one group of targets under one chain."""
 
     domain: str
     chain: str
     group: str
-    values: tuple[float, ...]
+    statistics: dict[str, float]
 
 
 def _lines(name: str, chain: str, targets: NDArray) -> list[Line]:
     good = targets[np.all(np.isfinite(targets), axis=1)]
     found = group_statistics(DOMAINS[name], good)
-    return [Line(name, chain, group, values) for group, values in found.items()]
+    return [_line(name, chain, *item) for item in found.items()]
+
+
+def _line(name: str, chain: str, group: str, values: tuple[float, ...]) -> Line:
+    return Line(name, chain, group, dict(zip(ROWS, values, strict=True)))
 
 
 def _published(name: str) -> list[Line]:
-    return [Line(name, "paper", *item) for item in PUBLISHED[name].items()]
+    return [_line(name, "paper", *item) for item in PUBLISHED[name].items()]
 
 
 def aberration_lines(name: str, n_rows: int) -> list[Line]:
@@ -105,12 +109,9 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{'':10s}{'':38s}" + "".join(f"{row:>10s}" for row in ROWS))
     for line in sorted(lines, key=lambda line: (line.domain, line.group)):
         label = f"{line.group.removesuffix('_mm'):28s}{line.chain:28s}"
-        print(label + "".join(f"{value:10.4f}" for value in line.values))
+        print(label + "".join(f"{value:10.4f}" for value in line.statistics.values()))
     if options.json:
-        rows = [
-            vars(line) | {"values": dict(zip(ROWS, line.values, strict=True))}
-            for line in lines
-        ]
+        rows = [asdict(line) for line in lines]
         table = {"commit": commit_id(), "n_rows": options.rows, "rows": rows}
         options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
     return 0

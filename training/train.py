@@ -128,7 +128,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                 step / n_steps,
                 n_epochs=settings.n_epochs,
                 decay_per_epoch=settings.decay_per_epoch,
-                final_share=settings.final_share,
+                final_ratio=settings.final_ratio,
             )
             optimiser.set_pace(
                 learning_rate=settings.learning_rate * share,

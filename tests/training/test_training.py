@@ -85,7 +85,7 @@ def test_weight_decay_is_decoupled():
 
 
 def test_the_pace_falls_by_a_factor_per_epoch_and_ends_at_zero():
-    settings = {"n_epochs": 10, "decay_per_epoch": 0.8, "final_share": 0.2}
+    settings = {"n_epochs": 10, "decay_per_epoch": 0.8, "final_ratio": 0.2}
     assert pace(0.0, **settings) == 1.0
     assert pace(0.3, **settings) == pytest.approx(0.8**3)
     assert pace(0.9, **settings) == pytest.approx(0.8**9 / 2)

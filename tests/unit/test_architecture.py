@@ -32,7 +32,10 @@ HOME = {
     # library: files that may import it, each with its reason
     "torch": ("training/*",),  # the service must run without it
     "onnx": ("training/*",),
-    "onnxruntime": ("estimator/networks.py",),
+    "onnxruntime": (
+        "estimator/networks.py",
+        "training/export.py",  # judges the file that it wrote
+    ),
     "moderngl": (
         "filter_service/gl/gpu.py",  # one owner of the context
         "clients/window.py",  # shows frames in a window of its own
@@ -72,7 +75,7 @@ HOME = {
         "clients/*",  # captions, textures, contact sheet
     ),
     "typer": ("filter_service/__main__.py", "filter_service/commands/*"),
-    "rich": ("filter_service/commands/*", "clients/*"),  # progress bars
+    "rich": ("filter_service/commands/*", "clients/*", "training/*"),  # progress bars
     "hypothesis": ("tests/*",),
     "pytest": ("tests/*",),
 }

@@ -37,6 +37,13 @@ DIMENSIONLESS = {
     "mean_abs": "in the unit that a network's card names",
     "p95_abs": "in the unit that a network's card names",
     "t": "the sender's own clock, echoed unread",
+    "inputs": "columns of a data set, each in the unit its name ends in",
+    "targets": "as inputs",
+    "ranges": "of inputs",
+    "n_epochs": "how often a training sees its rows, may be a fraction",
+    "learning_rate": "step of an optimiser",
+    "weight_decay": "as learning_rate",
+    "decay_per_epoch": "factor of both",
 }
 """Float fields without a unit, each with what it is instead."""
 
