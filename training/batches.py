@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from estimator.eye_parameters import sampled_ranges
 from training.datasets import Recipe, Shard, draw, label, load, split
+from training.device_labels import label_on_device
 from training.models import Network
 from training.run_file import Run
-from training.tasks import DOMAINS, N_EYE, TASKS
+from training.tasks import N_EYE, TASKS
 
 SCALING_ROWS = 200_000
 """Rows from which means and deviations are taken."""
@@ -128,7 +130,10 @@ class Batches:
         domain = TASKS[self._run.task].domain
         recipe = self._fresh_recipe(domain.n_repeats)
         block = draw(recipe, step * self._n_ranks + self._rank)
-        return task_rows(self._run.task, label(DOMAINS[recipe.domain], block))
+        labels = None
+        if self._device.type == "cuda":
+            labels = partial(label_on_device, domain, device=self._device)
+        return task_rows(self._run.task, label(domain, block, labels=labels))
 
     def _fresh_recipe(self, n_repeats: int) -> Recipe:
         per_shard = -(-self._size // n_repeats) * n_repeats

@@ -5,6 +5,7 @@ network, which takes its columns from one domain.  Ranges are those of the paper
 Table 2.  Labels come from the service's own tracer, on the CPU, in float64.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -32,6 +33,8 @@ is focused behind infinity."""
 MAX_COEFFICIENT_UM = 200.0
 """Coefficients beyond it belong to eyes that form no image; the published data, too,
 end at 115 um."""
+
+N_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 
 Labels = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -74,6 +77,7 @@ def label_on_axis(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         pack_eyes(eyes),
         media_indices_of(wavelength_nm),
         zernike_radius_mm=pupil_mm / 2.0,
+        n_threads=N_CORES,
     )
     return zernike_um[:, 1:]
 
@@ -90,6 +94,7 @@ def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         stop_diameters_mm=np.where(usable, pupil_mm / ratios, 1.0),
         h_deg=h_deg,
         v_deg=v_deg,
+        n_threads=N_CORES,
     )
     targets = np.concatenate(
         [

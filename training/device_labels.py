@@ -1,0 +1,60 @@
+"""Labels on a GPU: the domains of `tasks` by the tracer in torch, for fresh rows."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from training.tasks import N_EYE, Domain
+from training.tracer.accommodation import focus_of_eyes
+from training.tracer.circle import zernike_of_eyes
+from training.tracer.field import field_aberrations_of_eyes
+
+
+@torch.no_grad()
+def label_on_device(
+    domain: Domain, inputs: NDArray[np.float64], device: torch.device
+) -> NDArray[np.float64]:
+    """Label inputs (n, n_inputs) as ``domain.label`` does: targets (n, n_targets).
+
+    A row that light does not pass as a whole is nan.  Rays are traced in float64.
+
+    Raises
+    ------
+    ValueError
+        A domain that has no tracer here.
+    """
+    columns = torch.as_tensor(inputs, dtype=torch.float64, device=device)
+    makers = {"on_axis": _on_axis, "field": _field, "focus": _focus}
+    if domain.name not in makers:
+        raise ValueError(f"domain '{domain.name}': allowed are {', '.join(makers)}")
+    targets, is_traced = makers[domain.name](columns, domain)
+    targets = torch.where(is_traced[:, None], targets, torch.nan)
+    return targets.cpu().numpy()
+
+
+def _on_axis(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+    zernike_um, is_traced = zernike_of_eyes(
+        columns[:, :N_EYE], columns[:, N_EYE], columns[:, N_EYE + 1]
+    )
+    return zernike_um[:, 1:], is_traced
+
+
+def _field(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+    found = field_aberrations_of_eyes(columns[:, :N_EYE], *columns[:, N_EYE:].T)
+    parts = (
+        found.zernike_um[:, 1:],
+        found.zernike_radius_mm[:, None],
+        found.ellipse_mm,
+    )
+    return torch.cat(parts, dim=1), found.ok
+
+
+def _focus(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+    """Eyes come in runs of ``n_repeats`` rows, as `datasets.draw` makes them."""
+    eyes = columns[:: domain.n_repeats]
+    focus_dpt = columns[:, -1].reshape(len(eyes), domain.n_repeats)
+    found = focus_of_eyes(eyes[:, :N_EYE], eyes[:, N_EYE], focus_dpt)
+    changes = (found.lens_diameter_change_mm, found.aqueous_thickness_change_mm)
+    targets = torch.stack([change.flatten() for change in changes], dim=1)
+    return targets, torch.all(torch.isfinite(targets), dim=1)
