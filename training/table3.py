@@ -20,7 +20,7 @@ from training.datasets import DataError
 from training.evaluate import Judged, format_row, judge
 from training.export import JUDGED_ROWS, fresh_rows
 from training.models import ModelSettings
-from training.run_file import Run, RunFileError, TrainingSettings, read_run
+from training.run_file import Run, RunFileError, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT, train
 from training.versions import commit_id
@@ -59,14 +59,14 @@ def make_run(task: str, name: str, model: ModelSettings, loss: str, options) -> 
     n_training = base.recipe.n_rows * (1.0 - base.training.validation_ratio)
     judge_file = read_run(RUNS / "discriminator.toml").output_folder / CHECKPOINT
     label = name.replace(", ", "-").replace(" ", "-")
-    settings = TrainingSettings(
+    settings = replace(
+        base.training,
         loss=loss,
         n_epochs=options.rows / n_training,
         learning_rate=LEARNING_RATE,
         weight_decay=0.01,
         decay_per_epoch=1.0,
         final_ratio=0.5,
-        validation_ratio=base.training.validation_ratio,
         discriminator=str(judge_file) if loss == "discriminator" else "",
     )
     return replace(

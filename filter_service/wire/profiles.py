@@ -33,7 +33,7 @@ from filter_service.wire.text import clip, clip_notes, take_notes
 
 EYE_MODELS = ("traced", "wavefront")
 ACCURACIES = ("fast", "balanced", "exact")
-DEFAULT_ACCURACY = "balanced"
+DEFAULT_ACCURACY = "exact"
 MODES = ("on-axis", "quality", "dynamic")
 GRIDS = ("planned", "paper")
 TOLERANCES = ("loose", "normal", "fine")
