@@ -6,6 +6,7 @@ accommodation and chromatic difference.  It knows one field, and takes it for al
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,6 +151,29 @@ class MeasuredWavefront(FocusingEye):
         )
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
         return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[[float, float], NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        Returns
+        -------
+        callable
+            From a pupil, mm, and an accommodation, dpt, to dpt in the arguments'
+            broadcast shape.
+        """
+        shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
+
+        def defocus_dpt(pupil_mm: float, used_dpt: float) -> NDArray[np.float64]:
+            found_dpt = self.total_defocus_dpt(
+                pupil_diameter_mm=pupil_mm,
+                accommodation_dpt=used_dpt,
+                wavelength_nm=wavelength_nm,
+            )
+            return np.broadcast_to(found_dpt, shape)
+
+        return defocus_dpt
 
     def chief_ray_shift_mrad(
         self,
