@@ -8,6 +8,7 @@ accommodation and chromatic difference.  It knows one field, and takes it for al
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -164,16 +165,17 @@ class MeasuredWavefront(FocusingEye):
             broadcast shape.
         """
         shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
+        return partial(self._defocus_dpt, wavelength_nm, shape)
 
-        def defocus_dpt(pupil_mm: float, used_dpt: float) -> NDArray[np.float64]:
-            found_dpt = self.total_defocus_dpt(
-                pupil_diameter_mm=pupil_mm,
-                accommodation_dpt=used_dpt,
-                wavelength_nm=wavelength_nm,
-            )
-            return np.broadcast_to(found_dpt, shape)
-
-        return defocus_dpt
+    def _defocus_dpt(
+        self, wavelength_nm, shape: tuple, pupil_mm: float, used_dpt: float
+    ) -> NDArray[np.float64]:
+        found_dpt = self.total_defocus_dpt(
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=used_dpt,
+            wavelength_nm=wavelength_nm,
+        )
+        return np.broadcast_to(found_dpt, shape)
 
     def chief_ray_shift_mrad(
         self,

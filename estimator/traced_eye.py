@@ -7,6 +7,7 @@ may be made by network instead, see `grid_source`.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +27,7 @@ from estimator.field_wavefronts import (
     with_defocus,
 )
 from estimator.focusing import FocusingEye
-from estimator.traced_fields import TracedFields
+from estimator.traced_fields import TracedFields, check_limits
 from estimator.wavefront import FIELD_LIMIT_DEG
 
 MAX_PUPIL_MM = 8.0
@@ -54,9 +55,6 @@ SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
 """Step by which the traced field is made smaller until light passes all of it."""
 
 AXIS_PROGRESS = 0.1
-
-MARGIN = 1e-3
-"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
 
 FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
@@ -224,17 +222,15 @@ class TracedEye(FocusingEye):
         h_deg, v_deg, wavelength_nm = (column[first] for column in columns)
         self._check_fields(h_deg, v_deg)
         fields = self._fields(h_deg, v_deg, wavelength_nm)
+        return partial(self._defocus_dpt, fields, number.reshape(states[0].shape))
 
-        def defocus_dpt(pupil_mm: float, used_dpt: float) -> NDArray[np.float64]:
-            pupils_mm, used = (np.full(first.size, x) for x in (pupil_mm, used_dpt))
-            self._check_states(pupils_mm, used)
-            zernike_um, _, radius_mm = fields.wavefronts(
-                pupil_diameter_mm=pupils_mm, accommodation_dpt=used
-            )
-            found_dpt = total_defocus_dpt(zernike_um, radius_mm)
-            return found_dpt[number].reshape(states[0].shape)
-
-        return defocus_dpt
+    def _defocus_dpt(
+        self, fields: TracedFields, number: NDArray, pupil_mm: float, used_dpt: float
+    ) -> NDArray[np.float64]:
+        states = [np.full(fields.count, value) for value in (pupil_mm, used_dpt)]
+        self._check_states(*states)
+        zernike_um, _, radius_mm = fields.wavefronts(*states)
+        return total_defocus_dpt(zernike_um, radius_mm)[number]
 
     def wavefronts(
         self,
@@ -299,10 +295,7 @@ class TracedEye(FocusingEye):
         self._check_fields(h_deg, v_deg)
         self._check_states(pupil_mm, used_dpt)
         fields = self._fields(h_deg, v_deg, wavelength_nm, pupil_diameter_mm=pupil_mm)
-        found = fields.wavefronts(
-            pupil_diameter_mm=pupil_mm, accommodation_dpt=used_dpt
-        )
-        return *found, number
+        return *fields.wavefronts(pupil_mm, used_dpt), number
 
     def _fields(
         self, h_deg, v_deg, wavelength_nm, *, pupil_diameter_mm=None
@@ -322,13 +315,13 @@ class TracedEye(FocusingEye):
         )
 
     def _check_fields(self, h_deg, v_deg) -> None:
-        _check_limits("h_deg", h_deg, *self.field_range_deg[0])
-        _check_limits("v_deg", v_deg, *self.field_range_deg[1])
+        check_limits("h_deg", h_deg, *self.field_range_deg[0])
+        check_limits("v_deg", v_deg, *self.field_range_deg[1])
 
     def _check_states(self, pupil_mm, used_dpt) -> None:
-        _check_limits("pupil_diameter_mm", pupil_mm, 0.1, self.max_pupil_diameter_mm)
+        check_limits("pupil_diameter_mm", pupil_mm, 0.1, self.max_pupil_diameter_mm)
         traced_dpt = self.grid.accommodations_dpt
-        _check_limits("accommodation_dpt", used_dpt, traced_dpt[0], traced_dpt[-1])
+        check_limits("accommodation_dpt", used_dpt, traced_dpt[0], traced_dpt[-1])
 
 
 def largest_open_pupil_mm(grid: AberrationGrid) -> float:
@@ -389,16 +382,6 @@ def _share(
     if progress is None:
         return None
     return lambda done: progress(low + (high - low) * done)
-
-
-def _check_limits(name: str, values: NDArray, low: float, high: float) -> None:
-    if values.size and not (
-        values.min() >= low - MARGIN and values.max() <= high + MARGIN
-    ):
-        raise ValueError(
-            f"{name} {values.min():g} to {values.max():g}: traced are "
-            f"{low:g} to {high:g}"
-        )
 
 
 def _check_field_range(field_range_deg: FieldRange) -> None:

@@ -14,6 +14,25 @@ from estimator.field_wavefronts import (
     zernike_from_polynomial,
 )
 
+MARGIN = 1e-3
+"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
+
+
+def check_limits(name: str, values: NDArray, low: float, high: float) -> None:
+    """Refuse values that were not traced.
+
+    Raises
+    ------
+    ValueError
+    """
+    if values.size and not (
+        values.min() >= low - MARGIN and values.max() <= high + MARGIN
+    ):
+        raise ValueError(
+            f"{name} {values.min():g} to {values.max():g}: traced are "
+            f"{low:g} to {high:g}"
+        )
+
 
 class TracedFields:
     """Wavefronts at the fields and wavelengths of n states.
@@ -55,14 +74,22 @@ class TracedFields:
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
         )
 
+    @property
+    def count(self) -> int:
+        """Number of states."""
+        return self._states.field.size
+
     def wavefronts(
-        self,
-        *,
-        pupil_diameter_mm: NDArray[np.float64],
-        accommodation_dpt: NDArray[np.float64],
+        self, pupil_mm: NDArray[np.float64], used_dpt: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients (n, 28), um, rims (n, 5), mm, and radii (n,), mm, of states."""
-        pupil_mm, used_dpt = self._usable_mm(pupil_diameter_mm), accommodation_dpt
+        """Coefficients (n, 28), um, rims (n, 5), mm, and radii (n,), mm, of states.
+
+        Parameters
+        ----------
+        pupil_mm, used_dpt : (n,)
+            Pupil diameters and accommodations.
+        """
+        pupil_mm = self._usable_mm(pupil_mm)
         polynomial_um, rim_mm = self._field.between(
             self._states, pupil_diameter_mm=pupil_mm, accommodation_dpt=used_dpt
         )
