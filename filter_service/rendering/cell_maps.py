@@ -93,14 +93,14 @@ def _fill_ratios(maps, inverse, ratios):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mapped_reach(out, reach_px):
+def mapped_reach(out, cell, corner, reach_px):
     """Bring reaches (left, right, up, down) to the image's pixels, in place.
 
     Light that is interpolated ends one stored pixel beyond the last one.
     """
     left, right, up, down = reach_px
     for axis in range(2):
-        a, b = out[axis, 0], out[axis, 1]
+        a, b = out[cell, corner, axis, 0], out[cell, corner, axis, 1]
         low = min(-a * (left + 1.0), a * (right + 1.0))
         low += min(-b * (up + 1.0), b * (down + 1.0))
         high = max(-a * (left + 1.0), a * (right + 1.0))

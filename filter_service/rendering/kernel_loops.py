@@ -152,22 +152,25 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
         peak_ratio[k], spread_px[k] = 0.0, 0.0
         for j in range(CORNERS):
             part, weight = parts[k, j], weight_ratio[cell, j]
-            side_px[:], widest_px = node_reach_px[part], node_radius_px[part]
+            widest_px = node_radius_px[part]
+            for side in range(4):
+                side_px[side] = node_reach_px[part, side]
             area = box = 1.0
-            part_maps[k, j, 0, 0] = part_maps[k, j, 1, 1] = 1.0
-            part_maps[k, j, 0, 1] = part_maps[k, j, 1, 0] = 0.0
-            if maps.change_ratio[cell, j] * widest_px > UNMOVED_PX:
+            is_moved = maps.change_ratio[cell, j] * widest_px > UNMOVED_PX
+            for row in range(2):
+                for column in range(2):
+                    own = maps.node_from_cell[cell, j, row, column]
+                    part_maps[k, j, row, column] = own if is_moved else row == column
+            if is_moved:
                 area, box = maps.area_ratio[cell, j], maps.box_ratio[cell, j]
-                part_maps[k, j] = maps.node_from_cell[cell, j]
-                mapped_reach(maps.cell_from_node[cell, j], side_px)
+                mapped_reach(maps.cell_from_node, cell, j, side_px)
                 wider_px = maps.stretch_ratio[cell, j] * (widest_px + 1.0)
                 widest_px = int(min(math.ceil(wider_px), MAX_REACH_PX))
             part_ratio[k, j] = weight * box
             peak_ratio[k] += node_peak[part] * weight * area
-            for end in range(2):
-                spread_px[k, end] += node_spread_px[part, end] * (
-                    weight / math.sqrt(area)
-                )
+            share = weight / math.sqrt(area)
+            spread_px[k, 0] += node_spread_px[part, 0] * share
+            spread_px[k, 1] += node_spread_px[part, 1] * share
             if weight > 0.0:
                 radius_px[k] = max(radius_px[k], widest_px)
                 for side in range(4):
