@@ -7,6 +7,8 @@ of what a sixth-order fit leaves out.
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,6 +97,40 @@ def _linear(nodes: NDArray, at: NDArray) -> NDArray[np.float64]:
     return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
 
 
+def _for_distinct(function: Callable, values: NDArray):
+    """Array or arrays (n, ...) of a function that many of the values (n,) share."""
+    distinct, place = np.unique(values, return_inverse=True)
+    found = function(distinct)
+    if isinstance(found, tuple):
+        return tuple(array[place] for array in found)
+    return found[place]
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """A grid's values at the fields and wavelengths of n states.
+
+    All that is left open is pupil and accommodation.
+
+    Attributes
+    ----------
+    values : (n_fields, n_channels, n_pupils, n_accommodations, 33)
+    first_pupil : int
+        Which of the grid's pupils comes first in `values`.
+    field, channel : (n,)
+        Of each state.
+    """
+
+    values: NDArray[np.float64]
+    first_pupil: int
+    field: NDArray[np.int64]
+    channel: NDArray[np.int64]
+
+    def of(self, states: NDArray[np.int64]) -> "FieldValues":
+        """Values of some of the states."""
+        return replace(self, field=self.field[states], channel=self.channel[states])
+
+
 class FieldInterpolation:
     """Wavefronts and rims of one grid, anywhere between its nodes.
 
@@ -140,19 +176,18 @@ class FieldInterpolation:
         is_finite &= np.isfinite(grid.ellipse_mm).all(axis=-1)
         return is_finite & (grid.open_ratio > OPEN_RATIO)
 
-    def usable_pupils_mm(
-        self, h_deg: NDArray, v_deg: NDArray, pupil_diameter_mm: NDArray
-    ) -> NDArray[np.float64]:
-        """Pupils (n,), smaller at fields where light passes only a part of them."""
+    def open_pupils_mm(
+        self, h_deg: NDArray, v_deg: NDArray
+    ) -> NDArray[np.float64] | None:
+        """Pupils (n,) that light passes at fields; None where it passes them all."""
         if self.all_open:
-            return pupil_diameter_mm
-        open_mm = np.einsum(
+            return None
+        return np.einsum(
             "nh,nv,hv->n",
             _linear(self.grid.h_deg, h_deg),
             _linear(self.grid.v_deg, v_deg),
             self.open_pupil_mm,
         )
-        return np.minimum(pupil_diameter_mm, open_mm)
 
     def at(
         self,
@@ -170,29 +205,72 @@ class FieldInterpolation:
         ValueError
             A wavelength that is not among the traced ones.
         """
+        values = self.values(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            wavelength_nm=wavelength_nm,
+            pupil_diameter_mm=pupil_diameter_mm,
+        )
+        return self.between(
+            values,
+            pupil_diameter_mm=pupil_diameter_mm,
+            accommodation_dpt=accommodation_dpt,
+        )
+
+    def values(
+        self,
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+        pupil_diameter_mm: NDArray[np.float64] | None = None,
+    ) -> FieldValues:
+        """Values at the fields and wavelengths (n,) of states, for `between`.
+
+        Parameters
+        ----------
+        pupil_diameter_mm : (n,), optional
+            Pupils that will be asked for; any at all where it is None.
+
+        Raises
+        ------
+        ValueError
+            A wavelength that is not among the traced ones.
+        """
         channels, channel = np.unique(
             self._channels(wavelength_nm), return_inverse=True
         )
         first, field = distinct_rows(h_deg, v_deg)
-        used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
-        lower, share = self._pupil_shares(pupil_diameter_mm)
-        # Only what is asked for: few calls need all wavelengths and pupils.
-        pupils = slice(int(lower.min()), int(lower.max()) + 2)
-        lower = lower - pupils.start
-        over_field = self._over_field(h_deg[first], v_deg[first], channels, pupils)
-        found = np.empty((h_deg.size, N_TERMS + N_RIM))
-        for start in range(0, h_deg.size, _CHUNK):
+        pupils = slice(0, None)
+        if pupil_diameter_mm is not None:
+            # Only what is asked for: few calls need all wavelengths and pupils.
+            lower, _ = self._pupil_shares(pupil_diameter_mm)
+            pupils = slice(int(lower.min()), int(lower.max()) + 2)
+        values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
+        return FieldValues(values, pupils.start, field, channel)
+
+    def between(
+        self,
+        states: FieldValues,
+        *,
+        pupil_diameter_mm: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, at states (n,)."""
+        used = _for_distinct(
+            lambda dpt: lagrange_weights(self.grid.accommodations_dpt, dpt),
+            accommodation_dpt,
+        )
+        lower, share = _for_distinct(self._pupil_shares, pupil_diameter_mm)
+        lower = lower - states.first_pupil
+        upper = np.minimum(lower + 1, states.values.shape[2] - 1)
+        found = np.empty((lower.size, N_TERMS + N_RIM))
+        for start in range(0, lower.size, _CHUNK):
             part = slice(start, start + _CHUNK)
+            at = states.field[part], states.channel[part]
             low, high = (
-                np.einsum("na,nac->nc", used[part], over_field[chosen])
-                for chosen in (
-                    (field[part], channel[part], lower[part]),
-                    (
-                        field[part],
-                        channel[part],
-                        np.minimum(lower[part] + 1, over_field.shape[2] - 1),
-                    ),
-                )
+                np.einsum("na,nac->nc", used[part], states.values[*at, pupil[part]])
+                for pupil in (lower, upper)
             )
             found[part] = low + share[part] * (high - low)
         rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE

@@ -67,23 +67,30 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Radius (...) of the circle about the chief ray that a rim just fits into."""
     x, y, xx, xy, yy = np.moveaxis(rim_mm[..., None], -2, 0)
 
-    def derivatives(angle):
-        """Half the squared distance of a rim point, with two derivatives."""
-        cosine, sine = np.cos(angle), np.sin(angle)
-        px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
-        tx, ty = xy * cosine - xx * sine, yy * cosine - xy * sine
-        first = px * tx + py * ty
-        second = tx * tx + ty * ty - px * (px - x) - py * (py - y)
-        return 0.5 * (px * px + py * py), first, second
+    def rim_point(cosine, sine):
+        return x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
 
-    sampled = derivatives(_ANGLES)[0]
+    def half_square(angle):
+        """Half the squared distance of a rim point."""
+        px, py = rim_point(np.cos(angle), np.sin(angle))
+        return 0.5 * (px * px + py * py)
+
+    def derivatives(angle):
+        """Return the first two of that."""
+        cosine, sine = np.cos(angle), np.sin(angle)
+        px, py = rim_point(cosine, sine)
+        tx, ty = xy * cosine - xx * sine, yy * cosine - xy * sine
+        second = tx * tx + ty * ty - px * (px - x) - py * (py - y)
+        return px * tx + py * ty, second
+
+    sampled = half_square(_ANGLES)
     angle = _ANGLES[np.argmax(sampled, axis=-1)][..., None]
     for _ in range(_NEWTON_STEPS):
-        _, first, second = derivatives(angle)
+        first, second = derivatives(angle)
         bends_down = second < 0.0
         step = np.where(bends_down, -first / np.where(bends_down, second, 1.0), 0.0)
         angle = angle + np.clip(step, -0.2, 0.2)
-    highest = np.maximum(derivatives(angle)[0][..., 0], sampled.max(axis=-1))
+    highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
     return np.sqrt(2.0 * highest)
 
 
@@ -160,6 +167,8 @@ def distinct_rows(*columns: NDArray) -> tuple[NDArray, NDArray]:
     """First index of each distinct row of columns (n,), and every row's number."""
     number = np.zeros(columns[0].size, dtype=np.int64)
     for column in columns:
+        if (column == column[:1]).all():
+            continue  # most calls vary one or two of them only
         values, place = np.unique(column, return_inverse=True)
         number = np.unique(number * values.size + place, return_inverse=True)[1]
     return np.unique(number, return_index=True)[1], number

@@ -6,7 +6,9 @@ accommodation and chromatic difference.  It knows one field, and takes it for al
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -150,6 +152,30 @@ class MeasuredWavefront(FocusingEye):
         )
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
         return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[[float, float], NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        Returns
+        -------
+        callable
+            From a pupil, mm, and an accommodation, dpt, to dpt in the arguments'
+            broadcast shape.
+        """
+        shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
+        return partial(self._defocus_dpt, wavelength_nm, shape)
+
+    def _defocus_dpt(
+        self, wavelength_nm, shape: tuple, pupil_mm: float, used_dpt: float
+    ) -> NDArray[np.float64]:
+        found_dpt = self.total_defocus_dpt(
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=used_dpt,
+            wavelength_nm=wavelength_nm,
+        )
+        return np.broadcast_to(found_dpt, shape)
 
     def chief_ray_shift_mrad(
         self,

@@ -7,6 +7,7 @@ may be made by network instead, see `grid_source`.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,14 +21,13 @@ from estimator.field_interpolation import (
 )
 from estimator.field_wavefronts import (
     FieldWavefronts,
-    circumscribed_radius_mm,
     correction_polynomial,
     distinct_rows,
     total_defocus_dpt,
     with_defocus,
-    zernike_from_polynomial,
 )
 from estimator.focusing import FocusingEye
+from estimator.traced_fields import TracedFields, check_limits
 from estimator.wavefront import FIELD_LIMIT_DEG
 
 MAX_PUPIL_MM = 8.0
@@ -55,9 +55,6 @@ SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
 """Step by which the traced field is made smaller until light passes all of it."""
 
 AXIS_PROGRESS = 0.1
-
-MARGIN = 1e-3
-"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
 
 FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
@@ -208,6 +205,33 @@ class TracedEye(FocusingEye):
         zernike_um, _, radius_mm, number = self._distinct(states)
         return total_defocus_dpt(zernike_um, radius_mm)[number].reshape(states[0].shape)
 
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[[float, float], NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        Returns
+        -------
+        callable
+            From a pupil, mm, and an accommodation, dpt, to dpt in the arguments'
+            broadcast shape.
+        """
+        states = np.broadcast_arrays(h_deg, v_deg, wavelength_nm)
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h_deg, v_deg, wavelength_nm = (column[first] for column in columns)
+        self._check_fields(h_deg, v_deg)
+        fields = self._fields(h_deg, v_deg, wavelength_nm)
+        return partial(self._defocus_dpt, fields, number.reshape(states[0].shape))
+
+    def _defocus_dpt(
+        self, fields: TracedFields, number: NDArray, pupil_mm: float, used_dpt: float
+    ) -> NDArray[np.float64]:
+        states = [np.full(fields.count, value) for value in (pupil_mm, used_dpt)]
+        self._check_states(*states)
+        zernike_um, _, radius_mm = fields.wavefronts(*states)
+        return total_defocus_dpt(zernike_um, radius_mm)[number]
+
     def wavefronts(
         self,
         *,
@@ -268,43 +292,36 @@ class TracedEye(FocusingEye):
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
         h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
-        self._check_states(h_deg, v_deg, pupil_mm, used_dpt)
+        self._check_fields(h_deg, v_deg)
+        self._check_states(pupil_mm, used_dpt)
+        fields = self._fields(h_deg, v_deg, wavelength_nm, pupil_diameter_mm=pupil_mm)
+        return *fields.wavefronts(pupil_mm, used_dpt), number
+
+    def _fields(
+        self, h_deg, v_deg, wavelength_nm, *, pupil_diameter_mm=None
+    ) -> TracedFields:
         h_deg, v_deg = (
             np.clip(angle, *limits)
             for angle, limits in zip((h_deg, v_deg), self.traced_range_deg, strict=True)
         )
-        rest = {
-            "pupil_diameter_mm": self._field.usable_pupils_mm(h_deg, v_deg, pupil_mm),
-            "accommodation_dpt": used_dpt,
-            "wavelength_nm": wavelength_nm,
-        }
-        polynomial_um, rim_mm = self._field.at(h_deg=h_deg, v_deg=v_deg, **rest)
-        zeros = np.zeros(h_deg.size)
-        _, axis_rim_mm = self._on_axis.at(h_deg=zeros, v_deg=zeros, **rest)
-        scale = rest["pupil_diameter_mm"] / 2.0 / circumscribed_radius_mm(axis_rim_mm)
-        rim_mm = rim_mm * scale[:, None]
-        radius_mm = circumscribed_radius_mm(rim_mm)
-        zernike_um = zernike_from_polynomial(
-            polynomial_um - self._correction, radius_mm
+        return TracedFields(
+            self._field,
+            self._on_axis,
+            self._correction,
+            h_deg=h_deg,
+            v_deg=v_deg,
+            wavelength_nm=wavelength_nm,
+            pupil_diameter_mm=pupil_diameter_mm,
         )
-        return zernike_um, rim_mm, radius_mm, number
 
-    def _check_states(self, h_deg, v_deg, pupil_mm, used_dpt) -> None:
+    def _check_fields(self, h_deg, v_deg) -> None:
+        check_limits("h_deg", h_deg, *self.field_range_deg[0])
+        check_limits("v_deg", v_deg, *self.field_range_deg[1])
+
+    def _check_states(self, pupil_mm, used_dpt) -> None:
+        check_limits("pupil_diameter_mm", pupil_mm, 0.1, self.max_pupil_diameter_mm)
         traced_dpt = self.grid.accommodations_dpt
-        limits = {
-            "h_deg": (h_deg, *self.field_range_deg[0]),
-            "v_deg": (v_deg, *self.field_range_deg[1]),
-            "pupil_diameter_mm": (pupil_mm, 0.1, self.max_pupil_diameter_mm),
-            "accommodation_dpt": (used_dpt, traced_dpt[0], traced_dpt[-1]),
-        }
-        for name, (values, low, high) in limits.items():
-            if values.size and not (
-                values.min() >= low - MARGIN and values.max() <= high + MARGIN
-            ):
-                raise ValueError(
-                    f"{name} {values.min():g} to {values.max():g}: traced are "
-                    f"{low:g} to {high:g}"
-                )
+        check_limits("accommodation_dpt", used_dpt, traced_dpt[0], traced_dpt[-1])
 
 
 def largest_open_pupil_mm(grid: AberrationGrid) -> float:

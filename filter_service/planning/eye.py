@@ -1,5 +1,6 @@
 """What the PSF cache asks of an eye, whether a wavefront or a ray-traced model."""
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -44,6 +45,14 @@ class Eye(Protocol):
         """Least-squares refraction for an object at infinity, in the broadcast shape.
 
         On the circle about the pupil, worn correction included.
+        """
+
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[[float, float], NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        From a pupil, mm, and an accommodation, dpt, to dpt in the broadcast shape.
         """
 
     def chief_ray_shift_mrad(

@@ -345,11 +345,17 @@ def layer_distances_dpt(
         np.concatenate([np.linspace(low_dpt, high_dpt, max(count, 1)), inside])
     )
     blur_px = blur_radius_px(base)
-    layers = [base[:1]]
-    for k in range(len(base) - 1):
-        change_px = float(np.abs(blur_px[k + 1] - blur_px[k]).max())
-        smaller_px = float(np.minimum(blur_px[k + 1], blur_px[k]).min())
-        step_px = blur_step_px(smaller_px, max_blur_step_px)
-        transitional = max(math.ceil(change_px / step_px - 1e-9) - 1, 0)
-        layers.append(np.linspace(base[k], base[k + 1], transitional + 2)[1:])
-    return np.concatenate(layers)
+    change_px = np.abs(np.diff(blur_px, axis=0)).max(axis=1)
+    smaller_px = np.minimum(blur_px[1:], blur_px[:-1]).min(axis=1)
+    step_px = [blur_step_px(px, max_blur_step_px) for px in smaller_px.tolist()]
+    steps = np.ceil(change_px / step_px - 1e-9).astype(np.int64).clip(min=1)
+    return np.append(_between(base[:-1], base[1:], steps), base[-1])
+
+
+def _between(
+    first: NDArray[np.float64], last: NDArray[np.float64], steps: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Equal steps from each first value up to its last, the last not included."""
+    stretch = np.repeat(np.arange(first.size), steps)
+    step = np.arange(stretch.size) - (np.cumsum(steps) - steps)[stretch]
+    return step * ((last - first) / steps)[stretch] + first[stretch]

@@ -46,13 +46,19 @@ class RaggedNodes:
         return np.repeat(np.arange(len(self.starts) - 1), self.counts)
 
     @cached_property
-    def _span(self) -> float:
+    def lowest_dpt(self) -> float:
+        """Smallest value of all groups."""
+        return float(self.values_dpt.min())
+
+    @cached_property
+    def span_dpt(self) -> float:
+        """Stretch that each group has for itself in `keys_dpt`."""
         return float(np.ptp(self.values_dpt)) + 1.0
 
     @cached_property
-    def _keys(self) -> NDArray[np.float64]:
-        # Every group on a stretch of its own, so that one search serves all of them.
-        return self.values_dpt - self.values_dpt.min() + self._span * self.group_of_node
+    def keys_dpt(self) -> NDArray[np.float64]:
+        """Values (n,) shifted so that one search serves all groups, ascending."""
+        return self.values_dpt - self.lowest_dpt + self.span_dpt * self.group_of_node
 
     def bracket(
         self, groups: ArrayLike, t: ArrayLike
@@ -75,8 +81,8 @@ class RaggedNodes:
         groups, t = np.broadcast_arrays(np.asarray(groups), np.asarray(t, float))
         first, last = self.starts[groups], self.starts[groups + 1] - 1
         t = np.clip(t, self.values_dpt[first], self.values_dpt[last])
-        keys = t - self.values_dpt.min() + self._span * groups
-        upper = np.searchsorted(self._keys, keys)
+        keys = t - self.lowest_dpt + self.span_dpt * groups
+        upper = np.searchsorted(self.keys_dpt, keys)
         upper = np.clip(upper, np.minimum(first + 1, last), last)
         lower = np.maximum(upper - 1, first)
         span = self.values_dpt[upper] - self.values_dpt[lower]
@@ -141,6 +147,12 @@ class CachePlan:
     channel_shift_dpt: NDArray[np.float64]
     prediction: PlanPrediction
     is_limited: NDArray[np.bool_]
+
+    @property
+    def field_nodes_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Azimuths and elevations (n_fields,) of the nodes, [v, h] in C order."""
+        v_deg, h_deg = np.meshgrid(self.v_deg, self.h_deg, indexing="ij")
+        return h_deg.ravel(), v_deg.ravel()
 
     @property
     def group_shape(self) -> tuple[int, int, int, int]:

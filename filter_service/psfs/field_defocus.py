@@ -58,31 +58,65 @@ class FieldDefocus:
         )
 
 
-def field_defocus(
-    eye: Eye, spec: GridSpec, *, pupil_diameter_mm: float, accommodation_dpt: float
-) -> FieldDefocus:
-    """Defocus of green light over the field that a cache is for."""
-    if not (spec.follows_field and spec.blends_at_equal_blur):
-        return FieldDefocus.none()
-    h_deg, v_deg = (
-        np.linspace(low, high, count)
-        for (low, high), count in zip(
-            spec.field_range_deg, (COLUMNS, ROWS), strict=True
+class EyeDefocus:
+    """Defocus of an eye at field nodes and over the field, one state after the other.
+
+    Parameters
+    ----------
+    h_deg, v_deg : (n_fields,)
+        Field nodes.
+    """
+
+    def __init__(self, eye: Eye, spec: GridSpec, *, h_deg: NDArray, v_deg: NDArray):
+        wavelengths_nm = spec.channel_wavelengths_nm
+        h, v, nm = (
+            column.ravel()
+            for column in np.broadcast_arrays(
+                np.reshape(h_deg, (-1, 1)), np.reshape(v_deg, (-1, 1)), wavelengths_nm
+            )
         )
+        self._node_shape = (np.size(h_deg), wavelengths_nm.size)
+        self._axes_deg = None
+        if spec.follows_field and spec.blends_at_equal_blur:
+            self._axes_deg = tuple(
+                np.linspace(low, high, count)
+                for (low, high), count in zip(
+                    spec.field_range_deg, (COLUMNS, ROWS), strict=True
+                )
+            )
+            over_h_deg, over_v_deg = _directions(*self._axes_deg)
+            h, v = np.append(h, over_h_deg), np.append(v, over_v_deg)
+            nm = np.append(nm, np.full(over_h_deg.size, wavelengths_nm[GREEN]))
+        self._defocus_dpt = eye.defocus_at(h_deg=h, v_deg=v, wavelength_nm=nm)
+
+    def state(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> tuple[NDArray[np.float64], FieldDefocus]:
+        """Total defocus (n_fields, 3) for an object at infinity; and over the field.
+
+        Over the field it is that of green light.
+        """
+        at_infinity_dpt = self._defocus_dpt(pupil_diameter_mm, accommodation_dpt)
+        n_nodes = int(np.prod(self._node_shape))
+        nodes_dpt = at_infinity_dpt[:n_nodes].reshape(self._node_shape)
+        if self._axes_deg is None:
+            return nodes_dpt, FieldDefocus.none()
+        over_dpt = at_infinity_dpt[n_nodes:]
+        change_dpt = over_dpt[:-1] - over_dpt[-1]
+        return nodes_dpt, FieldDefocus(
+            *self._axes_deg, change_dpt.reshape(ROWS, COLUMNS)
+        )
+
+
+def _directions(h_deg: NDArray, v_deg: NDArray) -> tuple[NDArray, NDArray]:
+    """Azimuths and elevations of a grid, rows first; and of the direction of gaze.
+
+    That is asked too: it may lie outside of the camera's image.
+    """
+    return (
+        np.append(np.tile(h_deg, v_deg.size), _nearest(h_deg)),
+        np.append(np.repeat(v_deg, h_deg.size), _nearest(v_deg)),
     )
-    state = {
-        "pupil_diameter_mm": pupil_diameter_mm,
-        "accommodation_dpt": accommodation_dpt,
-        "wavelength_nm": spec.channel_wavelengths_nm[GREEN],
-    }
-    # The direction of gaze is asked too: it may lie outside of the camera's image.
-    at_infinity_dpt = eye.total_defocus_dpt(
-        h_deg=np.append(np.tile(h_deg, ROWS), _nearest(h_deg)),
-        v_deg=np.append(np.repeat(v_deg, COLUMNS), _nearest(v_deg)),
-        **state,
-    )
-    change_dpt = at_infinity_dpt[:-1] - at_infinity_dpt[-1]
-    return FieldDefocus(h_deg, v_deg, change_dpt.reshape(ROWS, COLUMNS))
 
 
 def _nearest(range_deg: NDArray) -> float:

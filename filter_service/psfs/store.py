@@ -4,16 +4,23 @@ Plain arrays without GL: the worker fills it, the renderer uploads it.
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import RGB
 from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec, layer_distances_dpt
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.plan import CachePlan
-from filter_service.psfs.field_defocus import FieldDefocus, field_defocus
+from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
+from filter_service.psfs.pack import pack_reach
+from filter_service.psfs.read_kernels import (
+    StateReads,
+    StoreTables,
+    largest_radius_px,
+    layer_blur_px,
+)
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,36 @@ class PsfStore:
     max_lost_energy_ratio: float = 0.0
     build_ms: float = 0.0
 
+    @cached_property
+    def defocus(self) -> EyeDefocus:
+        """Defocus of the eye's states at the field nodes."""
+        h_deg, v_deg = self.plan.field_nodes_deg
+        return EyeDefocus(self.eye, self.spec, h_deg=h_deg, v_deg=v_deg)
+
+    @cached_property
+    def tables(self) -> StoreTables:
+        """What plans of frames read, copied: a stored file's arrays cannot be written.
+
+        Compiled loops would be compiled once more for those.
+        """
+        plan, nodes = self.plan, self.plan.defocus
+        return StoreTables(
+            values_dpt=np.array(nodes.values_dpt, np.float64),
+            keys_dpt=np.array(nodes.keys_dpt, np.float64),
+            starts=np.array(nodes.starts, np.int64),
+            lowest_dpt=nodes.lowest_dpt,
+            span_dpt=nodes.span_dpt,
+            channel_shift_dpt=np.array(plan.channel_shift_dpt, np.float64, order="C"),
+            groups_per_field=plan.pupils_mm.size * plan.accommodations_dpt.size,
+            offsets=np.array(self.offsets, np.uint32),
+            reach_words=pack_reach(self.reach_px),
+            reach_px=np.array(self.reach_px, np.int64, order="C"),
+            radius_px=np.array(self.radius_px, np.int64),
+            blur_px=np.array(self.blur_px, np.float64),
+            spread_px=np.array(self.spread_px, np.float64),
+            peak_ratio=np.array(self.peak_ratio, np.float64),
+        )
+
     @property
     def psf_count(self) -> int:
         """Number of kernels."""
@@ -84,7 +121,7 @@ class FrameLayers:
         Object distances that the layers are for.
     layer_zero_dpt : (n_fields, 3)
         Total defocus at layer 0 dpt, per field node and channel.
-    corners : list of (pupil node, accommodation node, weight)
+    reads : StateReads
         Cached neighbours of the state.
     max_radius_px : int
         No kernel of these layers is larger.
@@ -94,31 +131,12 @@ class FrameLayers:
     object_range_dpt: tuple[float, float]
     field: FieldDefocus
     layer_zero_dpt: NDArray[np.float64]
-    corners: tuple[tuple[int, int, float], ...]
+    reads: StateReads
     max_radius_px: int
     pupil_diameter_mm: float
     focus_dpt: float
     blur_px_per_dpt: float
     notes: tuple[str, ...]
-
-
-def channel_defocus_dpt(
-    eye: Eye,
-    spec: GridSpec,
-    *,
-    h_deg: NDArray,
-    v_deg: NDArray,
-    pupil_diameter_mm: float,
-    accommodation_dpt: float,
-) -> NDArray[np.float64]:
-    """Total defocus (n_fields, 3) per channel for an object at infinity."""
-    return eye.total_defocus_dpt(
-        h_deg=np.asarray(h_deg, float)[:, None],
-        v_deg=np.asarray(v_deg, float)[:, None],
-        pupil_diameter_mm=pupil_diameter_mm,
-        accommodation_dpt=accommodation_dpt,
-        wavelength_nm=spec.channel_wavelengths_nm,
-    )
 
 
 def frame_layers(
@@ -145,23 +163,10 @@ def frame_layers(
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
     notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
     accommodation_dpt = eye.accommodation_dpt(focus_dpt)
-    v_deg, h_deg = (
-        axis.ravel() for axis in np.meshgrid(plan.v_deg, plan.h_deg, indexing="ij")
+    at_infinity_dpt, change = store.defocus.state(
+        pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
     )
-    at_infinity_dpt = channel_defocus_dpt(
-        eye,
-        store.spec,
-        h_deg=h_deg,
-        v_deg=v_deg,
-        pupil_diameter_mm=pupil_mm,
-        accommodation_dpt=accommodation_dpt,
-    )
-    change = field_defocus(
-        eye,
-        store.spec,
-        pupil_diameter_mm=pupil_mm,
-        accommodation_dpt=accommodation_dpt,
-    )
+    h_deg, v_deg = plan.field_nodes_deg
     layer_zero_dpt = at_infinity_dpt - change.at(h_deg, v_deg)[:, None]
     corners = tuple(
         (pupil, used, pupil_weight * used_weight)
@@ -170,13 +175,15 @@ def frame_layers(
         if pupil_weight * used_weight > 0.0
     )
     notes += _limit_notes(store, corners)
-    state = (store, pupil_mm, corners, layer_zero_dpt)
+    reads = _state_reads(plan, pupil_mm, corners)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
     near_far_dpt = object_range_dpt or store.spec.object_range_dpt
     layer_dpt = layer_distances_dpt(
         tuple(np.add(near_far_dpt, change.range_dpt)),
         focused_dpt=-layer_zero_dpt[gaze],
-        blur_radius_px=lambda distance_dpt: _blur_px(*state, distance_dpt),
+        blur_radius_px=lambda at_dpt: layer_blur_px(
+            store.tables, reads, layer_zero_dpt, at_dpt
+        ),
         max_blur_step_px=store.spec.max_blur_step_px,
     )
     return FrameLayers(
@@ -184,8 +191,10 @@ def frame_layers(
         object_range_dpt=near_far_dpt,
         field=change,
         layer_zero_dpt=layer_zero_dpt,
-        corners=corners,
-        max_radius_px=_max_radius_px(*state, layer_dpt),
+        reads=reads,
+        max_radius_px=largest_radius_px(
+            store.tables, reads, layer_zero_dpt, layer_dpt[0], layer_dpt[-1]
+        ),
         pupil_diameter_mm=pupil_mm,
         focus_dpt=eye.reachable_focus_dpt(focus_dpt),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
@@ -221,68 +230,10 @@ def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
     return [(int(lower), 1.0 - float(share)), (int(upper), float(share))]
 
 
-def neighbours(
-    store: PsfStore,
-    pupil_mm: float,
-    corners: tuple[tuple[int, int, float], ...],
-    fields: NDArray[np.int64],
-    total_dpt: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """PSFs and weights (n, 3, 2 n_corners) that make up n states of total defocus.
-
-    Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i is
-    read at total defocus t A / A_i, so no blended pair differs in size.
-
-    Parameters
-    ----------
-    fields : (n,)
-        Field nodes.
-    total_dpt : (n, 3)
-    """
-    plan = store.plan
-    channels = np.arange(RGB)
-    psfs, weights = [], []
-    for pupil, used, corner_weight in corners:
-        groups = (
-            fields * plan.pupils_mm.size + pupil
-        ) * plan.accommodations_dpt.size + used
-        lower, upper, share = plan.defocus.bracket(
-            groups[:, None],
-            total_dpt * (pupil_mm / plan.pupils_mm[pupil])
-            - plan.channel_shift_dpt[groups],
-        )
-        psfs += [RGB * lower + channels, RGB * upper + channels]
-        weights += [corner_weight * (1.0 - share), corner_weight * share]
-    return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
-
-
-def _blur_px(store, pupil_mm, corners, layer_zero_dpt, at_dpt) -> NDArray:
-    """Geometric blur radius (n, n_fields * 3), px, of n layers."""
-    n_fields = len(layer_zero_dpt)
-    fields = np.tile(np.arange(n_fields), len(at_dpt))
-    total_dpt = at_dpt[:, None, None] + layer_zero_dpt
-    psfs, weights = neighbours(
-        store, pupil_mm, corners, fields, total_dpt.reshape(-1, RGB)
+def _state_reads(plan: CachePlan, pupil_mm: float, corners: tuple) -> StateReads:
+    n_used = plan.accommodations_dpt.size
+    return StateReads(
+        groups=np.array([pupil * n_used + used for pupil, used, _ in corners]),
+        scales=np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners]),
+        weights=np.array([weight for _, _, weight in corners]),
     )
-    blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
-    return blur_px.reshape(len(at_dpt), n_fields * RGB)
-
-
-def _max_radius_px(store, pupil_mm, corners, layer_zero_dpt, layer_dpt) -> int:
-    """Largest kernel that the range of layers can read."""
-    plan = store.plan
-    fields = np.arange(len(layer_zero_dpt))
-    largest = 0
-    for pupil, used, _ in corners:
-        groups = (
-            fields * plan.pupils_mm.size + pupil
-        ) * plan.accommodations_dpt.size + used
-        scale = pupil_mm / plan.pupils_mm[pupil]
-        shift_dpt = plan.channel_shift_dpt[groups]
-        low = ((layer_zero_dpt + layer_dpt[0]) * scale - shift_dpt).min(axis=1)
-        high = ((layer_zero_dpt + layer_dpt[-1]) * scale - shift_dpt).max(axis=1)
-        first, _, _ = plan.defocus.bracket(groups, low)
-        _, last, _ = plan.defocus.bracket(groups, high)
-        for start, end in zip(RGB * first, RGB * (last + 1), strict=True):
-            largest = max(largest, int(store.radius_px[start:end].max()))
-    return largest

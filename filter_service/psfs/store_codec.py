@@ -1,7 +1,8 @@
 """Our own objects as JSON and plain arrays, and back, without running anybody's code.
 
 Covers what a PSF store is made of: classes of this project whose state is numbers,
-texts, arrays, lists, dicts and other such classes.  A file of these can at worst hold
+texts, arrays, lists, dicts and other such classes; what a class caches of that is left
+out.  A file of these can at worst hold
 wrong numbers, where a pickle could hold a program.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -92,6 +94,7 @@ def _packed(
     state = {
         field: _packed(item, f"{path}.{field}", arrays, known)
         for field, item in vars(value).items()
+        if not isinstance(getattr(type(value), field, None), cached_property)
     }
     return {"object": [name, state]}
 

@@ -13,16 +13,22 @@ from numpy.typing import NDArray
 from filter_service.constants import (
     KERNEL_WORDS,
     MAX_LEVEL,
-    MERGE_MIN_SPREAD_PX,
-    NO_LEVEL,
     NODE_WORDS,
     PART_WORDS,
     RECIPE_TAPS,
-    WEIGHT_MAX,
+    RGB,
 )
 from filter_service.psfs.pack import box_sizes, pack_reach
-from filter_service.psfs.store import FrameLayers, PsfStore, neighbours
+from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.image_cells import ImageCells
+from filter_service.rendering.kernel_loops import (
+    fill_kernels,
+    fill_levels,
+    fill_recipes,
+    fill_work,
+    used_nodes,
+    used_recipes,
+)
 
 
 @dataclass(frozen=True)
@@ -113,77 +119,65 @@ def frame_kernels(
     ----------
     used : (n_cells, n_intervals)
     """
-    cells, intervals = np.nonzero(used)
-    n_intervals = used.shape[1]
-    wanted = image.nodes[cells] * n_intervals + intervals[:, None]
-    # A node that weighs nothing is replaced by one that does.
-    weights = image.weight_ratio[cells]
-    heaviest = np.take_along_axis(wanted, weights.argmax(axis=1)[:, None], axis=1)
-    wanted = np.where(weights > 0.0, wanted, heaviest)
-    pairs, parts = np.unique(wanted, return_inverse=True)
-    parts = parts.reshape(wanted.shape)
-    nodes = _node_kernels(store, layers, *np.divmod(pairs, n_intervals))
+    n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
+    weight_ratio = np.ascontiguousarray(image.weight_ratio)
+    cells, intervals, parts, *pairs = used_nodes(
+        np.ascontiguousarray(used),
+        np.ascontiguousarray(image.nodes),
+        weight_ratio,
+        n_fields,
+    )
+    nodes = _node_kernels(store, layers, *pairs)
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
-    is_moved = image.maps.is_moved(cells, nodes.radius_px[parts])
-    area = np.where(is_moved, image.maps.area_ratio[cells], 1.0)
-    in_use = weights > 0.0
-    reach_px, radius_px = image.maps.mapped_sizes(
-        cells, is_moved, nodes.reach_px[parts], nodes.radius_px[parts]
+    made = {
+        "weight_ratio": np.empty(parts.shape),
+        "maps": np.empty((*parts.shape, 2, 2)),
+        "reach_px": np.empty((cells.size, 4), np.int64),
+        "radius_px": np.empty(cells.size, np.int64),
+        "peak_ratio": np.empty(cells.size),
+        "spread_px": np.empty((cells.size, 2)),
+    }
+    fill_kernels(
+        maps,
+        weight_ratio,
+        cells,
+        parts,
+        (nodes.reach_px, nodes.radius_px, nodes.peak_ratio, spread_px),
+        tuple(made.values()),
     )
     return FrameKernels(
-        nodes=nodes,
-        cells=cells,
-        intervals=intervals,
-        parts=parts,
-        weight_ratio=weights * np.where(is_moved, image.maps.box_ratio[cells], 1.0),
-        maps=np.where(
-            is_moved[..., None, None], image.maps.node_from_cell[cells], np.eye(2)
-        ),
-        reach_px=np.where(in_use[..., None], reach_px, 0).max(axis=1),
-        radius_px=np.where(in_use, radius_px, 0).max(axis=1),
-        peak_ratio=(nodes.peak_ratio[parts] * weights * area).sum(axis=1),
-        spread_px=(spread_px[parts] * (weights / np.sqrt(area))[..., None]).sum(axis=1),
+        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **made
     )
 
 
 def _node_kernels(
     store: PsfStore, layers: FrameLayers, fields: NDArray, intervals: NDArray
 ) -> NodeKernels:
-    n_layers = len(layers.layer_dpt)
-    ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
-    wanted, recipe_of = np.unique(fields * n_layers + ends, return_inverse=True)
-    near, far = recipe_of.reshape(ends.shape)
-    recipe_fields, recipe_layers = np.divmod(wanted, n_layers)
-    psfs, weights = neighbours(
-        store,
-        layers.pupil_diameter_mm,
-        layers.corners,
+    near, far, recipe_fields, recipe_layers = used_recipes(
+        fields, intervals, len(layers.layer_zero_dpt), len(layers.layer_dpt)
+    )
+    count = recipe_fields.size
+    recipes = np.zeros((count, RGB, 3, RECIPE_TAPS), dtype=np.uint32)
+    reach_px, radius_px = np.empty((count, 4), np.int64), np.empty(count, np.int64)
+    peak_ratio, spread_px = np.empty(count), np.empty(count)
+    fill_recipes(
+        store.tables,
+        layers.reads,
         recipe_fields,
         layers.layer_dpt[recipe_layers, None] + layers.layer_zero_dpt[recipe_fields],
+        recipes,
+        recipes.view(np.float32),
+        (reach_px, radius_px, peak_ratio, spread_px),
     )
-    taken = weights > 0.0
-    own_px = np.where(taken[..., None], store.reach_px[psfs], 0).max(axis=(1, 2))
-    own_radius_px = np.where(taken, store.radius_px[psfs], 0).max(axis=(1, 2))
-    own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
     return NodeKernels(
         near=near,
         far=far,
-        reach_px=np.maximum(own_px[near], own_px[far]),
-        radius_px=np.maximum(own_radius_px[near], own_radius_px[far]),
-        peak_ratio=np.maximum(own_peak[near], own_peak[far]),
-        recipes=_recipes(store, psfs, weights),
-        recipe_spread_px=(weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
+        reach_px=np.maximum(reach_px[near], reach_px[far]),
+        radius_px=np.maximum(radius_px[near], radius_px[far]),
+        peak_ratio=np.maximum(peak_ratio[near], peak_ratio[far]),
+        recipes=recipes.reshape(count, RGB, 3 * RECIPE_TAPS),
+        recipe_spread_px=spread_px,
     )
-
-
-def _recipes(store: PsfStore, psfs: NDArray, weights: NDArray) -> NDArray[np.uint32]:
-    recipes = np.zeros((*psfs.shape[:2], 3, RECIPE_TAPS), dtype=np.uint32)
-    taps = psfs.shape[-1]
-    recipes[..., 0, :taps] = store.offsets[psfs]
-    recipes[..., 1, :taps] = pack_reach(store.reach_px[psfs])
-    per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
-    recipes[..., 2, :taps] = per_step.astype(np.float32).view(np.uint32)
-    return recipes.reshape(*psfs.shape[:2], 3 * RECIPE_TAPS)
 
 
 def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
@@ -200,42 +194,28 @@ def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
     return table, int(sizes.sum())
 
 
-def kernel_levels(kernels: FrameKernels) -> NDArray[np.int64]:
-    """Return the merging level (n,) for which a kernel is wide enough at one end."""
-    steps = np.log2(
-        np.maximum(kernels.spread_px.max(axis=1), 1e-9) / MERGE_MIN_SPREAD_PX
-    )
-    return np.clip(np.floor(steps) + 1, 0, MAX_LEVEL).astype(np.int64)
-
-
-def level_sizes(kernels: FrameKernels, level: int) -> NDArray[np.int64]:
-    """Texels (n,) of the kernels of a level; 0 where there is none."""
-    widths, heights = box_sizes(kernels.reach_px)
-    extent = 2**level - 1
-    return np.where(
-        level <= kernel_levels(kernels), (widths + extent) * (heights + extent), 0
-    )
-
-
-def kernel_table(kernels: FrameKernels) -> tuple[NDArray[np.uint32], int]:
-    """Make records (n, 3, 4) of kernels for common/kernels.glsl; and texels of all.
+def kernel_table(
+    kernels: FrameKernels,
+) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Make records (n, 3, 4) of kernels for common/kernels.glsl; texels (n, levels).
 
     Each is followed by its merged forms: the kernel summed over squares of pixels.
     """
-    levels = np.arange(MAX_LEVEL + 1)
-    sizes = np.stack([level_sizes(kernels, int(level)) for level in levels], axis=-1)
-    starts = (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape)
-    scale = np.minimum(kernels.peak_ratio[:, None] * 4.0**levels, 1.0)
-    scale = scale.astype(np.float32)
-    scale[:, 0] = kernels.peak_ratio
-    spread_px = kernels.spread_px.astype(np.float32)
-    table = np.zeros((kernels.count, KERNEL_WORDS, 4), dtype=np.uint32)
-    table[:, 0, :2] = spread_px.view(np.uint32)
+    sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
+    starts, scale = np.empty(sizes.shape, np.uint32), np.empty(sizes.shape, np.float32)
+    fill_levels(
+        kernels.reach_px,
+        kernels.spread_px,
+        kernels.peak_ratio,
+        *(sizes, starts, scale),
+    )
+    table = np.empty((kernels.count, KERNEL_WORDS, 4), dtype=np.uint32)
+    table[:, 0, :2] = kernels.spread_px.astype(np.float32).view(np.uint32)
     table[:, 0, 2] = kernels.radius_px
     table[:, 0, 3] = pack_reach(kernels.reach_px)
-    table[:, 1] = np.where(sizes > 0, starts, NO_LEVEL)
+    table[:, 1] = starts
     table[:, 2] = scale.view(np.uint32)
-    return table, int(sizes.sum())
+    return table, sizes
 
 
 def part_table(kernels: FrameKernels) -> NDArray[np.uint32]:
@@ -257,7 +237,7 @@ def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint
 
 def work_list(n_texels: NDArray[np.int64], threads: int) -> NDArray[np.uint32]:
     """Work groups (n, 2) over kernels of different size: kernel, its first texel."""
-    groups = -(-n_texels // threads)
-    kernel = np.repeat(np.arange(groups.size), groups)
-    first = np.arange(kernel.size) - np.repeat(np.cumsum(groups) - groups, groups)
-    return np.stack([kernel, first * threads], axis=-1).astype(np.uint32)
+    groups = int((-(-n_texels // threads)).sum())
+    work = np.empty((groups, 2), np.uint32)
+    fill_work(np.ascontiguousarray(n_texels), threads, work)
+    return work

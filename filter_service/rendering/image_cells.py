@@ -76,6 +76,7 @@ def image_cells(
     gaze_deg: tuple[float, float] | None = None,
     *,
     cell_px: int | None = None,
+    node_scale: NDArray[np.float64] | None = None,
 ) -> ImageCells:
     """Cells of the spec's camera and their field nodes.
 
@@ -85,6 +86,8 @@ def image_cells(
         Where the eye looks; the spec's where it is None.
     cell_px : int, optional
         Larger cells than the mode's: their kernels take less memory.
+    node_scale : (n_fields, 2, 2), optional
+        `stored_scale` of the plan, where it is known.
     """
     if not spec.follows_field:
         return ImageCells(
@@ -123,13 +126,15 @@ def image_cells(
         np.arange(grid[1] + 1)[:, None] * cell_px,
         gaze_deg=gaze_deg,
     )
+    if node_scale is None:
+        node_scale = stored_scale(spec, plan)
     weights = [v * h for v in (1 - v_part, v_part) for h in (1 - h_part, h_part)]
     return ImageCells(
         cell_px=cell_px,
         grid=grid,
         nodes=nodes,
         weight_ratio=np.stack(weights, axis=-1),
-        maps=CellMaps(_node_from_cell(spec, plan, nodes, scale)),
+        maps=CellMaps(_node_from_cell(node_scale[nodes], scale)),
         corner_h_deg=corner_h_deg,
         corner_v_deg=corner_v_deg,
     )
@@ -140,13 +145,16 @@ def can_coarsen(image: ImageCells) -> bool:
     return 0 < image.cell_px < MAX_CELL_PX
 
 
+def stored_scale(spec: GridSpec, plan: CachePlan) -> NDArray[np.float64]:
+    """Scale (n_fields, 2, 2) of the pixels that nodes' kernels are stored in."""
+    return spec.node_pixel_from_mrad(*plan.field_nodes_deg)
+
+
 def _node_from_cell(
-    spec: GridSpec, plan: CachePlan, nodes: NDArray, cell_scale: NDArray
+    node_scale: NDArray[np.float64], cell_scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return maps (n_cells, 4, 2, 2) of offsets in pixels, y downwards."""
-    v_deg, h_deg = np.meshgrid(plan.v_deg, plan.h_deg, indexing="ij")
-    stored = spec.node_pixel_from_mrad(h_deg.ravel(), v_deg.ravel())
-    upwards = stored[nodes] @ np.linalg.inv(cell_scale)[:, None]
+    upwards = node_scale @ np.linalg.inv(cell_scale)[:, None]
     return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 

@@ -15,7 +15,6 @@ from filter_service.rendering.frame_kernels import (
     frame_kernels,
     interval_count,
     kernel_table,
-    level_sizes,
     node_table,
     pair_index,
     part_table,
@@ -81,21 +80,29 @@ class KernelMaker:
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
             kernels = frame_kernels(store, layers, image, used)
-            _, n_texels = kernel_table(kernels)
+            table, sizes = kernel_table(kernels)
+            n_texels = int(sizes.sum())
         if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):
             raise KernelsTooLarge(
                 f"the frame's kernels need {n_texels} texels; allowed are "
                 f"{MAX_KERNEL_TEXELS}",
             )
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(kernels, pages, used.shape)
+            self._set = self._blend(kernels, table, sizes, pages, used.shape)
         self._made_for, self._have = key, used
         return self._set
 
-    def _blend(self, kernels: FrameKernels, pages: Pages, shape: tuple) -> KernelSet:
+    def _blend(
+        self,
+        kernels: FrameKernels,
+        table: NDArray[np.uint32],
+        sizes: NDArray[np.int64],
+        pages: Pages,
+        shape: tuple,
+    ) -> KernelSet:
         gpu = self._gpu
         nodes, node_texels = node_table(kernels.nodes)
-        table, texels = kernel_table(kernels)
+        texels = int(sizes.sum())
         node_atlas = gpu.atlas("nodes", node_texels)
         atlas = gpu.atlas("kernels", texels)
         buffers = {
@@ -106,7 +113,6 @@ class KernelMaker:
             "KERNEL_OF": gpu.upload("KERNEL_OF", pair_index(kernels, shape)),
         }
         node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
-        widths, heights = box_sizes(kernels.reach_px)
         self._run(
             "blend_psfs",
             node_widths * node_heights,
@@ -116,7 +122,7 @@ class KernelMaker:
         )
         self._run(
             "blend_cells",
-            widths * heights,
+            sizes[:, 0],
             {name: buffers[name] for name in ("NODES", "PARTS", "KERNELS")},
             images={"ATLAS": atlas},
             textures={"NODES": node_atlas},
@@ -124,7 +130,7 @@ class KernelMaker:
         for level in range(1, MAX_LEVEL + 1):
             self._run(
                 "merge_psfs",
-                level_sizes(kernels, level),
+                sizes[:, level],
                 {"KERNELS": buffers["KERNELS"]},
                 images={"ATLAS": atlas},
                 uniforms={"level": level},

@@ -130,6 +130,7 @@ class FilterRenderer:
         except GeneratorExit:
             pages.release()
             raise
+        _ = store.defocus  # prepared here and not by the first frame
         yield LoadedStore(
             store=store, pages=pages, image=image_cells(store.spec, store.plan)
         )

@@ -8,9 +8,10 @@ from scipy.ndimage import zoom
 from estimator.profiles import parse_profile
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.build import build_psf_store
-from filter_service.psfs.store import frame_layers, neighbours
+from filter_service.psfs.store import frame_layers
 from filter_service.rendering.frame import View
 from filter_service.rendering.renderer import FilterRenderer
+from tests.numerical.plan_twin import layer_blur_px
 
 
 def tangents(width_px, height_px, vertical_fov_deg):
@@ -63,12 +64,5 @@ class Bench:
     def blur_px(self, **options):
         """Blur radius (n_layers, 3) of a frame's layers, on axis."""
         layers = self.layers(**options)
-        total_dpt = layers.layer_dpt[:, None] + layers.layer_zero_dpt[0]
-        psfs, weights = neighbours(
-            self.store,
-            layers.pupil_diameter_mm,
-            layers.corners,
-            np.zeros(len(total_dpt), int),
-            total_dpt,
-        )
-        return (self.store.blur_px[psfs] * weights).sum(axis=-1)
+        state = layers.reads, layers.layer_zero_dpt[:1], layers.layer_dpt
+        return layer_blur_px(self.store, *state)

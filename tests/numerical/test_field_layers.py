@@ -12,7 +12,7 @@ from filter_service.planning.plan import plan_cache
 from filter_service.planning.slopes import PupilStates, state_frames
 from filter_service.psfs.build import build_psf_store
 from filter_service.psfs.eye_model import prepare_eye
-from filter_service.psfs.field_defocus import field_defocus
+from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import kernel_passes
 from filter_service.rendering.frame import View
@@ -35,7 +35,7 @@ def test_defocus_between_asked_directions_is_the_eyes(rng, name, allowed_dpt):
         "pupil_diameter_mm": 5.0,
         "accommodation_dpt": eye.accommodation_dpt(0.5),
     }
-    found = field_defocus(eye, spec, **state)
+    _, found = EyeDefocus(eye, spec, h_deg=0.0, v_deg=0.0).state(**state)
     h_deg, v_deg = (rng.uniform(*ends, 400) for ends in spec.field_range_deg)
     exact_dpt = eye.total_defocus_dpt(
         h_deg=np.append(h_deg, 0.0),
@@ -51,7 +51,9 @@ def test_defocus_between_asked_directions_is_the_eyes(rng, name, allowed_dpt):
 def test_the_papers_grid_is_read_at_the_distance_of_the_object():
     spec = spec_for(64, 36, mode="dynamic", grid="paper", **STILL)
     eye = traced_eye("emmetropia", spec)
-    found = field_defocus(eye, spec, pupil_diameter_mm=5.0, accommodation_dpt=0.0)
+    _, found = EyeDefocus(eye, spec, h_deg=0.0, v_deg=0.0).state(
+        pupil_diameter_mm=5.0, accommodation_dpt=eye.accommodation_dpt(0.5)
+    )
     assert found.range_dpt == (0.0, 0.0)
 
 

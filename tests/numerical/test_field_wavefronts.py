@@ -316,6 +316,14 @@ def test_a_vignetted_field_is_seen_through_the_open_area():
     state = {"v_deg": 0.0, "accommodation_dpt": 0.0, "wavelength_nm": BLUE_NM}
     state |= {"h_deg": nodes_deg[[0, -1]], "total_defocus_dpt": 0.0}
     before, after = (eye.wavefronts(pupil_diameter_mm=7.0, **state) for eye in eyes)
+    for eye in eyes:  # prepared fields know of it too
+        state_deg = {name: state[name] for name in ("h_deg", "v_deg", "wavelength_nm")}
+        states = {"pupil_diameter_mm": 7.0, "accommodation_dpt": 0.0}
+        np.testing.assert_allclose(
+            eye.defocus_at(**state_deg)(*states.values()),
+            eye.total_defocus_dpt(**state_deg, **states),
+            rtol=1e-12,
+        )
     shrunk = after.circle_diameter_mm / before.circle_diameter_mm
     assert shrunk == pytest.approx([1.0, np.sqrt(0.5)], rel=0.01)
     in_mm = [

@@ -4,9 +4,21 @@ import numpy as np
 
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
+from filter_service.psfs import store
+from filter_service.rendering import frame_kernels
 from filter_service.rendering.renderer import FilterRenderer
 from filter_service.rendering.warm_up import warm_up
 from tests.numerical.synthetic import Bench, texture
+
+
+def compiled_loops():
+    """How often each loop that plans frames has been compiled or read from disk."""
+    return {
+        name: len(loop.signatures)
+        for module in (frame_kernels, store)
+        for name, loop in vars(module).items()
+        if hasattr(loop, "signatures")
+    }
 
 
 def test_no_program_is_compiled_by_the_first_frames(rng):
@@ -25,10 +37,13 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
         pupil_range_mm=(4.0, 5.0),
     )
     color = texture(rng, 64, 96)
+    loops = compiled_loops()
+    assert loops and all(loops.values())
     for dtype in (np.uint8, np.float32, np.float16):
         view = bench.view(color.astype(dtype), 1.0)
         for accumulation in ("coverage", "paper"):
             for output in ("srgb8", "linear", "linear16"):
                 bench.render(view, accumulation=accumulation, output=output)
     assert gpu.program_count == compiled
+    assert compiled_loops() == loops
     gpu.close()

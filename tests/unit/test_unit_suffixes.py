@@ -18,7 +18,7 @@ DIMENSIONLESS = {
     "color": "light, sRGB or linear as the header says",
     "hidden_color": "as color",
     "pupil_ellipse": "centre and semi-axes in mm, angle in rad",
-    "corners": "node numbers and weights",
+    "values": "polynomials in um/mm^degree, and rims in mm",
     "maps": "pixels per pixel",
     "node_from_cell": "pixels per pixel",
     "tangents": "of the angles to the image edges",

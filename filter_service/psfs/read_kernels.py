@@ -1,0 +1,155 @@
+"""How an eye's state reads its cache: compiled loops over field nodes and layers.
+
+Two nodes of defocus for each cached neighbour in pupil and accommodation.  Arrays of a
+few thousand entries, once per frame whose pupil or focus has changed.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from filter_service.constants import RGB
+
+
+class StoreTables(NamedTuple):
+    """What plans of frames read of a store, as plain arrays that all have one layout.
+
+    Attributes
+    ----------
+    values_dpt, keys_dpt : (n_nodes,)
+    starts : (n_groups + 1,)
+    lowest_dpt, span_dpt : float
+        See `RaggedNodes`.
+    channel_shift_dpt : (n_groups, 3)
+    groups_per_field : int
+    offsets : (n_psfs,)
+    reach_words : (n_psfs,)
+        Four reaches, a byte a side.
+    reach_px : (n_psfs, 4)
+    radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
+        See `PsfStore`.
+    """
+
+    values_dpt: NDArray[np.float64]
+    keys_dpt: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    lowest_dpt: float
+    span_dpt: float
+    channel_shift_dpt: NDArray[np.float64]
+    groups_per_field: int
+    offsets: NDArray[np.uint32]
+    reach_words: NDArray[np.uint32]
+    reach_px: NDArray[np.int64]
+    radius_px: NDArray[np.int64]
+    blur_px: NDArray[np.float64]
+    spread_px: NDArray[np.float64]
+    peak_ratio: NDArray[np.float64]
+
+
+class StateReads(NamedTuple):
+    """Cached neighbours in pupil and accommodation that a state reads.
+
+    Attributes
+    ----------
+    groups : (n_corners,)
+        Group of each neighbour, counted from the first of a field node.
+    scales : (n_corners,)
+        Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i
+        is read at total defocus t A / A_i, so no blended pair differs in size.
+    weights : (n_corners,)
+        Sum 1.
+    """
+
+    groups: NDArray[np.int64]
+    scales: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clipped(value, low, high):
+    """Bring a value into a range."""
+    return min(max(value, low), high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bracket(tables, group, t):
+    """Lower and upper node of a total defocus within a group; share of the upper.
+
+    As `RaggedNodes.bracket` has them.
+    """
+    values_dpt, keys_dpt = tables.values_dpt, tables.keys_dpt
+    first, last = tables.starts[group], tables.starts[group + 1] - 1
+    t = clipped(t, values_dpt[first], values_dpt[last])
+    key = t - tables.lowest_dpt + tables.span_dpt * group
+    low, high = first, last
+    while low < high:
+        middle = (low + high) // 2
+        if keys_dpt[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    upper = max(low, min(first + 1, last))
+    lower = max(upper - 1, first)
+    span = values_dpt[upper] - values_dpt[lower]
+    share = (t - values_dpt[lower]) / (span if span > 0.0 else 1.0)
+    return lower, upper, clipped(share, 0.0, 1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def layer_blur_px(tables, reads, zero_dpt, at_dpt):
+    """Geometric blur radius (n, n_fields * 3), px, of layers at n distances."""
+    n_fields = zero_dpt.shape[0]
+    found_px = np.zeros((n_fields * RGB, at_dpt.size))
+    for field in range(n_fields):
+        for corner in range(reads.groups.size):
+            group = field * tables.groups_per_field + reads.groups[corner]
+            weight, scale = reads.weights[corner], reads.scales[corner]
+            for channel in range(RGB):
+                of_layer = found_px[field * RGB + channel]
+                zero = zero_dpt[field, channel]
+                shift_dpt = tables.channel_shift_dpt[group, channel]
+                for k in range(at_dpt.size):
+                    t = (at_dpt[k] + zero) * scale - shift_dpt
+                    lower, upper, share = bracket(tables, group, t)
+                    low_px = tables.blur_px[RGB * lower + channel]
+                    high_px = tables.blur_px[RGB * upper + channel]
+                    of_layer[k] += low_px * (weight * (1.0 - share))
+                    of_layer[k] += high_px * (weight * share)
+    return found_px.T.copy()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def largest_radius_px(tables, reads, zero_dpt, low_dpt, high_dpt):
+    """Largest kernel that layers from one distance to another can read."""
+    largest = 0
+    for field in range(zero_dpt.shape[0]):
+        for corner in range(reads.groups.size):
+            group = field * tables.groups_per_field + reads.groups[corner]
+            scale, low, high = reads.scales[corner], np.inf, -np.inf
+            for channel in range(RGB):
+                shift_dpt = tables.channel_shift_dpt[group, channel]
+                zero = zero_dpt[field, channel]
+                low = min(low, (zero + low_dpt) * scale - shift_dpt)
+                high = max(high, (zero + high_dpt) * scale - shift_dpt)
+            first, _, _ = bracket(tables, group, low)
+            _, last, _ = bracket(tables, group, high)
+            for psf in range(RGB * first, RGB * (last + 1)):
+                largest = max(largest, tables.radius_px[psf])
+    return largest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def channel_taps(tables, reads, group_of_field, channel, total_dpt, psfs, weights):
+    """PSFs and weights (2 n_corners,) that make up one channel of a total defocus."""
+    for corner in range(reads.groups.size):
+        group = group_of_field + reads.groups[corner]
+        t = total_dpt * reads.scales[corner]
+        lower, upper, share = bracket(
+            tables, group, t - tables.channel_shift_dpt[group, channel]
+        )
+        psfs[2 * corner] = RGB * lower + channel
+        psfs[2 * corner + 1] = RGB * upper + channel
+        weights[2 * corner] = reads.weights[corner] * (1.0 - share)
+        weights[2 * corner + 1] = reads.weights[corner] * share

@@ -1,0 +1,211 @@
+"""Compiled loops that plan a frame's kernels; `frame_kernels.py` says what they are.
+
+A few thousand kernels, once per frame whose pupil, focus or gaze has changed.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from filter_service.constants import (
+    MAX_LEVEL,
+    MERGE_MIN_SPREAD_PX,
+    NO_LEVEL,
+    RGB,
+    WEIGHT_MAX,
+)
+from filter_service.psfs.read_kernels import channel_taps, clipped
+from filter_service.rendering.cell_maps import MAX_REACH_PX, UNMOVED_PX, mapped_reach
+
+CORNERS = 4
+MIN_SPREAD_PX = 1e-9
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def number_used(place_of):
+    """Put numbers in the place of marks, in order; return where the marks were."""
+    count = 0
+    for place in range(place_of.size):
+        if place_of[place]:
+            place_of[place] = count
+            count += 1
+        else:
+            place_of[place] = -1
+    places = np.empty(count, np.int64)
+    for place in range(place_of.size):
+        if place_of[place] >= 0:
+            places[place_of[place]] = place
+    return places
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def used_nodes(used, nodes, weight_ratio, n_fields):
+    """Kernels' cells and intervals (n,), parts (n, 4); nodes' fields and intervals.
+
+    A node that weighs nothing is replaced by the heaviest one.
+    """
+    n_intervals = used.shape[1]
+    count = 0
+    for is_used in used.flat:
+        count += is_used
+    cells, intervals = np.empty(count, np.int64), np.empty(count, np.int64)
+    parts = np.empty((count, CORNERS), np.int64)
+    number = np.zeros(n_fields * n_intervals, np.int64)
+    k = 0
+    for cell in range(used.shape[0]):
+        heaviest = nodes[cell, np.argmax(weight_ratio[cell])]
+        for interval in range(n_intervals):
+            if not used[cell, interval]:
+                continue
+            cells[k], intervals[k] = cell, interval
+            for j in range(CORNERS):
+                node = nodes[cell, j] if weight_ratio[cell, j] > 0.0 else heaviest
+                parts[k, j] = node * n_intervals + interval
+                number[parts[k, j]] = 1
+            k += 1
+    pairs = number_used(number)
+    for k in range(count):
+        for j in range(CORNERS):
+            parts[k, j] = number[parts[k, j]]
+    return cells, intervals, parts, pairs // n_intervals, pairs % n_intervals
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def used_recipes(fields, intervals, n_fields, n_layers):
+    """Recipes near and far (n,) of node kernels; recipes' fields and layers."""
+    near, far = np.empty(fields.size, np.int64), np.empty(fields.size, np.int64)
+    number = np.zeros(n_fields * n_layers, np.int64)
+    for n in range(fields.size):
+        near[n] = fields[n] * n_layers + min(intervals[n], n_layers - 1)
+        far[n] = fields[n] * n_layers + min(intervals[n] + 1, n_layers - 1)
+        number[near[n]] = number[far[n]] = 1
+    places = number_used(number)
+    for n in range(fields.size):
+        near[n], far[n] = number[near[n]], number[far[n]]
+    return near, far, places // n_layers, places % n_layers
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
+    """Write recipes, and what is known of the kernels that they make.
+
+    Parameters
+    ----------
+    fields : (n,)
+    total_dpt : (n, 3)
+    words : (n, 3, 3, 8), uint32
+        See `NodeKernels.recipes`.
+    steps : (n, 3, 3, 8), float32
+        The same memory.
+    sizes : reach_px (n, 4), radius_px (n,), peak_ratio (n,), spread_px (n,)
+    """
+    reach_px, radius_px, peak_ratio, spread_px = sizes
+    n_taps = 2 * reads.groups.size
+    psfs, weights = np.empty(n_taps, np.int64), np.empty(n_taps)
+    for n in range(fields.size):
+        group = fields[n] * tables.groups_per_field
+        reach_px[n], radius_px[n] = 0, 0
+        peak_ratio[n], spread_px[n] = 0.0, np.inf
+        for channel in range(RGB):
+            total = total_dpt[n, channel]
+            channel_taps(tables, reads, group, channel, total, psfs, weights)
+            peak = spread = 0.0
+            for tap in range(n_taps):
+                psf, weight = psfs[tap], weights[tap]
+                per_peak = weight * tables.peak_ratio[psf]
+                peak += per_peak
+                spread += weight * tables.spread_px[psf]
+                words[n, channel, 0, tap] = tables.offsets[psf]
+                words[n, channel, 1, tap] = tables.reach_words[psf]
+                steps[n, channel, 2, tap] = per_peak / WEIGHT_MAX
+                if weight > 0.0:
+                    radius_px[n] = max(radius_px[n], tables.radius_px[psf])
+                    for side in range(4):
+                        side_px = tables.reach_px[psf, side]
+                        reach_px[n, side] = max(reach_px[n, side], side_px)
+            peak_ratio[n] = max(peak_ratio[n], peak)
+            spread_px[n] = min(spread_px[n], spread)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
+    """Fill in maps, weights and sizes of kernels.
+
+    Parameters
+    ----------
+    maps : MapTables
+    weight_ratio : (n_cells, 4)
+    cells : (n,)
+    parts : (n, 4)
+    nodes : reach_px (m, 4), radius_px (m,), peak_ratio (m,), spread_px (m, 2)
+        Of the node kernels.
+    made : weights, maps, reach_px, radius_px, peak_ratio, spread_px
+        See `FrameKernels`.
+    """
+    node_reach_px, node_radius_px, node_peak, node_spread_px = nodes
+    part_ratio, part_maps, reach_px, radius_px, peak_ratio, spread_px = made
+    side_px = np.empty(4, np.int64)
+    for k in range(cells.size):
+        cell = cells[k]
+        reach_px[k], radius_px[k] = 0, 0
+        peak_ratio[k], spread_px[k] = 0.0, 0.0
+        for j in range(CORNERS):
+            part, weight = parts[k, j], weight_ratio[cell, j]
+            widest_px = node_radius_px[part]
+            for side in range(4):
+                side_px[side] = node_reach_px[part, side]
+            area = box = 1.0
+            is_moved = maps.change_ratio[cell, j] * widest_px > UNMOVED_PX
+            for row in range(2):
+                for column in range(2):
+                    own = maps.node_from_cell[cell, j, row, column]
+                    part_maps[k, j, row, column] = own if is_moved else row == column
+            if is_moved:
+                area, box = maps.area_ratio[cell, j], maps.box_ratio[cell, j]
+                mapped_reach(maps.cell_from_node, cell, j, side_px)
+                wider_px = maps.stretch_ratio[cell, j] * (widest_px + 1.0)
+                widest_px = int(min(math.ceil(wider_px), MAX_REACH_PX))
+            part_ratio[k, j] = weight * box
+            peak_ratio[k] += node_peak[part] * weight * area
+            share = weight / math.sqrt(area)
+            spread_px[k, 0] += node_spread_px[part, 0] * share
+            spread_px[k, 1] += node_spread_px[part, 1] * share
+            if weight > 0.0:
+                radius_px[k] = max(radius_px[k], widest_px)
+                for side in range(4):
+                    reach_px[k, side] = max(reach_px[k, side], side_px[side])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
+    """Texels, first texels and steps (n, levels) of kernels and their merged forms.
+
+    No texels above the level for which a kernel is wide enough at one end.
+    """
+    start = 0
+    for k in range(peak_ratio.size):
+        widest_px = max(spread_px[k, 0], spread_px[k, 1], MIN_SPREAD_PX)
+        steps = math.floor(math.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
+        highest = int(clipped(steps, 0, MAX_LEVEL))
+        width = reach_px[k, 0] + reach_px[k, 1] + 1
+        height = reach_px[k, 2] + reach_px[k, 3] + 1
+        for level in range(MAX_LEVEL + 1):
+            scale[k, level] = min(peak_ratio[k] * 4.0**level, 1.0)
+            starts[k, level], sizes[k, level] = NO_LEVEL, 0
+            if level <= highest:
+                beyond = 2**level - 1
+                sizes[k, level] = (width + beyond) * (height + beyond)
+                starts[k, level] = start
+                start += sizes[k, level]
+        scale[k, 0] = peak_ratio[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_work(n_texels, threads, work):
+    """Kernel and first texel (n, 2) of each work group."""
+    group = 0
+    for kernel in range(n_texels.size):
+        for first in range(0, n_texels[kernel], threads):
+            work[group, 0], work[group, 1] = kernel, first
+            group += 1

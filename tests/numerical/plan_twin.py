@@ -1,0 +1,202 @@
+"""How a frame is planned, stated plainly: arrays of everything, numpy alone.
+
+Twins of `psfs/read_kernels.py`, `rendering/kernel_loops.py`, `rendering/cell_maps.py`
+and of the layers' distances.
+"""
+
+import math
+
+import numpy as np
+
+from filter_service.constants import (
+    MAX_LEVEL,
+    MERGE_MIN_SPREAD_PX,
+    NO_LEVEL,
+    RECIPE_TAPS,
+    RGB,
+    WEIGHT_MAX,
+)
+from filter_service.planning.grid import BASE_OBJECT_STEP_DPT, blur_step_px
+from filter_service.psfs.pack import box_sizes, pack_reach
+from filter_service.rendering.cell_maps import MAX_REACH_PX, UNMOVED_PX
+
+
+def neighbours(store, reads, fields, total_dpt):
+    """PSFs and weights (n, 3, 2 n_corners) of states (n, 3) at fields (n,)."""
+    plan = store.plan
+    n_groups = plan.pupils_mm.size * plan.accommodations_dpt.size
+    channels = np.arange(RGB)
+    psfs, weights = [], []
+    for group, scale, weight in zip(*reads, strict=True):
+        groups = fields * n_groups + group
+        lower, upper, share = plan.defocus.bracket(
+            groups[:, None], total_dpt * scale - plan.channel_shift_dpt[groups]
+        )
+        psfs += [RGB * lower + channels, RGB * upper + channels]
+        weights += [weight * (1.0 - share), weight * share]
+    return np.stack(psfs, axis=-1), np.stack(weights, axis=-1)
+
+
+def layer_blur_px(store, reads, zero_dpt, at_dpt):
+    n_fields = len(zero_dpt)
+    fields = np.tile(np.arange(n_fields), len(at_dpt))
+    total_dpt = at_dpt[:, None, None] + zero_dpt
+    psfs, weights = neighbours(store, reads, fields, total_dpt.reshape(-1, RGB))
+    blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
+    return blur_px.reshape(len(at_dpt), n_fields * RGB)
+
+
+def largest_radius_px(store, reads, zero_dpt, layer_dpt):
+    """Largest kernel from the lowest to the highest node that layers read."""
+    fields = np.arange(len(zero_dpt))
+    n_groups = store.plan.pupils_mm.size * store.plan.accommodations_dpt.size
+    largest = 0
+    for group, scale, _ in zip(*reads, strict=True):
+        groups = fields * n_groups + group
+        shift_dpt = store.plan.channel_shift_dpt[groups]
+        low = ((zero_dpt + layer_dpt[0]) * scale - shift_dpt).min(axis=1)
+        high = ((zero_dpt + layer_dpt[-1]) * scale - shift_dpt).max(axis=1)
+        first, _, _ = store.plan.defocus.bracket(groups, low)
+        _, last, _ = store.plan.defocus.bracket(groups, high)
+        for start, end in zip(RGB * first, RGB * (last + 1), strict=True):
+            largest = max(largest, int(store.radius_px[start:end].max()))
+    return largest
+
+
+def layer_distances_dpt(
+    object_range_dpt, *, focused_dpt, blur_radius_px, max_blur_step_px
+):
+    low_dpt, high_dpt = object_range_dpt
+    count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
+    inside = focused_dpt[(focused_dpt > low_dpt) & (focused_dpt < high_dpt)]
+    base = np.unique(np.append(np.linspace(low_dpt, high_dpt, max(count, 1)), inside))
+    blur_px = blur_radius_px(base)
+    layers = [base[:1]]
+    for k in range(len(base) - 1):
+        change_px = float(np.abs(blur_px[k + 1] - blur_px[k]).max())
+        smaller_px = float(np.minimum(blur_px[k + 1], blur_px[k]).min())
+        step_px = blur_step_px(smaller_px, max_blur_step_px)
+        transitional = max(math.ceil(change_px / step_px - 1e-9) - 1, 0)
+        layers.append(np.linspace(base[k], base[k + 1], transitional + 2)[1:])
+    return np.concatenate(layers)
+
+
+def map_tables(node_from_cell):
+    """Inverse, area, box, stretch and change of maps (n, 4, 2, 2)."""
+    inverse = np.linalg.inv(node_from_cell)
+    area = np.abs(np.linalg.det(node_from_cell))
+    diagonal = np.diagonal(node_from_cell, axis1=-2, axis2=-1)
+    return (
+        inverse,
+        area,
+        area / np.abs(diagonal.prod(axis=-1)),
+        np.linalg.norm(inverse, ord=2, axis=(-2, -1)),
+        np.linalg.norm(node_from_cell - np.eye(2), axis=(-2, -1)),
+    )
+
+
+def mapped_sizes(inverse, stretch, is_moved, reach_px, radius_px):
+    """Reaches (n, 4, 4) and radii (n, 4) of parts in the image's pixels."""
+    row, corner = np.nonzero(is_moved)
+    out = inverse[row, corner]
+    left, right, up, down = (reach_px[row, corner] + 1.0).T
+    sides = []
+    for axis in range(2):
+        a, b = out[:, axis, 0], out[:, axis, 1]
+        low = np.minimum(-a * left, a * right) + np.minimum(-b * up, b * down)
+        high = np.maximum(-a * left, a * right) + np.maximum(-b * up, b * down)
+        sides += [-low, high]
+    reach_px, radius_px = reach_px.copy(), radius_px.copy()
+    mapped_px = np.ceil(np.stack(sides, axis=-1) - 1e-9) - 1
+    reach_px[row, corner] = np.clip(mapped_px, 0, MAX_REACH_PX)
+    wider_px = stretch[row, corner] * (radius_px[row, corner] + 1.0)
+    radius_px[row, corner] = np.minimum(np.ceil(wider_px), MAX_REACH_PX)
+    return reach_px, radius_px
+
+
+def frame_kernels(store, layers, image, used):
+    """Node kernels and kernels of used (cell, interval) pairs, as two dicts by name."""
+    cells, intervals = np.nonzero(used)
+    n_intervals = used.shape[1]
+    wanted = image.nodes[cells] * n_intervals + intervals[:, None]
+    weights = image.weight_ratio[cells]
+    heaviest = np.take_along_axis(wanted, weights.argmax(axis=1)[:, None], axis=1)
+    wanted = np.where(weights > 0.0, wanted, heaviest)
+    pairs, parts = np.unique(wanted, return_inverse=True)
+    parts = parts.reshape(wanted.shape)
+    nodes = node_kernels(store, layers, *np.divmod(pairs, n_intervals))
+    spread_px = nodes["recipe_spread_px"][np.stack([nodes["near"], nodes["far"]], -1)]
+    maps = image.maps.node_from_cell[cells]
+    inverse, area, box, stretch, change = map_tables(maps)
+    is_moved = change * nodes["radius_px"][parts] > UNMOVED_PX
+    area = np.where(is_moved, area, 1.0)
+    reach_px, radius_px = mapped_sizes(
+        inverse, stretch, is_moved, nodes["reach_px"][parts], nodes["radius_px"][parts]
+    )
+    in_use = weights > 0.0
+    spreads_px = spread_px[parts] * (weights / np.sqrt(area))[..., None]
+    return nodes, {
+        "cells": cells,
+        "intervals": intervals,
+        "parts": parts,
+        "weight_ratio": weights * np.where(is_moved, box, 1.0),
+        "maps": np.where(is_moved[..., None, None], maps, np.eye(2)),
+        "reach_px": np.where(in_use[..., None], reach_px, 0).max(axis=1),
+        "radius_px": np.where(in_use, radius_px, 0).max(axis=1),
+        "peak_ratio": (nodes["peak_ratio"][parts] * weights * area).sum(axis=1),
+        "spread_px": spreads_px.sum(axis=1),
+    }
+
+
+def node_kernels(store, layers, fields, intervals):
+    n_layers = len(layers.layer_dpt)
+    ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
+    wanted, recipe_of = np.unique(fields * n_layers + ends, return_inverse=True)
+    near, far = recipe_of.reshape(ends.shape)
+    recipe_fields, recipe_layers = np.divmod(wanted, n_layers)
+    psfs, weights = neighbours(
+        store,
+        layers.reads,
+        recipe_fields,
+        layers.layer_dpt[recipe_layers, None] + layers.layer_zero_dpt[recipe_fields],
+    )
+    taken = weights > 0.0
+    own_px = np.where(taken[..., None], store.reach_px[psfs], 0).max(axis=(1, 2))
+    own_radius_px = np.where(taken, store.radius_px[psfs], 0).max(axis=(1, 2))
+    own_peak = (weights * store.peak_ratio[psfs]).sum(axis=2).max(axis=1)
+    recipes = np.zeros((*psfs.shape[:2], 3, RECIPE_TAPS), dtype=np.uint32)
+    taps = psfs.shape[-1]
+    recipes[..., 0, :taps] = store.offsets[psfs]
+    recipes[..., 1, :taps] = pack_reach(store.reach_px[psfs])
+    per_step = weights * store.peak_ratio[psfs] / WEIGHT_MAX
+    recipes[..., 2, :taps] = per_step.astype(np.float32).view(np.uint32)
+    return {
+        "near": near,
+        "far": far,
+        "reach_px": np.maximum(own_px[near], own_px[far]),
+        "radius_px": np.maximum(own_radius_px[near], own_radius_px[far]),
+        "peak_ratio": np.maximum(own_peak[near], own_peak[far]),
+        "recipes": recipes.reshape(*psfs.shape[:2], 3 * RECIPE_TAPS),
+        "recipe_spread_px": (weights * store.spread_px[psfs]).sum(axis=2).min(axis=1),
+    }
+
+
+def kernel_levels(reach_px, spread_px, peak_ratio):
+    """Texels, first texels and scales (n, levels) of kernels and merged forms."""
+    levels = np.arange(MAX_LEVEL + 1)
+    widest_px = np.maximum(spread_px.max(axis=1), 1e-9)
+    highest = np.floor(np.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
+    highest = np.clip(highest, 0, MAX_LEVEL)
+    widths, heights = (size[:, None] + 2**levels - 1 for size in box_sizes(reach_px))
+    sizes = np.where(levels <= highest[:, None], widths * heights, 0)
+    starts = (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape)
+    scale = np.minimum(peak_ratio[:, None] * 4.0**levels, 1.0)
+    scale[:, 0] = peak_ratio
+    return sizes, np.where(sizes > 0, starts, NO_LEVEL), scale.astype(np.float32)
+
+
+def work_list(n_texels, threads):
+    groups = -(-n_texels // threads)
+    kernel = np.repeat(np.arange(groups.size), groups)
+    first = np.arange(kernel.size) - np.repeat(np.cumsum(groups) - groups, groups)
+    return np.stack([kernel, first * threads], axis=-1)

@@ -1,0 +1,194 @@
+"""What a frame plans, against the plain statement of it."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from estimator.measured_wavefront import MeasuredWavefront
+from estimator.profiles import parse_profile
+from filter_service.constants import MAX_LEVEL, RECIPE_TAPS, RGB, THREADS
+from filter_service.planning.plan import unchecked_plan
+from filter_service.psfs.read_kernels import layer_blur_px
+from filter_service.psfs.store import PsfStore, frame_layers
+from filter_service.rendering import frame_kernels
+from filter_service.rendering.cell_maps import CellMaps
+from filter_service.rendering.image_cells import image_cells
+from tests.numerical import plan_twin
+from tests.numerical.plan_cases import spec_for, traced_eye
+
+RTOL = 1e-12
+"""Sums of up to eight numbers in another order."""
+
+FIELD = {"mode": "dynamic", "tolerance": "loose", "object_range_dpt": (0.0, 4.0)}
+MOVING = {"pupil_range_mm": (3.0, 5.0), "focus_range_dpt": (0.0, 3.0)}
+STILL = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (1.0, 1.0)}
+AXIS = {"mode": "on-axis", "object_range_dpt": (0.0, 4.0)}
+
+
+@cache
+def store_for(name, model="traced", **settings):
+    """A store with a real plan and made-up kernels, of which no plan reads a texel."""
+    spec = spec_for(320, 180, **settings)
+    profile = parse_profile({"kind": "preset", "name": name})
+    measured = MeasuredWavefront.from_profile(profile)
+    eye = traced_eye(name, spec) if model == "traced" else measured
+    plan = unchecked_plan(eye, spec)
+    count = RGB * plan.defocus.values_dpt.size
+    rng = np.random.default_rng(count)
+    node_px = np.abs(np.repeat(plan.defocus.values_dpt, RGB)) * 4.0
+    return PsfStore(
+        spec=spec,
+        eye=eye,
+        plan=plan,
+        kernels=np.zeros(1, np.uint16),
+        offsets=np.cumsum(rng.integers(1, 900, count)),
+        reach_px=rng.integers(0, 40, (count, 4)),
+        radius_px=rng.integers(0, 60, count),
+        blur_px=node_px + rng.random(count),
+        spread_px=rng.uniform(0.3, 30.0, count),
+        peak_ratio=rng.uniform(1e-4, 1.0, count),
+    )
+
+
+CASES = {
+    # name: store's settings, pupil, focus, share of used pairs, gaze
+    "between all nodes": (("keratoconus", FIELD | MOVING), 3.7, 1.3, 0.3, None),
+    "pupil on a node": (("keratoconus", FIELD | MOVING), 5.0, 1.3, 0.3, None),
+    "lowest end": (("keratoconus", FIELD | MOVING), 3.0, 0.0, 0.3, None),
+    "highest end": (("emmetropia", FIELD | MOVING), 9.0, 3.0, 0.3, None),
+    "several accommodations": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 0.3, None),
+    "accommodation on a node": (("emmetropia", FIELD | MOVING), 3.7, 0.0, 0.3, None),
+    "gaze turned": (
+        ("emmetropia", FIELD | STILL | {"gaze_range_deg": (12.0, 6.0)}),
+        *(4.0, 1.0, 0.3, (-12.0, 5.0)),
+    ),
+    "one used pair": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 0.0, None),
+    "every pair": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 1.0, None),
+    "a single layer": (
+        ("emmetropia", AXIS | STILL | {"object_range_dpt": (1.0, 1.0)}),
+        *(4.0, 1.0, 1.0, None),
+    ),
+    "on axis": (("astigmatism", AXIS | MOVING), 3.7, 1.3, 0.5, None),
+    "the paper's grid": (
+        ("emmetropia", FIELD | STILL | {"grid": "paper"}),
+        *(4.0, 1.0, 0.3, None),
+    ),
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request, rng):
+    """Store, layers, image cells and used pairs."""
+    (name, settings), pupil_mm, focus_dpt, share, gaze_deg = CASES[request.param]
+    store = store_for(name, **settings)
+    state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}
+    layers = frame_layers(store, **state)
+    image = image_cells(store.spec, store.plan, gaze_deg)
+    used = rng.random((image.count, frame_kernels.interval_count(layers))) < share
+    used[image.count // 2, used.shape[1] // 2] = True
+    return store, layers, image, used
+
+
+def test_layers_equal_the_plain_statement(case):
+    store, layers, _, _ = case
+    reads, zero_dpt = layers.reads, layers.layer_zero_dpt
+    at_dpt = layers.layer_dpt
+    np.testing.assert_allclose(
+        layer_blur_px(store.tables, reads, zero_dpt, at_dpt),
+        plan_twin.layer_blur_px(store, reads, zero_dpt, at_dpt),
+        rtol=RTOL,
+    )
+    h_deg, v_deg = store.plan.field_nodes_deg
+    gaze = np.argmin(np.hypot(h_deg, v_deg))
+    expected_dpt = plan_twin.layer_distances_dpt(
+        tuple(np.add(layers.object_range_dpt, layers.field.range_dpt)),
+        focused_dpt=-zero_dpt[gaze],
+        blur_radius_px=lambda d: plan_twin.layer_blur_px(store, reads, zero_dpt, d),
+        max_blur_step_px=store.spec.max_blur_step_px,
+    )
+    np.testing.assert_array_equal(layers.layer_dpt, expected_dpt)
+    largest_px = plan_twin.largest_radius_px(store, reads, zero_dpt, at_dpt)
+    assert layers.max_radius_px == largest_px
+    assert reads.weights.sum() == pytest.approx(1.0, rel=RTOL)
+    assert (reads.weights > 0.0).all()
+
+
+def test_defocus_is_the_eyes(case):
+    store, layers, _, _ = case
+    eye, spec = store.eye, store.spec
+    h_deg, v_deg = store.plan.field_nodes_deg
+    state = {
+        "pupil_diameter_mm": layers.pupil_diameter_mm,
+        "accommodation_dpt": eye.accommodation_dpt(layers.focus_dpt),
+    }
+    own_dpt = eye.total_defocus_dpt(
+        h_deg=h_deg[:, None],
+        v_deg=v_deg[:, None],
+        wavelength_nm=spec.channel_wavelengths_nm,
+        **state,
+    )
+    change_dpt = layers.field.at(h_deg, v_deg)[:, None]
+    found_dpt = layers.layer_zero_dpt + change_dpt
+    np.testing.assert_allclose(found_dpt, own_dpt, rtol=RTOL, atol=1e-12)
+
+
+def test_kernels_equal_the_plain_statement(case):
+    store, layers, image, used = case
+    kernels = frame_kernels.frame_kernels(store, layers, image, used)
+    nodes, expected = plan_twin.frame_kernels(store, layers, image, used)
+    recipes, plain = kernels.nodes.recipes, nodes.pop("recipes")
+    words = slice(0, 2 * RECIPE_TAPS)
+    np.testing.assert_array_equal(recipes[..., words], plain[..., words])
+    shares, plain = (
+        r[..., 2 * RECIPE_TAPS :].view(np.float32) for r in (recipes, plain)
+    )
+    np.testing.assert_allclose(shares, plain, rtol=1e-7)  # of a rounded float32
+    for made, twin in ((kernels.nodes, nodes), (kernels, expected)):
+        for name, values in twin.items():
+            found = getattr(made, name)
+            if values.dtype == np.float64:
+                np.testing.assert_allclose(found, values, RTOL, RTOL, err_msg=name)
+            else:
+                np.testing.assert_array_equal(found, values, err_msg=name)
+
+
+def test_tables_equal_the_plain_statement(case):
+    store, layers, image, used = case
+    kernels = frame_kernels.frame_kernels(store, layers, image, used)
+    table, sizes = frame_kernels.kernel_table(kernels)
+    texels, starts, scale = plan_twin.kernel_levels(
+        kernels.reach_px, kernels.spread_px, kernels.peak_ratio
+    )
+    np.testing.assert_array_equal(sizes, texels)
+    np.testing.assert_array_equal(table[:, 1], starts)
+    np.testing.assert_array_equal(table[:, 2].view(np.float32), scale)
+    for level in range(MAX_LEVEL + 1):
+        np.testing.assert_array_equal(
+            frame_kernels.work_list(sizes[:, level], THREADS),
+            plan_twin.work_list(sizes[:, level], THREADS),
+        )
+
+
+def test_a_measured_wavefront_has_one_defocus_over_the_field():
+    store = store_for("myopia", model="measured", **FIELD, **MOVING)
+    layers = frame_layers(store, pupil_diameter_mm=3.3, focus_dpt=1.0)
+    own_dpt = store.eye.total_defocus_dpt(
+        pupil_diameter_mm=3.3,
+        accommodation_dpt=store.eye.accommodation_dpt(1.0),
+        wavelength_nm=store.spec.channel_wavelengths_nm,
+    )
+    expected_dpt = np.broadcast_to(own_dpt, layers.layer_zero_dpt.shape)
+    np.testing.assert_array_equal(layers.layer_zero_dpt, expected_dpt)
+    assert layers.field.range_dpt == (0.0, 0.0)
+
+
+def test_maps_and_their_ratios(rng):
+    """Any map but those that fold."""
+    maps = rng.normal(size=(50, 4, 2, 2))
+    maps[np.abs(np.linalg.det(maps)) < 0.05] = np.diag([2.0, 3.0])
+    maps[0] = np.eye(2)
+    found = CellMaps(maps).tables
+    np.testing.assert_array_equal(found.node_from_cell, maps)
+    for made, plain in zip(found[1:], plan_twin.map_tables(maps), strict=True):
+        np.testing.assert_allclose(made, plain, rtol=1e-11, atol=1e-13)
