@@ -27,7 +27,6 @@ class StoreTables(NamedTuple):
     offsets : (n_psfs,)
     reach_words : (n_psfs,)
         Four reaches, a byte a side.
-    reach_px : (n_psfs, 4)
     radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
         See `PsfStore`.
     """
@@ -41,7 +40,6 @@ class StoreTables(NamedTuple):
     groups_per_field: int
     offsets: NDArray[np.uint32]
     reach_words: NDArray[np.uint32]
-    reach_px: NDArray[np.int64]
     radius_px: NDArray[np.int64]
     blur_px: NDArray[np.float64]
     spread_px: NDArray[np.float64]
@@ -74,23 +72,20 @@ def clipped(value, low, high):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bracket(tables, group, t):
+def bracket(tables, group, t, start):
     """Lower and upper node of a total defocus within a group; share of the upper.
 
-    As `RaggedNodes.bracket` has them.
+    As `RaggedNodes.bracket` has them.  The search begins at a node of the group: the
+    upper one of the last and smaller t, which is mostly the one that is sought, where
+    the halves of an interval are guessed wrongly every other time.
     """
     values_dpt, keys_dpt = tables.values_dpt, tables.keys_dpt
     first, last = tables.starts[group], tables.starts[group + 1] - 1
     t = clipped(t, values_dpt[first], values_dpt[last])
     key = t - tables.lowest_dpt + tables.span_dpt * group
-    low, high = first, last
-    while low < high:
-        middle = (low + high) // 2
-        if keys_dpt[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
-    upper = max(low, min(first + 1, last))
+    upper = max(start, min(first + 1, last))
+    while upper < last and keys_dpt[upper] < key:
+        upper += 1
     lower = max(upper - 1, first)
     span = values_dpt[upper] - values_dpt[lower]
     share = (t - values_dpt[lower]) / (span if span > 0.0 else 1.0)
@@ -99,7 +94,7 @@ def bracket(tables, group, t):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def layer_blur_px(tables, reads, zero_dpt, at_dpt):
-    """Geometric blur radius (n, n_fields * 3), px, of layers at n distances."""
+    """Geometric blur radius (n, n_fields * 3), px, of n layers, ascending."""
     n_fields = zero_dpt.shape[0]
     found_px = np.zeros((n_fields * RGB, at_dpt.size))
     for field in range(n_fields):
@@ -110,9 +105,10 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
                 of_layer = found_px[field * RGB + channel]
                 zero = zero_dpt[field, channel]
                 shift_dpt = tables.channel_shift_dpt[group, channel]
+                upper = tables.starts[group]
                 for k in range(at_dpt.size):
                     t = (at_dpt[k] + zero) * scale - shift_dpt
-                    lower, upper, share = bracket(tables, group, t)
+                    lower, upper, share = bracket(tables, group, t, upper)
                     low_px = tables.blur_px[RGB * lower + channel]
                     high_px = tables.blur_px[RGB * upper + channel]
                     of_layer[k] += low_px * (weight * (1.0 - share))
@@ -133,22 +129,30 @@ def largest_radius_px(tables, reads, zero_dpt, low_dpt, high_dpt):
                 zero = zero_dpt[field, channel]
                 low = min(low, (zero + low_dpt) * scale - shift_dpt)
                 high = max(high, (zero + high_dpt) * scale - shift_dpt)
-            first, _, _ = bracket(tables, group, low)
-            _, last, _ = bracket(tables, group, high)
+            first, start, _ = bracket(tables, group, low, tables.starts[group])
+            _, last, _ = bracket(tables, group, high, start)
             for psf in range(RGB * first, RGB * (last + 1)):
                 largest = max(largest, tables.radius_px[psf])
     return largest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def channel_taps(tables, reads, group_of_field, channel, total_dpt, psfs, weights):
-    """PSFs and weights (2 n_corners,) that make up one channel of a total defocus."""
+def channel_taps(tables, reads, group, channel, total_dpt, uppers, psfs, weights):
+    """PSFs and weights (2 n_corners,) that make up one channel of a total defocus.
+
+    Parameters
+    ----------
+    group : int
+        First of the field node.
+    uppers : (n_corners,)
+        Upper nodes of a smaller total defocus, or the groups' first; brought up to
+        date.
+    """
     for corner in range(reads.groups.size):
-        group = group_of_field + reads.groups[corner]
-        t = total_dpt * reads.scales[corner]
-        lower, upper, share = bracket(
-            tables, group, t - tables.channel_shift_dpt[group, channel]
-        )
+        own = group + reads.groups[corner]
+        t = total_dpt * reads.scales[corner] - tables.channel_shift_dpt[own, channel]
+        lower, upper, share = bracket(tables, own, t, uppers[corner])
+        uppers[corner] = upper
         psfs[2 * corner] = RGB * lower + channel
         psfs[2 * corner + 1] = RGB * upper + channel
         weights[2 * corner] = reads.weights[corner] * (1.0 - share)

@@ -88,7 +88,6 @@ class PsfStore:
             groups_per_field=plan.pupils_mm.size * plan.accommodations_dpt.size,
             offsets=np.array(self.offsets, np.uint32),
             reach_words=pack_reach(self.reach_px),
-            reach_px=np.array(self.reach_px, np.int64, order="C"),
             radius_px=np.array(self.radius_px, np.int64),
             blur_px=np.array(self.blur_px, np.float64),
             spread_px=np.array(self.spread_px, np.float64),

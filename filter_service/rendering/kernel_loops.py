@@ -93,7 +93,9 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
     Parameters
     ----------
     fields : (n,)
+        Field by field.
     total_dpt : (n, 3)
+        Ascending within a field.
     words : (n, 3, 3, 8), uint32
         See `NodeKernels.recipes`.
     steps : (n, 3, 3, 8), float32
@@ -103,29 +105,37 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
     reach_px, radius_px, peak_ratio, spread_px = sizes
     n_taps = 2 * reads.groups.size
     psfs, weights = np.empty(n_taps, np.int64), np.empty(n_taps)
+    uppers = np.empty((RGB, reads.groups.size), np.int64)
     for n in range(fields.size):
         group = fields[n] * tables.groups_per_field
-        reach_px[n], radius_px[n] = 0, 0
-        peak_ratio[n], spread_px[n] = 0.0, np.inf
+        if n == 0 or fields[n] != fields[n - 1]:
+            uppers[:] = tables.starts[group + reads.groups]
+        left = right = up = down = widest_px = 0
+        highest, narrowest_px = 0.0, np.inf
         for channel in range(RGB):
             total = total_dpt[n, channel]
-            channel_taps(tables, reads, group, channel, total, psfs, weights)
+            taken = uppers[channel], psfs, weights
+            channel_taps(tables, reads, group, channel, total, *taken)
             peak = spread = 0.0
             for tap in range(n_taps):
                 psf, weight = psfs[tap], weights[tap]
-                per_peak = weight * tables.peak_ratio[psf]
+                word, per_peak = (
+                    tables.reach_words[psf],
+                    weight * tables.peak_ratio[psf],
+                )
                 peak += per_peak
                 spread += weight * tables.spread_px[psf]
                 words[n, channel, 0, tap] = tables.offsets[psf]
-                words[n, channel, 1, tap] = tables.reach_words[psf]
+                words[n, channel, 1, tap] = word
                 steps[n, channel, 2, tap] = per_peak / WEIGHT_MAX
                 if weight > 0.0:
-                    radius_px[n] = max(radius_px[n], tables.radius_px[psf])
-                    for side in range(4):
-                        side_px = tables.reach_px[psf, side]
-                        reach_px[n, side] = max(reach_px[n, side], side_px)
-            peak_ratio[n] = max(peak_ratio[n], peak)
-            spread_px[n] = min(spread_px[n], spread)
+                    widest_px = max(widest_px, tables.radius_px[psf])
+                    left, right = max(left, word & 255), max(right, (word >> 8) & 255)
+                    up, down = max(up, (word >> 16) & 255), max(down, word >> 24)
+            highest, narrowest_px = max(highest, peak), min(narrowest_px, spread)
+        reach_px[n, 0], reach_px[n, 1] = left, right
+        reach_px[n, 2], reach_px[n, 3] = up, down
+        radius_px[n], peak_ratio[n], spread_px[n] = widest_px, highest, narrowest_px
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
