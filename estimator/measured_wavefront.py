@@ -155,26 +155,22 @@ class MeasuredWavefront(FocusingEye):
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
-    ) -> Callable[[float, float], NDArray[np.float64]]:
+    ) -> Callable[..., NDArray[np.float64]]:
         """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
 
         Returns
         -------
         callable
-            From a pupil, mm, and an accommodation, dpt, to dpt in the arguments'
-            broadcast shape.
+            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
+            arguments' broadcast shape.
         """
         shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
         return partial(self._defocus_dpt, wavelength_nm, shape)
 
     def _defocus_dpt(
-        self, wavelength_nm, shape: tuple, pupil_mm: float, used_dpt: float
+        self, wavelength_nm: ArrayLike, shape: tuple, **state: float
     ) -> NDArray[np.float64]:
-        found_dpt = self.total_defocus_dpt(
-            pupil_diameter_mm=pupil_mm,
-            accommodation_dpt=used_dpt,
-            wavelength_nm=wavelength_nm,
-        )
+        found_dpt = self.total_defocus_dpt(wavelength_nm=wavelength_nm, **state)
         return np.broadcast_to(found_dpt, shape)
 
     def chief_ray_shift_mrad(

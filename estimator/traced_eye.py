@@ -207,14 +207,14 @@ class TracedEye(FocusingEye):
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
-    ) -> Callable[[float, float], NDArray[np.float64]]:
+    ) -> Callable[..., NDArray[np.float64]]:
         """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
 
         Returns
         -------
         callable
-            From a pupil, mm, and an accommodation, dpt, to dpt in the arguments'
-            broadcast shape.
+            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
+            arguments' broadcast shape.
         """
         states = np.broadcast_arrays(h_deg, v_deg, wavelength_nm)
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
@@ -225,11 +225,11 @@ class TracedEye(FocusingEye):
         return partial(self._defocus_dpt, fields, number.reshape(states[0].shape))
 
     def _defocus_dpt(
-        self, fields: TracedFields, number: NDArray, pupil_mm: float, used_dpt: float
+        self, fields: TracedFields, number: NDArray, **state: float
     ) -> NDArray[np.float64]:
-        states = [np.full(fields.count, value) for value in (pupil_mm, used_dpt)]
-        self._check_states(*states)
-        zernike_um, _, radius_mm = fields.wavefronts(*states)
+        states = {name: np.full(fields.count, value) for name, value in state.items()}
+        self._check_states(**states)
+        zernike_um, _, radius_mm = fields.wavefronts(**states)
         return total_defocus_dpt(zernike_um, radius_mm)[number]
 
     def wavefronts(
@@ -293,9 +293,10 @@ class TracedEye(FocusingEye):
         first, number = distinct_rows(*columns)
         h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
         self._check_fields(h_deg, v_deg)
-        self._check_states(pupil_mm, used_dpt)
+        rest = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": used_dpt}
+        self._check_states(**rest)
         fields = self._fields(h_deg, v_deg, wavelength_nm, pupil_diameter_mm=pupil_mm)
-        return *fields.wavefronts(pupil_mm, used_dpt), number
+        return *fields.wavefronts(**rest), number
 
     def _fields(
         self, h_deg, v_deg, wavelength_nm, *, pupil_diameter_mm=None
@@ -318,10 +319,11 @@ class TracedEye(FocusingEye):
         check_limits("h_deg", h_deg, *self.field_range_deg[0])
         check_limits("v_deg", v_deg, *self.field_range_deg[1])
 
-    def _check_states(self, pupil_mm, used_dpt) -> None:
-        check_limits("pupil_diameter_mm", pupil_mm, 0.1, self.max_pupil_diameter_mm)
-        traced_dpt = self.grid.accommodations_dpt
-        check_limits("accommodation_dpt", used_dpt, traced_dpt[0], traced_dpt[-1])
+    def _check_states(self, *, pupil_diameter_mm, accommodation_dpt) -> None:
+        largest_mm = self.max_pupil_diameter_mm
+        check_limits("pupil_diameter_mm", pupil_diameter_mm, 0.1, largest_mm)
+        low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]]
+        check_limits("accommodation_dpt", accommodation_dpt, low_dpt, high_dpt)
 
 
 def largest_open_pupil_mm(grid: AberrationGrid) -> float:

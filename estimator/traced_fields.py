@@ -80,16 +80,18 @@ class TracedFields:
         return self._states.field.size
 
     def wavefronts(
-        self, pupil_mm: NDArray[np.float64], used_dpt: NDArray[np.float64]
+        self,
+        *,
+        pupil_diameter_mm: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Coefficients (n, 28), um, rims (n, 5), mm, and radii (n,), mm, of states.
 
         Parameters
         ----------
-        pupil_mm, used_dpt : (n,)
-            Pupil diameters and accommodations.
+        pupil_diameter_mm, accommodation_dpt : (n,)
         """
-        pupil_mm = self._usable_mm(pupil_mm)
+        pupil_mm, used_dpt = self._usable_mm(pupil_diameter_mm), accommodation_dpt
         polynomial_um, rim_mm = self._field.between(
             self._states, pupil_diameter_mm=pupil_mm, accommodation_dpt=used_dpt
         )

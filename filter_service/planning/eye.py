@@ -49,10 +49,11 @@ class Eye(Protocol):
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
-    ) -> Callable[[float, float], NDArray[np.float64]]:
+    ) -> Callable[..., NDArray[np.float64]]:
         """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
 
-        From a pupil, mm, and an accommodation, dpt, to dpt in the broadcast shape.
+        From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the broadcast
+        shape.
         """
 
     def chief_ray_shift_mrad(

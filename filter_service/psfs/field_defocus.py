@@ -96,7 +96,9 @@ class EyeDefocus:
 
         Over the field it is that of green light.
         """
-        at_infinity_dpt = self._defocus_dpt(pupil_diameter_mm, accommodation_dpt)
+        at_infinity_dpt = self._defocus_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
+        )
         n_nodes = int(np.prod(self._node_shape))
         nodes_dpt = at_infinity_dpt[:n_nodes].reshape(self._node_shape)
         if self._axes_deg is None:

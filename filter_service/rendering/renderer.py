@@ -130,7 +130,7 @@ class FilterRenderer:
         except GeneratorExit:
             pages.release()
             raise
-        _ = store.defocus  # prepared here and not by the first frame
+        _ = store.defocus, store.tables  # made here and not by the first frame
         yield LoadedStore(
             store=store, pages=pages, image=image_cells(store.spec, store.plan)
         )

@@ -320,7 +320,7 @@ def test_a_vignetted_field_is_seen_through_the_open_area():
         state_deg = {name: state[name] for name in ("h_deg", "v_deg", "wavelength_nm")}
         states = {"pupil_diameter_mm": 7.0, "accommodation_dpt": 0.0}
         np.testing.assert_allclose(
-            eye.defocus_at(**state_deg)(*states.values()),
+            eye.defocus_at(**state_deg)(**states),
             eye.total_defocus_dpt(**state_deg, **states),
             rtol=1e-12,
         )

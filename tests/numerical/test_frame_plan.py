@@ -90,6 +90,15 @@ def case(request, rng):
     return store, layers, image, used
 
 
+def test_the_cases_read_one_two_and_four_neighbours():
+    found = set()
+    for (name, settings), pupil_mm, focus_dpt, *_ in CASES.values():
+        store = store_for(name, **settings)
+        state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}
+        found.add(frame_layers(store, **state).reads.weights.size)
+    assert found == {1, 2, 4}
+
+
 def test_layers_equal_the_plain_statement(case):
     store, layers, _, _ = case
     reads, zero_dpt = layers.reads, layers.layer_zero_dpt
