@@ -109,6 +109,10 @@ class EstimationProblem:
             noise_um=FIT_NOISE_UM,
         )
 
+    def error_um(self, fit: BoundedFit) -> float:
+        """Return the mean error of a fit over the compared coefficients."""
+        return float(np.mean(np.abs(fit.values_um - self.target_um)))
+
     def determined_ratio(self, vector: NDArray[np.float64]) -> dict[str, float]:
         """Tell which share of each parameter's prior variance the measurement takes."""
         jacobian_um = self.jacobian_um(self.prior.to_unit(vector))

@@ -42,7 +42,8 @@ class Rows:
 
         The eye estimator's outputs are scaled to the ranges of Table 2.
         """
-        chosen = torch.as_tensor(self.training_index[:SCALING_ROWS])
+        step = -(-len(self.training_index) // SCALING_ROWS)
+        chosen = torch.as_tensor(self.training_index[::step])
         x, y = self.x[chosen], self.y[chosen]
         if self.task == "eye":
             network.fit_scaling(x, y[:, :N_EYE])
@@ -74,9 +75,9 @@ def load_rows(run: Run, folder: Path) -> Rows:
     DataError
         It is not there or not whole.
     """
-    x, y = task_rows(run.task, load(folder))
-    share = run.training.validation_ratio
-    return Rows(run.task, x, y, *split(len(x), share=share, seed=run.seed))
+    shard, share = load(folder), run.training.validation_ratio
+    parts = split(shard.inputs, share=share, seed=run.seed)
+    return Rows(run.task, *task_rows(run.task, shard), *parts)
 
 
 class Batches:

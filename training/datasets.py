@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, Domain, Labels
+from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, N_EYE, Domain, Labels
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -231,7 +231,15 @@ def load(folder: Path) -> Shard:
     )
 
 
-def split(n_rows: int, *, share: float, seed: int) -> tuple[NDArray, NDArray]:
-    """Return indices of training and validation rows, drawn with ``share``."""
-    chosen = np.random.default_rng(seed).random(n_rows) < share
+def split(
+    inputs: NDArray[np.float32], *, share: float, seed: int
+) -> tuple[NDArray, NDArray]:
+    """Return indices of training and validation rows, drawn with ``share``.
+
+    Rows (n, n_inputs) of one eye follow each other and go the same way: in a product
+    of eyes and distances, a network knows an eye that it saw at another distance.
+    """
+    is_new = np.r_[True, np.any(inputs[1:, :N_EYE] != inputs[:-1, :N_EYE], axis=1)]
+    eye = np.cumsum(is_new) - 1
+    chosen = np.random.default_rng(seed).random(eye[-1] + 1)[eye] < share
     return np.flatnonzero(~chosen), np.flatnonzero(chosen)

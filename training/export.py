@@ -41,6 +41,9 @@ JUDGED_ROWS = 20_000
 JUDGE_SEED = 20_001
 """Fresh rows: no data set has this seed."""
 
+MORE_PRODUCT_ROWS = 4
+"""Rows of a product of eyes and distances for each row elsewhere: it holds few eyes."""
+
 SMALLEST_HALVED = 256
 """Smaller tensors, scalings among them, stay in 32 bits."""
 
@@ -110,6 +113,7 @@ def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) 
 def fresh_rows(task: Task, n_rows: int) -> tuple[NDArray, NDArray]:
     """Return inputs and targets, float32, that no training saw."""
     repeats = task.domain.n_repeats
+    n_rows *= MORE_PRODUCT_ROWS if repeats > 1 else 1
     n_rows = -(-n_rows // repeats) * repeats
     recipe = Recipe(task.domain.name, n_rows, n_rows, JUDGE_SEED, "random")
     shard: Shard = label(task.domain, draw(recipe, 0))

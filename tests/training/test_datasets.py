@@ -141,6 +141,15 @@ def test_focus_labels_are_those_of_the_accommodating_eye():
 
 
 def test_the_split_is_a_partition():
-    training, validation = split(1000, share=0.15, seed=3)
+    eyes = np.random.default_rng(0).random((1000, 47)).astype(np.float32)
+    training, validation = split(eyes, share=0.15, seed=3)
     assert 100 < len(validation) < 200
     assert sorted([*training, *validation]) == list(range(1000))
+
+
+def test_an_eye_is_not_split_between_training_and_validation():
+    rows = draw(Recipe("focus", 4000, 4000), 0)
+    training, validation = split(rows, share=0.3, seed=3)
+    eyes = [{tuple(row) for row in rows[part, :45]} for part in (training, validation)]
+    assert not eyes[0] & eyes[1]
+    assert 15 < len(eyes[1]) < 45
