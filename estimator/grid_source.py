@@ -26,11 +26,11 @@ TRACED_MS_PER_RAY = 2e-3
 rays, 0.40 on the axis with 192 (2 cores at 2 threads; emmetropia, myopia, keratoconus
 within a tenth)."""
 
-NETWORK_MS, NETWORK_MS_PER_WEIGHT = 8e-3, 1e-8
+NETWORK_MS, NETWORK_MS_PER_WEIGHT = 8e-3, 2.6e-8
 """Of one node by network, on the same cores: chief rays, checks and columns; and for
-each weight.  Plain layers take 1.4 us a node for 0.22 million weights, 4.9 for 0.83,
-7.5 for 1.36; residual ones of 1.23 million, with Mish of one exponential and layer
-norms, 19 us of processor time.  (With Mish of onnx's own Softplus it was 70.)"""
+each weight: the shipped network, features and quadratic form included, takes 19.6 us
+of processor time a node for 0.76 million weights.  (With Mish of onnx's own Softplus,
+layers of 1.23 million took 70 instead of 19.)"""
 
 LEAST_GAIN_MS = 100.0
 """Time that a network must save for a grid that need not be exact: a tenth of the

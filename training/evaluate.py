@@ -106,6 +106,12 @@ def format_row(row: Judged) -> str:
     )
 
 
+def write_table(rows: list[Judged], file: Path) -> None:
+    """Write rows as JSON, with the commit."""
+    table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
+    file.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     parser = argparse.ArgumentParser(
@@ -128,8 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"evaluate: {error}", file=sys.stderr)
         return 2
     if options.json:
-        table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
-        options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        write_table(rows, options.json)
     return 0
 
 

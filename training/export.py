@@ -77,8 +77,15 @@ def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) 
     ------
     DataError
         There is no checkpoint.
+    RunFileError
+        The checkpoint is of another run file.
     """
     network, state = load_checkpoint(run.output_folder / CHECKPOINT)
+    if state["run"] != run.text:
+        raise RunFileError(
+            f"{run.output_folder / CHECKPOINT} was trained by another run file; a card "
+            "must state what its network was trained with"
+        )
     task = TASKS[run.task]
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{task.name}.onnx"

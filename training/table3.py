@@ -11,19 +11,17 @@ eye's loss, a trained discriminator.  What is already trained is kept.
 """
 
 import argparse
-import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from training.datasets import DataError
-from training.evaluate import Judged, format_row, judge
+from training.evaluate import Judged, format_row, judge, write_table
 from training.export import JUDGED_ROWS, fresh_rows
 from training.models import ModelSettings
 from training.run_file import Run, RunFileError, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT, train
-from training.versions import commit_id
 
 RUNS = Path(__file__).parent / "runs"
 FOLDER = Path("out/training/table3")
@@ -105,8 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"table3: {error}", file=sys.stderr)
         return 2
     if options.json:
-        table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
-        options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        write_table(rows, options.json)
     return 0
 
 

@@ -17,7 +17,7 @@ from training.export import export, fresh_rows
 from training.generate import generate
 from training.losses import DiscriminatorLoss
 from training.optimiser import Lookahead, make_optimiser, pace
-from training.run_file import read_run
+from training.run_file import RunFileError, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT, LOG, train
 from training.validation import misfit_of_eyes
@@ -194,6 +194,14 @@ def test_a_whole_run_beats_a_straight_line(tmp_path):
     assert card["error"]["mean_abs"] < 0.75 * straight
     assert card["parity"]["max_abs"]["um"] < 0.2 * card["error"]["mean_abs"]
     assert card["bytes"] < 3 * card["n_parameters"] + 100_000
+
+
+def test_a_card_is_not_written_for_another_run_file(folder, tmp_path):
+    run = _run(folder, "carded", n_epochs=1)
+    train(run)
+    with pytest.raises(RunFileError, match="another run file"):
+        export(replace(run, text=run.text + "# changed"), tmp_path, is_half=False)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_estimated_eye_is_judged_by_its_light():
