@@ -77,9 +77,9 @@ MERGE_MAX_BLUR_STEP_PX = 0.25
 """Largest blur difference within a merged quad; more where the blur is wide."""
 
 MERGE_MAX_BLUR_RATIO = 0.08
-"""The same over the spread of the kernels, which is the radius of a disc.  With the fixed step
-alone sloping surfaces no longer merge at 64 px of blur: 3.7 times the list entries for
-65 instead of 62 dB."""
+"""The same over the spread of the kernels, which is the radius of a disc.  With the
+fixed step alone sloping surfaces no longer merge at 64 px of blur: 3.7 times the list
+entries for 65 instead of 62 dB."""
 
 PAPER_TIE_BREAK_M = 0.01
 """The paper's rule sorts by distance plus this times the scan position (0..1)."""
