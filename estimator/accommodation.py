@@ -18,7 +18,11 @@ from estimator import prescription as rx
 from estimator.eye import eye_surfaces
 from estimator.eye_parameters import EyeParameters, RetinaShape, column
 from estimator.eye_wavefront import TraceFailed, refraction_of_vectors
-from estimator.lens_shape import lens_shape
+from estimator.lens_shape import (
+    ANTERIOR_THICKNESS_RATIO,
+    CAP_VOLUME_RATIO,
+    lens_shape,
+)
 from estimator.surfaces import EyeSurfaces
 from estimator.units import REFERENCE_WAVELENGTH_NM
 
@@ -72,6 +76,20 @@ def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
         lens_diameter_mm=float(vectors[0, DIAMETER]),
         aqueous_thickness_mm=float(vectors[0, AQUEOUS]),
     )
+
+
+def smallest_diameter_mm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lens diameters (...) to which relaxed eyes (..., 45) can shrink their lens.
+
+    `SMALLEST_DIAMETER_RATIO` of the relaxed one, or where the chamber is
+    `SMALLEST_AQUEOUS_MM` deep: the lens thickens before its equator by
+    c (1/D² - 1/D0²), c = 8 eta V tau / (pi (1 + tau)), see `lens_shape`.
+    """
+    relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
+    room_mm = np.maximum(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, 0.0)
+    c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
+    fitting_mm = (relaxed_mm**-2 + room_mm / c_mm3) ** -0.5
+    return np.maximum(fitting_mm, SMALLEST_DIAMETER_RATIO * relaxed_mm)
 
 
 @dataclass(frozen=True)
@@ -132,16 +150,15 @@ class AccommodatingEye:
     def _refraction_table(self):
         """Lens diameters, falling, and the refraction at each, as far as it falls."""
         relaxed_mm = self._vector[DIAMETER]
-        diameters_mm = relaxed_mm * np.linspace(1.0, SMALLEST_DIAMETER_RATIO, N_TABLE)
+        smallest_mm = smallest_diameter_mm(self._vector)
+        diameters_mm = np.linspace(relaxed_mm, smallest_mm, N_TABLE)
         vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
         refractions_dpt = self._refractions_dpt(vectors)
         if not np.isfinite(refractions_dpt[0]):
             raise TraceFailed(
                 f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
             )
-        usable = np.isfinite(refractions_dpt) & (
-            vectors[:, AQUEOUS] >= SMALLEST_AQUEOUS_MM
-        )
+        usable = np.isfinite(refractions_dpt)
         usable[1:] &= np.diff(refractions_dpt) < 0.0
         usable[0] = True
         count = int(np.argmin(usable)) if not usable.all() else usable.size

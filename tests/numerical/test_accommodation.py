@@ -130,6 +130,16 @@ def test_the_lens_itself_limits_a_young_eye():
     assert "stops at" in state.notes[0]
 
 
+def test_a_shallow_chamber_limits_the_lens_exactly():
+    relaxed = replace(EyeParameters.mean_eye(), aqueous_thickness_mm=1.2)
+    shallow = AccommodatingEye(relaxed)
+    state = shallow.focused(60.0)
+    assert state.parameters.aqueous_thickness_mm == pytest.approx(1.0, abs=1e-9)
+    # a little deeper, a little farther: the reach has no steps
+    deeper = AccommodatingEye(replace(relaxed, aqueous_thickness_mm=1.201))
+    assert 0.0 < deeper.amplitude_dpt - shallow.amplitude_dpt < 0.05
+
+
 def test_worn_correction_moves_the_far_point(myope):
     glasses = Prescription(sphere_dpt=-6.0)
     bare = AccommodatingEye(myope)

@@ -5,6 +5,7 @@ shrinks at constant volume until the least-squares refraction at 555 nm meets th
 an eye that cannot do so stays relaxed, or goes as far as its lens reaches.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from estimator.accommodation import (
     SMALLEST_DIAMETER_RATIO,
     VOLUME,
 )
-from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO
+from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO, CAP_VOLUME_RATIO
 from training.tracer.circle import refraction_of_eyes
 from training.tracer.eye import lens_shape
 
@@ -59,6 +60,15 @@ def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
     return torch.stack(columns, -1)
 
 
+def smallest_diameters_mm(vectors: Tensor) -> Tensor:
+    """See `estimator.accommodation.smallest_diameter_mm`."""
+    relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
+    room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
+    c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
+    fitting_mm = (relaxed_mm**-2 + room_mm / c_mm3) ** -0.5
+    return torch.maximum(fitting_mm, SMALLEST_DIAMETER_RATIO * relaxed_mm)
+
+
 class _Table(NamedTuple):
     """Lens diameters (B, 10), falling, and the accommodation at each.
 
@@ -72,21 +82,15 @@ class _Table(NamedTuple):
 
 
 def _tabulate(vectors: Tensor, refractions) -> _Table:
-    ratios = torch.linspace(
-        1.0,
-        SMALLEST_DIAMETER_RATIO,
-        N_TABLE,
-        dtype=vectors.dtype,
-        device=vectors.device,
-    )
-    diameters_mm = vectors[:, DIAMETER, None] * ratios
+    relaxed_mm = vectors[:, DIAMETER, None]
+    share = torch.linspace(0.0, 1.0, N_TABLE, dtype=vectors.dtype)
+    shrunk_mm = smallest_diameters_mm(vectors)[:, None] - relaxed_mm
+    diameters_mm = relaxed_mm + shrunk_mm * share.to(vectors.device)
     eyes = accommodated_eyes(vectors[:, None].expand(-1, N_TABLE, -1), diameters_mm)
     rows = torch.arange(len(vectors), device=vectors.device)
     rows = rows.repeat_interleave(N_TABLE)
     refractions_dpt = refractions(eyes.flatten(0, 1), rows).unflatten(0, (-1, N_TABLE))
-    usable = torch.isfinite(refractions_dpt) & (
-        eyes[..., AQUEOUS] >= SMALLEST_AQUEOUS_MM
-    )
+    usable = torch.isfinite(refractions_dpt)
     usable[:, 1:] &= refractions_dpt.diff(dim=1) < 0.0
     usable[:, 0] = True
     last = usable.to(torch.int64).cumprod(1).sum(1) - 1
