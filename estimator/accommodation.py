@@ -53,11 +53,20 @@ def accommodated_vectors(
     """Vectors (P, 45) of one relaxed eye with these lens diameters (P,)."""
     lens_diameter_mm = np.atleast_1d(np.asarray(lens_diameter_mm, dtype=np.float64))
     vectors = np.repeat(vector[None], lens_diameter_mm.size, axis=0)
-    relaxed = lens_shape(diameter_mm=vector[DIAMETER], volume_mm3=vector[VOLUME])
-    shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=vector[VOLUME])
-    vectors[:, DIAMETER] = lens_diameter_mm
-    vectors[:, AQUEOUS] -= shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
-    return vectors
+    return accommodated_eyes(vectors, lens_diameter_mm)
+
+
+def accommodated_eyes(
+    vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Relaxed eyes (P, 45) with other lens diameters (P,), their volumes kept."""
+    volume_mm3 = vectors[:, VOLUME]
+    relaxed = lens_shape(diameter_mm=vectors[:, DIAMETER], volume_mm3=volume_mm3)
+    shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=volume_mm3)
+    focused = vectors.copy()
+    focused[:, DIAMETER] = lens_diameter_mm
+    focused[:, AQUEOUS] -= shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
+    return focused
 
 
 def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):

@@ -7,9 +7,15 @@ one nearest to what eyes of that refraction are like.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from estimator.eye_parameters import PARAMETERS, allowed_ranges, column, mean_vector
+from estimator.eye_parameters import (
+    N_PARAMETERS,
+    PARAMETERS,
+    allowed_ranges,
+    column,
+    mean_vector,
+)
 
 LENGTH_PER_DPT_MM = -0.299
 RADIUS_PER_DPT_MM = 0.022
@@ -41,17 +47,23 @@ class Prior:
         return self.to_unit(low), self.to_unit(high)
 
 
-def prior_for_refraction(refraction_dpt: float) -> Prior:
-    """Prior around the mean eye of this spherical refraction.
+def mean_eyes(refraction_dpt: ArrayLike) -> NDArray[np.float64]:
+    """Vectors (..., 45) of the mean eyes of spherical refractions (...), dpt.
 
-    Parameters
-    ----------
-    refraction_dpt : float
-        M, dpt; used within `REFRACTION_LIMITS_DPT`.
+    Refractions count within `REFRACTION_LIMITS_DPT`.
     """
-    low, high = REFRACTION_LIMITS_DPT
-    clipped_dpt = min(max(refraction_dpt, low), high)
-    mean = mean_vector()
-    mean[column("eye_length_mm")] += LENGTH_PER_DPT_MM * clipped_dpt
-    mean[column("cornea_anterior_radius_mm")] += RADIUS_PER_DPT_MM * clipped_dpt
-    return Prior(mean, np.array([row.deviation for row in PARAMETERS]))
+    clipped_dpt = np.clip(refraction_dpt, *REFRACTION_LIMITS_DPT)
+    eyes = np.broadcast_to(mean_vector(), (*np.shape(clipped_dpt), N_PARAMETERS)).copy()
+    eyes[..., column("eye_length_mm")] += LENGTH_PER_DPT_MM * clipped_dpt
+    eyes[..., column("cornea_anterior_radius_mm")] += RADIUS_PER_DPT_MM * clipped_dpt
+    return eyes
+
+
+def deviations() -> NDArray[np.float64]:
+    """Give standard deviations (45,) about a mean eye, each in its own unit."""
+    return np.array([row.deviation for row in PARAMETERS])
+
+
+def prior_for_refraction(refraction_dpt: float) -> Prior:
+    """Prior around the mean eye of this spherical refraction M, dpt."""
+    return Prior(mean_eyes(refraction_dpt), deviations())

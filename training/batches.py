@@ -40,14 +40,16 @@ class Rows:
     def fit_scaling(self, network: Network) -> None:
         """Take scales, and a baseline, from training rows.
 
-        The eye estimator's outputs are scaled to the ranges of Table 2.
+        The eye estimator's outputs are scaled to the ranges of Table 2, or to what its
+        features say.
         """
         step = -(-len(self.training_index) // SCALING_ROWS)
         chosen = torch.as_tensor(self.training_index[::step])
         x, y = self.x[chosen], self.y[chosen]
         if self.task == "eye":
             network.fit_scaling(x, y[:, :N_EYE])
-            network.set_output_range(*torch.from_numpy(sampled_ranges().T))
+            ranges = getattr(network.features, "output_ranges", sampled_ranges)()
+            network.set_output_range(*torch.from_numpy(ranges.T))
         else:
             network.fit_scaling(x, y)
 
@@ -61,6 +63,10 @@ class Rows:
 def task_rows(task: str, shard: Shard) -> tuple[Tensor, Tensor]:
     """Return inputs and targets of a task, from labelled rows of its domain."""
     inputs, targets = torch.from_numpy(shard.inputs), torch.from_numpy(shard.targets)
+    if task == "focus":
+        # The lens was given and its focus traced; the network is asked the other way.
+        known = torch.cat([inputs[:, : N_EYE + 1], targets[:, :1]], dim=1)
+        return known, targets[:, 1:]
     if task != "eye":
         return inputs, targets
     measured = torch.cat([targets[:, 2:], inputs[:, N_EYE:]], dim=1)

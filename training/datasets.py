@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from training.population import at_some_focus, population_eyes, population_ranges
 from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, N_EYE, Domain, Labels
 
 FORMAT = 1
 MANIFEST = "manifest.json"
 SAMPLINGS = ("random", "sobol")
+N_MORE_AXES = 3
+"""Of a population: whether an eye belongs to it, its refraction, what it uses of its
+accommodation."""
 
 
 class DataError(ValueError):
@@ -39,6 +43,9 @@ class Recipe:
     seed : int
     sampling : {"random", "sobol"}
         Uniform and independent, or a scrambled low-discrepancy sequence.
+    population_ratio : float
+        Share of rows whose eyes are drawn as people have them (`population`) instead
+        of from the box of Table 2.
     """
 
     domain: str
@@ -46,6 +53,7 @@ class Recipe:
     rows_per_shard: int = 20_480
     seed: int = 132
     sampling: str = "sobol"
+    population_ratio: float = 0.0
 
     def __post_init__(self):
         if self.domain not in DOMAINS:
@@ -53,6 +61,10 @@ class Recipe:
         if self.sampling not in SAMPLINGS:
             raise DataError(
                 f"sampling '{self.sampling}': allowed are {', '.join(SAMPLINGS)}"
+            )
+        if not 0.0 <= self.population_ratio <= 1.0:
+            raise DataError(
+                f"population_ratio {self.population_ratio}: must be within 0 and 1"
             )
         repeats = DOMAINS[self.domain].n_repeats
         if self.n_rows < 1 or self.rows_per_shard < 1 or self.rows_per_shard % repeats:
@@ -82,23 +94,48 @@ class Shard:
 def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
     """Draw the inputs (n, n_inputs) of one shard.
 
-    In a Cartesian product every eye comes with all ``n_repeats`` values of the last
-    input, evenly spread over its range (the paper's focus set).
+    In a Cartesian product every eye comes with ``n_repeats`` values of the last input,
+    one in each part of its range (the paper's focus set), at a place of its own there.
     """
-    domain = DOMAINS[recipe.domain]
+    domain, n_repeats = DOMAINS[recipe.domain], DOMAINS[recipe.domain].n_repeats
     first = shard * recipe.rows_per_shard
     n = min(recipe.rows_per_shard, recipe.n_rows - first)
     if n < 1:
         raise DataError(f"shard {shard}: the data set has {recipe.n_shards}")
     low, high = domain.ranges.T
-    if domain.n_repeats == 1:
-        return low + (high - low) * _unit_points(recipe, first, n, len(low))
-    n_eyes = -(-n // domain.n_repeats)
-    unit = _unit_points(recipe, first // domain.n_repeats, n_eyes, len(low) - 1)
-    eyes = low[:-1] + (high - low)[:-1] * unit
-    last = np.linspace(low[-1], high[-1], domain.n_repeats)
-    rows = np.repeat(eyes, domain.n_repeats, axis=0)
-    return np.column_stack([rows, np.tile(last, n_eyes)])[:n]
+    n_eyes = -(-n // n_repeats)
+    n_axes = len(low) + (N_MORE_AXES if recipe.population_ratio else 0)
+    unit = _unit_points(recipe, first // n_repeats, n_eyes, n_axes)
+    rows = low + (high - low) * unit[:, : len(low)]
+    if recipe.population_ratio:
+        _populate(recipe, domain, rows, unit)
+    if n_repeats == 1:
+        return rows
+    part = (np.arange(n_repeats) + unit[:, len(low) - 1, None]) / n_repeats
+    rows = np.repeat(rows, n_repeats, axis=0)
+    rows[:, -1] = low[-1] + (high - low)[-1] * part.ravel()
+    return rows[:n]
+
+
+def _populate(recipe: Recipe, domain: Domain, rows: NDArray, unit: NDArray) -> None:
+    """Exchange a share of the eyes of rows (n, n_inputs) for such as people have."""
+    choice, refraction, used = unit[:, -N_MORE_AXES:].T
+    chosen = choice < recipe.population_ratio
+    eyes = population_eyes(unit[chosen, :N_EYE], refraction[chosen])
+    if domain.is_focused:
+        eyes = at_some_focus(eyes, used[chosen])
+    rows[chosen, :N_EYE] = eyes
+
+
+def input_ranges(recipe: Recipe) -> NDArray[np.float64]:
+    """Ranges (n_inputs, 2) that hold all inputs of a data set."""
+    domain = DOMAINS[recipe.domain]
+    ranges = domain.ranges.copy()
+    if recipe.population_ratio:
+        wider = population_ranges(is_focused=domain.is_focused)
+        ranges[:N_EYE, 0] = np.minimum(ranges[:N_EYE, 0], wider[:, 0])
+        ranges[:N_EYE, 1] = np.maximum(ranges[:N_EYE, 1], wider[:, 1])
+    return ranges
 
 
 def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray:
@@ -165,7 +202,9 @@ def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
         "commit": commit,
         "inputs": [
             {"name": name, "low": float(low), "high": float(high)}
-            for name, (low, high) in zip(domain.inputs, domain.ranges, strict=True)
+            for name, (low, high) in zip(
+                domain.inputs, input_ranges(recipe), strict=True
+            )
         ],
         "targets": list(domain.targets),
         "n_shards_done": len(done),
@@ -198,7 +237,8 @@ def read_manifest(folder: Path) -> dict:
 
 def recipe_of(manifest: dict) -> Recipe:
     """Return the recipe that a manifest was written for."""
-    return Recipe(**{name: manifest[name] for name in Recipe.__dataclass_fields__})
+    known = Recipe.__dataclass_fields__
+    return Recipe(**{name: manifest[name] for name in known if name in manifest})
 
 
 def load_shards(folder: Path) -> Iterator[Shard]:

@@ -5,9 +5,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from training.tasks import N_EYE, Domain
-from training.tracer.accommodation import focus_of_eyes
-from training.tracer.circle import zernike_of_eyes
+from estimator.accommodation import AQUEOUS, DIAMETER
+from training.tasks import LENS_ROOM, N_EYE, Domain
+from training.tracer.accommodation import (
+    accommodated_eyes,
+    focus_of_eyes,
+    smallest_diameters_mm,
+)
+from training.tracer.circle import refraction_of_eyes, zernike_of_eyes
 from training.tracer.field import field_aberrations_of_eyes
 
 
@@ -25,7 +30,7 @@ def label_on_device(
         A domain that has no tracer here.
     """
     columns = torch.as_tensor(inputs, dtype=torch.float64, device=device)
-    makers = {"on_axis": _on_axis, "field": _field, "focus": _focus}
+    makers = {"on_axis": _on_axis, "field": _field, "focus": _focus, "lens": _lens}
     if domain.name not in makers:
         raise ValueError(f"domain '{domain.name}': allowed are {', '.join(makers)}")
     targets, is_traced = makers[domain.name](columns, domain)
@@ -58,3 +63,14 @@ def _focus(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
     changes = (found.lens_diameter_change_mm, found.aqueous_thickness_change_mm)
     targets = torch.stack([change.flatten() for change in changes], dim=1)
     return targets, torch.all(torch.isfinite(targets), dim=1)
+
+
+def _lens(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+    eyes, pupil_mm = columns[:, :N_EYE], columns[:, N_EYE]
+    widest, least = LENS_ROOM.ravel().tolist()
+    widest_mm = widest * eyes[:, DIAMETER]
+    room_mm = least * smallest_diameters_mm(eyes) - widest_mm
+    focused = accommodated_eyes(eyes, widest_mm + columns[:, -1] * room_mm)
+    refraction_dpt, is_traced = refraction_of_eyes(focused, pupil_mm)
+    changes_mm = (focused - eyes)[:, [DIAMETER, AQUEOUS]]
+    return torch.cat([-refraction_dpt[:, None], changes_mm], dim=1), is_traced

@@ -4,6 +4,7 @@ Turned and shifted offsets, curvatures, paraxial vergence.  Used by `features`.
 """
 
 import math
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
@@ -156,12 +157,27 @@ class EyeFeatures(nn.Module):
         """
         cornea, lens = _cornea(eye, cosine, sine), _lens(eye, cosine, sine)
         offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, cosine, sine))
-        vergence = _vergence(cornea, lens, offsets, wavelength_nm)
+        vergence = _vergence(cornea, lens, _apex(offsets), _indices(wavelength_nm))
         x, a = _footprint(cornea, lens, tangent)
         half = 0.5 * pupil_mm / OFFSET_RADIUS_MM
         met = self.shift(offsets, x / OFFSET_RADIUS_MM, half * a, half)
         columns = torch.stack([*cornea.values(), *lens.values(), *vergence], dim=1)
         return torch.cat([columns, met / self.scale(pupil_mm)], dim=1)
+
+    def vergence_of(
+        self, eye: Tensor, wavelength_nm: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Return what gives eyes that differ in their lenses their vergence.
+
+        Mean and paraxial, (N,), 1/mm, of light from the retina, outside of the eye.
+        """
+        one, zero = torch.ones_like(wavelength_nm), torch.zeros_like(wavelength_nm)
+        cornea, indices = _cornea(eye, one, zero), _indices(wavelength_nm)
+        offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, one, zero))
+        apex = _apex(offsets)
+        return lambda other: _vergence(cornea, _lens(other, one, zero), apex, indices)[
+            0
+        ]
 
 
 def named(eye: Tensor, name: str) -> Tensor:
@@ -244,9 +260,9 @@ def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
     return kept * scale, along * scale, across * scale
 
 
-def _vergence(cornea: dict, lens: dict, offsets: Tensor, wavelength_nm) -> Tensor3:
+def _vergence(cornea: dict, lens: dict, apex: Sequence, indices: Sequence) -> Tensor3:
     """Paraxial vergence, 1/mm, of the light from the retina outside the eye."""
-    n_cornea, n_aqueous, n_lens, n_vitreous = _indices(wavelength_nm)
+    n_cornea, n_aqueous, n_lens, n_vitreous = indices
     zero = torch.zeros_like(n_lens)
     rear = (n_lens - n_vitreous) * lens["rear"] - n_vitreous / lens["vitreous"]
     light = _transferred((rear, zero, zero), lens["thickness"] / n_lens)
@@ -255,7 +271,7 @@ def _vergence(cornea: dict, lens: dict, offsets: Tensor, wavelength_nm) -> Tenso
     step = n_aqueous - n_cornea
     back = (cornea["back"], cornea["along"], cornea["across"])
     light = tuple(v + step * c for v, c in zip(light, back, strict=True))
-    mean, along, across, height_mm = _apex(offsets)
+    mean, along, across, height_mm = apex
     light = _transferred(light, (cornea["thickness"] - height_mm) / n_cornea)
     front = (cornea["front"] + mean, along, across)
     return tuple(v + (n_cornea - 1.0) * c for v, c in zip(light, front, strict=True))

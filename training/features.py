@@ -7,23 +7,20 @@ turned.  All four are closed forms.  Layers here apply them, so that the network
 the rest; they are part of the exported graph.
 """
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from estimator.accommodation import SMALLEST_DIAMETER_RATIO
-from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO
-from estimator.units import REFERENCE_WAVELENGTH_NM
+from estimator.eye_parameters import allowed_ranges, mean_vector
 from training.eye_features import (
     EyeFeatures,
     PupilPowers,
     Turn,
-    lens_thickness_mm,
-    named,
     turned_pair,
 )
-
-BOUND_MARGIN_MM = 1e-4
-"""Changes of the lens nearer to a bound than this count as bounded."""
+from training.eye_prior import mean_eyes
+from training.focus_features import FocusFeatures
 
 SMALLEST_SINE = 1e-6
 """Nearer to the axis than this the direction of the field means nothing."""
@@ -124,51 +121,11 @@ class FieldFeatures(nn.Module):
         return torch.stack([radius, x, y, mean + along, across, mean - along], dim=1)
 
 
-class FocusFeatures(nn.Module):
-    """Inputs (N, 47) of the focused-eye estimator.
-
-    The network says the change of the lens' diameter alone, and may leave what a lens
-    can do: it is bounded here, and the aqueous follows from the lens.
-    """
-
-    n_features = EyeFeatures.N_FEATURES + 3
-    n_encoded = 1
-
-    def __init__(self):
-        super().__init__()
-        self.eye = EyeFeatures()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 52)."""
-        one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
-        color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
-        eye = self.eye(x[:, :45], x[:, 45], color_nm, one, zero, zero)
-        more = torch.stack([x[:, 45], x[:, 45] ** 2, x[:, 46]], dim=1)
-        return torch.cat([eye, more], dim=1)
-
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
-        """From an unbounded change (N, 1) to those of lens and aqueous (N, 2)."""
-        relaxed_mm = named(x, "lens_diameter_mm")
-        lowest_mm = (SMALLEST_DIAMETER_RATIO - 1.0) * relaxed_mm
-        change_mm = torch.minimum(torch.maximum(y[:, 0], lowest_mm), 0.0 * lowest_mm)
-        volume_mm3 = named(x, "lens_volume_mm3")
-        growth_mm = lens_thickness_mm(
-            relaxed_mm + change_mm, volume_mm3
-        ) - lens_thickness_mm(relaxed_mm, volume_mm3)
-        return torch.stack([change_mm, -ANTERIOR_THICKNESS_RATIO * growth_mm], dim=1)
-
-    def encode(self, x: Tensor, y: Tensor) -> Tensor:
-        """Undo `decode` where the change is not at a bound."""
-        return y[:, :1]
-
-    def is_free(self, x: Tensor, y: Tensor) -> Tensor:
-        """Rows (N,) whose change is not at a bound."""
-        lowest_mm = (SMALLEST_DIAMETER_RATIO - 1.0) * named(x, "lens_diameter_mm")
-        return (y[:, 0] < -BOUND_MARGIN_MM) & (y[:, 0] > lowest_mm + BOUND_MARGIN_MM)
-
-
 class MeasurementFeatures(nn.Module):
-    """Inputs (N, 27) of the eye estimator: coefficients over their powers of pupil."""
+    """Inputs (N, 27) of the eye estimator: coefficients over their powers of pupil.
+
+    The network says by how much an eye differs from the mean eye of its refraction.
+    """
 
     n_features = 25 + 25 + 4
     n_encoded = 45
@@ -176,6 +133,9 @@ class MeasurementFeatures(nn.Module):
     def __init__(self):
         super().__init__()
         self.scale = PupilPowers(first=3)
+        for name, bound in zip(("low", "high"), allowed_ranges().T, strict=True):
+            bound = torch.from_numpy(bound).float()
+            self.register_buffer(name, bound, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return features (N, 54)."""
@@ -183,11 +143,20 @@ class MeasurementFeatures(nn.Module):
         scaled = x[:, :25] / self.scale(x[:, 25])
         return torch.cat([x[:, :25], scaled, more], dim=1)
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
-        """Nothing to undo."""
-        return y
+    @staticmethod
+    def output_ranges() -> NDArray[np.float64]:
+        """Ranges (45, 2) of differences, even about the mean eye."""
+        mean = mean_vector()[:, None]
+        half = np.abs(allowed_ranges() - mean).max(axis=1)
+        return np.stack([-half, half], axis=1)
 
-    encode = decode
+    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+        """From differences (N, 45) to an eye within its allowed ranges."""
+        return torch.minimum(torch.maximum(y + mean_eyes(x), self.low), self.high)
+
+    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+        """Undo `decode` within the ranges."""
+        return y - mean_eyes(x)
 
 
 class RawFeatures(nn.Module):

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from training.eye_prior import squared_deviation
 from training.models import Network
 from training.tasks import N_EYE, ZERNIKE_NAMES
 from training.tracer.circle import zernike_of_eyes
@@ -17,7 +18,7 @@ LARGEST_MISFIT_UM = 20.0
 
 def standard_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
     """Mean absolute error of targets (N, n) in standard units."""
-    return torch.mean(torch.abs(model.standard(x) - model.to_standard(x, y)))
+    return torch.mean(torch.abs(model.standard_error(x, y)))
 
 
 def physical_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
@@ -39,22 +40,28 @@ def parameter_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
 class DiscriminatorLoss(nn.Module):
     """The estimated eye's coefficients by a trained discriminator (paper, 5.4)."""
 
-    def __init__(self, discriminator: Network):
+    def __init__(self, discriminator: Network, *, prior_weight: float = 0.0):
         super().__init__()
+        self.prior_weight = prior_weight
         self.discriminator = discriminator.eval().requires_grad_(False)
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """Mean absolute error (um) of the 25 terms without tilt."""
-        eyes = torch.cat([model(x), x[:, -2:]], dim=1)
-        found_um = self.discriminator(eyes)[:, 2:]
-        return torch.mean(torch.abs(found_um - x[:, :-2]))
+        """Mean absolute error (um) of the 25 terms without tilt, and the prior."""
+        eyes = model(x)
+        found_um = self.discriminator(torch.cat([eyes, x[:, -2:]], dim=1))[:, 2:]
+        misfit_um = torch.mean(torch.abs(found_um - x[:, :-2]))
+        return misfit_um + _prior(eyes, x, self.prior_weight)
 
 
 class TracerLoss(nn.Module):
     """The estimated eye's coefficients by ray tracing, to 1e-4 um (float32 rays)."""
 
+    def __init__(self, *, prior_weight: float = 0.0):
+        super().__init__()
+        self.prior_weight = prior_weight
+
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """Mean absolute error (um) of the 25 terms; eyes that fail are left out."""
+        """As `DiscriminatorLoss`; eyes that light does not pass are left out."""
         eyes = model(x)
         with torch.autocast(x.device.type, enabled=False):
             found_um, is_traced = zernike_of_eyes(
@@ -64,4 +71,10 @@ class TracerLoss(nn.Module):
                 ray_dtype=torch.float32,
             )
         misfit_um = torch.abs(found_um[is_traced, 3:] - x[is_traced, :-2])
-        return torch.clamp(misfit_um, max=LARGEST_MISFIT_UM).mean()
+        misfit_um = torch.clamp(misfit_um, max=LARGEST_MISFIT_UM).mean()
+        return misfit_um + _prior(eyes, x, self.prior_weight)
+
+
+def _prior(eyes: Tensor, x: Tensor, weight: float) -> Tensor | float:
+    """Loss of eyes (N, 45) that differ from what eyes of that refraction are like."""
+    return weight * squared_deviation(eyes, x).mean() if weight else 0.0

@@ -16,6 +16,7 @@ BLOCKS_PER_STACK = 3
 LAYERS_PER_BLOCK = 3
 LAYER_NORM_EPSILON = 1e-3
 
+SMALL_WEIGHT = 1e-3
 FIT_CHUNK = 8192
 FIT_RIDGE = 1e-7
 """Of the quadratic form, against features that nearly repeat each other."""
@@ -210,6 +211,8 @@ class Network(nn.Module):
             layers = _residual(block, n_features, width, settings.n_stacks)
         self.layers = nn.Sequential(*layers, _dense(width, n_encoded))
         self.bound = nn.Tanh() if is_bounded else nn.Identity()
+        if is_bounded:  # it starts in the middle of its range, far from where tanh ends
+            nn.init.uniform_(self.layers[-1].weight, -SMALL_WEIGHT, SMALL_WEIGHT)
         is_quadratic = settings.baseline == "quadratic"
         self.baseline = Quadratic(n_features, n_encoded) if is_quadratic else None
         for name, size in (("input", n_features), ("output", n_encoded)):
@@ -224,11 +227,9 @@ class Network(nn.Module):
         features, encoded = self.features(x), self.features.encode(x, y)
         _take(self.input_mean, self.input_scale, features)
         if self.baseline is not None:
-            free = getattr(self.features, "is_free", None)
-            rows = slice(None) if free is None else free(x, y)
-            standard = (features[rows] - self.input_mean) / self.input_scale
-            self.baseline.fit(standard, encoded[rows])
-            encoded = encoded[rows] - self.baseline(standard)
+            standard = (features - self.input_mean) / self.input_scale
+            self.baseline.fit(standard, encoded)
+            encoded = encoded - self.baseline(standard)
         _take(self.output_mean, self.output_scale, encoded)
 
     @torch.no_grad()
@@ -246,15 +247,19 @@ class Network(nn.Module):
             return self.output_mean
         return self.output_mean + self.baseline(features)
 
-    def standard(self, x: Tensor) -> Tensor:
-        """Return outputs (N, n_encoded) in standard units."""
-        return self.bound(self.layers(self._standard_features(x)))
-
     def to_standard(self, x: Tensor, y: Tensor) -> Tensor:
-        """Targets in the units of `standard`."""
-        with torch.no_grad():
-            start = self._start(self._standard_features(x))
-            return (self.features.encode(x, y) - start) / self.output_scale
+        """Targets of the layers (N, n_encoded), in standard units."""
+        return self._wanted(x, y, self._standard_features(x))
+
+    @torch.no_grad()
+    def _wanted(self, x: Tensor, y: Tensor, features: Tensor) -> Tensor:
+        encoded = self.features.encode(x, y)
+        return (encoded - self._start(features)) / self.output_scale
+
+    def standard_error(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return errors (N, n_encoded) of the layers, in standard units."""
+        features = self._standard_features(x)
+        return self.bound(self.layers(features)) - self._wanted(x, y, features)
 
     def forward(self, x: Tensor) -> Tensor:
         """Physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""

@@ -39,6 +39,9 @@ class TrainingSettings:
         Draw and trace new rows for every step instead of reading shards.
     discriminator : str
         Checkpoint, for the eye's loss ``discriminator``.
+    prior_weight : float
+        Of the mean squared deviation from the mean eye of a refraction, in deviations
+        of the prior, against an error in um: for the eye's losses by light.
     start_from : str
         Checkpoint of whose weights the network starts.
     """
@@ -54,6 +57,7 @@ class TrainingSettings:
     is_mixed: bool = True
     is_fresh: bool = False
     discriminator: str = ""
+    prior_weight: float = 0.0
     start_from: str = ""
 
 
@@ -107,12 +111,18 @@ def read_run(file: Path) -> Run:
         task=task,
         seed=body.get("seed", 548),
         recipe=recipe,
-        data_folder=Path(folder or DEFAULT_FOLDER / "data" / recipe.domain),
+        data_folder=Path(folder) if folder else default_data_folder(recipe),
         output_folder=Path(body.get("output_folder", DEFAULT_FOLDER / file.stem)),
         model=model,
         training=training,
         text=text,
     )
+
+
+def default_data_folder(recipe: Recipe) -> Path:
+    """Where a data set lies of which nothing else is said."""
+    kind = "_population" if recipe.population_ratio else ""
+    return DEFAULT_FOLDER / "data" / (recipe.domain + kind)
 
 
 def _only(body: dict, allowed: tuple[str, ...], table: str) -> None:

@@ -75,7 +75,11 @@ def group_statistics(
 def format_statistics(domain: str, found: dict[str, tuple[float, ...]]) -> str:
     """Render a table as text, with the published figures beside ours."""
     lines = [f"{'':32s}" + "".join(f"{row:>10s}" for row in ROWS)]
+    published = PUBLISHED.get(domain, {})
     for group, values in found.items():
-        for who, row in (("", values), (" (paper)", PUBLISHED[domain][group])):
+        rows = [("", values)]
+        if group in published:
+            rows.append((" (paper)", published[group]))
+        for who, row in rows:
             lines.append(f"{group + who:32s}" + "".join(f"{v:10.4f}" for v in row))
     return "\n".join(lines)

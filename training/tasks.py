@@ -12,13 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.accommodation import AccommodatingEye
+from estimator.accommodation import (
+    AQUEOUS,
+    DIAMETER,
+    AccommodatingEye,
+    accommodated_eyes,
+    smallest_diameter_mm,
+)
 from estimator.eye import pack_eyes
 from estimator.eye_parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
 from estimator.eye_wavefront import MEDIA_INWARDS, TraceFailed, eye_indices
 from estimator.media import refractive_index
 from estimator.network_card import INPUTS, OUTPUTS, ZERNIKE_NAMES
-from estimator.units import REFERENCE_WAVELENGTH_NM
+from estimator.prescription import C20
+from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.wavefront import eyes_aberrations, on_axis_zernike
 from estimator.wavefront_kernels import magnifications
 
@@ -26,9 +33,13 @@ N_EYE = len(PARAMETER_NAMES)
 COMPARED_NAMES = ZERNIKE_NAMES[2:]
 """Without tilt: the chief ray's zero slope ties it to coma."""
 
-FOCUS_RANGE_DPT = (-4.0, 8.125)
-"""The paper's begins at 0.125; a hyperope that accommodates by less than the refraction
-is focused behind infinity."""
+FOCUS_RANGE_DPT = (-6.0, 16.0)
+"""The paper's is 0.125 to 8.125.  A hyperope that accommodates by less than the
+refraction is focused behind infinity; a myope of -10 dpt begins at 10."""
+
+LENS_ROOM = np.array([[1.02], [0.99]])
+"""Lenses of the training are drawn a little beyond the widest and the smallest one,
+where a network's answer is cut off."""
 
 MAX_COEFFICIENT_UM = 200.0
 """Coefficients beyond it belong to eyes that form no image; the published data, too,
@@ -54,6 +65,8 @@ class Domain:
     n_repeats : int
         How many values the last input takes for each eye: 1, or the length of a
         Cartesian product.
+    is_focused : bool
+        Eyes may be accommodated.
     """
 
     name: str
@@ -62,6 +75,7 @@ class Domain:
     targets: tuple[str, ...]
     label: Labels
     n_repeats: int = 1
+    is_focused: bool = False
 
 
 def media_indices_of(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,6 +169,27 @@ def _focus_of_one(
     return eye.changes_mm(used_dpt)
 
 
+def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Focus (dpt) of eyes with a shrunken lens, and its changes (mm): targets (n, 3).
+
+    The other way round than `label_focus`: one trace for an answer instead of a search,
+    so that every row can be another eye.
+    """
+    eyes, pupil_mm, share = inputs[:, :N_EYE], inputs[:, N_EYE], inputs[:, -1]
+    relaxed_mm = eyes[:, DIAMETER]
+    widest_mm, least_mm = LENS_ROOM * np.stack([relaxed_mm, smallest_diameter_mm(eyes)])
+    focused = accommodated_eyes(eyes, widest_mm + share * (least_mm - widest_mm))
+    zernike_um, _ = on_axis_zernike(
+        pack_eyes(focused),
+        media_indices_of(np.full(len(eyes), REFERENCE_WAVELENGTH_NM)),
+        zernike_radius_mm=pupil_mm / 2.0,
+        n_threads=N_CORES,
+    )
+    focus_dpt = SPHERE_PER_C20 * zernike_um[:, C20] / (pupil_mm / 2.0) ** 2
+    changes_mm = (focused - eyes)[:, [DIAMETER, AQUEOUS]]
+    return np.column_stack([focus_dpt, changes_mm])
+
+
 def _ranges(*others: tuple[float, float], lens_mm=None) -> NDArray[np.float64]:
     eye = sampled_ranges()
     if lens_mm is not None:
@@ -184,6 +219,7 @@ DOMAINS = {
             ),
             OUTPUTS["aberration"],
             label_field,
+            is_focused=True,
         ),
         Domain(
             "focus",
@@ -191,7 +227,14 @@ DOMAINS = {
             _ranges((2.0, 7.0), FOCUS_RANGE_DPT),
             OUTPUTS["focus"],
             label_focus,
-            n_repeats=40,
+            n_repeats=10,
+        ),
+        Domain(
+            "lens",
+            (*PARAMETER_NAMES, "pupil_diameter_mm", "lens_shrinkage_ratio"),
+            _ranges((2.0, 7.0), (0.0, 1.0)),
+            ("focus_dpt", *OUTPUTS["focus"]),
+            label_lens,
         ),
     )
 }
@@ -199,24 +242,37 @@ DOMAINS = {
 
 @dataclass(frozen=True)
 class Task:
-    """A network: columns in, columns out, and the domain they are drawn from."""
+    """A network: columns in, columns out, and where its rows come from.
+
+    Attributes
+    ----------
+    domain : Domain
+        That it is trained on.
+    judged_domain : Domain
+        That its error is stated for.
+    unit : str
+        Of that error.
+    """
 
     name: str
     domain: Domain
+    judged_domain: Domain
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     unit: str
 
 
 TASKS = {
-    name: Task(name, DOMAINS[domain], INPUTS[name], OUTPUTS[name], unit)
-    for name, domain, unit in (
-        ("discriminator", "on_axis", "um"),
-        ("eye", "on_axis", "um"),
-        ("focus", "focus", "mm"),
-        ("aberration", "field", "um"),
+    name: Task(
+        name, DOMAINS[trained], DOMAINS[judged], INPUTS[name], OUTPUTS[name], unit
+    )
+    for name, trained, judged, unit in (
+        ("discriminator", "on_axis", "on_axis", "um"),
+        ("eye", "on_axis", "on_axis", "um"),
+        ("focus", "lens", "focus", "mm"),
+        ("aberration", "field", "field", "um"),
     )
 }
 """The paper's four networks (Table 1).  The aberration estimator also says on which
-circle its coefficients are, without which they mean nothing; ``unit`` is that of the
-error a network is judged by."""
+circle its coefficients are, without which they mean nothing.  The focused-eye estimator
+is trained on lenses and their focus, and judged by what a focus needs of the lens."""

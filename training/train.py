@@ -63,14 +63,14 @@ def _loss(run: Run, device: torch.device):
         "standard": lambda: standard_loss,
         "physical": lambda: physical_loss,
         "parameters": lambda: parameter_loss,
-        "tracer": TracerLoss,
+        "tracer": lambda: TracerLoss(prior_weight=run.training.prior_weight),
     }
     if run.training.loss in named:
         return named[run.training.loss]()
     if not run.training.discriminator:
         raise RunFileError("training.discriminator: name a checkpoint")
     judge, _ = load_checkpoint(Path(run.training.discriminator))
-    return DiscriminatorLoss(judge.to(device))
+    return DiscriminatorLoss(judge.to(device), prior_weight=run.training.prior_weight)
 
 
 def train(run: Run, *, data_folder: Path | None = None) -> dict:

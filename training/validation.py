@@ -5,6 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from training.batches import Rows
+from training.focus_features import is_within_reach
 from training.models import Network
 from training.run_file import Run
 from training.statistics import radial_order_columns
@@ -67,5 +68,9 @@ def summary(task: str, error: NDArray[np.float64]) -> dict[str, float]:
 def validation_error(network: Network, run: Run, rows: Rows, device) -> dict:
     """`summary` on the validation rows of a run."""
     limit = TRACED_ROWS if run.task == "eye" else VALIDATION_ROWS
-    x, y = (part[:limit] for part in rows.validation)
+    x, y = rows.validation
+    if run.task == "focus":
+        asked = is_within_reach(x, y)
+        x, y = x[asked], y[asked]
+    x, y = x[:limit], y[:limit]
     return summary(run.task, errors(run.task, network, x, y, device))

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
-from estimator.accommodation import AccommodatingEye
+from estimator.accommodation import AccommodatingEye, smallest_diameter_mm
+from estimator.estimation_prior import prior_for_refraction
 from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters
+from estimator.eye_parameters import EyeParameters, column
 from estimator.wavefront import wavefront_aberrations
 from training.datasets import (
     DataError,
     Recipe,
     draw,
+    input_ranges,
     label,
     load,
     read_manifest,
@@ -19,6 +21,7 @@ from training.datasets import (
     write_manifest,
 )
 from training.generate import generate
+from training.population import at_some_focus, population_eyes, population_ranges
 from training.tasks import DOMAINS, ellipse_matrix
 
 SMALL = Recipe("on_axis", 96, rows_per_shard=32, seed=5)
@@ -48,15 +51,19 @@ def test_a_sequence_fills_the_box_more_evenly_than_chance():
 def test_the_focus_set_is_a_product_of_eyes_and_distances():
     recipe = Recipe("focus", 120, rows_per_shard=80)
     rows = np.concatenate([draw(recipe, 0), draw(recipe, 1)])
-    eyes = rows[:, :-1].reshape(3, 40, -1)
+    eyes = rows[:, :-1].reshape(12, 10, -1)
     assert np.all(eyes == eyes[:, :1])
-    assert len(np.unique(eyes[:, 0], axis=0)) == 3
-    np.testing.assert_allclose(rows[:40, -1], np.linspace(-4.0, 8.125, 40))
+    assert len(np.unique(eyes[:, 0], axis=0)) == 12
+    low_dpt, high_dpt = DOMAINS["focus"].ranges[-1]
+    part = 10.0 * (rows[:, -1].reshape(12, 10) - low_dpt) / (high_dpt - low_dpt)
+    assert np.all(np.floor(part) == np.arange(10))
+    # every eye at distances of its own
+    assert len(np.unique(rows[:, -1].round(9))) == 120
 
 
 def test_a_shard_of_a_product_holds_whole_eyes():
-    with pytest.raises(DataError, match="multiple of 40"):
-        Recipe("focus", 120, rows_per_shard=50)
+    with pytest.raises(DataError, match="multiple of 10"):
+        Recipe("focus", 120, rows_per_shard=55)
 
 
 @pytest.mark.parametrize("bad", [{"domain": "moon"}, {"sampling": "dice"}])
@@ -99,6 +106,52 @@ def test_rows_that_light_does_not_pass_are_counted():
     found = label(domain, rows)
     assert found.n_rejected == 1
     np.testing.assert_array_equal(found.inputs, rows[1:].astype(np.float32))
+
+
+def test_a_population_is_a_share_of_the_rows_and_the_rest_is_the_box():
+    box, mixed = (
+        draw(Recipe("on_axis", 400, 400, seed=2, population_ratio=share), 0)
+        for share in (1e-9, 0.4)
+    )
+    exchanged = np.any(box != mixed, axis=1)
+    assert np.mean(exchanged) == pytest.approx(0.4, abs=0.02)
+    # pupils and wavelengths are drawn as before
+    np.testing.assert_array_equal(box[:, 45:], mixed[:, 45:])
+    low, high = input_ranges(Recipe("on_axis", 400, population_ratio=0.4)).T
+    assert np.all((mixed >= low) & (mixed <= high))
+
+
+def test_a_population_is_the_prior_of_the_estimation():
+    unit = np.random.default_rng(4).random((20_000, 46))
+    eyes = population_eyes(unit[:, :45], np.full(20_000, 1.0 / 3.0))  # of -6 dpt
+    found = prior_for_refraction(-6.0).to_unit(eyes)
+    # cut off where ranges end; most parameters are not
+    assert np.median(np.abs(found.mean(axis=0))) < 0.02
+    assert np.median(found.std(axis=0)) == pytest.approx(1.0, abs=0.03)
+
+
+def test_half_of_the_population_accommodates_in_the_field():
+    rows = np.random.default_rng(5).random((2000, 46))
+    relaxed = population_eyes(rows[:, :45], rows[:, 45])
+    eyes = at_some_focus(relaxed, np.linspace(0.0, 1.0, 2000))
+    lens_mm = eyes[:, column("lens_diameter_mm")]
+    is_relaxed = lens_mm == relaxed[:, column("lens_diameter_mm")]
+    assert np.mean(is_relaxed) == pytest.approx(0.5, abs=0.01)
+    assert lens_mm[-1] == pytest.approx(smallest_diameter_mm(relaxed)[-1])
+    low, high = population_ranges(is_focused=True).T
+    assert np.all((eyes >= low - 1e-9) & (eyes <= high + 1e-9))
+
+
+def test_lens_labels_are_what_the_accommodating_eye_finds():
+    rows = draw(Recipe("lens", 6, 6, seed=3, population_ratio=0.5), 0)
+    rows[:, -1] = np.linspace(0.2, 0.8, 6)  # within what the lens can do
+    for row, found in zip(rows, DOMAINS["lens"].label(rows), strict=True):
+        eye = AccommodatingEye(
+            EyeParameters.from_vector(row[:45]), pupil_diameter_mm=float(row[45])
+        )
+        used_dpt = eye.accommodation_dpt(found[0])
+        assert used_dpt == pytest.approx(found[0] + eye.refraction_dpt, abs=1e-9)
+        np.testing.assert_allclose(eye.changes_mm([used_dpt])[0], found[1:], atol=1e-6)
 
 
 def test_field_labels_are_single_traces():
@@ -148,7 +201,7 @@ def test_the_split_is_a_partition():
 
 
 def test_an_eye_is_not_split_between_training_and_validation():
-    rows = draw(Recipe("focus", 4000, 4000), 0)
+    rows = draw(Recipe("focus", 1000, 1000), 0)
     training, validation = split(rows, share=0.3, seed=3)
     eyes = [{tuple(row) for row in rows[part, :45]} for part in (training, validation)]
     assert not eyes[0] & eyes[1]

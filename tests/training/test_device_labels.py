@@ -11,7 +11,12 @@ from training.tasks import DOMAINS
 
 @pytest.mark.parametrize(
     ("name", "n_rows", "tolerance"),
-    [("on_axis", 40, 1e-6), ("field", 40, 1e-6), ("focus", 80, 1e-5)],
+    [
+        ("on_axis", 40, 1e-6),
+        ("field", 40, 1e-6),
+        ("focus", 80, 1e-5),
+        ("lens", 40, 1e-5),
+    ],
 )
 def test_labels_on_a_device_are_those_of_the_domain(name, n_rows, tolerance):
     domain = DOMAINS[name]

@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-from estimator.eye_parameters import column
+from estimator.estimation_prior import deviations, mean_eyes
+from estimator.eye_parameters import column, mean_vector
+from estimator.network_card import FIRST_TERM
+from estimator.prescription import C20
+from estimator.units import SPHERE_PER_C20
 from estimator.zernike import nm_from_index, zernike_values
 from training.datasets import Recipe, draw
 from training.eye_features import Shift, Turn
-from training.features import FieldFeatures, FocusFeatures, OnAxisFeatures
+from training.eye_prior import squared_deviation
+from training.features import (
+    FieldFeatures,
+    FocusFeatures,
+    MeasurementFeatures,
+    OnAxisFeatures,
+)
+from training.focus_features import is_within_reach
 from training.tasks import DOMAINS, ZERNIKE_NAMES
 
 N_EYES = 24
@@ -144,13 +155,40 @@ def test_the_vergence_is_the_refraction_of_a_small_pupil():
     assert np.ptp(traced_dpt[0]) > 5.0
 
 
-def test_a_bounded_lens_is_bounded_by_the_features():
+def test_the_lens_is_bounded_by_the_features():
     rows = torch.from_numpy(draw(Recipe("focus", 400, 400), 0))
     labels = torch.from_numpy(DOMAINS["focus"].label(rows.numpy()))
     features = FocusFeatures().double()
-    # where a bound holds, whatever lies beyond it is answered by it
-    relaxed = labels[:, 0] == 0.0
-    assert relaxed.any() and not features.is_free(rows, labels)[relaxed].any()
-    change = labels[:, :1] + torch.where(relaxed, 0.3, 0.0)[:, None]
-    answered = features.decode(rows, change)
+    free = is_within_reach(rows, labels)
+    assert 0.2 < free.double().mean() < 0.8
+    # where no bound holds, coding is undone; where one does, what lies beyond is cut
+    coded = features.encode(rows, labels)
+    beyond = torch.where(labels[:, :1] == 0.0, -3.0, 3.0)
+    coded = torch.where(free[:, None], coded, coded + beyond)
+    answered = features.decode(rows, coded)
     torch.testing.assert_close(answered, labels, atol=1e-9, rtol=0)
+
+
+def test_a_paraxial_eye_needs_no_network_to_focus():
+    """A small pupil and no offsets: the closed form alone finds the lens."""
+    eye = torch.from_numpy(mean_vector())[None].repeat(6, 1)
+    focus_dpt = torch.linspace(0.0, 5.0, 6, dtype=torch.float64)
+    rows = torch.cat([eye, torch.full((6, 1), 0.4), focus_dpt[:, None]], dim=1)
+    labels = torch.from_numpy(DOMAINS["focus"].label(rows.numpy()))
+    features = FocusFeatures().double()
+    assert features.encode(rows, labels).abs().max() < 0.03
+    missed_mm = features.decode(rows, torch.zeros(6, 1)) - labels
+    assert missed_mm.abs().max() < 0.003 < 0.2 < labels.abs().max()
+
+
+def test_the_eye_estimator_starts_from_the_mean_eye_of_a_refraction():
+    x = torch.zeros(3, 27, dtype=torch.float64)
+    x[:, 25], x[:, 26] = 4.0, 555.0
+    for row, refraction_dpt in enumerate((-6.0, 0.0, 3.0)):
+        x[row, C20 - FIRST_TERM] = -refraction_dpt * 2.0**2 / SPHERE_PER_C20
+    found = MeasurementFeatures().decode(x, torch.zeros(3, 45))
+    wanted = mean_eyes(np.array([-6.0, 0.0, 3.0]))
+    np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-6)
+    assert squared_deviation(found, x).max() < 1e-6
+    away = found + torch.from_numpy(deviations())
+    assert squared_deviation(away, x) == pytest.approx(np.ones(3), rel=1e-5)

@@ -81,6 +81,9 @@ def test_a_bounded_network_keeps_to_its_range():
     )
     network.fit_scaling(1e-3 * torch.randn(100, 27), torch.randn(100, 45))
     network.set_output_range(torch.full((45,), 3.0), torch.full((45,), 7.0))
+    started = network(torch.randn(64, 27))
+    assert torch.all(torch.abs(started - 5.0) < 0.5)  # in the middle of its range
+    network.layers[-1].weight.data *= 1e3
     found = network(1e3 * torch.randn(64, 27))
     assert 3.0 <= found.min() < 3.5 < 6.5 < found.max() <= 7.0
 

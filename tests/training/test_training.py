@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from training.batches import load_rows
 from training.checkpoint import load_checkpoint
 from training.datasets import load
 from training.export import export, fresh_rows
+from training.eye_prior import squared_deviation
 from training.generate import generate
 from training.losses import DiscriminatorLoss
 from training.optimiser import Lookahead, make_optimiser, pace
@@ -164,6 +166,11 @@ def test_fresh_rows_are_traced_for_every_step(folder):
     assert not torch.equal(first[0], other[0])
 
 
+def _network_and_rows(run):
+    network, _ = load_checkpoint(run.output_folder / CHECKPOINT)
+    return network, load_rows(run, run.data_folder).validation
+
+
 def test_the_eye_learns_through_a_discriminator(folder):
     judge = _run(folder, "judge", n_epochs=8)
     train(judge)
@@ -174,7 +181,16 @@ def test_the_eye_learns_through_a_discriminator(folder):
     lines = (run.output_folder / LOG).read_text().splitlines()
     losses_um = [json.loads(line)["loss"] for line in lines]
     assert losses_um[-1] < 0.9 * losses_um[0]
-    loss = DiscriminatorLoss(load_checkpoint(checkpoint)[0])
+    judge = load_checkpoint(checkpoint)[0]
+    loss, with_prior = (
+        DiscriminatorLoss(judge),
+        DiscriminatorLoss(judge, prior_weight=1),
+    )
+    network, (x, y) = _network_and_rows(run)
+    with torch.no_grad():
+        deviation = squared_deviation(network(x), x).mean().item()
+        gain = (with_prior(network, x, y) - loss(network, x, y)).item()
+    assert gain == pytest.approx(deviation, rel=1e-4)
     assert not any(p.requires_grad for p in loss.parameters())
 
 

@@ -1,0 +1,116 @@
+"""Focusing as paraxial optics has it, before and behind the focused-eye estimator.
+
+The lens that focuses the paraxial light of an eye is found by Newton steps, as a layer.
+What is left to learn is how far the eye's refraction over the whole pupil is from the
+paraxial one: some tenths of a dioptre, smooth in everything.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from estimator.accommodation import AQUEOUS, DIAMETER
+from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO
+from estimator.units import REFERENCE_WAVELENGTH_NM
+from training.eye_features import EyeFeatures, lens_thickness_mm, named
+from training.tracer.accommodation import smallest_diameters_mm
+
+BOUND_MARGIN_MM = 1e-4
+"""Changes of the lens nearer to a bound than this count as bounded."""
+
+N_NEWTON = 4
+STEP_MM = -0.02
+"""For the slope of the vergence."""
+
+WIDEST_RATIO = 1.03
+"""Of the relaxed lens: so far the paraxial lens may stretch."""
+
+
+class FocusFeatures(nn.Module):
+    """Inputs (N, 47) of the focused-eye estimator.
+
+    The network says by how many dioptres the paraxial lens misses, and may leave what
+    a lens can do: it is bounded here, and the aqueous follows from the lens.
+    """
+
+    n_features = EyeFeatures.N_FEATURES + 5
+    n_encoded = 1
+
+    def __init__(self):
+        super().__init__()
+        self.eye = EyeFeatures()
+        for name, place in (("diameter", DIAMETER), ("aqueous", AQUEOUS)):
+            one = torch.zeros(45)
+            one[place] = 1.0
+            self.register_buffer(f"{name}_column", one, persistent=False)
+
+    def _accommodated(self, eye: Tensor, change_mm: Tensor) -> Tensor:
+        """Eyes (N, 45) whose lens diameter is changed by (N,), their volume kept."""
+        aqueous_mm = _aqueous_change_mm(eye, change_mm)
+        return (
+            eye
+            + change_mm[:, None] * self.diameter_column
+            + aqueous_mm[:, None] * self.aqueous_column
+        )
+
+    def _paraxial(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Change of the lens, mm, its slope, mm/dpt, and the focus missed, dpt (N,)."""
+        eye, focus_dpt = x[:, :45], x[:, 46]
+        lowest_mm, highest_mm = _room_mm(eye)
+        highest_mm = highest_mm + (WIDEST_RATIO - 1.0) * named(eye, "lens_diameter_mm")
+        color_nm = torch.full_like(focus_dpt, REFERENCE_WAVELENGTH_NM)
+        vergence = self.eye.vergence_of(eye, color_nm)
+        change_mm = torch.zeros_like(focus_dpt)
+        for step in range(N_NEWTON + 1):
+            at_dpt = 1e3 * vergence(self._accommodated(eye, change_mm))
+            beside = self._accommodated(eye, change_mm + STEP_MM)
+            slope = STEP_MM / (1e3 * vergence(beside) - at_dpt)
+            if step == N_NEWTON:
+                break
+            change_mm = change_mm + slope * (focus_dpt - at_dpt)
+            change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
+        return change_mm, slope, focus_dpt - at_dpt
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return features (N, 54)."""
+        change_mm, slope, missed_dpt = self._paraxial(x)
+        one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
+        color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
+        focused = self._accommodated(x[:, :45], change_mm)
+        eye = self.eye(focused, x[:, 45], color_nm, one, zero, zero)
+        more = [x[:, 45], x[:, 45] ** 2, change_mm, slope, missed_dpt]
+        return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
+
+    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+        """From dioptres (N, 1) to the changes of lens and aqueous (N, 2), mm."""
+        paraxial_mm, slope, missed_dpt = self._paraxial(x)
+        change_mm = paraxial_mm + slope * (missed_dpt + y[:, 0])
+        lowest_mm, highest_mm = _room_mm(x)
+        change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
+        return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
+
+    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+        """Undo `decode`, for changes beyond what a lens can do as well."""
+        paraxial_mm, slope, missed_dpt = self._paraxial(x)
+        return ((y[:, 0] - paraxial_mm) / slope - missed_dpt)[:, None]
+
+
+def is_within_reach(x: Tensor, y: Tensor) -> Tensor:
+    """Rows (N,) whose change of the lens (N, 2) is not at a bound."""
+    lowest_mm, highest_mm = _room_mm(x)
+    above = y[:, 0] > lowest_mm + BOUND_MARGIN_MM
+    return above & (y[:, 0] < highest_mm - BOUND_MARGIN_MM)
+
+
+def _room_mm(eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and greatest change (N,) of the lens' diameter."""
+    lowest_mm = smallest_diameters_mm(eye[:, :45]) - named(eye, "lens_diameter_mm")
+    return lowest_mm, torch.zeros_like(lowest_mm)
+
+
+def _aqueous_change_mm(eye: Tensor, change_mm: Tensor) -> Tensor:
+    diameter_mm = named(eye, "lens_diameter_mm")
+    volume_mm3 = named(eye, "lens_volume_mm3")
+    growth_mm = lens_thickness_mm(
+        diameter_mm + change_mm, volume_mm3
+    ) - lens_thickness_mm(diameter_mm, volume_mm3)
+    return -ANTERIOR_THICKNESS_RATIO * growth_mm

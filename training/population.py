@@ -1,0 +1,68 @@
+"""Eyes as people have them: rows drawn from the prior of the estimation.
+
+Table 2 is a box: its corners hold eyes that nobody has, and a myope's long eye lies
+outside of it.  The service estimates with a prior (`estimator.estimation_prior`), so
+these are the eyes that its networks are asked about.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from estimator.accommodation import (
+    AQUEOUS,
+    DIAMETER,
+    SMALLEST_AQUEOUS_MM,
+    SMALLEST_DIAMETER_RATIO,
+    accommodated_eyes,
+    smallest_diameter_mm,
+)
+from estimator.estimation_prior import REFRACTION_LIMITS_DPT, deviations, mean_eyes
+from estimator.eye_parameters import allowed_ranges
+
+LEAST_PROBABILITY = 1e-4
+"""A normal deviate ends there, at 3.7 deviations."""
+
+RELAXED_RATIO = 0.5
+"""Share of eyes that look at their far point, where some accommodate."""
+
+
+def population_eyes(
+    unit: NDArray[np.float64], refraction_unit: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Eyes (n, 45) within their allowed ranges.
+
+    Parameters
+    ----------
+    unit : (n, 45)
+        Uniform in 0..1: the probability below each parameter.
+    refraction_unit : (n,)
+        The same for the refraction, uniform over `REFRACTION_LIMITS_DPT`.
+    """
+    low_dpt, high_dpt = REFRACTION_LIMITS_DPT
+    means = mean_eyes(low_dpt + (high_dpt - low_dpt) * refraction_unit)
+    normal = ndtri(np.clip(unit, LEAST_PROBABILITY, 1.0 - LEAST_PROBABILITY))
+    return np.clip(means + deviations() * normal, *allowed_ranges().T)
+
+
+def at_some_focus(
+    eyes: NDArray[np.float64], used_unit: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Eyes (n, 45), of which half use a part of what their lens can do.
+
+    ``used_unit`` (n,) in 0..1: relaxed up to `RELAXED_RATIO`, then evenly over the
+    lens' diameters.
+    """
+    used = np.maximum(used_unit - RELAXED_RATIO, 0.0) / (1.0 - RELAXED_RATIO)
+    relaxed_mm = eyes[:, DIAMETER]
+    shrunk_mm = used * (smallest_diameter_mm(eyes) - relaxed_mm)
+    return accommodated_eyes(eyes, relaxed_mm + shrunk_mm)
+
+
+def population_ranges(*, is_focused: bool) -> NDArray[np.float64]:
+    """Ranges (45, 2) that such eyes keep to, accommodated ones if asked."""
+    ranges = allowed_ranges()
+    if is_focused:
+        ranges[DIAMETER, 0] *= SMALLEST_DIAMETER_RATIO
+        ranges[AQUEOUS, 0] = min(ranges[AQUEOUS, 0], SMALLEST_AQUEOUS_MM)
+    return ranges
