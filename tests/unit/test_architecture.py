@@ -70,6 +70,7 @@ HOME = {
         "clients/*",
         "tests/*",  # plots of measurements
         "estimator/eye_plot.py",  # `ocufilter estimate --plot`
+        "training/learning_curve.py",
     ),
     "OpenEXR": ("filter_service/commands/image_files.py",),
     "PIL": (

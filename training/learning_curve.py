@@ -1,0 +1,97 @@
+"""Learning curves: error against rows seen and against weights.
+
+    python -m training.learning_curve [--tasks NAME ...] [--json FILE] [--plot FILE]
+
+Trains the modified ResNet on physical features with a quadratic form, as `table3` does,
+for several numbers of rows at one width and for several widths at one number of rows;
+judged by ray tracing on fresh rows of the paper's Table 2.  What would more data, or
+more weights, be good for?  What is already trained is kept.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from training.datasets import DataError
+from training.evaluate import Judged, format_row, write_table
+from training.export import JUDGED_ROWS, fresh_rows
+from training.run_file import RunFileError
+from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, train_and_judge
+from training.tasks import TASKS
+
+TASK_NAMES = ("discriminator", "aberration", "focus")
+ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000)
+WIDTHS = (32, 64, 128, 256)
+VARIANT = "ours, quadratic"
+
+
+def sizes(rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS):
+    """Width and rows seen of every point, each once."""
+    points = [(WIDTH, n) for n in rows] + [(width, ROWS_SEEN) for width in widths]
+    return list(dict.fromkeys(points))
+
+
+def plot(rows: list[Judged], file: Path) -> None:
+    """Draw both curves of every task, error over its goal."""
+    from matplotlib import pyplot as plt
+
+    figure, (by_rows, by_weights) = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
+    for task in dict.fromkeys(row.task for row in rows):
+        mine = [row for row in rows if row.task == task]
+        for axes, name, kept in (
+            (by_rows, "rows_seen", [r for r in mine if r.width == WIDTH]),
+            (by_weights, "n_parameters", _of_one_budget(mine)),
+        ):
+            kept.sort(key=lambda row: getattr(row, name))
+            x = [getattr(row, name) for row in kept]
+            y = [row.error["mean_abs"] for row in kept]
+            axes.loglog(x, y, "o-", label=f"{task}, {TASKS[task].unit}")
+    by_rows.set(xlabel="rows seen", ylabel="mean absolute error against ray tracing")
+    by_weights.set(xlabel="weights")
+    for axes in (by_rows, by_weights):
+        axes.grid(which="both", alpha=0.3)
+    by_rows.legend()
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def _of_one_budget(rows: list[Judged]) -> list[Judged]:
+    return [row for row in rows if abs(row.rows_seen / ROWS_SEEN - 1.0) < 0.05]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.learning_curve",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=TASK_NAMES)
+    parser.add_argument("--rows", type=int, nargs="+", default=ROWS)
+    parser.add_argument("--widths", type=int, nargs="+", default=WIDTHS)
+    parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    options = parser.parse_args(arguments)
+    judged: list[Judged] = []
+    try:
+        for task in options.tasks:
+            samples = fresh_rows(TASKS[task], options.judged_rows)
+            for width, rows in sizes(tuple(options.rows), tuple(options.widths)):
+                variant = (VARIANT, VARIANTS[VARIANT], "standard", 0.0)
+                run = make_run(task, *variant, width=width, rows=rows)
+                judged.append(train_and_judge(run, samples))
+                print(format_row(judged[-1]), flush=True)
+    except (DataError, RunFileError) as error:
+        print(f"learning_curve: {error}", file=sys.stderr)
+        return 2
+    if options.json:
+        write_table(judged, options.json)
+    if options.plot:
+        plot(judged, options.plot)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
