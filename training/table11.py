@@ -32,8 +32,8 @@ from training.versions import commit_id
 
 ROWS_DRAWN = 6_000
 SEED = 132
-FIRST_FOCUS_DPT = 0.125
-"""The published distances begin here; ours also hold those behind infinity."""
+PUBLISHED_FOCUS_DPT = (0.125, 8.125)
+"""The published distances; ours are also behind infinity, and nearer."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,12 @@ def focus_lines(n_rows: int) -> list[Line]:
     n_rows = -(-n_rows // repeats) * repeats
     inputs = draw(Recipe("focus", n_rows, n_rows, SEED), 0)
     targets = DOMAINS["focus"].label(inputs)
-    far = inputs[:, -1] >= FIRST_FOCUS_DPT
-    bound = lens_search_as_published(inputs[far], targets[far])
+    low_dpt, high_dpt = PUBLISHED_FOCUS_DPT
+    theirs = (inputs[:, -1] >= low_dpt) & (inputs[:, -1] <= high_dpt)
+    bound = lens_search_as_published(inputs[theirs], targets[theirs])
     return [
         *_lines("focus", "ours", targets),
-        *_lines("focus", f"from {FIRST_FOCUS_DPT} dpt on", targets[far]),
+        *_lines("focus", f"{low_dpt:g} to {high_dpt:g} dpt", targets[theirs]),
         *_lines("focus", "+ lens diameter within 9 %", bound),
         *_published("focus"),
     ]
