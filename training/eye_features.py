@@ -4,7 +4,7 @@ Turned and shifted offsets, curvatures, paraxial vergence.  Used by `features`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -23,15 +23,20 @@ from estimator.zernike import (
     EXPONENTS,
     MAX_RADIAL_ORDER,
     N_TERMS,
+    index_from_nm,
     monomial_matrix,
     nm_from_index,
 )
+from training.meridional import Conic, excess_vergence
 
 PUPIL_MM = 6.0
 """Pupil to which coefficients are scaled; any constant would do."""
 
 ENTRANCE_PUPIL_RATIO = 0.86
 """Depth of the entrance pupil over that of the stop, about."""
+
+DEFOCUS = index_from_nm(2, 0) - 1
+"""Place of C(2,0) in terms from j = 1 on."""
 
 INDEX_RANGE_NM = (450.0, 900.0)
 
@@ -164,20 +169,36 @@ class EyeFeatures(nn.Module):
         columns = torch.stack([*cornea.values(), *lens.values(), *vergence], dim=1)
         return torch.cat([columns, met / self.scale(pupil_mm)], dim=1)
 
-    def vergence_of(
-        self, eye: Tensor, wavelength_nm: Tensor
-    ) -> Callable[[Tensor], Tensor]:
-        """Return what gives eyes that differ in their lenses their vergence.
+    def vergence_of(self, eye: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor):
+        """Return what gives eyes that differ in their lenses their vergence, 1/mm.
 
-        Mean and paraxial, (N,), 1/mm, of light from the retina, outside of the eye.
+        Of light from the retina, outside of the eye, its mean (N,): paraxial; and what
+        is to be added over the pupil by least squares: of the offsets, to first order,
+        and the spherical aberration of the centred eye.
         """
         one, zero = torch.ones_like(wavelength_nm), torch.zeros_like(wavelength_nm)
         cornea, indices = _cornea(eye, one, zero), _indices(wavelength_nm)
         offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, one, zero))
-        apex = _apex(offsets)
-        return lambda other: _vergence(cornea, _lens(other, one, zero), apex, indices)[
-            0
-        ]
+        apex, radius_mm = _apex(offsets), 0.5 * pupil_mm
+        half = radius_mm / OFFSET_RADIUS_MM
+        defocus_mm = self.shift(offsets, zero, half, half)[:, DEFOCUS]
+        over_pupil = 4.0 * math.sqrt(3.0) * defocus_mm / radius_mm**2
+        of_offsets = (indices[0] - 1.0) * (over_pupil - apex[0])
+
+        def paraxial(other: Tensor) -> Tensor:
+            return _vergence(cornea, _lens(other, one, zero), apex, indices)[0]
+
+        def excess(other: Tensor) -> Tensor:
+            lens = _lens(other, one, zero)
+            return of_offsets + excess_vergence(
+                retina_mm=cornea["length"],
+                surfaces=_centred(other, cornea, lens, apex[0]),
+                indices=(*indices[::-1], one),
+                radius_mm=radius_mm,
+                pupil_z_mm=_pupil_depth_mm(cornea, lens),
+            )
+
+        return paraxial, excess
 
 
 def named(eye: Tensor, name: str) -> Tensor:
@@ -293,6 +314,25 @@ def _apex_matrix() -> np.ndarray:
     return np.stack([xx + yy, xx - yy, xy, one], axis=1)
 
 
+def _centred(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
+    """Surfaces of the eye without tilts and offsets, from the retina outwards."""
+    before_mm = cornea["thickness"] + lens["aqueous"]
+    surfaces = (
+        ("lens_posterior", before_mm + lens["thickness"], -lens["rear"]),
+        ("lens_anterior", before_mm, lens["front"]),
+        ("cornea_posterior", cornea["thickness"], cornea["back"]),
+        ("cornea_anterior", 0.0 * before_mm, cornea["front"] + offset_curvature),
+    )
+    return [
+        Conic(z_mm, curvature, named(eye, f"{name}_conic_constant"))
+        for name, z_mm, curvature in surfaces
+    ]
+
+
+def _pupil_depth_mm(cornea: dict, lens: dict) -> Tensor:
+    return ENTRANCE_PUPIL_RATIO * (cornea["thickness"] + lens["aqueous"])
+
+
 def _indices(wavelength_nm: Tensor) -> list[Tensor]:
     """Refractive indices (N,) of cornea, aqueous, lens and vitreous: a cubic fit."""
     t = (500.0 / wavelength_nm) ** 2
@@ -315,7 +355,7 @@ def _footprint(cornea: dict, lens: dict, tangent: Tensor) -> tuple[Tensor, Tenso
     The ray aims at the entrance pupil; where the cornea leans, the light of a pupil
     covers more of it along the field.
     """
-    depth_mm = ENTRANCE_PUPIL_RATIO * (cornea["thickness"] + lens["aqueous"])
+    depth_mm = _pupil_depth_mm(cornea, lens)
     x = torch.zeros_like(tangent)
     for _ in range(3):
         x = (depth_mm - 0.5 * x * x * cornea["front"]) * tangent

@@ -1,8 +1,8 @@
-"""Focusing as paraxial optics has it, before and behind the focused-eye estimator.
+"""Focusing in closed forms, before and behind the focused-eye estimator.
 
-The lens that focuses the paraxial light of an eye is found by Newton steps, as a layer.
-What is left to learn is how far the eye's refraction over the whole pupil is from the
-paraxial one: some tenths of a dioptre, smooth in everything.
+The lens that focuses an eye's light is found by Newton steps, as a layer: paraxially,
+with the spherical aberration of the centred eye.  What is left to learn is what tilts,
+decentration and offsets add, some hundredths of a dioptre and smooth in everything.
 """
 
 import torch
@@ -17,19 +17,22 @@ from training.tracer.accommodation import smallest_diameters_mm
 BOUND_MARGIN_MM = 1e-4
 """Changes of the lens nearer to a bound than this count as bounded."""
 
-N_NEWTON = 4
+N_STEPS = 3
 STEP_MM = -0.02
 """For the slope of the vergence."""
 
+SLOPE_SHARES = (0.5, 2.0)
+"""Least and greatest slope of the vergence over the paraxial one."""
+
 WIDEST_RATIO = 1.03
-"""Of the relaxed lens: so far the paraxial lens may stretch."""
+"""Of the relaxed lens: so far it may stretch while it is sought."""
 
 
 class FocusFeatures(nn.Module):
     """Inputs (N, 47) of the focused-eye estimator.
 
-    The network says by how many dioptres the paraxial lens misses, and may leave what
-    a lens can do: it is bounded here, and the aqueous follows from the lens.
+    The network says by how many dioptres the lens so found misses, and may leave what a
+    lens can do: it is bounded here, and the aqueous follows from the lens.
     """
 
     n_features = EyeFeatures.N_FEATURES + 5
@@ -52,27 +55,32 @@ class FocusFeatures(nn.Module):
             + aqueous_mm[:, None] * self.aqueous_column
         )
 
-    def _paraxial(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _centred(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Change of the lens, mm, its slope, mm/dpt, and the focus missed, dpt (N,)."""
         eye, focus_dpt = x[:, :45], x[:, 46]
         lowest_mm, highest_mm = _room_mm(eye)
         highest_mm = highest_mm + (WIDEST_RATIO - 1.0) * named(eye, "lens_diameter_mm")
         color_nm = torch.full_like(focus_dpt, REFERENCE_WAVELENGTH_NM)
-        vergence = self.eye.vergence_of(eye, color_nm)
+        paraxial, excess = self.eye.vergence_of(eye, x[:, 45], color_nm)
         change_mm = torch.zeros_like(focus_dpt)
-        for step in range(N_NEWTON + 1):
-            at_dpt = 1e3 * vergence(self._accommodated(eye, change_mm))
+        for step in range(N_STEPS + 1):
+            found = self._accommodated(eye, change_mm)
             beside = self._accommodated(eye, change_mm + STEP_MM)
-            slope = STEP_MM / (1e3 * vergence(beside) - at_dpt)
-            if step == N_NEWTON:
+            at_dpt, more_dpt = 1e3 * paraxial(found), 1e3 * excess(found)
+            slope = STEP_MM / (1e3 * paraxial(beside) - at_dpt)
+            # Spherical aberration changes it, but may not turn it.
+            share = 1.0 + slope * (1e3 * excess(beside) - more_dpt) / STEP_MM
+            slope = slope / torch.clamp(share, *SLOPE_SHARES)
+            missed_dpt = focus_dpt - at_dpt - more_dpt
+            if step == N_STEPS:
                 break
-            change_mm = change_mm + slope * (focus_dpt - at_dpt)
+            change_mm = change_mm + slope * missed_dpt
             change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
-        return change_mm, slope, focus_dpt - at_dpt
+        return change_mm, slope, missed_dpt
 
     def forward(self, x: Tensor) -> Tensor:
         """Return features (N, 54)."""
-        change_mm, slope, missed_dpt = self._paraxial(x)
+        change_mm, slope, missed_dpt = self._centred(x)
         one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
         color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
         focused = self._accommodated(x[:, :45], change_mm)
@@ -82,16 +90,16 @@ class FocusFeatures(nn.Module):
 
     def decode(self, x: Tensor, y: Tensor) -> Tensor:
         """From dioptres (N, 1) to the changes of lens and aqueous (N, 2), mm."""
-        paraxial_mm, slope, missed_dpt = self._paraxial(x)
-        change_mm = paraxial_mm + slope * (missed_dpt + y[:, 0])
+        found_mm, slope, missed_dpt = self._centred(x)
+        change_mm = found_mm + slope * (missed_dpt + y[:, 0])
         lowest_mm, highest_mm = _room_mm(x)
         change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
         return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
 
     def encode(self, x: Tensor, y: Tensor) -> Tensor:
         """Undo `decode`, for changes beyond what a lens can do as well."""
-        paraxial_mm, slope, missed_dpt = self._paraxial(x)
-        return ((y[:, 0] - paraxial_mm) / slope - missed_dpt)[:, None]
+        found_mm, slope, missed_dpt = self._centred(x)
+        return ((y[:, 0] - found_mm) / slope - missed_dpt)[:, None]
 
 
 def is_within_reach(x: Tensor, y: Tensor) -> Tensor:

@@ -1,0 +1,135 @@
+"""Spherical aberration of a centred eye, by a few rays in closed form, as a layer.
+
+Rays leave the axial point of the retina in one meridian, are refracted at four conics
+exactly, and their slopes outside are integrated to the least-squares vergence over the
+pupil.  No offsets, no tilts: what those add is left to a network.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+NODES = (0.5 - math.sqrt(3.0 / 28.0), 0.5, 0.5 + math.sqrt(3.0 / 28.0))
+"""q = r²/R² of the rays in the pupil: Gauss nodes of the weight q (1 - q)."""
+
+MOMENTS = (1.0, 0.5, 0.3)
+"""Integrals of 6 q (1 - q) q^k over 0..1."""
+
+NODAL_DISTANCE_MM = 22.3
+"""Height in the pupil over the slope at the retina, about; the first ray scales it."""
+
+LARGEST_EXCESS = 0.015
+"""Rays of an eye beyond it, 15 dpt, have crossed or missed a surface."""
+
+LEAST_ROOT = 1e-4
+"""Of squares under a root: a ray that misses a surface grazes it instead."""
+
+
+class Conic(NamedTuple):
+    """A surface: vertex (N,) from the corneal one, mm; curvature and conic constant."""
+
+    z_mm: Tensor
+    curvature: Tensor
+    conic: Tensor
+
+
+class Ray(NamedTuple):
+    """Position and direction cosines (N,) in the meridian; light goes to -z."""
+
+    z: Tensor
+    r: Tensor
+    along: Tensor
+    across: Tensor
+
+
+def _root(square: Tensor) -> Tensor:
+    return torch.sqrt(torch.clamp(square, min=LEAST_ROOT))
+
+
+def _refracted(ray: Ray, surface: Conic, ratio: Tensor) -> Ray:
+    """Ray behind a surface; ``ratio`` (N,) is the index before over that behind."""
+    c, shape = surface.curvature, 1.0 + surface.conic
+    z = ray.z - surface.z_mm
+    a = c * (ray.across**2 + shape * ray.along**2)
+    b = c * (ray.r * ray.across + shape * z * ray.along) - ray.along
+    d = c * (ray.r**2 + shape * z**2) - 2.0 * z
+    way = -d / (b + _root(b * b - a * d))
+    z, r = z + way * ray.along, ray.r + way * ray.across
+    normal_z, normal_r = c * shape * z - 1.0, c * r
+    length = torch.sqrt(normal_z**2 + normal_r**2)
+    normal_z, normal_r = normal_z / length, normal_r / length
+    cosine = ray.along * normal_z + ray.across * normal_r
+    behind = _root(1.0 - ratio**2 * (1.0 - cosine**2))
+    bend = behind - ratio * cosine
+    return Ray(
+        z + surface.z_mm,
+        r,
+        ratio * ray.along + bend * normal_z,
+        ratio * ray.across + bend * normal_r,
+    )
+
+
+def _outside(
+    slope: Tensor,
+    retina_mm: Tensor,
+    surfaces: Sequence[Conic],
+    ratios: Sequence[Tensor],
+    pupil_z_mm: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Height (N,), mm, in the entrance pupil's plane, and direction towards the axis.
+
+    Of the ray that leaves the retina with this ``slope``.
+    """
+    length = torch.sqrt(1.0 + slope**2)
+    ray = Ray(retina_mm, torch.zeros_like(slope), -1.0 / length, slope / length)
+    for surface, ratio in zip(surfaces, ratios, strict=True):
+        ray = _refracted(ray, surface, ratio)
+    height_mm = ray.r + (pupil_z_mm - ray.z) * ray.across / ray.along
+    return height_mm, -ray.across
+
+
+def excess_vergence(
+    *,
+    retina_mm: Tensor,
+    surfaces: Sequence[Conic],
+    indices: Sequence[Tensor],
+    radius_mm: Tensor,
+    pupil_z_mm: Tensor,
+) -> Tensor:
+    """Least-squares vergence over the pupil less the paraxial one (N,), 1/mm.
+
+    With the direction s(r) towards the axis, s = r g(q), q = r²/R²: the coefficient of
+    Z(2,0) is sqrt(3) R times the integral of s (ρ² - ρ⁴) over ρ, and so the vergence is
+    that of 6 q (1 - q) g(q) over q.  g is the parabola through three rays.
+
+    Parameters
+    ----------
+    surfaces : of Conic
+        In the order that light from the retina meets them.
+    indices : of (N,)
+        From the vitreous to air, one more than surfaces.
+    radius_mm, pupil_z_mm : (N,)
+        Of the entrance pupil, and its plane.
+    """
+    ratios = [before / behind for before, behind in pairwise(indices)]
+    eye = (retina_mm, surfaces, ratios, pupil_z_mm)
+    first = math.sqrt(NODES[1]) * radius_mm / NODAL_DISTANCE_MM
+    reached_mm, _ = _outside(first, *eye)
+    scale = first / reached_mm
+    q, g = [], []
+    for node in NODES:
+        slope = math.sqrt(node) * radius_mm * scale
+        height_mm, towards = _outside(slope, *eye)
+        q.append((height_mm / radius_mm) ** 2)
+        g.append(towards / height_mm)
+    first_01 = (g[1] - g[0]) / (q[1] - q[0])
+    first_12 = (g[2] - g[1]) / (q[2] - q[1])
+    second = (first_12 - first_01) / (q[2] - q[0])
+    # Newton's form of g: its integral less its value at the axis
+    linear = first_01 * MOMENTS[1]
+    excess = linear + second * (MOMENTS[2] - (q[0] + q[1]) * MOMENTS[1])
+    return torch.clamp(excess, -LARGEST_EXCESS, LARGEST_EXCESS)
