@@ -50,9 +50,6 @@ JUDGED_ROWS = 20_000
 JUDGE_SEED = 20_001
 """Fresh rows: no data set has this seed."""
 
-MORE_PRODUCT_ROWS = 4
-"""Rows of a product of eyes and distances for each row elsewhere: it holds few eyes."""
-
 SMALLEST_HALVED = 256
 """Smaller tensors, scalings among them, stay in 32 bits."""
 
@@ -142,7 +139,6 @@ def fresh_rows(
     Of the box of Table 2, or with a share of eyes as people have them.
     """
     domain = task.judged_domain
-    n_rows *= MORE_PRODUCT_ROWS if domain.n_repeats > 1 else 1
     n_rows = -(-n_rows // domain.n_repeats) * domain.n_repeats
     recipe = Recipe(
         *(domain.name, n_rows, n_rows, JUDGE_SEED, "random", population_ratio)

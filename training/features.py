@@ -48,11 +48,11 @@ class OnAxisFeatures(nn.Module):
         more = torch.stack(_size_and_color(x[:, 45], x[:, 46]), dim=1)
         return torch.cat([eye, more], dim=1)
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+    def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """From scaled coefficients (N, 27) to those of the pupil."""
         return y * self.scale(x[:, 45])
 
-    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+    def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Undo `decode`."""
         return y / self.scale(x[:, 45])
 
@@ -97,14 +97,14 @@ class FieldFeatures(nn.Module):
         )
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+    def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """From scaled values in turned axes (N, 33) to those asked for."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
         zernike = self.turn(y[:, :27] * self.scale(x[:, 45]), c, s)
         return torch.cat([zernike, self._rim(y[:, 27:] * x[:, 45:46], c, s)], dim=1)
 
-    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+    def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Undo `decode`."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
@@ -150,11 +150,11 @@ class MeasurementFeatures(nn.Module):
         half = np.abs(allowed_ranges() - mean).max(axis=1)
         return np.stack([-half, half], axis=1)
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+    def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """From differences (N, 45) to an eye within its allowed ranges."""
         return torch.minimum(torch.maximum(y + mean_eyes(x), self.low), self.high)
 
-    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+    def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Undo `decode` within the ranges."""
         return y - mean_eyes(x)
 
@@ -170,7 +170,7 @@ class RawFeatures(nn.Module):
         """Return the inputs."""
         return x
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+    def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Nothing to undo."""
         return y
 

@@ -17,7 +17,7 @@ from training.tracer.accommodation import smallest_diameters_mm
 BOUND_MARGIN_MM = 1e-4
 """Changes of the lens nearer to a bound than this count as bounded."""
 
-N_STEPS = 3
+N_STEPS = 2
 STEP_MM = -0.02
 """For the slope of the vergence."""
 
@@ -68,18 +68,17 @@ class FocusFeatures(nn.Module):
             beside = self._accommodated(eye, change_mm + STEP_MM)
             at_dpt, more_dpt = 1e3 * paraxial(found), 1e3 * excess(found)
             slope = STEP_MM / (1e3 * paraxial(beside) - at_dpt)
-            # Spherical aberration changes it, but may not turn it.
-            share = 1.0 + slope * (1e3 * excess(beside) - more_dpt) / STEP_MM
-            slope = slope / torch.clamp(share, *SLOPE_SHARES)
             missed_dpt = focus_dpt - at_dpt - more_dpt
             if step == N_STEPS:
                 break
             change_mm = change_mm + slope * missed_dpt
             change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
-        return change_mm, slope, missed_dpt
+        # Spherical aberration changes the slope, but may not turn it.
+        share = 1.0 + slope * (1e3 * excess(beside) - more_dpt) / STEP_MM
+        return change_mm, slope / torch.clamp(share, *SLOPE_SHARES), missed_dpt
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 54)."""
+        """Return features (N, 54); the last three are those of `_centred`."""
         change_mm, slope, missed_dpt = self._centred(x)
         one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
         color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
@@ -88,17 +87,19 @@ class FocusFeatures(nn.Module):
         more = [x[:, 45], x[:, 45] ** 2, change_mm, slope, missed_dpt]
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
-    def decode(self, x: Tensor, y: Tensor) -> Tensor:
+    def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """From dioptres (N, 1) to the changes of lens and aqueous (N, 2), mm."""
-        found_mm, slope, missed_dpt = self._centred(x)
+        features = self(x) if features is None else features
+        found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
         change_mm = found_mm + slope * (missed_dpt + y[:, 0])
         lowest_mm, highest_mm = _room_mm(x)
         change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
         return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
 
-    def encode(self, x: Tensor, y: Tensor) -> Tensor:
+    def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Undo `decode`, for changes beyond what a lens can do as well."""
-        found_mm, slope, missed_dpt = self._centred(x)
+        features = self(x) if features is None else features
+        found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
         return ((y[:, 0] - found_mm) / slope - missed_dpt)[:, None]
 
 

@@ -2,10 +2,10 @@
 
     python -m training.learning_curve [--tasks NAME ...] [--json FILE] [--plot FILE]
 
-Trains the modified ResNet on physical features with a quadratic form, as `table3` does,
-for several numbers of rows at one width and for several widths at one number of rows;
-judged by ray tracing on fresh rows of the paper's Table 2.  What would more data, or
-more weights, be good for?  What is already trained is kept.
+Trains the modified ResNet on physical features with a quadratic form, on the data of
+`table3`, for several numbers of rows at one width and for several widths at one number
+of rows; judged by ray tracing on fresh rows of the paper's Table 2.  What would more
+data, or more weights, be good for?  What is already trained is kept.
 """
 
 import argparse
@@ -19,10 +19,11 @@ from training.run_file import RunFileError
 from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, train_and_judge
 from training.tasks import TASKS
 
-TASK_NAMES = ("discriminator", "aberration", "focus")
 ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000)
 WIDTHS = (32, 64, 128, 256)
 VARIANT = "ours, quadratic"
+LOSSES = {"discriminator": "physical", "aberration": "physical", "focus": "standard"}
+"""As in the run files: in standard units the smallest terms weigh as the largest."""
 
 
 def sizes(rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS):
@@ -67,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=TASK_NAMES)
+    parser.add_argument("--tasks", nargs="+", choices=LOSSES, default=list(LOSSES))
     parser.add_argument("--rows", type=int, nargs="+", default=ROWS)
     parser.add_argument("--widths", type=int, nargs="+", default=WIDTHS)
     parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
@@ -79,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
         for task in options.tasks:
             samples = fresh_rows(TASKS[task], options.judged_rows)
             for width, rows in sizes(tuple(options.rows), tuple(options.widths)):
-                variant = (VARIANT, VARIANTS[VARIANT], "standard", 0.0)
+                variant = (VARIANT, VARIANTS[VARIANT], LOSSES[task], 0.0)
                 run = make_run(task, *variant, width=width, rows=rows)
                 judged.append(train_and_judge(run, samples))
                 print(format_row(judged[-1]), flush=True)

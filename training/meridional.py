@@ -20,7 +20,7 @@ MOMENTS = (1.0, 0.5, 0.3)
 """Integrals of 6 q (1 - q) q^k over 0..1."""
 
 NODAL_DISTANCE_MM = 22.3
-"""Height in the pupil over the slope at the retina, about; the first ray scales it."""
+"""Height in the pupil over the slope at the retina, about."""
 
 LARGEST_EXCESS = 0.015
 """Rays of an eye beyond it, 15 dpt, have crossed or missed a surface."""
@@ -37,8 +37,8 @@ class Conic(NamedTuple):
     conic: Tensor
 
 
-class Ray(NamedTuple):
-    """Position and direction cosines (N,) in the meridian; light goes to -z."""
+class Rays(NamedTuple):
+    """Positions and direction cosines (N, n_rays) in a meridian; light goes to -z."""
 
     z: Tensor
     r: Tensor
@@ -50,46 +50,26 @@ def _root(square: Tensor) -> Tensor:
     return torch.sqrt(torch.clamp(square, min=LEAST_ROOT))
 
 
-def _refracted(ray: Ray, surface: Conic, ratio: Tensor) -> Ray:
-    """Ray behind a surface; ``ratio`` (N,) is the index before over that behind."""
-    c, shape = surface.curvature, 1.0 + surface.conic
-    z = ray.z - surface.z_mm
-    a = c * (ray.across**2 + shape * ray.along**2)
-    b = c * (ray.r * ray.across + shape * z * ray.along) - ray.along
-    d = c * (ray.r**2 + shape * z**2) - 2.0 * z
+def _refracted(rays: Rays, surface: Conic, ratio: Tensor) -> Rays:
+    """Rays behind a surface; ``ratio`` (N,) is the index before over that behind."""
+    vertex_mm, c, conic, ratio = (v[:, None] for v in (*surface, ratio))
+    shape, z = 1.0 + conic, rays.z - vertex_mm
+    a = c * (rays.across**2 + shape * rays.along**2)
+    b = c * (rays.r * rays.across + shape * z * rays.along) - rays.along
+    d = c * (rays.r**2 + shape * z**2) - 2.0 * z
     way = -d / (b + _root(b * b - a * d))
-    z, r = z + way * ray.along, ray.r + way * ray.across
+    z, r = z + way * rays.along, rays.r + way * rays.across
     normal_z, normal_r = c * shape * z - 1.0, c * r
     length = torch.sqrt(normal_z**2 + normal_r**2)
     normal_z, normal_r = normal_z / length, normal_r / length
-    cosine = ray.along * normal_z + ray.across * normal_r
-    behind = _root(1.0 - ratio**2 * (1.0 - cosine**2))
-    bend = behind - ratio * cosine
-    return Ray(
-        z + surface.z_mm,
+    cosine = rays.along * normal_z + rays.across * normal_r
+    bend = _root(1.0 - ratio**2 * (1.0 - cosine**2)) - ratio * cosine
+    return Rays(
+        z + vertex_mm,
         r,
-        ratio * ray.along + bend * normal_z,
-        ratio * ray.across + bend * normal_r,
+        ratio * rays.along + bend * normal_z,
+        ratio * rays.across + bend * normal_r,
     )
-
-
-def _outside(
-    slope: Tensor,
-    retina_mm: Tensor,
-    surfaces: Sequence[Conic],
-    ratios: Sequence[Tensor],
-    pupil_z_mm: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Height (N,), mm, in the entrance pupil's plane, and direction towards the axis.
-
-    Of the ray that leaves the retina with this ``slope``.
-    """
-    length = torch.sqrt(1.0 + slope**2)
-    ray = Ray(retina_mm, torch.zeros_like(slope), -1.0 / length, slope / length)
-    for surface, ratio in zip(surfaces, ratios, strict=True):
-        ray = _refracted(ray, surface, ratio)
-    height_mm = ray.r + (pupil_z_mm - ray.z) * ray.across / ray.along
-    return height_mm, -ray.across
 
 
 def excess_vergence(
@@ -115,17 +95,17 @@ def excess_vergence(
     radius_mm, pupil_z_mm : (N,)
         Of the entrance pupil, and its plane.
     """
-    ratios = [before / behind for before, behind in pairwise(indices)]
-    eye = (retina_mm, surfaces, ratios, pupil_z_mm)
-    first = math.sqrt(NODES[1]) * radius_mm / NODAL_DISTANCE_MM
-    reached_mm, _ = _outside(first, *eye)
-    scale = first / reached_mm
-    q, g = [], []
-    for node in NODES:
-        slope = math.sqrt(node) * radius_mm * scale
-        height_mm, towards = _outside(slope, *eye)
-        q.append((height_mm / radius_mm) ** 2)
-        g.append(towards / height_mm)
+    heights = torch.tensor([math.sqrt(node) for node in NODES], dtype=radius_mm.dtype)
+    heights = heights.to(radius_mm.device) / NODAL_DISTANCE_MM
+    slope = radius_mm[:, None] * heights
+    length = torch.sqrt(1.0 + slope**2)
+    start_mm = retina_mm[:, None].expand_as(slope)
+    rays = Rays(start_mm, torch.zeros_like(slope), -1.0 / length, slope / length)
+    for surface, (before, behind) in zip(surfaces, pairwise(indices), strict=True):
+        rays = _refracted(rays, surface, before / behind)
+    height_mm = rays.r + (pupil_z_mm[:, None] - rays.z) * rays.across / rays.along
+    q = ((height_mm / radius_mm[:, None]) ** 2).unbind(dim=1)
+    g = (-rays.across / height_mm).unbind(dim=1)
     first_01 = (g[1] - g[0]) / (q[1] - q[0])
     first_12 = (g[2] - g[1]) / (q[2] - q[1])
     second = (first_12 - first_01) / (q[2] - q[0])

@@ -224,10 +224,11 @@ class Network(nn.Module):
         """Take scales, and the baseline, from rows (N, n_inputs), (N, n_outputs)."""
         self.input_mean.copy_(torch.zeros(()))
         self.input_scale.copy_(torch.ones(()))
-        features, encoded = self.features(x), self.features.encode(x, y)
+        features = self.features(x)
+        encoded = self.features.encode(x, y, features)
         _take(self.input_mean, self.input_scale, features)
         if self.baseline is not None:
-            standard = (features - self.input_mean) / self.input_scale
+            standard = self._standard(features)
             self.baseline.fit(standard, encoded)
             encoded = encoded - self.baseline(standard)
         _take(self.output_mean, self.output_scale, encoded)
@@ -238,34 +239,36 @@ class Network(nn.Module):
         self.output_mean.copy_((low + high) / 2.0)
         self.output_scale.copy_((high - low) / 2.0)
 
-    def _standard_features(self, x: Tensor) -> Tensor:
-        return (self.features(x) - self.input_mean) / self.input_scale
+    def _standard(self, features: Tensor) -> Tensor:
+        return (features - self.input_mean) / self.input_scale
 
-    def _start(self, features: Tensor) -> Tensor:
+    def _start(self, standard: Tensor) -> Tensor:
         """Return what the layers' outputs are added to, encoded."""
         if self.baseline is None:
             return self.output_mean
-        return self.output_mean + self.baseline(features)
-
-    def to_standard(self, x: Tensor, y: Tensor) -> Tensor:
-        """Targets of the layers (N, n_encoded), in standard units."""
-        return self._wanted(x, y, self._standard_features(x))
+        return self.output_mean + self.baseline(standard)
 
     @torch.no_grad()
     def _wanted(self, x: Tensor, y: Tensor, features: Tensor) -> Tensor:
-        encoded = self.features.encode(x, y)
-        return (encoded - self._start(features)) / self.output_scale
+        encoded = self.features.encode(x, y, features)
+        return (encoded - self._start(self._standard(features))) / self.output_scale
+
+    def to_standard(self, x: Tensor, y: Tensor) -> Tensor:
+        """Targets of the layers (N, n_encoded), in standard units."""
+        return self._wanted(x, y, self.features(x))
 
     def standard_error(self, x: Tensor, y: Tensor) -> Tensor:
         """Return errors (N, n_encoded) of the layers, in standard units."""
-        features = self._standard_features(x)
-        return self.bound(self.layers(features)) - self._wanted(x, y, features)
+        features = self.features(x)
+        found = self.bound(self.layers(self._standard(features)))
+        return found - self._wanted(x, y, features)
 
     def forward(self, x: Tensor) -> Tensor:
         """Physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""
-        features = self._standard_features(x)
-        y = self.bound(self.layers(features)) * self.output_scale
-        return self.features.decode(x, y + self._start(features))
+        features = self.features(x)
+        standard = self._standard(features)
+        y = self.bound(self.layers(standard)) * self.output_scale
+        return self.features.decode(x, y + self._start(standard), features)
 
     @property
     def n_parameters(self) -> int:

@@ -98,7 +98,7 @@ def make_run(
         task=task,
         recipe=recipe,
         data_folder=default_data_folder(recipe),
-        output_folder=FOLDER / f"{task}-{label}-{width}-{rows // 1000}k",
+        output_folder=FOLDER / f"{task}-{label}-{loss}-{width}-{rows // 1000}k",
         model=replace(model, width=width),
         training=settings,
         text=repr((task, name, width, settings)),
