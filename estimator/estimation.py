@@ -37,11 +37,11 @@ from estimator.zernike import N_TERMS, remove_central_tilt
 
 METHODS = ("network", "refined", "search")
 STARTS = ("table", "network")
+"""Where ``refined`` may start: the built-in eyes, the network's guess."""
 
 GOOD_FIT_UM = 5e-4
 """Mean error above which a fit that began at one kind of start is tried from another:
-from the network's eye, keratoconus ends at 3.6e-3 um, from the table's at 3e-5."""
-"""Where ``refined`` may start: the built-in eyes, the network's guess."""
+from the network's eye, keratoconus ends at 7e-3 um, from the table's at 3e-5."""
 
 POOR_FIT_UM = 0.01
 """Mean error above which the answer says that the model does not reach the data."""

@@ -7,7 +7,7 @@ takes them from here.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +137,11 @@ class Card:
         Weights and biases.
     precision : str
         Of the stored weights, ``float16`` or ``float32``.
+    error : ExpectedError
+        Of the eyes that the service meets.
+    error_by_rows : mapping
+        The same by where eyes were drawn from: ``table_2``, the box of the paper's
+        Table 2, and ``population``, the prior of the estimation.
     """
 
     network: str
@@ -146,6 +151,7 @@ class Card:
     precision: str
     commit: str
     error: ExpectedError
+    error_by_rows: Mapping[str, ExpectedError] = field(default_factory=dict)
 
     def outside(self, features: NDArray[np.float64]) -> tuple[Excess, ...]:
         """Columns of inputs (P, n_inputs) that leave their ranges, farthest first.
@@ -254,7 +260,6 @@ def parse_card(name: str, data: Mapping) -> Card:
     )
     if not np.all(low <= high):
         raise ValueError("a range that is not ascending")
-    error = data["error"]
     return Card(
         network=name,
         low=low,
@@ -262,14 +267,22 @@ def parse_card(name: str, data: Mapping) -> Card:
         n_parameters=int(data["n_parameters"]),
         precision=str(data["precision"]),
         commit=str(data["commit"]),
-        error=ExpectedError(
-            mean_abs=float(error["mean_abs"]),
-            p95_abs=float(error["p95_abs"]),
-            unit=str(error["unit"]),
-            n_samples=int(error["n_samples"]),
-            by_radial_order={
-                int(order): float(value)
-                for order, value in error.get("by_radial_order", {}).items()
-            },
-        ),
+        error=_parse_error(data["error"]),
+        error_by_rows={
+            rows: _parse_error(error)
+            for rows, error in data.get("error_by_rows", {}).items()
+        },
+    )
+
+
+def _parse_error(error: Mapping) -> ExpectedError:
+    return ExpectedError(
+        mean_abs=float(error["mean_abs"]),
+        p95_abs=float(error["p95_abs"]),
+        unit=str(error["unit"]),
+        n_samples=int(error["n_samples"]),
+        by_radial_order={
+            int(order): float(value)
+            for order, value in error.get("by_radial_order", {}).items()
+        },
     )

@@ -43,6 +43,7 @@ DIMENSIONLESS = {
     "n_epochs": "how often a training sees its rows, may be a fraction",
     "learning_rate": "step of an optimiser",
     "weight_decay": "as learning_rate",
+    "prior_weight": "um of error that a deviation from the prior counts as",
     "decay_per_epoch": "factor of both",
 }
 """Float fields without a unit, each with what it is instead."""
