@@ -31,8 +31,8 @@ WIDEST_RATIO = 1.03
 class FocusFeatures(nn.Module):
     """Inputs (N, 47) of the focused-eye estimator.
 
-    The network says by how many dioptres the lens so found misses, and may leave what a
-    lens can do: it is bounded here, and the aqueous follows from the lens.
+    The network says by how much the lens so found misses, and may leave what a lens can
+    do: it is bounded here, and the aqueous follows from the lens.
     """
 
     n_features = EyeFeatures.N_FEATURES + 5
@@ -88,10 +88,10 @@ class FocusFeatures(nn.Module):
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """From dioptres (N, 1) to the changes of lens and aqueous (N, 2), mm."""
+        """From what is missed (N, 1) to the changes of lens and aqueous (N, 2), mm."""
         features = self(x) if features is None else features
         found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
-        change_mm = found_mm + slope * (missed_dpt + y[:, 0])
+        change_mm = found_mm + slope * missed_dpt + y[:, 0]
         lowest_mm, highest_mm = _room_mm(x)
         change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
         return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
@@ -100,7 +100,7 @@ class FocusFeatures(nn.Module):
         """Undo `decode`, for changes beyond what a lens can do as well."""
         features = self(x) if features is None else features
         found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
-        return ((y[:, 0] - found_mm) / slope - missed_dpt)[:, None]
+        return (y[:, 0] - found_mm - slope * missed_dpt)[:, None]
 
 
 def is_within_reach(x: Tensor, y: Tensor) -> Tensor:
