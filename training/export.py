@@ -201,6 +201,7 @@ def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
     asked = np.ones(len(error), dtype=bool)
     if task.name == "focus":  # at a bound any answer beyond it is right
         asked = is_within_reach(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    everywhere = float(np.abs(error).mean())
     error = error[asked]
     good = np.all(np.isfinite(error), axis=1)
     found_means = summary(task.name, error)
@@ -219,6 +220,8 @@ def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
             if key.startswith("error_n")
         },
     }
+    if task.name == "focus":
+        report["mean_abs_with_bounded"] = everywhere
     if "error_rim_mm" in found_means:
         report["rim_mean_abs_mm"] = found_means["error_rim_mm"]
     return report
