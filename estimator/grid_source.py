@@ -21,16 +21,16 @@ from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
 
 CHOICES = ("network", "cheaper", "traced")
 
-TRACED_MS_PER_RAY = 2e-3
-"""Of one node, for each ray through its stop: 0.13 ms a node over the field with 70
-rays, 0.40 on the axis with 192 (2 cores at 2 threads; emmetropia, myopia, keratoconus
-within a tenth)."""
+TRACED_MS_PER_RAY = 1.2e-3
+"""Of one node, for each ray through its stop: 0.082 to 0.088 ms a node over the field
+with 70 rays (2 cores at 2 threads; emmetropia, myopia, keratoconus).  On the axis, with
+192 rays and few nodes, 0.36 ms, half as much again."""
 
-NETWORK_MS, NETWORK_MS_PER_WEIGHT = 8e-3, 2.6e-8
+NETWORK_MS, NETWORK_MS_PER_WEIGHT = 15e-3, 1.6e-8
 """Of one node by network, on the same cores: chief rays, checks and columns; and for
-each weight: the shipped network, features and quadratic form included, takes 19.6 us
-of processor time a node for 0.76 million weights.  (With Mish of onnx's own Softplus,
-layers of 1.23 million took 70 instead of 19.)"""
+each weight: the network of 1.0 million weights takes 16 us a node, a grid of 1,920 nodes
+31 us.  (With Mish of onnx's own Softplus, layers of 1.23 million took 70 instead of
+19.)"""
 
 LEAST_GAIN_MS = 100.0
 """Time that a network must save for a grid that need not be exact: a tenth of the
