@@ -28,9 +28,9 @@ with 70 rays (2 cores at 2 threads; emmetropia, myopia, keratoconus).  On the ax
 
 NETWORK_MS, NETWORK_MS_PER_WEIGHT = 15e-3, 1.6e-8
 """Of one node by network, on the same cores: chief rays, checks and columns; and for
-each weight: the network of 1.0 million weights takes 16 us a node, a grid of 1,920 nodes
-31 us.  (With Mish of onnx's own Softplus, layers of 1.23 million took 70 instead of
-19.)"""
+each weight: the network of 1.0 million weights takes 16 us a node, a grid of 1,920
+nodes 31 us.  (With Mish of onnx's own Softplus, layers of 1.23 million took 70 us
+instead of 19.)"""
 
 LEAST_GAIN_MS = 100.0
 """Time that a network must save for a grid that need not be exact: a tenth of the
