@@ -10,15 +10,16 @@ the paper's figures of its 72 M and 221 M parameters beside ours.
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 
 from training.checkpoint import load_checkpoint
-from training.datasets import DataError
+from training.command import make_parser, run_command
 from training.export import JUDGED_ROWS, fresh_rows, judged
-from training.run_file import Run, RunFileError, read_run
+from training.run_file import Run, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT
 from training.validation import predict
@@ -106,36 +107,39 @@ def format_row(row: Judged) -> str:
     )
 
 
-def write_table(rows: list[Judged], file: Path) -> None:
-    """Write rows as JSON, with the commit."""
-    table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
-    file.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judged]:
+    """Judge every run on the same fresh rows of its task; printed as they come.
+
+    The table goes into ``file``, too, as JSON with the commit.
+
+    Raises
+    ------
+    DataError
+        A run has no checkpoint.
+    """
+    rows, samples = [], {}
+    for run in runs:
+        if run.task not in samples:
+            samples[run.task] = fresh_rows(TASKS[run.task], n_rows)
+        rows.append(judge(run, *samples[run.task]))
+        print(format_row(rows[-1]), flush=True)
+    if file:
+        table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
+        file.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    return rows
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.evaluate",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("evaluate", __doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN.toml")
     parser.add_argument("--rows", type=int, default=JUDGED_ROWS)
     parser.add_argument("--json", type=Path, help="write the table here, too")
-    options = parser.parse_args(arguments)
-    rows, samples = [], {}
-    try:
-        for run in map(read_run, options.runs):
-            if run.task not in samples:
-                samples[run.task] = fresh_rows(TASKS[run.task], options.rows)
-            rows.append(judge(run, *samples[run.task]))
-            print(format_row(rows[-1]), flush=True)
-    except (DataError, RunFileError) as error:
-        print(f"evaluate: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        write_table(rows, options.json)
-    return 0
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    make_table(map(read_run, options.runs), options.rows, options.json)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from training.batches import task_rows
 from training.checkpoint import load_checkpoint
+from training.command import make_parser, run_command
 from training.datasets import (
     DataError,
     Recipe,
@@ -56,24 +57,18 @@ SMALLEST_HALVED = 256
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.export",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("export", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     parser.add_argument("--half", action="store_true", help="weights in 16 bits")
     parser.add_argument("--rows", type=int, default=JUDGED_ROWS, help="traced anew")
-    options = parser.parse_args(arguments)
-    try:
-        run = read_run(options.run)
-        card = export(run, options.out, is_half=options.half, n_rows=options.rows)
-    except (DataError, RunFileError) as error:
-        print(f"export: {error}", file=sys.stderr)
-        return 2
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    run = read_run(options.run)
+    card = export(run, options.out, is_half=options.half, n_rows=options.rows)
     print(json.dumps({k: card[k] for k in ("network", "bytes", "parity", "error")}))
-    return 0
 
 
 def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) -> dict:

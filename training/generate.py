@@ -23,6 +23,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from training.command import make_parser, run_command
 from training.datasets import (
     MANIFEST,
     DataError,
@@ -36,7 +37,7 @@ from training.datasets import (
     write_manifest,
     write_shard,
 )
-from training.run_file import RunFileError, read_run
+from training.run_file import read_run
 from training.statistics import format_statistics, group_statistics
 from training.tasks import DOMAINS
 from training.versions import commit_id
@@ -44,22 +45,16 @@ from training.versions import commit_id
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.generate",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("generate", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--folder", type=Path, help="instead of the run file's")
-    options = parser.parse_args(arguments)
-    try:
-        run = read_run(options.run)
-        folder = options.folder or run.data_folder
-        generate(run.recipe, folder, rank=_rank(), n_ranks=_n_ranks())
-    except (DataError, RunFileError) as error:
-        print(f"generate: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    run = read_run(options.run)
+    folder = options.folder or run.data_folder
+    generate(run.recipe, folder, rank=_rank(), n_ranks=_n_ranks())
 
 
 def _rank() -> int:

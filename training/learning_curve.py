@@ -12,11 +12,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from training.datasets import DataError
-from training.evaluate import Judged, format_row, write_table
-from training.export import JUDGED_ROWS, fresh_rows
-from training.run_file import RunFileError
-from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, train_and_judge
+from training.command import make_parser, run_command
+from training.evaluate import Judged, make_table
+from training.export import JUDGED_ROWS
+from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, trained
 from training.tasks import TASKS
 
 ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000)
@@ -63,35 +62,26 @@ def _of_one_budget(rows: list[Judged]) -> list[Judged]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.learning_curve",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("learning_curve", __doc__)
     parser.add_argument("--tasks", nargs="+", choices=LOSSES, default=list(LOSSES))
     parser.add_argument("--rows", type=int, nargs="+", default=ROWS)
     parser.add_argument("--widths", type=int, nargs="+", default=WIDTHS)
     parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
-    options = parser.parse_args(arguments)
-    judged: list[Judged] = []
-    try:
-        for task in options.tasks:
-            samples = fresh_rows(TASKS[task], options.judged_rows)
-            for width, rows in sizes(tuple(options.rows), tuple(options.widths)):
-                variant = (VARIANT, VARIANTS[VARIANT], LOSSES[task], 0.0)
-                run = make_run(task, *variant, width=width, rows=rows)
-                judged.append(train_and_judge(run, samples))
-                print(format_row(judged[-1]), flush=True)
-    except (DataError, RunFileError) as error:
-        print(f"learning_curve: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        write_table(judged, options.json)
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    variant = (VARIANT, VARIANTS[VARIANT])
+    runs = (
+        make_run(task, *variant, LOSSES[task], 0.0, width=width, rows=rows)
+        for task in options.tasks
+        for width, rows in sizes(tuple(options.rows), tuple(options.widths))
+    )
+    judged = make_table(map(trained, runs), options.judged_rows, options.json)
     if options.plot:
         plot(judged, options.plot)
-    return 0
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from training.command import make_parser, run_command
 from training.datasets import Recipe, draw
 from training.published_chain import (
     FIELD_STEPS,
@@ -95,14 +96,13 @@ def focus_lines(n_rows: int) -> list[Line]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.table11",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("table11", __doc__)
     parser.add_argument("--rows", type=int, default=ROWS_DRAWN)
     parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
     lines = []
     for name in ("on_axis", "field"):
         lines += aberration_lines(name, options.rows)
@@ -115,7 +115,6 @@ def main(arguments: list[str] | None = None) -> int:
         rows = [asdict(line) for line in lines]
         table = {"commit": commit_id(), "n_rows": options.rows, "rows": rows}
         options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":

@@ -16,14 +16,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from training.datasets import MANIFEST, DataError, Recipe
-from training.evaluate import Judged, format_row, judge, write_table
-from training.export import JUDGED_ROWS, fresh_rows
+from training.command import make_parser, run_command
+from training.datasets import MANIFEST, Recipe
+from training.evaluate import make_table
+from training.export import JUDGED_ROWS
 from training.generate import generate
 from training.models import ModelSettings
 from training.run_file import (
     Run,
-    RunFileError,
     TrainingSettings,
     default_data_folder,
     read_run,
@@ -105,42 +105,32 @@ def make_run(
     )
 
 
-def train_and_judge(run: Run, samples) -> Judged:
-    """Train a run, where that is not done, and judge it on fresh rows."""
+def trained(run: Run) -> Run:
+    """Return the run, trained where that was not done, on data made if missing."""
     if not (run.data_folder / MANIFEST).exists():
         generate(run.recipe, run.data_folder)
     train(run)
-    return judge(run, *samples)
+    return run
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.table3",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("table3", __doc__)
     parser.add_argument("--width", type=int, default=WIDTH)
     parser.add_argument("--rows", type=int, default=ROWS_SEEN, help="seen in training")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
     parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
-    size = {"width": options.width, "rows": options.rows}
-    rows: list[Judged] = []
-    try:
-        for task in options.tasks:
-            samples = fresh_rows(TASKS[task], options.judged_rows)
-            for variant in variants(task):
-                run = make_run(task, *variant, **size)
-                rows.append(train_and_judge(run, samples))
-                print(format_row(rows[-1]), flush=True)
-    except (DataError, RunFileError) as error:
-        print(f"table3: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        write_table(rows, options.json)
-    return 0
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    runs = (
+        make_run(task, *variant, width=options.width, rows=options.rows)
+        for task in options.tasks
+        for variant in variants(task)
+    )
+    make_table(map(trained, runs), options.judged_rows, options.json)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from training.batches import Batches, Rows, load_rows
 from training.checkpoint import load_checkpoint, make_network, save_checkpoint
-from training.datasets import DataError
+from training.command import make_parser, run_command
 from training.losses import (
     DiscriminatorLoss,
     TracerLoss,
@@ -41,21 +41,14 @@ CHECKPOINT_SECONDS = 120.0
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.train",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("train", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--folder", type=Path, help="of the data, not the run file's")
-    options = parser.parse_args(arguments)
-    try:
-        run = read_run(options.run)
-        train(run, data_folder=options.folder)
-    except (DataError, RunFileError) as error:
-        print(f"train: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, _work, arguments)
+
+
+def _work(options: argparse.Namespace) -> None:
+    train(read_run(options.run), data_folder=options.folder)
 
 
 def _loss(run: Run, device: torch.device):

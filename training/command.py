@@ -1,0 +1,35 @@
+"""What the commands of the training share: their help, and errors in one line."""
+
+import argparse
+import sys
+from collections.abc import Callable
+
+from training.datasets import DataError
+from training.run_file import RunFileError
+
+
+def make_parser(module: str, documentation: str) -> argparse.ArgumentParser:
+    """Return the parser of ``python -m training.<module>``, its docstring the help."""
+    return argparse.ArgumentParser(
+        prog=f"python -m training.{module}",
+        description=documentation,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def run_command(
+    parser: argparse.ArgumentParser,
+    work: Callable[[argparse.Namespace], None],
+    arguments: list[str] | None,
+) -> int:
+    """Do the work of a command; the exit code, 2 where data or a run file are at fault.
+
+    ``arguments`` are those of the command line when None.
+    """
+    options = parser.parse_args(arguments)
+    try:
+        work(options)
+    except (DataError, RunFileError) as error:
+        print(f"{parser.prog.rpartition('.')[2]}: {error}", file=sys.stderr)
+        return 2
+    return 0
