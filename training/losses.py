@@ -63,13 +63,9 @@ class TracerLoss(nn.Module):
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
         """As `DiscriminatorLoss`; eyes that light does not pass are left out."""
         eyes = model(x)
-        with torch.autocast(x.device.type, enabled=False):
-            found_um, is_traced = zernike_of_eyes(
-                eyes.double(),
-                x[:, -2].double(),
-                x[:, -1].double(),
-                ray_dtype=torch.float32,
-            )
+        found_um, is_traced = zernike_of_eyes(
+            eyes.double(), x[:, -2].double(), x[:, -1].double(), ray_dtype=torch.float32
+        )
         misfit_um = torch.abs(found_um[is_traced, 3:] - x[is_traced, :-2])
         misfit_um = torch.clamp(misfit_um, max=LARGEST_MISFIT_UM).mean()
         return misfit_um + _prior(eyes, x, self.prior_weight)

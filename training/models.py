@@ -187,6 +187,11 @@ class Network(nn.Module):
     settings : ModelSettings
     is_bounded : bool
         A last tanh, so that outputs stay in a range: the eye estimator's.
+
+    Attributes
+    ----------
+    is_mixed : bool
+        In training, let the layers compute in bfloat16 where that is safe.
     """
 
     def __init__(
@@ -210,6 +215,7 @@ class Network(nn.Module):
             block = MishBlock if settings.kind == "ours" else ReluBlock
             layers = _residual(block, n_features, width, settings.n_stacks)
         self.layers = nn.Sequential(*layers, _dense(width, n_encoded))
+        self.is_mixed = False
         self.bound = nn.Tanh() if is_bounded else nn.Identity()
         if is_bounded:  # it starts in the middle of its range, far from where tanh ends
             nn.init.uniform_(self.layers[-1].weight, -SMALL_WEIGHT, SMALL_WEIGHT)
@@ -260,14 +266,26 @@ class Network(nn.Module):
     def standard_error(self, x: Tensor, y: Tensor) -> Tensor:
         """Return errors (N, n_encoded) of the layers, in standard units."""
         features = self.features(x)
-        found = self.bound(self.layers(self._standard(features)))
+        found = self._through_layers(self._standard(features))
         return found - self._wanted(x, y, features)
+
+    def _through_layers(self, standard: Tensor) -> Tensor:
+        """Return what the layers add (N, n_encoded); in training perhaps in 16 bits.
+
+        They alone: 8 bits of mantissa in the optics before them or in the quadratic
+        form would leave an error that the layers cannot learn.
+        """
+        if not (self.is_mixed and self.training):
+            return self.bound(self.layers(standard))
+        with torch.autocast(standard.device.type, torch.bfloat16):
+            found = self.layers(standard)
+        return self.bound(found.float())
 
     def forward(self, x: Tensor) -> Tensor:
         """Physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""
         features = self.features(x)
         standard = self._standard(features)
-        y = self.bound(self.layers(standard)) * self.output_scale
+        y = self._through_layers(standard) * self.output_scale
         return self.features.decode(x, y + self._start(standard), features)
 
     @property

@@ -34,7 +34,7 @@ class TrainingSettings:
         Last part of the training in which both fall to zero.
     validation_ratio : float
     is_mixed : bool
-        bfloat16 products on a GPU.
+        bfloat16 products in the layers, on a GPU.
     is_fresh : bool
         Draw and trace new rows for every step instead of reading shards.
     discriminator : str

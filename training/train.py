@@ -88,6 +88,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
             load_checkpoint(Path(settings.start_from))[0].state_dict()
         )
     network.to(device)
+    network.is_mixed = settings.is_mixed and device.type == "cuda"
     optimiser = make_optimiser(
         network.parameters(),
         learning_rate=settings.learning_rate,
@@ -128,12 +129,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                 weight_decay=settings.weight_decay * share,
             )
             network.train()
-            with torch.autocast(
-                device.type,
-                torch.bfloat16,
-                enabled=settings.is_mixed and device.type == "cuda",
-            ):
-                loss = model(x, y)
+            loss = model(x, y)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
