@@ -13,12 +13,12 @@ import sys
 from pathlib import Path
 
 from training.command import make_parser, run_command
-from training.evaluate import Judged, make_table
+from training.evaluate import PUBLISHED, Judged, make_table
 from training.export import JUDGED_ROWS
 from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, trained
 from training.tasks import TASKS
 
-ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000)
+ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
 WIDTHS = (32, 64, 128, 256)
 VARIANT = "ours, quadratic"
 LOSSES = {"discriminator": "physical", "aberration": "physical", "focus": "standard"}
@@ -32,26 +32,35 @@ def sizes(rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS):
 
 
 def plot(rows: list[Judged], file: Path) -> None:
-    """Draw both curves of every task, error over its goal."""
+    """Draw both curves of every task; dashed what the paper's networks reach."""
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import LogLocator
 
-    figure, (by_rows, by_weights) = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
-    for task in dict.fromkeys(row.task for row in rows):
-        mine = [row for row in rows if row.task == task]
+    figure, (by_rows, by_weights) = plt.subplots(
+        1, 2, figsize=(10, 4.5), sharey=True, layout="constrained"
+    )
+    for number, task in enumerate(dict.fromkeys(row.task for row in rows)):
+        mine, colour = [row for row in rows if row.task == task], f"C{number}"
         for axes, name, kept in (
             (by_rows, "rows_seen", [r for r in mine if r.width == WIDTH]),
             (by_weights, "n_parameters", _of_one_budget(mine)),
         ):
             kept.sort(key=lambda row: getattr(row, name))
-            x = [getattr(row, name) for row in kept]
+            x = [getattr(row, name) / 1e6 for row in kept]
             y = [row.error["mean_abs"] for row in kept]
-            axes.loglog(x, y, "o-", label=f"{task}, {TASKS[task].unit}")
-    by_rows.set(xlabel="rows seen", ylabel="mean absolute error against ray tracing")
-    by_weights.set(xlabel="weights")
+            axes.loglog(x, y, "o-", color=colour, label=f"{task}, {TASKS[task].unit}")
+            axes.axhline(PUBLISHED[task, "ours", ""], color=colour, linestyle="--")
+    by_rows.plot([], [], "k--", label="the paper's, 72 million weights")
+    label = "mean absolute error against ray tracing"
+    by_rows.set(xlabel="rows seen, millions", ylabel=label)
+    by_weights.set(xlabel="weights, millions")
     for axes in (by_rows, by_weights):
         axes.grid(which="both", alpha=0.3)
-    by_rows.legend()
-    figure.tight_layout()
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+    handles, _ = by_rows.get_legend_handles_labels()
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     figure.savefig(file, dpi=110)
     plt.close(figure)
 

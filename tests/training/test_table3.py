@@ -42,7 +42,7 @@ def test_the_command_trains_judges_and_writes(tmp_path, monkeypatch, capsys):
 
 
 def test_a_learning_curve_has_each_point_once(tmp_path, monkeypatch):
-    assert len(learning_curve.sizes()) == len(set(learning_curve.sizes())) == 8
+    assert len(learning_curve.sizes()) == len(set(learning_curve.sizes())) == 9
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(table3, "DATA_ROWS", {"lens": 1000})
     monkeypatch.setattr(learning_curve, "ROWS_SEEN", 1000)
