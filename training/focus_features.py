@@ -18,8 +18,8 @@ BOUND_MARGIN_MM = 1e-4
 """Changes of the lens nearer to a bound than this count as bounded."""
 
 N_STEPS = 2
-STEP_MM = -0.02
-"""For the slope of the vergence."""
+STEP_MM = -0.2
+"""For the slope of the vergence: shorter steps lose it in the rounding of 32 bits."""
 
 SLOPE_SHARES = (0.5, 2.0)
 """Least and greatest slope of the vergence over the paraxial one."""

@@ -25,6 +25,7 @@ from estimator.eye_wavefront import MEDIA_INWARDS, TraceFailed, eye_indices
 from estimator.media import refractive_index
 from estimator.network_card import INPUTS, OUTPUTS, ZERNIKE_NAMES
 from estimator.prescription import C20
+from estimator.raytrace import RayStatus
 from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.wavefront import eyes_aberrations, on_axis_zernike
 from estimator.wavefront_kernels import magnifications
@@ -86,14 +87,23 @@ def media_indices_of(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def label_on_axis(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients (n, 27), um, on the filled circle of the pupil."""
-    eyes, pupil_mm, wavelength_nm = inputs[:, :N_EYE], inputs[:, -2], inputs[:, -1]
-    zernike_um, _ = on_axis_zernike(
+    return _whole_circles(inputs[:, :N_EYE], inputs[:, -2], inputs[:, -1])[:, 1:]
+
+
+def _whole_circles(
+    eyes: NDArray[np.float64],
+    pupil_mm: NDArray[np.float64],
+    wavelength_nm: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Coefficients (n, 28), um; nan for an eye that only a part of the light passes."""
+    zernike_um, status_index = on_axis_zernike(
         pack_eyes(eyes),
         media_indices_of(wavelength_nm),
         zernike_radius_mm=pupil_mm / 2.0,
         n_threads=N_CORES,
     )
-    return zernike_um[:, 1:]
+    zernike_um[status_index != RayStatus.TRACED] = np.nan
+    return zernike_um
 
 
 def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,12 +189,8 @@ def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     relaxed_mm = eyes[:, DIAMETER]
     widest_mm, least_mm = LENS_ROOM * np.stack([relaxed_mm, smallest_diameter_mm(eyes)])
     focused = accommodated_eyes(eyes, widest_mm + share * (least_mm - widest_mm))
-    zernike_um, _ = on_axis_zernike(
-        pack_eyes(focused),
-        media_indices_of(np.full(len(eyes), REFERENCE_WAVELENGTH_NM)),
-        zernike_radius_mm=pupil_mm / 2.0,
-        n_threads=N_CORES,
-    )
+    color_nm = np.full(len(eyes), REFERENCE_WAVELENGTH_NM)
+    zernike_um = _whole_circles(focused, pupil_mm, color_nm)
     focus_dpt = SPHERE_PER_C20 * zernike_um[:, C20] / (pupil_mm / 2.0) ** 2
     changes_mm = (focused - eyes)[:, [DIAMETER, AQUEOUS]]
     return np.column_stack([focus_dpt, changes_mm])
