@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from estimator.eye_parameters import sampled_ranges
-from training.datasets import Recipe, Shard, draw, label, load, split
+from training.datasets import (
+    DataError,
+    Recipe,
+    Shard,
+    draw,
+    label,
+    load,
+    read_manifest,
+    recipe_of,
+    split,
+)
 from training.device_labels import label_on_device
 from training.models import Network
 from training.run_file import Run
@@ -22,6 +32,9 @@ SCALING_ROWS = 200_000
 
 FRESH_SEED = 7919
 """Added to the run's seed, so that fresh rows are never those of the shards."""
+
+FRESH_STEPS = 8
+"""So many steps' rows are traced at once: a GPU takes as long for one step's."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +92,14 @@ def load_rows(run: Run, folder: Path) -> Rows:
     Raises
     ------
     DataError
-        It is not there or not whole.
+        It is not there, not whole, or another one than the run file says.
     """
+    found = recipe_of(read_manifest(folder))
+    if found != run.recipe:
+        raise DataError(
+            f"{folder} holds {found}, the run asks for {run.recipe}; "
+            "choose another folder, or remove it and generate"
+        )
     shard, share = load(folder), run.training.validation_ratio
     parts = split(shard.inputs, share=share, seed=run.seed)
     return Rows(run.task, *task_rows(run.task, shard), *parts)
@@ -96,6 +115,11 @@ class Batches:
     rank, n_ranks : int
         This process takes every n-th batch.
     device : torch.device
+
+    Raises
+    ------
+    DataError
+        A step takes more rows than there are.
     """
 
     def __init__(self, rows: Rows, run: Run, *, rank: int, n_ranks: int, device):
@@ -104,7 +128,13 @@ class Batches:
         self._rank, self._n_ranks = rank, n_ranks
         self._size = settings.batch_size
         self.rows_per_step = self._size * n_ranks
-        self.steps_per_epoch = max(1, len(rows.training_index) // self.rows_per_step)
+        n_rows = len(rows.training_index)
+        if n_ranks > 1 and n_rows < self.rows_per_step:
+            raise DataError(
+                f"{n_rows} rows to train on: fewer than the {self.rows_per_step} of a "
+                f"step of {n_ranks} processes"
+            )
+        self.steps_per_epoch = max(1, n_rows // self.rows_per_step)
         self.n_steps = max(1, round(settings.n_epochs * self.steps_per_epoch))
         self._order = (-1, rows.training_index)
         self._pool = ThreadPoolExecutor(1) if settings.is_fresh else None
@@ -128,23 +158,30 @@ class Batches:
         return self._rows.x[chosen], self._rows.y[chosen]
 
     def _fresh(self, step: int) -> tuple[Tensor, Tensor]:
-        """Rows traced for this step, the next one's begun in a thread."""
-        now = self._coming.pop(step, None) or self._pool.submit(self._trace, step)
-        self._coming = {step + 1: self._pool.submit(self._trace, step + 1)}
-        return now.result()
+        """Rows traced for this step and its neighbours, the next ones' in a thread."""
+        block, place = divmod(step, FRESH_STEPS)
+        for number in (block, block + 1):
+            if number not in self._coming:
+                self._coming[number] = self._pool.submit(self._trace, number)
+        self._coming = {n: self._coming[n] for n in (block, block + 1)}
+        x, y = self._coming[block].result()
+        share = len(x) // FRESH_STEPS
+        part = slice(place * share, (place + 1) * share)
+        return x[part], y[part]
 
-    def _trace(self, step: int) -> tuple[Tensor, Tensor]:
+    def _trace(self, block: int) -> tuple[Tensor, Tensor]:
         domain = TASKS[self._run.task].domain
         recipe = self._fresh_recipe(domain.n_repeats)
-        block = draw(recipe, step * self._n_ranks + self._rank)
+        inputs = draw(recipe, block * self._n_ranks + self._rank)
         labels = None
         if self._device.type == "cuda":
             labels = partial(label_on_device, domain, device=self._device)
-        return task_rows(self._run.task, label(domain, block, labels=labels))
+        return task_rows(self._run.task, label(domain, inputs, labels=labels))
 
     def _fresh_recipe(self, n_repeats: int) -> Recipe:
-        per_shard = -(-self._size // n_repeats) * n_repeats
-        n_rows = per_shard * self._n_ranks * (self.n_steps + 1)
+        per_shard = -(-self._size * FRESH_STEPS // n_repeats) * n_repeats
+        n_blocks = -(-self.n_steps // FRESH_STEPS) + 1  # one is always begun ahead
+        n_rows = per_shard * self._n_ranks * n_blocks
         return replace(
             self._run.recipe,
             n_rows=n_rows,

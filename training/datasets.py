@@ -127,11 +127,10 @@ def _populate(recipe: Recipe, domain: Domain, rows: NDArray, unit: NDArray) -> N
     rows[chosen, :N_EYE] = eyes
 
 
-def input_ranges(recipe: Recipe) -> NDArray[np.float64]:
+def input_ranges(domain: Domain, population_ratio: float) -> NDArray[np.float64]:
     """Ranges (n_inputs, 2) that hold all inputs of a data set."""
-    domain = DOMAINS[recipe.domain]
     ranges = domain.ranges.copy()
-    if recipe.population_ratio:
+    if population_ratio:
         wider = population_ranges(is_focused=domain.is_focused)
         ranges[:N_EYE, 0] = np.minimum(ranges[:N_EYE, 0], wider[:, 0])
         ranges[:N_EYE, 1] = np.maximum(ranges[:N_EYE, 1], wider[:, 1])
@@ -203,7 +202,9 @@ def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
         "inputs": [
             {"name": name, "low": float(low), "high": float(high)}
             for name, (low, high) in zip(
-                domain.inputs, input_ranges(recipe), strict=True
+                domain.inputs,
+                input_ranges(domain, recipe.population_ratio),
+                strict=True,
             )
         ],
         "targets": list(domain.targets),

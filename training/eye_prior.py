@@ -21,19 +21,20 @@ def mean_eyes(x: Tensor) -> Tensor:
     refraction_dpt = -SPHERE_PER_C20 * x[:, C20 - FIRST_TERM] / (x[:, 25] / 2.0) ** 2
     low, high = estimation_prior.REFRACTION_LIMITS_DPT
     clipped_dpt = torch.clamp(refraction_dpt, low, high)
-    start, slope = (torch.as_tensor(v, device=x.device) for v in _line())
-    return start.to(x.dtype) + clipped_dpt[:, None] * slope.to(x.dtype)
+    start, slope, _ = _constants(x.dtype, x.device)
+    return start + clipped_dpt[:, None] * slope
 
 
 @cache
-def _line() -> tuple[np.ndarray, np.ndarray]:
-    """Mean eye of a refraction: its value at 0 dpt and its change with 1 dpt."""
+def _constants(dtype, device) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean eye at 0 dpt, its change with 1 dpt, and the deviations from it (45,)."""
     start, one = estimation_prior.mean_eyes(np.array([0.0, 1.0]))
-    return start, one - start
+    values = (start, one - start, estimation_prior.deviations())
+    return tuple(torch.as_tensor(v, dtype=dtype, device=device) for v in values)
 
 
 def squared_deviation(eyes: Tensor, x: Tensor) -> Tensor:
     """Mean over the 45 parameters (N,) of the squared deviation from the mean eye."""
-    deviations = torch.as_tensor(estimation_prior.deviations(), device=x.device)
-    unit = (eyes - mean_eyes(x)) / deviations.to(eyes.dtype)
+    *_, deviations = _constants(x.dtype, x.device)
+    unit = (eyes - mean_eyes(x)) / deviations
     return torch.mean(unit**2, dim=1)

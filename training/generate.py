@@ -80,7 +80,8 @@ def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -
             "choose another folder or remove it"
         )
     if rank == 0:
-        write_manifest(folder, recipe, commit=commit_id())
+        commit = _commits(recipe, folder)
+        write_manifest(folder, recipe, commit=commit)
     mine = range(rank, recipe.n_shards, n_ranks)
     wanted = [k for k in mine if not shard_file(folder, k).exists()]
     domain, started_s = DOMAINS[recipe.domain], time.perf_counter()
@@ -97,18 +98,27 @@ def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -
             write_shard(folder, number, label(domain, draw(recipe, number)))
             bar.advance(task)
     if rank == 0:
-        _finish(recipe, folder, console, started_s, n_ranks)
+        _await_others(recipe, folder, n_ranks)
+        manifest = write_manifest(folder, recipe, commit=commit)
+        _finish(manifest, folder, console, started_s)
 
 
-def _finish(recipe, folder, console, started_s, n_ranks) -> None:
-    _await_others(recipe, folder, n_ranks)
-    manifest = write_manifest(folder, recipe, commit=commit_id())
+def _commits(recipe: Recipe, folder: Path) -> str:
+    """Say of which commits the shards are, those still to be made included."""
+    is_made = [shard_file(folder, k).exists() for k in range(recipe.n_shards)]
+    is_begun = any(is_made) and (folder / MANIFEST).exists()
+    before = read_manifest(folder)["commit"].split(", ") if is_begun else []
+    now = [] if all(is_made) else [commit_id()]
+    return ", ".join(dict.fromkeys(before + now))
+
+
+def _finish(manifest: dict, folder: Path, console, started_s: float) -> None:
     console.print(
         f"{manifest['n_rows_kept']} rows, {manifest['n_rows_rejected']} rejected, "
         f"{time.perf_counter() - started_s:.0f} s, in {folder}"
     )
-    data, domain = load(folder), DOMAINS[recipe.domain]
-    print(format_statistics(recipe.domain, group_statistics(domain, data.targets)))
+    name, data = manifest["domain"], load(folder)
+    print(format_statistics(name, group_statistics(DOMAINS[name], data.targets)))
 
 
 def _await_others(recipe: Recipe, folder: Path, n_ranks: int) -> None:

@@ -95,9 +95,8 @@ def excess_vergence(
     radius_mm, pupil_z_mm : (N,)
         Of the entrance pupil, and its plane.
     """
-    heights = torch.tensor([math.sqrt(node) for node in NODES], dtype=radius_mm.dtype)
-    heights = heights.to(radius_mm.device) / NODAL_DISTANCE_MM
-    slope = radius_mm[:, None] * heights
+    slopes = [math.sqrt(node) / NODAL_DISTANCE_MM for node in NODES]
+    slope = torch.stack([radius_mm * one for one in slopes], dim=1)
     length = torch.sqrt(1.0 + slope**2)
     start_mm = retina_mm[:, None].expand_as(slope)
     rays = Rays(start_mm, torch.zeros_like(slope), -1.0 / length, slope / length)

@@ -34,7 +34,7 @@ class TrainingSettings:
         Last part of the training in which both fall to zero.
     validation_ratio : float
     is_mixed : bool
-        bfloat16 products in the layers, on a GPU.
+        bfloat16 products in the layers, on a GPU, until the final part.
     is_fresh : bool
         Draw and trace new rows for every step instead of reading shards.
     discriminator : str
@@ -95,7 +95,11 @@ def read_run(file: Path) -> Run:
         raise RunFileError(f"task '{task}': allowed are {', '.join(TASKS)}")
     data = dict(body.get("data", {}))
     folder = data.pop("folder", None)
-    data.setdefault("domain", TASKS[task].domain.name)
+    domain = TASKS[task].domain.name
+    if data.setdefault("domain", domain) != domain:
+        raise RunFileError(
+            f"data.domain '{data['domain']}': the task '{task}' needs '{domain}'"
+        )
     training = _table(TrainingSettings, body.get("training", {}), "training")
     allowed = EYE_LOSSES if task == "eye" else LOSSES
     if training.loss not in allowed:

@@ -92,6 +92,15 @@ def test_an_interrupted_set_goes_on_and_ends_the_same(tmp_path, capsys):
     assert "n=1,2 (paper)" in capsys.readouterr().out
 
 
+def test_a_manifest_names_the_commits_that_its_shards_are_of(tmp_path, monkeypatch):
+    for commit in ("first", "second", "third"):
+        monkeypatch.setattr("training.generate.commit_id", lambda name=commit: name)
+        generate(SMALL, tmp_path)
+        if commit == "first":
+            shard_file(tmp_path, 1).unlink()
+    assert read_manifest(tmp_path)["commit"] == "first, second"
+
+
 def test_a_folder_of_another_set_is_refused(tmp_path):
     write_manifest(tmp_path, SMALL, commit="none")
     with pytest.raises(DataError, match="another data set"):
@@ -117,7 +126,7 @@ def test_a_population_is_a_share_of_the_rows_and_the_rest_is_the_box():
     assert np.mean(exchanged) == pytest.approx(0.4, abs=0.02)
     # pupils and wavelengths are drawn as before
     np.testing.assert_array_equal(box[:, 45:], mixed[:, 45:])
-    low, high = input_ranges(Recipe("on_axis", 400, population_ratio=0.4)).T
+    low, high = input_ranges(DOMAINS["on_axis"], 0.4).T
     assert np.all((mixed >= low) & (mixed <= high))
 
 

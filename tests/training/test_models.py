@@ -123,6 +123,10 @@ def test_a_bounded_network_keeps_to_its_range():
         ('task = "focus"\n[model]\nkind = "svm"', "kind 'svm': allowed are ours"),
         ('task = "focus"\n[data]\nn_rows = 0', "must be positive"),
         ('task = "focus"\n[data]', "n_rows"),
+        (
+            'task = "focus"\n[data]\ndomain = "focus"',
+            "data.domain 'focus': the task 'focus' needs 'lens'",
+        ),
         ("task = ", "Invalid value"),
     ],
 )
