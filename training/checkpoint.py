@@ -38,6 +38,23 @@ def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None
     partial.replace(file)
 
 
+def load_finished(file: Path) -> tuple[Network, dict]:
+    """As `load_checkpoint`, of a training that came to its end.
+
+    Raises
+    ------
+    DataError
+        There is none, or its training is to go on.
+    """
+    network, state = load_checkpoint(file)
+    if state["step"] != state["n_steps"]:
+        raise DataError(
+            f"checkpoint {file} is of step {state['step']} of {state['n_steps']}: "
+            "`python -m training.train` goes on where it stopped"
+        )
+    return network, state
+
+
 def load_checkpoint(file: Path) -> tuple[Network, dict]:
     """Network and the rest of a checkpoint, on the CPU.
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from training.checkpoint import load_checkpoint
+from training.checkpoint import load_finished
 from training.command import make_parser, run_command
 from training.export import JUDGED_ROWS, fresh_rows, judged
 from training.run_file import Run, read_run
@@ -68,9 +68,9 @@ def judge(run: Run, x, y) -> Judged:
     Raises
     ------
     DataError
-        There is no checkpoint.
+        There is no checkpoint, or its training is to go on.
     """
-    network, state = load_checkpoint(run.output_folder / CHECKPOINT)
+    network, state = load_finished(run.output_folder / CHECKPOINT)
     found = predict(network, torch.from_numpy(x), torch.device("cpu"))
     loss = run.training.loss if run.task == "eye" else ""
     return Judged(
@@ -115,7 +115,7 @@ def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judg
     Raises
     ------
     DataError
-        A run has no checkpoint.
+        A run is not trained to its end.
     """
     rows, samples = [], {}
     for run in runs:

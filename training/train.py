@@ -88,32 +88,23 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
             load_checkpoint(Path(settings.start_from))[0].state_dict()
         )
     network.to(device)
-    network.is_mixed = settings.is_mixed and device.type == "cuda"
     optimiser = make_optimiser(
         network.parameters(),
         learning_rate=settings.learning_rate,
         weight_decay=settings.weight_decay,
     )
-    loss_of = _loss(run, device)
-    folder, step, spent_s = run.output_folder, 0, 0.0
+    folder = run.output_folder
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / CHECKPOINT).exists():
-        saved, state = load_checkpoint(folder / CHECKPOINT)
-        if state["run"] != run.text:
-            raise RunFileError(
-                f"{folder / CHECKPOINT} is of another run file; remove it to start anew"
-            )
-        network.load_state_dict(saved.state_dict())
-        optimiser.load_state_dict(state["optimiser"])
-        step, spent_s = state["step"], state["seconds"]
-    model = (
-        DistributedDataParallel(_Whole(network, loss_of))
-        if n_ranks > 1
-        else _Whole(network, loss_of)
-    )
+    step, spent_s, smooth, entry = _resumed(run, batches, network, optimiser)
+    if rank == 0:
+        _cut_log(folder / LOG, step)
+    model = _Whole(network, _loss(run, device))
+    if n_ranks > 1:  # BatchNorm's running means must agree; other buffers are constant
+        has_means = run.model.kind == "resnet"
+        model = DistributedDataParallel(model, broadcast_buffers=has_means)
     n_steps, per_epoch = batches.n_steps, batches.steps_per_epoch
-    saved_s, smooth, entry = time.perf_counter(), None, {}
-    console = Console(stderr=True)
+    n_mixed = (1.0 - settings.final_ratio) * n_steps if settings.is_mixed else 0
+    saved_s, console = time.perf_counter(), Console(stderr=True)
     with Progress(console=console, disable=rank != 0) as bar:
         task = bar.add_task(run.name, total=n_steps, completed=step)
         while step < n_steps:
@@ -129,6 +120,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                 weight_decay=settings.weight_decay * share,
             )
             network.train()
+            network.is_mixed = device.type == "cuda" and step < n_mixed
             loss = model(x, y)
             optimiser.zero_grad()
             loss.backward()
@@ -161,6 +153,9 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                     {
                         "optimiser": optimiser.state_dict(),
                         "step": step,
+                        "n_steps": n_steps,
+                        "rows_per_step": batches.rows_per_step,
+                        "smooth_loss": smooth,
                         "seconds": spent_s + time.perf_counter() - started_s,
                         "run": run.text,
                         "log": entry,
@@ -170,6 +165,34 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
     if n_ranks > 1:
         dist.destroy_process_group()
     return entry
+
+
+def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:
+    """Put a checkpoint's state into place: step, seconds spent, loss, last entry."""
+    file = run.output_folder / CHECKPOINT
+    if not file.exists():
+        return 0, 0.0, None, {}
+    saved, state = load_checkpoint(file)
+    if state["run"] != run.text:
+        raise RunFileError(f"{file} is of another run file; remove it to start anew")
+    if state["rows_per_step"] != batches.rows_per_step:
+        raise RunFileError(
+            f"{file} was made with {state['rows_per_step']} rows a step, over all "
+            f"processes; now they are {batches.rows_per_step}: start as many processes "
+            "as before, or remove it to start anew"
+        )
+    network.load_state_dict(saved.state_dict())
+    optimiser.load_state_dict(state["optimiser"])
+    return state["step"], state["seconds"], state["smooth_loss"], state["log"]
+
+
+def _cut_log(file: Path, step: int) -> None:
+    """Drop what was logged after the step from which a training goes on."""
+    if not file.exists():
+        return
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = [line for line in lines if json.loads(line)["step"] <= step]
+    file.write_text("".join(kept), encoding="utf-8")
 
 
 class _Whole(torch.nn.Module):
@@ -184,19 +207,20 @@ class _Whole(torch.nn.Module):
 
 
 def _join() -> tuple[int, int, torch.device]:
-    """Rank, number of processes and device of this one."""
-    rank, n_ranks = (
-        int(os.environ.get("RANK", "0")),
-        int(os.environ.get("WORLD_SIZE", "1")),
+    """Rank, number of processes and device of this one.
+
+    On the CPU where the machine has fewer GPUs than processes.
+    """
+    names = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1"}
+    rank, n_ranks, local_rank, n_local = (
+        int(os.environ.get(name, default)) for name, default in names.items()
     )
-    has_gpu = torch.cuda.is_available()
-    if n_ranks > 1 and not dist.is_initialized():
-        dist.init_process_group("nccl" if has_gpu else "gloo")
-    if has_gpu:
-        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    device, backend = torch.device("cpu"), "gloo"
+    if torch.cuda.device_count() >= n_local:
+        device, backend = torch.device("cuda", local_rank), "nccl"
         torch.cuda.set_device(device)
-    else:
-        device = torch.device("cpu")
+    if n_ranks > 1 and not dist.is_initialized():
+        dist.init_process_group(backend)
     return rank, n_ranks, device
 
 
