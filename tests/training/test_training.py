@@ -8,16 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
-from training.batches import load_rows
+from training.batches import FRESH_STEPS, Batches, load_rows
 from training.checkpoint import load_checkpoint
-from training.datasets import load
-from training.export import export, fresh_rows
+from training.datasets import DataError, load
+from training.export import export, fresh_rows, to_onnx
 from training.eye_prior import squared_deviation
 from training.generate import generate
 from training.losses import DiscriminatorLoss
+from training.models import ModelSettings, Network
 from training.optimiser import Lookahead, make_optimiser, pace
 from training.run_file import RunFileError, read_run
 from training.tasks import TASKS
@@ -119,6 +121,54 @@ def test_an_interrupted_training_ends_with_the_same_weights(folder, monkeypatch)
     ends = [load_checkpoint(r.output_folder / CHECKPOINT)[0] for r in (whole, stopped)]
     for one, other in zip(*(e.state_dict().values() for e in ends), strict=True):
         assert torch.equal(one, other)
+    logs = [_log(run) for run in (whole, stopped)]
+    for entry in (*logs[0], *logs[1]):
+        del entry["seconds"]
+    assert logs[0] == logs[1]
+    assert train(whole) == train(whole) != {}
+
+
+def _log(run):
+    lines = (run.output_folder / LOG).read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_what_was_logged_after_a_checkpoint_is_dropped(folder):
+    run = _run(folder, "crashed")
+    train(run)
+    file = run.output_folder / LOG
+    whole = file.read_text()
+    file.write_text(whole + json.dumps({"step": 10_000}) + "\n")
+    train(run)
+    assert file.read_text() == whole
+
+
+def test_a_training_goes_on_with_as_many_processes(folder, monkeypatch):
+    run = _run(folder, "alone")
+    train(run)
+
+    def two_processes():
+        return 0, 2, torch.device("cpu")
+
+    monkeypatch.setattr("training.train._join", two_processes)
+    with pytest.raises(RunFileError, match=r"128 rows a step.*now they are 256"):
+        train(run)
+
+
+def test_data_of_another_recipe_are_refused(folder):
+    run = _run(folder, "other")
+    other = replace(run, recipe=replace(run.recipe, population_ratio=0.5))
+    with pytest.raises(
+        DataError, match=r"population_ratio=0\.0.*population_ratio=0\.5"
+    ):
+        train(other)
+
+
+def test_more_processes_than_rows_are_refused(folder):
+    run = _run(folder, "many")
+    rows = load_rows(run, run.data_folder)
+    with pytest.raises(DataError, match="fewer than the 12800 of a step of 100"):
+        Batches(rows, run, rank=0, n_ranks=100, device=torch.device("cpu"))
 
 
 def test_two_processes_agree_and_learn(folder):
@@ -143,8 +193,7 @@ def test_two_processes_agree_and_learn(folder):
             timeout=240,
             cwd=ROOT,
         )
-    lines = (run.output_folder / LOG).read_text().splitlines()
-    entries = [json.loads(line) for line in lines]
+    entries = _log(run)
     assert [round(entry["epoch"]) for entry in entries] == list(range(1, 9))
     assert entries[0]["rows"] == entries[0]["step"] * 256
     assert entries[-1]["error"] < 0.95 * entries[0]["error"]
@@ -154,8 +203,6 @@ def test_fresh_rows_are_traced_for_every_step(folder):
     run = _run(folder, "fresh", n_epochs=1, more="is_fresh = true\n")
     entry = train(run)
     assert entry["error"] < 2.0
-    from training.batches import Batches, load_rows
-
     rows = load_rows(run, run.data_folder)
     batches = Batches(rows, run, rank=0, n_ranks=1, device=torch.device("cpu"))
     first, again, other = batches.at(0)[0], batches.at(0)[0], batches.at(1)[0]
@@ -163,7 +210,9 @@ def test_fresh_rows_are_traced_for_every_step(folder):
     known = load(run.data_folder).inputs
     for row in (first[0], other[0]):
         assert not np.any(np.all(known == row.numpy(), axis=1))
-    assert not torch.equal(first[0], other[0])
+    steps = [batches.at(step)[0] for step in range(FRESH_STEPS + 2)]
+    assert len({tuple(x[0].tolist()) for x in steps}) == len(steps)
+    assert all(120 < len(x) <= 128 for x in steps)  # some rows let no light pass
 
 
 def _network_and_rows(run):
@@ -178,8 +227,7 @@ def test_the_eye_learns_through_a_discriminator(folder):
     more = f'loss = "discriminator"\ndiscriminator = "{checkpoint}"\n'
     run = _run(folder, "eye", task="eye", n_epochs=20, more=more)
     train(run)
-    lines = (run.output_folder / LOG).read_text().splitlines()
-    losses_um = [json.loads(line)["loss"] for line in lines]
+    losses_um = [entry["loss"] for entry in _log(run)]
     assert losses_um[-1] < 0.9 * losses_um[0]
     judge = load_checkpoint(checkpoint)[0]
     loss, with_prior = (
@@ -218,6 +266,43 @@ def test_a_card_is_not_written_for_another_run_file(folder, tmp_path):
     with pytest.raises(RunFileError, match="another run file"):
         export(replace(run, text=run.text + "# changed"), tmp_path, is_half=False)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_unfinished_network_is_not_exported(folder, tmp_path, monkeypatch):
+    run = _run(folder, "unfinished", n_epochs=1)
+    train(run)
+    file = run.output_folder / CHECKPOINT
+    state = torch.load(file, weights_only=True)
+    torch.save(state | {"step": 5}, file)
+    with pytest.raises(DataError, match="step 5 of 13"):
+        export(run, tmp_path, is_half=False)
+
+
+def test_a_file_that_is_no_copy_of_its_network_leaves_the_old_one(
+    folder, tmp_path, monkeypatch
+):
+    run = _run(folder, "copied", n_epochs=1)
+    train(run)
+    export(run, tmp_path, is_half=True, n_rows=100)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    assert set(before) == {"discriminator.onnx", "discriminator.json"}
+    monkeypatch.setattr("training.export.LARGEST_PARITY_RATIO", 1e-9)
+    with pytest.raises(DataError, match="differs from the trained one"):
+        export(run, tmp_path, is_half=True, n_rows=100)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_only_layers_are_halved():
+    settings = ModelSettings(width=32, features="physical", baseline="quadratic")
+    network = Network("discriminator", n_inputs=47, n_outputs=27, settings=settings)
+    model = onnx.load_from_string(to_onnx(network.eval(), n_inputs=47, half=True))
+    halved = [
+        tensor.name
+        for tensor in model.graph.initializer
+        if tensor.data_type == onnx.TensorProto.FLOAT16
+    ]
+    assert len(halved) > 20
+    assert all(name.startswith("layers.") for name in halved)
 
 
 def test_an_estimated_eye_is_judged_by_its_light():
