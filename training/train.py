@@ -76,6 +76,9 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
     RunFileError
         The run cannot be done as it stands.
     """
+    done = _finished_log(run)
+    if done:
+        return done
     settings, started_s = run.training, time.perf_counter()
     rank, n_ranks, device = _join()
     torch.manual_seed(run.seed)
@@ -165,6 +168,16 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
     if n_ranks > 1:
         dist.destroy_process_group()
     return entry
+
+
+def _finished_log(run: Run) -> dict:
+    """Return the last entry of a run that is at its end already, or nothing."""
+    file = run.output_folder / CHECKPOINT
+    if not file.exists():
+        return {}
+    _, state = load_checkpoint(file)
+    is_done = state["step"] == state["n_steps"] and state["run"] == run.text
+    return state["log"] if is_done else {}
 
 
 def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:

@@ -96,27 +96,40 @@ def test_the_pace_falls_by_a_factor_per_epoch_and_ends_at_zero():
     assert pace(1.0, **settings) == pytest.approx(0.0)
 
 
-def test_an_interrupted_training_ends_with_the_same_weights(folder, monkeypatch):
-    whole, stopped = _run(folder, "whole"), _run(folder, "stopped")
-    train(whole)
+@pytest.fixture
+def stop_late(monkeypatch):
+    """Train a run up to its 16th step."""
 
     class Stop(Exception):
         pass
 
-    calls = []
+    def stop(run):
+        calls = []
 
-    def stop_late(*arguments, **named):
-        calls.append(1)
-        if len(calls) == 17:
-            raise Stop
-        return pace(*arguments, **named)
+        def pace_and_stop(*arguments, **named):
+            calls.append(1)
+            if len(calls) == 17:
+                raise Stop
+            return pace(*arguments, **named)
 
-    monkeypatch.setattr("training.train.CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("training.train.pace", stop_late)
-    with pytest.raises(Stop):
-        train(stopped)
-    assert load_checkpoint(stopped.output_folder / CHECKPOINT)[1]["step"] == 16
-    monkeypatch.setattr("training.train.pace", pace)
+        with monkeypatch.context() as patch, pytest.raises(Stop):
+            patch.setattr("training.train.CHECKPOINT_SECONDS", 0.0)
+            patch.setattr("training.train.pace", pace_and_stop)
+            train(run)
+        assert load_checkpoint(run.output_folder / CHECKPOINT)[1]["step"] == 16
+
+    return stop
+
+
+def _log(run):
+    lines = (run.output_folder / LOG).read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(folder, stop_late):
+    whole, stopped = _run(folder, "whole"), _run(folder, "stopped")
+    train(whole)
+    stop_late(stopped)
     train(stopped)
     ends = [load_checkpoint(r.output_folder / CHECKPOINT)[0] for r in (whole, stopped)]
     for one, other in zip(*(e.state_dict().values() for e in ends), strict=True):
@@ -125,31 +138,31 @@ def test_an_interrupted_training_ends_with_the_same_weights(folder, monkeypatch)
     for entry in (*logs[0], *logs[1]):
         del entry["seconds"]
     assert logs[0] == logs[1]
-    assert train(whole) == train(whole) != {}
 
 
-def _log(run):
-    lines = (run.output_folder / LOG).read_text().splitlines()
-    return [json.loads(line) for line in lines]
+def test_a_finished_training_is_left_alone(folder):
+    run = _run(folder, "finished")
+    entry = train(run)
+    before = (run.output_folder / CHECKPOINT).read_bytes()
+    assert train(run) == entry != {}
+    assert (run.output_folder / CHECKPOINT).read_bytes() == before
 
 
-def test_what_was_logged_after_a_checkpoint_is_dropped(folder):
+def test_what_was_logged_after_a_checkpoint_is_dropped(folder, stop_late):
     run = _run(folder, "crashed")
+    stop_late(run)
+    with (run.output_folder / LOG).open("a") as log:
+        log.write(json.dumps({"step": 17}) + "\n")
     train(run)
-    file = run.output_folder / LOG
-    whole = file.read_text()
-    file.write_text(whole + json.dumps({"step": 10_000}) + "\n")
-    train(run)
-    assert file.read_text() == whole
+    assert [entry["step"] for entry in _log(run)] == [13, 26]
 
 
-def test_a_training_goes_on_with_as_many_processes(folder, monkeypatch):
-    run = _run(folder, "alone")
-    train(run)
-
+def test_a_training_goes_on_with_as_many_processes(folder, stop_late, monkeypatch):
     def two_processes():
         return 0, 2, torch.device("cpu")
 
+    run = _run(folder, "alone")
+    stop_late(run)
     monkeypatch.setattr("training.train._join", two_processes)
     with pytest.raises(RunFileError, match=r"128 rows a step.*now they are 256"):
         train(run)
