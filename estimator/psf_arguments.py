@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.arrays import broadcast_copy
 from estimator.psf_pupil import ELLIPSE_COLUMNS
 from estimator.zernike import N_TERMS
 
@@ -28,7 +29,7 @@ def checked_positive(name: str, values: ArrayLike, count: int) -> NDArray[np.flo
         )
     if not (np.all(np.isfinite(array)) and np.all(array > 0)):
         raise ValueError(f"{name} {values}: must be positive and finite")
-    return np.ascontiguousarray(np.broadcast_to(array, (count,)))
+    return broadcast_copy(array, (count,))
 
 
 def checked_choice(name: str, value: str, allowed) -> None:
@@ -52,9 +53,7 @@ def checked_scale(
             ) from None
         if not (np.all(np.isfinite(pitch)) and np.all(pitch > 0)):
             raise ValueError(f"pixel_pitch_mrad {pixel_pitch_mrad}: must be positive")
-        return np.ascontiguousarray(
-            np.broadcast_to(np.diag(1.0 / pitch), (count, 2, 2))
-        )
+        return broadcast_copy(np.diag(1.0 / pitch), (count, 2, 2))
     array = np.asarray(pixel_from_mrad, dtype=np.float64)
     if array.shape not in ((2, 2), (count, 2, 2)):
         raise ValueError(
@@ -67,7 +66,7 @@ def checked_scale(
             "pixel_from_mrad must be finite with a positive determinant (x right, y "
             f"up on both sides); the least is {np.min(determinant):.3g}"
         )
-    return np.ascontiguousarray(np.broadcast_to(array, (count, 2, 2)))
+    return broadcast_copy(array, (count, 2, 2))
 
 
 def checked_ellipse(
@@ -86,7 +85,7 @@ def checked_ellipse(
             f"pupil_ellipse has shape {array.shape}: must be ({count}, 5), centre x, "
             "centre y, semi-major, semi-minor in mm and the angle in rad"
         )
-    array = np.ascontiguousarray(np.broadcast_to(array, (count, ELLIPSE_COLUMNS)))
+    array = broadcast_copy(array, (count, ELLIPSE_COLUMNS))
     if not np.all(np.isfinite(array)) or not np.all(array[:, 2:4] > 0.0):
         raise ValueError("pupil_ellipse: semi-axes must be positive, all finite")
     angle = 2.0 * math.pi * np.arange(64) / 64

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator import wavefront_bundle as bundle
+from estimator.arrays import broadcast_copy
 from estimator.paraxial import entrance_pupil_mm
 from estimator.raytrace import STATUS_WORDS, RayStatus
 from estimator.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
@@ -320,7 +321,7 @@ def eyes_aberrations(
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes, n_rows = packed.shape[:2]
-    indices = np.ascontiguousarray(np.broadcast_to(indices, (n_eyes, n_rows)))
+    indices = broadcast_copy(indices, (n_eyes, n_rows))
     stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
     fields_deg = np.empty((n_eyes, 2))
     fields_deg[:, 0], fields_deg[:, 1] = h_deg, v_deg
@@ -378,7 +379,7 @@ def on_axis_zernike(
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes, n_rows = packed.shape[:2]
-    indices = np.ascontiguousarray(np.broadcast_to(indices, (n_eyes, n_rows)))
+    indices = broadcast_copy(indices, (n_eyes, n_rows))
     zernike_um, status = np.empty((n_eyes, N_TERMS)), np.empty(n_eyes, np.int64)
     field_rad = (math.radians(h_deg), math.radians(v_deg))
     radii_mm = np.empty(n_eyes)
