@@ -15,6 +15,7 @@ from filter_service.service.config import ServiceConfig
 from filter_service.service.worker_handle import WorkerHandle
 
 BUILD = "filter_service.service.profile_build:build"
+WARM_UP = "filter_service.service.worker_warm_up:build_a_few"
 
 
 def serve(
@@ -64,7 +65,9 @@ def _announce(config: ServiceConfig, endpoint: str) -> None:
 def run(config: ServiceConfig) -> None:
     """Serve with the real renderer and the real PSFs."""
     logging.basicConfig(level=logging.INFO, format="ocufilter: %(message)s")
-    worker = WorkerHandle(BUILD, config.build_niceness, config.cancel_grace_s)
+    worker = WorkerHandle(
+        BUILD, config.build_niceness, config.cancel_grace_s, warm_up=WARM_UP
+    )
     worker.start()
     try:
         _run_beside(worker, config)

@@ -27,6 +27,7 @@ from multiprocessing.reduction import send_handle
 from typing import Any
 
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
+from filter_service.service.head_start import HeadStart
 from filter_service.wire.shared_buffers import write_shared
 
 PROGRESS_INTERVAL_S = 0.1
@@ -38,37 +39,48 @@ class ParentGone(Exception):
     """The service has ended; so does the worker."""
 
 
-def worker_main(pipe: Connection, build_name: str, niceness: int) -> None:
+def worker_main(
+    pipe: Connection, build_name: str, niceness: int, warm_up_name: str = ""
+) -> None:
     """Build what is asked for until the pipe closes; the process's entry point."""
     # Ctrl-C goes to the whole group; the service ends the worker in its own time.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.basicConfig(level=logging.INFO, format="ocufilter worker: %(message)s")
     try:
-        module, _, function = build_name.partition(":")
-        build = getattr(importlib.import_module(module), function)
+        build = _named(build_name)
+        await_warm = HeadStart(_named(warm_up_name)).wait if warm_up_name else None
         pipe.send(("ready",))
         while True:
             message = pipe.recv()
             if message[0] == "build":
-                _build_one(pipe, build, niceness, ticket=message[1], job=message[2])
+                ticket, job = message[1:]
+                _build_one(pipe, build, niceness, await_warm, ticket=ticket, job=job)
     except (EOFError, OSError, ParentGone):
         return
+
+
+def _named(name: str) -> Callable:
+    module, _, function = name.partition(":")
+    return getattr(importlib.import_module(module), function)
 
 
 def _build_one(
     pipe: Connection,
     build: Callable[..., Iterator[Any]],
     niceness: int,
+    await_warm: Callable[..., None] | None,
     *,
     ticket: int,
     job: object,
 ) -> None:
+    asked = {
+        "progress": _throttled_progress(pipe, ticket),
+        "cancelled": lambda: _is_cancelled(pipe, ticket),
+    }
     try:
-        stores = build(
-            job,
-            progress=_throttled_progress(pipe, ticket),
-            cancelled=lambda: _is_cancelled(pipe, ticket),
-        )
+        if await_warm is not None:
+            await_warm(**asked)
+        stores = build(job, **asked)
         # Somebody waits for the first; what follows makes room for the frames.
         _send_result(pipe, ticket, next(stores))
         _run_nicely(niceness, lambda: _send_all(pipe, ticket, stores))

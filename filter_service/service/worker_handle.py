@@ -93,11 +93,14 @@ class WorkerHandle:
         Of what a build does after the first store that it yields.
     cancel_grace_s : float
         A cancelled build that goes on longer is ended with its process.
+    warm_up : str
+        ``module:function`` of what the process does until the first job comes.
     """
 
     build: str
     niceness: int = 10
     cancel_grace_s: float = 3.0
+    warm_up: str = ""
     n_restarts: int = 0
     _queue: deque[tuple[int, Any]] = field(default_factory=deque)
     _next_ticket: int = 1
@@ -117,7 +120,7 @@ class WorkerHandle:
         self._pipe, theirs = spawn.Pipe()
         self._process = spawn.Process(
             target=worker_main,
-            args=(theirs, self.build, self.niceness),
+            args=(theirs, self.build, self.niceness, self.warm_up),
             name="ocufilter-worker",
             daemon=True,
         )

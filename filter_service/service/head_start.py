@@ -1,0 +1,61 @@
+"""Work that a process begins before somebody asks for what needs it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from filter_service.errors import BuildCancelled
+
+COMPILING_STAGE = "compiling"
+QUIET_S = 1.0
+"""Reading what is compiled already takes less: nothing is said of it."""
+
+POLL_S = 0.1
+
+log = logging.getLogger("ocufilter.worker")
+
+
+class HeadStart:
+    """A call that runs in a thread until a build needs what it prepares.
+
+    It fails quietly but for a line of the log: a build then does what is left.
+    """
+
+    def __init__(self, work: Callable[[], None]):
+        self._work = work
+        self._done = threading.Event()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        late = threading.Timer(QUIET_S, self._say_why)
+        late.daemon = True
+        late.start()
+        try:
+            self._work()
+        except Exception:
+            log.exception("could not prepare for builds")
+        finally:
+            late.cancel()
+            self._done.set()
+
+    @staticmethod
+    def _say_why() -> None:
+        log.info("compiling, which takes up to a minute; it is kept for the next time")
+
+    def wait(
+        self, progress: Callable[[float, str], None], cancelled: Callable[[], bool]
+    ) -> None:
+        """Return when it is done; says so if that takes long.
+
+        Raises
+        ------
+        BuildCancelled
+        """
+        if self._done.wait(QUIET_S):
+            return
+        while not self._done.wait(POLL_S):
+            if cancelled():
+                raise BuildCancelled("a newer profile took over")
+            progress(0.0, COMPILING_STAGE)

@@ -1,0 +1,48 @@
+"""What the worker compiles ahead is all that the builds of profiles need."""
+
+import subprocess
+import sys
+
+SCRIPT = """
+import sys
+from dataclasses import replace
+from numba.core.registry import CPUDispatcher
+from filter_service.messages import Camera, ProfileSettings
+from filter_service.service.profile_build import build
+from filter_service.service.worker_warm_up import FEW_PSFS, build_a_few
+
+def compiled():
+    modules = [m for name, m in sys.modules.items()
+               if name.startswith(("estimator", "filter_service"))]
+    found = {id(f): f for m in modules for f in vars(m).values()
+             if isinstance(f, CPUDispatcher)}
+    return {(f.__module__, f.__name__, str(s)) for f in found.values()
+            for s in f.signatures}
+
+build_a_few()
+before = compiled()
+assert len(before) > 8, before
+camera = Camera(160, 90, (-0.5, 0.5, 0.28, -0.28))
+for sphere_dpt in (0.0, -6.0):
+    body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "cylinder_dpt": -1.0,
+            "axis_deg": 30.0}
+    for settings in (ProfileSettings(tolerance="loose"),
+                     ProfileSettings(mode="on-axis", eye_model="wavefront")):
+        job = replace(FEW_PSFS, body=body, settings=settings, camera=camera)
+        for _ in build(job, progress=lambda *_: None, cancelled=lambda: False):
+            pass
+for missed in sorted(compiled() - before):
+    print(*missed)
+"""
+
+
+def test_builds_after_the_warm_up_compile_nothing():
+    ran = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == ""

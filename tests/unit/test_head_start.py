@@ -1,0 +1,56 @@
+"""What the worker prepares ahead of its first build: awaited, said, done without."""
+
+import threading
+
+import pytest
+
+from filter_service.errors import BuildCancelled
+from filter_service.service import head_start
+from filter_service.service.head_start import COMPILING_STAGE, HeadStart
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    monkeypatch.setattr(head_start, "QUIET_S", 0.02)
+    monkeypatch.setattr(head_start, "POLL_S", 0.01)
+
+
+@pytest.fixture
+def release():
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def test_a_build_waits_and_says_why(release, caplog):
+    caplog.set_level("INFO")
+    start, said = HeadStart(release.wait), []
+
+    def progress(fraction, stage):
+        said.append((fraction, stage))
+        release.set()
+
+    start.wait(progress, lambda: False)
+    assert said[0] == (0.0, COMPILING_STAGE)
+    assert "kept for the next time" in caplog.text
+
+
+def test_what_is_there_already_is_not_spoken_of(caplog):
+    caplog.set_level("INFO")
+    said = []
+    HeadStart(lambda: None).wait(lambda *of: said.append(of), lambda: False)
+    assert not said and not caplog.text
+
+
+def test_a_cancelled_build_does_not_wait(release):
+    with pytest.raises(BuildCancelled):
+        HeadStart(release.wait).wait(lambda *_: None, lambda: True)
+
+
+def test_a_head_start_that_fails_stops_no_build(caplog):
+    def fail():
+        raise OSError("disk full")
+
+    HeadStart(fail).wait(lambda *_: None, lambda: False)
+    assert "could not prepare for builds" in caplog.text
+    assert "disk full" in caplog.text
