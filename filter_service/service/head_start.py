@@ -14,6 +14,8 @@ QUIET_S = 1.0
 
 POLL_S = 0.1
 
+Progress = Callable[[float, str], None]
+
 log = logging.getLogger("ocufilter.worker")
 
 
@@ -44,9 +46,19 @@ class HeadStart:
     def _say_why() -> None:
         log.info("compiling, which takes up to a minute; it is kept for the next time")
 
-    def wait(
-        self, progress: Callable[[float, str], None], cancelled: Callable[[], bool]
-    ) -> None:
+    def before(self, progress: Progress, cancelled: Callable[[], bool]) -> Progress:
+        """Return a ``progress`` that waits for this call when it is first called.
+
+        What a build reads from the disk has no progress and waits for nothing.
+        """
+
+        def waited(fraction: float, stage: str) -> None:
+            self.wait(progress, cancelled)
+            progress(fraction, stage)
+
+        return waited
+
+    def wait(self, progress: Progress, cancelled: Callable[[], bool]) -> None:
         """Return when it is done; says so if that takes long.
 
         Raises

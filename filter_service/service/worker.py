@@ -31,6 +31,8 @@ from filter_service.service.head_start import HeadStart
 from filter_service.wire.shared_buffers import write_shared
 
 PROGRESS_INTERVAL_S = 0.1
+IDLE_S = 3.0
+"""Without a job for so long, the worker prepares for those that will come."""
 
 log = logging.getLogger("ocufilter.worker")
 
@@ -47,14 +49,17 @@ def worker_main(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.basicConfig(level=logging.INFO, format="ocufilter worker: %(message)s")
     try:
-        build = _named(build_name)
-        await_warm = HeadStart(_named(warm_up_name)).wait if warm_up_name else None
+        build, head_start = _named(build_name), None
         pipe.send(("ready",))
+        # A client that knows a restarted service comes at once, and maybe for a store
+        # from the disk: it shall not share the processor with what it does not need.
+        if warm_up_name and not pipe.poll(IDLE_S):
+            head_start = HeadStart(_named(warm_up_name))
         while True:
             message = pipe.recv()
             if message[0] == "build":
                 ticket, job = message[1:]
-                _build_one(pipe, build, niceness, await_warm, ticket=ticket, job=job)
+                _build_one(pipe, build, niceness, head_start, ticket=ticket, job=job)
     except (EOFError, OSError, ParentGone):
         return
 
@@ -68,19 +73,20 @@ def _build_one(
     pipe: Connection,
     build: Callable[..., Iterator[Any]],
     niceness: int,
-    await_warm: Callable[..., None] | None,
+    head_start: HeadStart | None,
     *,
     ticket: int,
     job: object,
 ) -> None:
-    asked = {
-        "progress": _throttled_progress(pipe, ticket),
-        "cancelled": lambda: _is_cancelled(pipe, ticket),
-    }
+    progress = _throttled_progress(pipe, ticket)
+
+    def cancelled() -> bool:
+        return _is_cancelled(pipe, ticket)
+
+    if head_start is not None:
+        progress = head_start.before(progress, cancelled)
     try:
-        if await_warm is not None:
-            await_warm(**asked)
-        stores = build(job, **asked)
+        stores = build(job, progress=progress, cancelled=cancelled)
         # Somebody waits for the first; what follows makes room for the frames.
         _send_result(pipe, ticket, next(stores))
         _run_nicely(niceness, lambda: _send_all(pipe, ticket, stores))

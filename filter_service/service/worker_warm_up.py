@@ -1,7 +1,7 @@
 """Has the loops that trace and integrate compiled before the worker's first build.
 
 numba compiles them at their first call on a machine and keeps them on disk: most of a
-minute of one core, then 0.5 s to read them.  Both are done while the worker would wait.
+minute of one core, then 0.5 s to read them.  Both are done while the worker is idle.
 """
 
 from filter_service.messages import Camera, ProfileSettings

@@ -35,6 +35,16 @@ def test_a_build_waits_and_says_why(release, caplog):
     assert "kept for the next time" in caplog.text
 
 
+def test_what_takes_no_progress_waits_for_nothing(release):
+    said = []
+    progress = HeadStart(release.wait).before(lambda *of: said.append(of), lambda: 0)
+    assert not said
+    release.set()
+    progress(0.5, "eye")
+    progress(0.6, "psfs")
+    assert said == [(0.5, "eye"), (0.6, "psfs")]
+
+
 def test_what_is_there_already_is_not_spoken_of(caplog):
     caplog.set_level("INFO")
     said = []
