@@ -23,7 +23,8 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	mkdir -p $(RESULTS) out
 	for bench in $(BENCHES); do \
 	    $(PYTHON) -m filter_service bench $$bench --json > out/$$bench.json && \
-	    mv out/$$bench.json $(RESULTS)/$$bench.json || exit 1; \
+	    $(PYTHON) -m json.tool --indent 1 out/$$bench.json $(RESULTS)/$$bench.json \
+	    || exit 1; \
 	done
 	$(PYTHON) -m tests.benchmarks.bench_wavefront
 
