@@ -5,89 +5,32 @@ import json
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from filter_service import errors, messages
 from filter_service.messages import (
     LINEAR,
     LINEAR16,
     SRGB8,
-    Camera,
-    Frame,
     Limits,
     ProfileRequest,
-    ProfileSettings,
     ViewHeader,
     ViewImages,
     decode_reply,
     decode_request,
     encode,
 )
-
-CAMERA = Camera(4, 3, (-1.0, 1.25, 0.75, -0.5))
-
-
-def as_bytes(parts):
-    return [bytes(memoryview(part)) for part in parts]
-
-
-def view_images(color_dtype=np.uint8):
-    color = np.arange(36).reshape(3, 4, 3).astype(color_dtype)
-    return ViewImages(color, np.linspace(0.5, 6, 12, dtype=np.float32).reshape(3, 4))
-
-
-def frame(**changes):
-    fields = {
-        "frame_id": 7,
-        "views": (ViewHeader(CAMERA),),
-        "pupil_diameter_mm": 4.0,
-        "focus_dpt": 0.5,
-        "images": (view_images(),),
-    }
-    return Frame(**fields | changes)
-
-
-def changed_header(parts, **changes):
-    """Return the parts with header fields replaced; None removes a field."""
-    header = msgpack.unpackb(parts[0]) | changes
-    header = {key: value for key, value in header.items() if value is not None}
-    return [msgpack.packb(header), *as_bytes(parts[1:])]
-
-
-def frame_parts(**changes):
-    return changed_header(encode(frame()), **changes)
-
-
-def view_map(**changes):
-    return ViewHeader(CAMERA).fields() | changes
-
-
-REQUESTS = [
-    messages.Hello("a client"),
-    messages.Ping(12.5),
-    messages.Bye(),
-    frame(),
-    frame(gaze_deg=(12.5, -60.0)),
-    ProfileRequest(
-        3,
-        {"kind": "preset"},
-        ProfileSettings(
-            age_years=40.0, gaze_deg=(-5.0, 2.0), gaze_range_deg=(10.0, 0.0)
-        ),
-        (CAMERA, CAMERA),
-    ),
-]
-REPLIES = [
-    messages.Welcome(1, {"name": "ocufilter"}, Limits(), 2, ("tcp",)),
-    messages.Accepted(1, 2, True),
-    messages.Progress(1, 2, "psfs", 0.5),
-    messages.Ready(1, 2, 10.5, 99, 1.5, (1.0, 1.1), ("a note",)),
-    messages.Dropped(4, "superseded"),
-    messages.ErrorReply("bad_message", "text", "views[0]", "1 to 2", frame_id=3),
-    messages.Pong(1.0, 2.0, 50.0, 1, 2, 3, False),
-    messages.Alive(),
-]
+from tests.unit.message_parts import (
+    CAMERA,
+    REPLIES,
+    REQUESTS,
+    as_bytes,
+    changed_header,
+    frame,
+    frame_parts,
+    profile_parts,
+    view_images,
+    view_map,
+)
 
 
 @pytest.mark.parametrize("message", REQUESTS, ids=lambda m: m.type_name)
@@ -371,10 +314,6 @@ def test_no_parts_at_all_are_refused():
     assert refusal([]).field == "header"
 
 
-def profile_parts(body):
-    return [encode(ProfileRequest(1, {}))[0], body]
-
-
 def test_a_profile_body_may_be_json_or_msgpack():
     body = {"kind": "zernike", "zernike_um": {"2,0": 5.41}, "eye_side": "OD"}
     for encoded in (json.dumps(body).encode(), b" \n" + json.dumps(body).encode()):
@@ -435,70 +374,3 @@ def test_ids_of_a_broken_message_are_still_found():
     assert messages.peek_ids(frame_parts(frame_id="7")) == (None, None)
     assert messages.peek_ids([b"\xc1"]) == (None, None)
     assert messages.peek_ids([]) == (None, None)
-
-
-json_like = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**63), 2**64 - 1)
-    | st.floats()
-    | st.text(max_size=20)
-    | st.binary(max_size=20),
-    lambda inner: (
-        st.lists(inner, max_size=5)
-        | st.dictionaries(st.text(max_size=8), inner, max_size=5)
-    ),
-    max_leaves=12,
-)
-field_names = st.sampled_from(
-    ["type", "version", *sorted({key for m in REQUESTS for key in m.fields()})]
-)
-
-
-def decodes_or_is_refused(parts):
-    """Decode; only the protocol's own errors may come out, and each says where."""
-    try:
-        decode_request(parts)
-    except errors.ProtocolError as error:
-        assert error.field
-        str(error)
-
-
-@settings(max_examples=400, deadline=None)
-@given(st.lists(st.binary(max_size=200), max_size=4))
-def test_random_bytes_never_do_more_than_be_refused(parts):
-    decodes_or_is_refused(parts)
-
-
-@settings(max_examples=600, deadline=None)
-@given(st.sampled_from(REQUESTS), field_names, json_like, st.data())
-def test_a_message_with_one_strange_field_never_does_more_than_be_refused(
-    message, name, value, data
-):
-    parts = as_bytes(encode(message))
-    header = msgpack.unpackb(parts[0])
-    target = header
-    inner = [v for v in header.values() if isinstance(v, dict) and v]
-    inner += [v for v in header.get("views", []) if isinstance(v, dict)]
-    if inner and data.draw(st.booleans()):
-        target = data.draw(st.sampled_from(inner))
-        name = data.draw(st.sampled_from(sorted(target)))
-    target[name] = value
-    decodes_or_is_refused([msgpack.packb(header), *parts[1:]])
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.sampled_from(REQUESTS), st.data())
-def test_a_message_with_one_strange_byte_never_does_more_than_be_refused(message, data):
-    parts = as_bytes(encode(message))
-    index = data.draw(st.integers(0, len(parts) - 1))
-    place = data.draw(st.integers(0, max(0, len(parts[index]) - 1)))
-    byte = data.draw(st.binary(max_size=2))
-    parts[index] = parts[index][:place] + byte + parts[index][place + 1 :]
-    decodes_or_is_refused(parts)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.dictionaries(st.text(max_size=8), json_like, max_size=4))
-def test_strange_profiles_never_do_more_than_be_refused(body):
-    decodes_or_is_refused(profile_parts(msgpack.packb(body)))
