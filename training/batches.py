@@ -34,7 +34,8 @@ FRESH_SEED = 7919
 """Added to the run's seed, so that fresh rows are never those of the shards."""
 
 FRESH_STEPS = 8
-"""So many steps' rows are traced at once: a GPU takes as long for one step's."""
+"""So many steps' rows are traced at once: some ten thousand operations a call, however
+many rows.  On a GPU, where nobody has measured it, launching them should cost most."""
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,15 @@ def make_run(
 
 
 def trained(run: Run) -> Run:
-    """Return the run, trained where that was not done, on data made if missing."""
+    """Return the run, trained where that was not done, on data made if missing.
+
+    Raises
+    ------
+    DataError
+        The folder holds data of another recipe.
+    RunFileError
+        The checkpoint there is of another run.
+    """
     if not (run.data_folder / MANIFEST).exists():
         generate(run.recipe, run.data_folder)
     train(run)

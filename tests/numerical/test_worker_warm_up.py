@@ -26,8 +26,11 @@ camera = Camera(160, 90, (-0.5, 0.5, 0.28, -0.28))
 for sphere_dpt in (0.0, -6.0):
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "cylinder_dpt": -1.0,
             "axis_deg": 30.0}
-    for settings in (ProfileSettings(tolerance="loose"),
-                     ProfileSettings(mode="on-axis", eye_model="wavefront")):
+    for settings in (dict(), dict(mode="on-axis", eye_model="wavefront"),
+                     dict(mode="quality", lateral_color=True), dict(diffraction=False),
+                     dict(chromatic=False), dict(accuracy="fast"),
+                     dict(gaze_range_deg=(5.0, 5.0))):
+        settings = ProfileSettings(**dict(tolerance="loose") | settings)
         job = replace(FEW_PSFS, body=body, settings=settings, camera=camera)
         for _ in build(job, progress=lambda *_: None, cancelled=lambda: False):
             pass
