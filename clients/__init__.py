@@ -1,1 +1,18 @@
-"""What users copy: the client library and programs that use it."""
+"""Programs to copy: the client library, scenes, a demo, benchmarks.
+
+Importing this loads nothing but names.
+
+    filter_client    `FilterClient`: the library
+    link             its side of the protocol
+    connection       its socket
+    service_process  a service of one's own
+    hello            the smallest client
+    pyrender_stream  a scene through a running service
+    demo             two scenes through six eyes
+    latency          how long a frame takes
+    scenes/          two scenes
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

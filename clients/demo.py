@@ -25,7 +25,7 @@ from clients.demo_eyes import EYES
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.pyrender_stream import parse_size, path_settings
 from clients.scene_renderer import SceneFrame, scene_frames
-from clients.scenes.scene import build_scene
+from clients.scenes.catalogue import build_scene
 from clients.service_process import ServiceProcess
 from clients.sheet import (
     Cell,

@@ -1,9 +1,8 @@
 """The client library: connect, send a profile, stream RGB-D frames, get them filtered.
 
     with FilterClient("tcp://127.0.0.1:5577") as client:
-        client.set_profile({"kind": "preset", "name": "keratoconus"})
-        view = RgbdView(color, depth_m, tangents_from_fov(60.0, 640, 360))
-        reply = client.filter(view, pupil_diameter_mm=4.0, focus_dpt=0.0)
+        client.set_profile("keratoconus", views=[camera])
+        reply = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
 
 `filter` sends one frame and waits for it.  `submit` and `poll` are for live streams:
 at most ``max_in_flight`` frames are on their way, and of those that wait at the client
@@ -20,29 +19,33 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clients.connection import SendBufferPool
 from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
-from clients.rgbd_view import RgbdView, tangents_from_fov
+from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
 from filter_service.errors import FilterError
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
-    LINEAR,
-    LINEAR16,
-    SRGB8,
+    FORMATS,
     Accepted,
     Camera,
     Dropped,
     ErrorReply,
+    FilterSettings,
     Frame,
+    FrameOptions,
     Ping,
     Pong,
     ProfileRequest,
-    ProfileSettings,
     Progress,
     Ready,
+    ViewHeader,
     ViewImages,
     Welcome,
     encode,
+    tangents_from_fov,
 )
 
 __all__ = [
@@ -53,7 +56,8 @@ __all__ = [
     "tangents_from_fov",
 ]
 
-OUTPUTS = {"srgb8": SRGB8, "linear": LINEAR, "linear16": LINEAR16}
+
+DEFAULT_SETTINGS = FilterSettings()
 
 
 class FilterClient:
@@ -88,6 +92,7 @@ class FilterClient:
         self.timeout_s = timeout_s
         self._link = ServiceLink(endpoint, max_in_flight, client_name)
         self._pool = SendBufferPool(timeout_s)
+        self._camera: Camera | None = None
         self._next_frame_id = 0
         self._next_profile_id = 0
 
@@ -132,9 +137,9 @@ class FilterClient:
 
     def set_profile(
         self,
-        body: Mapping[str, Any],
+        body: Mapping[str, Any] | str,
         *,
-        settings: Mapping[str, Any] | None = None,
+        settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
         views: Sequence[Camera | RgbdView] = (),
         wait: bool | str = True,
         on_progress: Callable[[Progress], None] | None = None,
@@ -144,10 +149,11 @@ class FilterClient:
 
         Parameters
         ----------
-        body : mapping
-            The profile, as in ``{"kind": "preset", "name": "myopia"}``.
-        settings : mapping, optional
-            Fields of `ProfileSettings` that differ from the defaults.
+        body : mapping or str
+            The profile, as in ``{"kind": "prescription", "sphere_dpt": -6}``, or a
+            preset's name.
+        settings : FilterSettings or mapping, optional
+            Or its fields that differ from the defaults.
         views : sequence, optional
             The cameras to prepare for.  Without them the service prepares for those
             of the last frame; before any frame there is nothing to prepare, and
@@ -167,12 +173,12 @@ class FilterClient:
         if wait not in (True, False, "first"):
             raise ValueError(f"wait is {wait!r}; allowed: True, False or 'first'")
         cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
-        request = ProfileRequest(
-            self._next_profile_id,
-            dict(body),
-            ProfileSettings(**(settings or {})),
-            cameras,
-        )
+        if isinstance(body, str):
+            body = {"kind": "preset", "name": body}
+        if not isinstance(settings, FilterSettings):
+            settings = FilterSettings(**settings)
+        request = ProfileRequest(self._next_profile_id, dict(body), settings, cameras)
+        self._camera = next(iter(cameras), self._camera)
         parts = encode(request)  # before any state changes: it may refuse the body
         self.hello()
         self._next_profile_id += 1
@@ -221,13 +227,14 @@ class FilterClient:
 
     def filter(
         self,
-        views: RgbdView | Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[np.float32] | None = None,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
-        output: str = "srgb8",
-        accumulation: str = "coverage",
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
         merge: bool = True,
         timeout_s: float | None = None,
     ) -> FilteredFrame:
@@ -244,7 +251,8 @@ class FilterClient:
         deadline_s = time.monotonic() + limit_s
         while True:
             frame_id = self.submit(
-                views,
+                color,
+                depth_m,
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
                 gaze_deg=gaze_deg,
@@ -289,13 +297,14 @@ class FilterClient:
 
     def submit(
         self,
-        views: RgbdView | Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[np.float32] | None = None,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
-        output: str = "srgb8",
-        accumulation: str = "coverage",
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
         merge: bool = True,
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
@@ -306,15 +315,20 @@ class FilterClient:
 
         Parameters
         ----------
+        color : (height, width, 3) array, RgbdView, or several views
+            uint8 sRGB, or float32 or float16 linear light.
+        depth_m : (height, width) float32, optional
+            View-space z in metres, beside an array of colour, which is then seen by the
+            first camera of the profile; else part of the view.
         gaze_deg : (h, v), optional
             Where the eye looks in the image, to the right and up from the camera's
             axis; as in the profile's settings where it is None.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
         """
-        if output not in OUTPUTS:
-            raise ValueError(f"output is {output!r}; allowed: {', '.join(OUTPUTS)}")
-        items = (views,) if isinstance(views, RgbdView) else tuple(views)
+        if output not in FORMATS:
+            raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
+        items = as_views(color, depth_m, self._camera)
         self._check_limits(items)
         buffers, images = [], []
         for item in items:
@@ -323,13 +337,12 @@ class FilterClient:
             images.append(ViewImages(*(copy for _, copy in copies)))
         frame = Frame(
             frame_id=self._next_frame_id,
-            views=tuple(item.header for item in items),
+            views=tuple(ViewHeader.describing(item) for item in items),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else tuple(map(float, gaze_deg)),
-            output=OUTPUTS[output],
-            accumulation=accumulation,
-            merge=merge,
+            output=FORMATS[output],
+            options=FrameOptions(accumulation, merge),
             images=tuple(images),
         )
         self._next_frame_id += 1

@@ -31,8 +31,8 @@ from clients.latency_report import (
     save_plot,
     summary,
 )
-from clients.rgbd_view import tangents_from_fov
 from clients.service_process import ServiceProcess
+from filter_service import tangents_from_fov
 from filter_service.errors import FilterError
 from filter_service.messages import Dropped, ErrorReply
 

@@ -28,8 +28,9 @@ from clients.scene_renderer import (
     frame_at,
     scene_frames,
 )
+from clients.scenes.catalogue import SCENE_BUILDERS, build_scene
 from clients.scenes.paths import PATHS, path_moments
-from clients.scenes.scene import Scene, build_scene, scene_builders
+from clients.scenes.scene import Scene
 from clients.streaming import FrameLog, view_of
 from clients.window import LiveWindow, NoDisplay
 from filter_service.errors import FilterError, ServiceTimeout
@@ -179,9 +180,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         prog="python -m clients.pyrender_stream", description=__doc__.split("\n")[0]
     )
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
-    parser.add_argument(
-        "--scene", default="courtyard", choices=sorted(scene_builders())
-    )
+    parser.add_argument("--scene", default="courtyard", choices=sorted(SCENE_BUILDERS))
     parser.add_argument(
         "--profile", default="myopia", help="a preset's name or a JSON file"
     )

@@ -185,7 +185,7 @@ def change_eye(
     Parameters
     ----------
     body : profile, as ``{"kind": "preset", "name": "myopia"}``
-    settings : fields of `ProfileSettings`
+    settings : fields of `FilterSettings`
     frames : sent round and round meanwhile; the first one's camera is prepared for
     has_eye : whether an earlier eye serves them
     on_progress : called with (fraction 0..1, stage)

@@ -1,1 +1,19 @@
-"""Optics of the eye: profiles, wavefronts and float64 point-spread functions."""
+"""The eye: what is known of it, what it is like, and what light it lets through.
+
+From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `compute_psfs`.
+
+    optics/        light and surfaces
+    wavefront/     wavefronts of surfaces, traced
+    psf/           point-spread functions of wavefronts
+    eye/           the 45-parameter model
+    profiles/      what is known of one eye
+    networks/      the trained networks
+    estimate/      from a measurement to the eye
+    field/         an eye over its visual field
+    threads        how many threads this machine gives us
+    machine_speed  how fast one of its cores is
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

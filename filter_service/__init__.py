@@ -1,1 +1,27 @@
-"""The running filter service; this file imports nothing, so clients never load GL."""
+"""The filter: pictures through a person's eye, in process or as a service.
+
+Importing this loads nothing but names: clients stay light.
+
+    settings         every setting of a filter, once
+    camera           a pinhole, and which cameras share PSFs
+    rgbd_view        colour, depth and camera of one view
+    messages         the wire protocol's types (PROTOCOL.md)
+    errors           the exceptions
+    checked          values against annotated types
+    constants        numbers that Python and GLSL share
+    threads          numba's thread layer
+    one_blas_thread  numpy on one thread
+    gl/              the OpenGL context and its shaders
+    planning/        which PSFs an eye needs for a stated error
+    psfs/            the PSF cache: built, packed, kept
+    rendering/       from a frame and the cache to the picture
+    building/        the worker process that makes caches
+    filtering/       `EyeFilter`: streams of frames through eyes
+    wire/            messages, field by field
+    service/         sockets, sessions and the loop
+    commands/        the command line
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,8 @@
 
     FilterError
     ├── ProtocolError            the message itself is wrong
-    │   ├── BadMessage           a part or a field is missing, malformed or out of range
+    │   ├── BadMessage           a part, a field or an argument is missing, malformed or
+    │   │                        out of range; a ValueError, too
     │   ├── UnknownType          the header names a message type nobody knows
     │   ├── VersionMismatch      the two sides speak different protocol versions
     │   └── CreditExceeded       more unanswered frames than the service granted
@@ -67,8 +68,8 @@ class ProtocolError(FilterError):
     code = "protocol_error"
 
 
-class BadMessage(ProtocolError):
-    """A part or a field is missing, malformed or out of range."""
+class BadMessage(ProtocolError, ValueError):
+    """A part, a field or an argument is missing, malformed or out of range."""
 
     code = "bad_message"
 

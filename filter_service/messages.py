@@ -1,9 +1,8 @@
 """The wire types of protocol version 1, and how they become message parts and back.
 
-This is the only module (with `errors`) that clients import.  The types live in
-`wire.requests`, `wire.profiles` and `wire.replies`, images and cameras in
-`wire.images`, the checks of single fields in `wire.checks`.  PROTOCOL.md is the
-authority.
+The types live in `wire.requests` and `wire.replies`, images in `wire.images`; settings
+and camera belong to the filter and are here for those who only speak the protocol.
+PROTOCOL.md is the authority; `wire.schema` writes the headers as JSON Schema.
 
 A message is a list of parts: ``[header, part, part, ...]``.  Nothing here touches a
 socket, and nothing is copied: decoded images are read-only views of the parts.
@@ -11,64 +10,58 @@ socket, and nothing is copied: decoded images are read-only views of the parts.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgpack
 
+from filter_service.camera import Camera, tangents_from_fov
+from filter_service.checked import show
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
-from filter_service.wire.checks import (
-    MAX_HEADER_BYTES,
-    MAX_ID,
-    show,
-    unpack_header,
-)
+from filter_service.settings import FilterSettings
 from filter_service.wire.images import (
-    DEPTH_KINDS,
+    FORMATS,
     LINEAR,
     LINEAR16,
     SRGB8,
-    Camera,
     ImageFormat,
-    Limits,
-    Part,
     ViewHeader,
     ViewImages,
 )
-from filter_service.wire.profiles import (
-    Accepted,
-    ProfileRequest,
-    ProfileSettings,
-    Progress,
-    Ready,
-)
+from filter_service.wire.message import MAX_ID, Limits, Message, Part
 from filter_service.wire.replies import (
+    DROP_REASONS,
+    Accepted,
     Alive,
     Dropped,
     ErrorReply,
     Pong,
+    Progress,
+    Ready,
     Result,
     ResultView,
     Welcome,
-    check_output,
 )
 from filter_service.wire.requests import (
-    ACCUMULATIONS,
     Bye,
     Frame,
+    FrameOptions,
     Hello,
     Ping,
+    ProfileRequest,
 )
+from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
 __all__ = [
-    "ACCUMULATIONS",
     "DEFAULT_ENDPOINT",
-    "DEPTH_KINDS",
+    "DROP_REASONS",
+    "FORMATS",
     "LINEAR",
     "LINEAR16",
     "MAX_HEADER_BYTES",
     "PROTOCOL_VERSION",
+    "REPLIES",
+    "REQUESTS",
     "SRGB8",
     "Accepted",
     "Alive",
@@ -76,7 +69,9 @@ __all__ = [
     "Camera",
     "Dropped",
     "ErrorReply",
+    "FilterSettings",
     "Frame",
+    "FrameOptions",
     "Hello",
     "ImageFormat",
     "Limits",
@@ -84,7 +79,6 @@ __all__ = [
     "Ping",
     "Pong",
     "ProfileRequest",
-    "ProfileSettings",
     "Progress",
     "Ready",
     "Reply",
@@ -98,6 +92,7 @@ __all__ = [
     "decode_request",
     "encode",
     "peek_ids",
+    "tangents_from_fov",
 ]
 
 PROTOCOL_VERSION = 1
@@ -108,26 +103,19 @@ Reply = (
     Welcome | Accepted | Progress | Ready | Result | Dropped | ErrorReply | Pong | Alive
 )
 
-_REQUESTS: dict[str, type[Request]] = {
+REQUESTS: dict[str, type[Message]] = {
     kind.type_name: kind for kind in (Hello, ProfileRequest, Frame, Ping, Bye)
 }
-_REPLIES: dict[str, type[Reply]] = {
+REPLIES: dict[str, type[Message]] = {
     kind.type_name: kind
     for kind in (
-        Welcome,
-        Accepted,
-        Progress,
-        Ready,
-        Result,
-        Dropped,
-        ErrorReply,
-        Pong,
-        Alive,
+        *(Welcome, Accepted, Progress, Ready, Result, Dropped),
+        *(ErrorReply, Pong, Alive),
     )
 }
 
 
-def encode(message: Request | Reply) -> list[Any]:
+def encode(message: Message) -> list[Any]:
     """Return the parts of a message: the header's bytes, then its images or body.
 
     Images are handed out as they are (made contiguous where they are not), so a
@@ -145,35 +133,10 @@ def encode(message: Request | Reply) -> list[Any]:
             f"the header of {message.type_name} has {len(packed)} bytes; "
             f"at most {MAX_HEADER_BYTES} are allowed"
         )
-    return [packed, *_payload(message)]
+    return [packed, *message.parts()]
 
 
-def _payload(message: Request | Reply) -> list[Any]:
-    if isinstance(message, Frame):
-        parts: list[Any] = []
-        for view, images in zip(message.views, message.images, strict=True):
-            parts.append(check_output(images.color, view.color))
-            parts.append(images.depth_m)
-            if view.has_hidden != images.has_hidden:
-                raise ValueError(
-                    f"has_hidden is {view.has_hidden}, but there is "
-                    f"{'a' if images.has_hidden else 'no'} hidden layer"
-                )
-            if images.has_hidden:
-                parts.append(check_output(images.hidden_color, view.color))
-                parts.append(images.hidden_depth_m)
-        return parts
-    if isinstance(message, Result):
-        return [
-            check_output(color, view.color)
-            for view, color in zip(message.views, message.colors, strict=True)
-        ]
-    if isinstance(message, ProfileRequest):
-        return [json.dumps(message.body, allow_nan=False).encode("utf-8")]
-    return []
-
-
-def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Request:
+def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Message:
     """Return what a client sent, checked field by field.
 
     Raises
@@ -181,19 +144,17 @@ def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Reque
     BadMessage, UnknownType, VersionMismatch
         With the field at fault and what is allowed.
     """
-    header, rest = _open(parts)
-    kind = _kind(header, _REQUESTS)
-    return kind.parse(header, rest, limits or Limits())
+    return _decoded(parts, REQUESTS, limits or Limits())
 
 
-def decode_reply(parts: Sequence[Part]) -> Reply:
+def decode_reply(parts: Sequence[Part]) -> Message:
     """Return what the service sent; raises like decode_request."""
-    header, rest = _open(parts)
-    kind = _kind(header, _REPLIES)
-    return kind.parse(header, rest)
+    return _decoded(parts, REPLIES, Limits())
 
 
-def _open(parts: Sequence[Part]) -> tuple[dict[str, Any], Sequence[Part]]:
+def _decoded(
+    parts: Sequence[Part], kinds: Mapping[str, type[Message]], limits: Limits
+) -> Message:
     if not parts:
         raise BadMessage("the message has no parts", field="header")
     header = unpack_header(parts[0])
@@ -202,17 +163,13 @@ def _open(parts: Sequence[Part]) -> tuple[dict[str, Any], Sequence[Part]]:
         raise VersionMismatch(
             f"it is {show(version)}", field="version", allowed=str(PROTOCOL_VERSION)
         )
-    return header, parts[1:]
-
-
-def _kind(header: Mapping[str, Any], kinds: Mapping[str, type[Any]]) -> type[Any]:
     name = header.get("type")
     kind = kinds.get(name) if isinstance(name, str) else None
     if kind is None:
         raise UnknownType(
             f"it is {show(name)}", field="type", allowed="one of " + ", ".join(kinds)
         )
-    return kind
+    return kind.parse(header, parts[1:], limits)
 
 
 def peek_ids(parts: Sequence[Part]) -> tuple[int | None, int | None]:

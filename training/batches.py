@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from estimator.eye_parameters import sampled_ranges
+from estimator.eye.parameters import sampled_ranges
 from training.datasets import (
     DataError,
     Recipe,

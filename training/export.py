@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from estimator.networks.card import WEIGHTS_FOLDER
 from training.batches import task_rows
 from training.checkpoint import load_finished
 from training.command import make_parser, run_command
@@ -44,7 +45,6 @@ from training.train import CHECKPOINT
 from training.validation import error_columns, misfit_of_eyes, summary
 from training.versions import commit_id
 
-WEIGHTS = Path(__file__).parents[1] / "estimator" / "weights"
 CARD_FORMAT = 1
 PARITY_ROWS = 1_000
 JUDGED_ROWS = 20_000
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     parser = make_parser("export", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
-    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    parser.add_argument("--out", type=Path, default=WEIGHTS_FOLDER)
     parser.add_argument("--half", action="store_true", help="weights in 16 bits")
     parser.add_argument("--rows", type=int, default=JUDGED_ROWS, help="traced anew")
     return run_command(parser, _work, arguments)

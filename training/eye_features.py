@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from estimator.eye_parameters import OFFSET_RADIUS_MM, OFFSET_SLICE, column
-from estimator.lens_shape import (
+from estimator.eye.lens_shape import (
     CAP_VOLUME_RATIO,
     HEIGHT_RATIO,
     RIM_THICKNESS_MM,
 )
-from estimator.media import refractive_index
-from estimator.surfaces import horner_order, offset_monomials
-from estimator.zernike import (
+from estimator.eye.parameters import OFFSET_RADIUS_MM, OFFSET_SLICE, column
+from estimator.optics.media import refractive_index
+from estimator.optics.surfaces import horner_order, offset_monomials
+from estimator.optics.zernike import (
     EXPONENTS,
     MAX_RADIAL_ORDER,
     N_TERMS,
@@ -264,7 +264,7 @@ def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
 
 
 def lens_thickness_mm(diameter_mm: Tensor, volume_mm3: Tensor) -> Tensor:
-    """Thickness (N,) of the lens, as `estimator.lens_shape.lens_shape` has it."""
+    """Thickness (N,) of the lens, as `estimator.eye.lens_shape.lens_shape` has it."""
     caps_mm3 = CAP_VOLUME_RATIO * volume_mm3
     return RIM_THICKNESS_MM + 8.0 * caps_mm3 / (math.pi * diameter_mm**2)
 

@@ -1,6 +1,6 @@
 """The prior of the estimation in torch: what eyes of a refraction are like.
 
-See `estimator.estimation_prior`.  25 coefficients leave 20 of the 45 parameters open;
+See `estimator.estimate.prior`.  25 coefficients leave 20 of the 45 parameters open;
 an estimator that is only judged by them turns corneas and tilts lenses at random.
 """
 
@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from estimator import estimation_prior
-from estimator.network_card import FIRST_TERM
-from estimator.prescription import C20
-from estimator.units import SPHERE_PER_C20
+from estimator.estimate import prior as estimation_prior
+from estimator.networks.card import FIRST_TERM
+from estimator.optics.prescription import C20
+from estimator.optics.units import SPHERE_PER_C20
 
 
 def mean_eyes(x: Tensor) -> Tensor:

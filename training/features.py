@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from estimator.eye_parameters import allowed_ranges, mean_vector
+from estimator.eye.parameters import allowed_ranges, mean_vector
 from training.eye_features import (
     EyeFeatures,
     PupilPowers,

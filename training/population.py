@@ -1,7 +1,7 @@
 """Eyes as people have them: rows drawn from the prior of the estimation.
 
 Table 2 is a box: its corners hold eyes that nobody has, and a myope's long eye lies
-outside of it.  The service estimates with a prior (`estimator.estimation_prior`), so
+outside of it.  The service estimates with a prior (`estimator.estimate.prior`), so
 these are the eyes that its networks are asked about.
 """
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from estimator.accommodation import (
+from estimator.estimate.prior import REFRACTION_LIMITS_DPT, deviations, mean_eyes
+from estimator.eye.accommodation import (
     AQUEOUS,
     DIAMETER,
     SMALLEST_AQUEOUS_MM,
@@ -17,8 +18,7 @@ from estimator.accommodation import (
     accommodated_eyes,
     smallest_diameter_mm,
 )
-from estimator.estimation_prior import REFRACTION_LIMITS_DPT, deviations, mean_eyes
-from estimator.eye_parameters import allowed_ranges
+from estimator.eye.parameters import allowed_ranges
 
 LEAST_PROBABILITY = 1e-4
 """A normal deviate ends there, at 3.7 deviations."""

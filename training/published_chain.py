@@ -1,6 +1,6 @@
 """Known properties of the published data sets, to compare with their statistics only.
 
-What the authors' framework does differently (`estimator.lens_shape.compat_lens_shape`
+What the authors' framework does differently (`lens_shape.compat_lens_shape`
 and the facts in its published sources): circles of the stop's size, another lens rule,
 two offset slots that receive other terms, a narrower range of one conic, and off the
 axis a stretch that multiplies slopes where it should divide them.  Nothing here is
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import OFFSET_SLICE, EyeParameters, column
-from estimator.surfaces import pack_eye
-from estimator.wavefront import FieldResults, eyes_aberrations
-from estimator.zernike import N_TERMS, zernike_gradient
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import OFFSET_SLICE, EyeParameters, column
+from estimator.optics.surfaces import pack_eye
+from estimator.optics.zernike import N_TERMS, zernike_gradient
+from estimator.wavefront.aberrations import FieldResults, eyes_aberrations
 from training.tasks import N_EYE, media_indices_of
 
 CIRCLE, LENS, SLIP, STRETCH = (

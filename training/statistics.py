@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.zernike import nm_from_index
+from estimator.optics.zernike import nm_from_index
 from training.tasks import Domain
 
 ROWS = ("min", "max", "mean", "abs_mean", "std", "q1", "q2", "q3")

@@ -12,23 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.accommodation import (
+from estimator.eye.accommodation import (
     AQUEOUS,
     DIAMETER,
     AccommodatingEye,
     accommodated_eyes,
     smallest_diameter_mm,
 )
-from estimator.eye import pack_eyes
-from estimator.eye_parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
-from estimator.eye_wavefront import MEDIA_INWARDS, TraceFailed, eye_indices
-from estimator.media import refractive_index
-from estimator.network_card import INPUTS, OUTPUTS, ZERNIKE_NAMES
-from estimator.prescription import C20
-from estimator.raytrace import RayStatus
-from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
-from estimator.wavefront import eyes_aberrations, on_axis_zernike
-from estimator.wavefront_kernels import magnifications
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
+from estimator.eye.tracing import MEDIA_INWARDS, TraceFailed, eye_indices
+from estimator.networks.card import INPUTS, OUTPUTS, ZERNIKE_NAMES
+from estimator.optics.media import refractive_index
+from estimator.optics.prescription import C20
+from estimator.optics.raytrace import RayStatus
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
+from estimator.wavefront.kernels import magnifications
 
 N_EYE = len(PARAMETER_NAMES)
 COMPARED_NAMES = ZERNIKE_NAMES[2:]

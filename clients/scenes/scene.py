@@ -1,6 +1,5 @@
 """A finished scene: triangles with their light baked in, ready for a flat render."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,24 +74,3 @@ def _wound(mesh: Mesh) -> NDArray[np.int64]:
     normals = mesh.normals[mesh.faces].sum(axis=1)
     against = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0.0
     return np.where(against[:, None], mesh.faces[:, ::-1], mesh.faces)
-
-
-def scene_builders() -> dict[str, Callable[[], Scene]]:
-    """Return the scenes by name; a scene is built when its function is called."""
-    from clients.scenes import courtyard, primitives
-
-    return {"primitives": primitives.build, "courtyard": courtyard.build}
-
-
-def build_scene(name: str) -> Scene:
-    """Build a scene.
-
-    Raises
-    ------
-    ValueError
-        No scene has that name.
-    """
-    builders = scene_builders()
-    if name not in builders:
-        raise ValueError(f"scene {name!r} is unknown; choose from {sorted(builders)}")
-    return builders[name]()

@@ -1,4 +1,16 @@
-"""The commands of the `ocufilter` program, one module each.
+"""The command line: one file a command.
 
-Heavy libraries are imported inside the functions, so that ``--help`` stays quick.
+console          output, errors, progress
+setting_options  options made from `FilterSettings`
+programs         demo and bench: programs of the clients and the checkout
+serve            the service
+filter_image     one picture
+image_files      pictures and depth in files
+plan_text        a plan in words
+estimate         an eye from a profile
+wavefront        its aberrations
+psf              its PSFs
+doctor           what works here
+doctor_checks    each thing tried
+doctor_probes    trials in a process of their own
 """

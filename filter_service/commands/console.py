@@ -1,10 +1,9 @@
-"""What all commands share: where output goes, and where the checkout is."""
+"""What all commands share: where output goes, errors, progress."""
 
 import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -58,20 +57,3 @@ def progress_bar(title: str, *, quiet: bool) -> Iterator[Callable[[float, str], 
         yield lambda fraction, stage: progress.update(
             task, completed=fraction, description=f"{title}: {stage}"
         )
-
-
-def checkout_root(needs: str) -> Path:
-    """Folder of the checkout this program runs from.
-
-    Raises
-    ------
-    CommandFailed
-        The program was installed without the folder ``needs`` beside it.
-    """
-    root = Path(__file__).resolve().parents[2]
-    if not (root / needs).is_dir() or not (root / "pyproject.toml").is_file():
-        raise CommandFailed(
-            f"this command runs the programs in {needs}/ and works from a checkout "
-            f"only; {root} is none"
-        )
-    return root

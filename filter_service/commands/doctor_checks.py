@@ -10,7 +10,8 @@ import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
-from filter_service.service.threads import UNSAFE_THREADING_LAYER
+from estimator.threads import thread_count
+from filter_service.threads import UNSAFE_THREADING_LAYER
 
 SERVICE_PACKAGES = (
     "numpy",
@@ -35,7 +36,7 @@ PROBE_TIMEOUT_S = 60.0
 
 FIX_PACKAGES = "make demo, or: sh setup.sh"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
-FIX_WEIGHTS = "git checkout -- estimator/weights"
+FIX_WEIGHTS = "git checkout -- estimator/networks/weights"
 FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
 
@@ -122,7 +123,7 @@ def machine() -> dict:
     return {
         "system": system,
         "processor": processor_name(),
-        "n_cores": len(os.sched_getaffinity(0)),
+        "n_cores": thread_count(),
         "python": platform.python_version(),
     }
 

@@ -71,8 +71,8 @@ def probe_threads() -> dict:
 
 def probe_networks() -> dict:
     """Load every trained network and evaluate it once."""
-    from estimator.network_card import NETWORK_NAMES, NetworkUnavailable
-    from estimator.networks import load_network
+    from estimator.networks.card import NETWORK_NAMES, NetworkUnavailable
+    from estimator.networks.inference import load_network
 
     cards, missing = {}, {}
     for name in NETWORK_NAMES:

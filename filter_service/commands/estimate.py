@@ -15,7 +15,7 @@ from filter_service.commands.console import (
 )
 
 if TYPE_CHECKING:
-    from estimator.estimation import EstimatedEye
+    from estimator.estimate.estimation import EstimatedEye
 
 TIME_LIMITS_S = (0.1, 86400.0)
 
@@ -59,9 +59,9 @@ def estimate(
     """
     check_range("--max-time-s", max_time_s, TIME_LIMITS_S)
 
-    from estimator.estimation import estimate_eye
-    from estimator.network_card import DamagedWeights, WeightsMissing
-    from estimator.profile_files import load_profile
+    from estimator.estimate.estimation import estimate_eye
+    from estimator.networks.card import DamagedWeights, WeightsMissing
+    from estimator.profiles.files import load_profile
     from filter_service.commands.image_files import check_output
 
     if plot is not None:
@@ -72,7 +72,7 @@ def estimate(
     except (WeightsMissing, DamagedWeights) as error:  # no fault of the input
         raise CommandFailed(str(error)) from error
     if plot is not None:
-        from estimator.eye_plot import plot_eye
+        from estimator.estimate.plot import plot_eye
 
         plot_eye(found, plot)
     summary = _summary(found)

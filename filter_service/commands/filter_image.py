@@ -1,11 +1,11 @@
 """`ocufilter filter`: one RGB-D image through one eye, without a server."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from filter_service.camera import tangents_from_fov
 from filter_service.commands.console import (
     Json,
     check_range,
@@ -14,76 +14,29 @@ from filter_service.commands.console import (
     say,
 )
 from filter_service.commands.plan_text import plan_summary, say_plan
-from filter_service.wire.profiles import DEFAULT_ACCURACY
+from filter_service.commands.setting_options import with_setting_options
+from filter_service.settings import (
+    MAX_PUPIL_MM,
+    MAX_VERGENCE_DPT,
+    MIN_PUPIL_MM,
+    Accumulation,
+    DepthKind,
+    Output,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from estimator.profiles import EyeProfile
-    from filter_service.commands.one_image import FilteredImage
-    from filter_service.rendering.frame import View
+    from estimator.profiles.parse import EyeProfile
+    from filter_service.filtering.one_image import FilteredImage
+    from filter_service.rgbd_view import RgbdView
 
-PUPIL_LIMITS_MM = (0.5, 9.0)
-FOCUS_LIMITS_DPT = (0.0, 20.0)
+PUPIL_LIMITS_MM = (MIN_PUPIL_MM, MAX_PUPIL_MM)
+FOCUS_LIMITS_DPT = (0.0, MAX_VERGENCE_DPT)
 FOV_LIMITS_DEG = (1.0, 150.0)
-GAZE_LIMITS_DEG = (-60.0, 60.0)
 
 
-class Mode(StrEnum):
-    """Which directions have a PSF of their own."""
-
-    ON_AXIS = "on-axis"
-    QUALITY = "quality"
-    DYNAMIC = "dynamic"
-
-
-class Grid(StrEnum):
-    """Where the PSFs between which others are blended lie."""
-
-    PLANNED = "planned"
-    PAPER = "paper"
-
-
-class Tolerance(StrEnum):
-    """What blending between planned PSFs may cost."""
-
-    LOOSE = "loose"
-    NORMAL = "normal"
-    FINE = "fine"
-
-
-class Accumulation(StrEnum):
-    """How fragments of one pixel add up."""
-
-    COVERAGE = "coverage"
-    PAPER = "paper"
-
-
-class EyeModel(StrEnum):
-    """Where the wavefronts come from."""
-
-    TRACED = "traced"
-    WAVEFRONT = "wavefront"
-
-
-class Accuracy(StrEnum):
-    """What of a traced eye may come from trained networks."""
-
-    FAST = "fast"
-    BALANCED = "balanced"
-    EXACT = "exact"
-
-
-BY_DEFAULT = Accuracy(DEFAULT_ACCURACY)
-
-
-class DepthKind(StrEnum):
-    """What the depth file measures."""
-
-    PLANAR = "planar"
-    RADIAL = "radial"
-
-
+@with_setting_options(mode="on-axis", eye_model="wavefront")
 def filter_image(
     color: Annotated[
         Path,
@@ -132,63 +85,17 @@ def filter_image(
     focus_dpt: Annotated[
         float, typer.Option(help="Focus distance, dpt; 0 is infinity.")
     ] = 0.0,
-    mode: Annotated[
-        Mode,
-        typer.Option(
-            help="on-axis: one direction for the whole image; quality and dynamic: "
-            "PSFs that follow the visual field, over a finer and a coarser grid."
-        ),
-    ] = Mode.ON_AXIS,
-    grid: Annotated[
-        Grid,
-        typer.Option(help="planned: PSFs where this eye needs them; paper: its grid."),
-    ] = Grid.PLANNED,
-    tolerance: Annotated[
-        Tolerance,
-        typer.Option(help="Interpolation of a planned grid at about 43, 49 or 55 dB."),
-    ] = Tolerance.NORMAL,
-    gaze_h_deg: Annotated[
-        float, typer.Option(help="Gaze from the image's axis to the right, deg.")
-    ] = 0.0,
-    gaze_v_deg: Annotated[float, typer.Option(help="The same upwards, deg.")] = 0.0,
     accumulation: Annotated[
         Accumulation,
         typer.Option(help="coverage conserves light; paper is the published rule."),
-    ] = Accumulation.COVERAGE,
-    eye_model: Annotated[
-        EyeModel,
-        typer.Option(
-            help="wavefront: the measurement by formula, up to its own pupil; traced: "
-            "an estimated eye, ray-traced at any pupil and focus."
-        ),
-    ] = EyeModel.WAVEFRONT,
-    accuracy: Annotated[
-        Accuracy,
-        typer.Option(
-            help="Of a traced eye.  fast: networks; balanced: a refined eye, networks "
-            "where they save time; exact: everything ray-traced."
-        ),
-    ] = BY_DEFAULT,
+    ] = "coverage",
     depth_kind: Annotated[
         DepthKind, typer.Option(help="planar: view-space z; radial: distance.")
-    ] = DepthKind.PLANAR,
+    ] = "planar",
     depth_scale: Annotated[
         float | None,
         typer.Option(help="Metres per unit of the depth file [integers: 0.001]."),
     ] = None,
-    no_diffraction: Annotated[
-        bool, typer.Option("--no-diffraction", help="Geometrical optics only.")
-    ] = False,
-    no_chromatic: Annotated[
-        bool, typer.Option("--no-chromatic", help="Focus all colours alike.")
-    ] = False,
-    lateral_color: Annotated[
-        bool,
-        typer.Option(
-            "--lateral-color",
-            help="Displace red and blue against green off the axis; a traced eye only.",
-        ),
-    ] = False,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
     ] = False,
@@ -200,6 +107,8 @@ def filter_image(
         typer.Option("--plan", help="Say which PSFs would be computed, and stop."),
     ] = False,
     json_output: Json = False,
+    *,
+    settings: dict[str, Any],
 ) -> None:
     """Filter one image with depth through one eye; no server is needed.
 
@@ -209,11 +118,10 @@ def filter_image(
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
     check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
-    check_range("--gaze-h-deg", gaze_h_deg, GAZE_LIMITS_DEG)
-    check_range("--gaze-v-deg", gaze_v_deg, GAZE_LIMITS_DEG)
 
-    from estimator.profile_files import load_profile
-    from filter_service.commands import image_files, one_image
+    from estimator.profiles.files import load_profile
+    from filter_service.commands import image_files
+    from filter_service.filtering import one_image
 
     image_files.check_output(out)
     eye = load_profile(profile)
@@ -221,34 +129,26 @@ def filter_image(
         color,
         depth,
         fov_deg=fov_deg,
-        depth_kind=depth_kind.value,
+        depth_kind=depth_kind,
         depth_scale=depth_scale,
         hidden_paths=(hidden_color, hidden_depth),
     )
-    linear = out.suffix.lower() in image_files.LINEAR_SUFFIXES
-    if half and not linear:
-        raise ValueError("--half: allowed with an output of .npy or .exr")
-    settings = one_image.ImageSettings(
-        pupil_diameter_mm=pupil_mm,
-        focus_dpt=focus_dpt,
-        accumulation=accumulation.value,
-        diffraction=not no_diffraction,
-        chromatic=not no_chromatic,
-        lateral_color=lateral_color,
-        merge=not no_merge,
-        output=("linear16" if half else "linear") if linear else "srgb8",
-        eye_model=eye_model.value,
-        accuracy=accuracy.value,
-        mode=mode.value,
-        grid=grid.value,
-        tolerance=tolerance.value,
-        gaze_deg=(gaze_h_deg, gaze_v_deg),
+    spec = one_image.image_spec(
+        view, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt, settings=settings
     )
     if plan:
-        say_plan(one_image.plan_one_image(view, eye, settings), json_output=json_output)
+        say_plan(one_image.plan_one_image(spec, eye), json_output=json_output)
         return
     with progress_bar("PSFs", quiet=json_output) as progress:
-        filtered = one_image.filter_one_image(view, eye, settings, progress=progress)
+        filtered = one_image.filter_one_image(
+            view,
+            eye,
+            spec,
+            accumulation=accumulation,
+            merge=not no_merge,
+            output=_output(out, half=half),
+            progress=progress,
+        )
     image_files.write_image(out, filtered.rendered.color)
     summary = _summary(filtered, out=out, eye=eye)
     if json_output:
@@ -257,18 +157,27 @@ def filter_image(
         _report(summary)
 
 
+def _output(out: Path, *, half: bool) -> Output:
+    """Light as a file of this name holds it."""
+    from filter_service.commands.image_files import LINEAR_SUFFIXES
+
+    linear = out.suffix.lower() in LINEAR_SUFFIXES
+    if half and not linear:
+        raise ValueError("--half: allowed with an output of .npy or .exr")
+    return ("linear16" if half else "linear") if linear else "srgb8"
+
+
 def _read_view(
     color_path: Path,
     depth_path: Path,
     *,
     fov_deg: float,
-    depth_kind: str,
+    depth_kind: DepthKind,
     depth_scale: float | None,
     hidden_paths: tuple[Path | None, Path | None] = (None, None),
-) -> "View":
+) -> "RgbdView":
     from filter_service.commands.image_files import read_color, read_depth
-    from filter_service.commands.one_image import symmetric_tangents
-    from filter_service.rendering.frame import View
+    from filter_service.rgbd_view import RgbdView
 
     color = read_color(color_path)
     depth_m = read_depth(depth_path, depth_scale=depth_scale)
@@ -277,10 +186,8 @@ def _read_view(
     hidden_color, hidden_depth_m = _read_hidden(
         *hidden_paths, color=color, depth_scale=depth_scale
     )
-    tangents = symmetric_tangents(
-        width_px=width_px, height_px=height_px, vertical_fov_deg=fov_deg
-    )
-    return View(
+    tangents = tangents_from_fov(fov_deg, width_px, height_px)
+    return RgbdView(
         color=color,
         depth_m=depth_m,
         tangents=tangents,
@@ -335,7 +242,7 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "profile": eye.name,
         "pupil_diameter_mm": rendered.pupil_diameter_mm,
         "focus_dpt": rendered.focus_dpt,
-        "object_range_dpt": list(filtered.grid.object_range_dpt),
+        "object_range_dpt": list(filtered.spec.settings.object_range_dpt),
         "missing_depth_count": int(rendered.missing_depth_count),
         "clamped_depth_count": int(rendered.clamped_depth_count),
         "bad_color_count": int(rendered.bad_color_count),

@@ -1,8 +1,9 @@
-"""`ocufilter demo` and `ocufilter bench`: programs of the checkout, as subprocesses.
+"""`ocufilter demo` and `ocufilter bench`: programs of clients and tests, started.
 
 The service never imports its clients or tests; it can only start them.
 """
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from filter_service.commands.console import CommandFailed, Json, checkout_root, say
+from filter_service.commands.console import CommandFailed, Json, say
 
 
 class Bench(StrEnum):
@@ -102,13 +103,13 @@ def _checked_size(size: str) -> str:
 
 
 def _run_program(module: str, arguments: list[str], *, json_output: bool) -> None:
-    root = checkout_root(module.split(".")[0])
+    _check_is_there(module)
     command = [sys.executable, "-m", module, *arguments]
     if not json_output:
-        finished = subprocess.run(command, cwd=root, check=False)
+        finished = subprocess.run(command, check=False)
     else:
         finished = subprocess.run(
-            [*command, "--json"], cwd=root, stdout=subprocess.PIPE, check=False
+            [*command, "--json"], stdout=subprocess.PIPE, check=False
         )
     if finished.returncode in (1, 2):  # it has said why, on the stderr we share
         raise typer.Exit(finished.returncode)
@@ -123,3 +124,23 @@ def _one_json_object(output: bytes, module: str) -> dict:
         return json.loads(output)
     except ValueError as error:
         raise CommandFailed(f"{module} printed no JSON object: {error}") from None
+
+
+def _check_is_there(module: str) -> None:
+    """Refuse a program that did not come along.
+
+    Raises
+    ------
+    CommandFailed
+        Says that it needs a checkout.
+    """
+    package = module.partition(".")[0]
+    try:
+        found = importlib.util.find_spec(module)
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        raise CommandFailed(
+            f"this command runs a program in {package}/, which an installed package "
+            "does not hold: run it in a checkout"
+        )

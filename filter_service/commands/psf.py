@@ -25,8 +25,8 @@ from filter_service.commands.wavefront import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from estimator.psf_types import Psf
-    from estimator.stiles_crawford import StilesCrawford
+    from estimator.psf.kernel_types import Psf
+    from estimator.psf.stiles_crawford import StilesCrawford
 
 PUPIL_LIMITS_MM = (0.5, 9.0)
 DISTANCE_LIMITS_DPT = (0.0, 20.0)
@@ -153,8 +153,8 @@ def psf(
 
 
 def _measured(source: str, focus_dpt: float | None, **view) -> _State:
-    from estimator.measured_wavefront import MeasuredWavefront
-    from estimator.profile_files import load_profile
+    from estimator.profiles.files import load_profile
+    from estimator.profiles.measured_wavefront import MeasuredWavefront
 
     profile = load_profile(source)
     found = MeasuredWavefront.from_profile(profile).state(
@@ -172,8 +172,8 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
 
 
 def _traced(source: str, focus_dpt: float | None, **view) -> _State:
-    from estimator.profile_files import load_profile
-    from estimator.wavefront import wavefront_aberrations
+    from estimator.profiles.files import load_profile
+    from estimator.wavefront.aberrations import wavefront_aberrations
 
     is_explicit = explicit_body(source) is not None
     if focus_dpt is None and not is_explicit:
@@ -197,7 +197,7 @@ def _traced(source: str, focus_dpt: float | None, **view) -> _State:
 
 
 def _apodisation(state: _State) -> "StilesCrawford":
-    from estimator.stiles_crawford import EYE_SIDES, StilesCrawford
+    from estimator.psf.stiles_crawford import EYE_SIDES, StilesCrawford
 
     if state.eye_side in EYE_SIDES:
         return StilesCrawford.of_eye(state.eye_side)
@@ -206,9 +206,9 @@ def _apodisation(state: _State) -> "StilesCrawford":
 
 def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", float]:
     """Return the PSF, and the PSNR that images filtered with it should exceed."""
-    from estimator.psf import compute_psfs, plan_psfs
-    from estimator.psf_switch import predicted_least_psnr_db
-    from estimator.units import MRAD_PER_RAD
+    from estimator.optics.units import MRAD_PER_RAD
+    from estimator.psf.compute import compute_psfs, plan_psfs
+    from estimator.psf.switch import predicted_least_psnr_db
 
     options |= {
         "pupil_diameter_mm": 2.0 * state.zernike_radius_mm,

@@ -30,7 +30,7 @@ def serve(
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
-    from filter_service.service import serving
+    from filter_service.service import launch as serving
     from filter_service.service.config import load_config
 
     if config is not None and not config.is_file():

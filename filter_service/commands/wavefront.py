@@ -16,8 +16,8 @@ from filter_service.commands.console import (
 )
 
 if TYPE_CHECKING:
-    from estimator.surfaces import EyeSurfaces
-    from estimator.wavefront import Aberrations, PupilEllipse
+    from estimator.optics.surfaces import EyeSurfaces
+    from estimator.wavefront.aberrations import Aberrations, PupilEllipse
 
 PUPIL_LIMITS_MM = (0.05, 12.0)
 WAVELENGTH_LIMITS_NM = (365.0, 1014.0)
@@ -71,7 +71,7 @@ def wavefront(
     """
     _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt)
 
-    from estimator.wavefront import wavefront_aberrations
+    from estimator.wavefront.aberrations import wavefront_aberrations
 
     name, surfaces, notes = load_surfaces(eye, focus_dpt)
     found = wavefront_aberrations(
@@ -124,7 +124,7 @@ def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt
 
 def explicit_body(source: str) -> dict | None:
     """Content of a JSON file that gives surfaces; None for any other source."""
-    from estimator.explicit_eye import is_explicit_eye
+    from estimator.eye.explicit import is_explicit_eye
 
     path = Path(source)
     if path.suffix.lower() != ".json" or not path.is_file():
@@ -142,7 +142,7 @@ def load_surfaces(
     """Name, surfaces and notes of what the user named."""
     body = explicit_body(source)
     if body is not None:
-        from estimator.explicit_eye import parse_explicit_eye
+        from estimator.eye.explicit import parse_explicit_eye
 
         if focus_dpt is not None:
             raise ValueError(
@@ -151,9 +151,9 @@ def load_surfaces(
             )
         return str(body.get("name", Path(source).name)), parse_explicit_eye(body), ()
 
-    from estimator.estimation import estimate_eye
-    from estimator.eye import eye_surfaces
-    from estimator.profile_files import load_profile
+    from estimator.estimate.estimation import estimate_eye
+    from estimator.eye.assembly import eye_surfaces
+    from estimator.profiles.files import load_profile
 
     profile = load_profile(source)
     found = estimate_eye(profile)
@@ -180,7 +180,7 @@ def ellipse_facts(ellipse: "PupilEllipse") -> dict:
 
 
 def _facts(found: "Aberrations") -> dict:
-    from estimator.raytrace import STATUS_WORDS
+    from estimator.optics.raytrace import STATUS_WORDS
 
     return {
         "zernike_um": found.zernike_um.tolist(),
@@ -196,7 +196,7 @@ def _facts(found: "Aberrations") -> dict:
 
 
 def _report(summary: dict) -> None:
-    from estimator.zernike import nm_from_index
+    from estimator.optics.zernike import nm_from_index
 
     for note in summary["notes"]:
         say(f"note: {note}")

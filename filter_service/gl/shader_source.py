@@ -6,7 +6,13 @@ from pathlib import Path
 from filter_service import constants
 from filter_service.errors import ShaderError
 
-SHADER_ROOT = Path(__file__).resolve().parents[2] / "shaders"
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+_INSIDE = _PACKAGE / "shaders"
+
+SHADER_ROOT = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "shaders"
+"""Inside the package where it was installed from a wheel, beside it in a checkout."""
+
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 

@@ -1,1 +1,17 @@
-"""Which PSFs an eye needs: the nodes for a stated error, what they cost in all."""
+"""Which PSFs an eye needs for a stated error.
+
+grid              what a cache is for, and where its nodes may lie
+field_directions  directions of an image's pixels
+sampled_use       what frames will ask for, sampled
+slopes            ray slopes over a pupil, which PSFs differ by
+error_law         what blending two PSFs costs
+axis_nodes        nodes along one axis
+nodes             a plan, and reading between its nodes
+paper_grid        the paper's fixed grids as plans
+cost              memory and time of a plan
+plan              the entry
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

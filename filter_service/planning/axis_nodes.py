@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.error_law import (
     AXIS_FACTOR,
     MEAN_OF_HALF_WAY,
@@ -17,11 +18,10 @@ from filter_service.planning.error_law import (
     mean_square,
     spot_covariance,
 )
-from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import RaggedNodes
+from filter_service.planning.sampled_use import Use, axis_error, moved
 from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
-from filter_service.planning.use import Use, axis_error, moved
 
 TOLERANCE_DB = {"loose": 43.0, "normal": 49.0, "fine": 55.0}
 """PSNR that interpolation may cost down to.  Frames planned for 49 dB, unmerged,
@@ -44,8 +44,8 @@ _LARGEST_RATIO = 0.9
 
 def target_error(spec: GridSpec) -> float:
     """Mean square error that interpolation may make in all."""
-    gain_db = QUALITY_GAIN_DB if spec.mode == "quality" else 0.0
-    return 10.0 ** (-(TOLERANCE_DB[spec.tolerance] + gain_db) / 10.0)
+    gain_db = QUALITY_GAIN_DB if spec.settings.mode == "quality" else 0.0
+    return 10.0 ** (-(TOLERANCE_DB[spec.settings.tolerance] + gain_db) / 10.0)
 
 
 def axis_nodes(
@@ -105,7 +105,7 @@ def _needed_over_ladder(
 
 
 def limited_ranges_dpt(
-    eye: Eye, spec: GridSpec, groups: PupilStates, ranges_dpt: NDArray[np.float64]
+    eye: EyeOptics, spec: GridSpec, groups: PupilStates, ranges_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Ranges (P, 2) without the defocus whose kernels would be too large.
 
@@ -138,7 +138,7 @@ def limited_ranges_dpt(
 
 
 def defocus_groups(
-    eye: Eye,
+    eye: EyeOptics,
     spec: GridSpec,
     groups: PupilStates,
     ranges_dpt: NDArray[np.float64],

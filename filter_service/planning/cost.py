@@ -1,16 +1,16 @@
 """What a planned cache costs: memory from predicted radii, time from a cost model."""
 
-import os
-
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf import ACCURACY
-from estimator.psf_fourier import plan_grids
-from estimator.psf_survey import PupilSurvey, needed_radius_px, survey_pupils
-from estimator.psf_switch import geometric_shares
+from estimator.field.eye_optics import EyeOptics
+from estimator.machine_speed import relative_core_time
+from estimator.psf.compute import ACCURACY
+from estimator.psf.fourier import plan_grids
+from estimator.psf.survey import PupilSurvey, needed_radius_px, survey_pupils
+from estimator.psf.switch import geometric_shares
+from estimator.threads import thread_count
 from filter_service.constants import RGB
-from filter_service.planning.eye import Eye
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.slopes import PupilStates, state_frames
@@ -29,14 +29,14 @@ COMPUTED_BEYOND = 0.2
 """Light that trimming drops, over what a computed kernel lacks (`psfs/build.py`)."""
 
 
-def predicted_cost(eye: Eye, spec: GridSpec, plan: CachePlan) -> dict:
+def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
     """Fields of `PlanPrediction`: count, memory, time and cores."""
-    count = (RGB if spec.chromatic else 1) * len(plan.defocus.values_dpt)
+    count = (RGB if spec.settings.chromatic else 1) * len(plan.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
     survey = survey_pupils(state_frames(eye, spec, states))
     texels = float(np.mean(box_texels(spec, survey)))
-    cores = len(os.sched_getaffinity(0))
-    time_us = sum(
+    cores = thread_count()
+    time_us = relative_core_time() * sum(
         TERM_US[name] * float(np.mean(values))
         for name, values in cost_terms(spec, survey).items()
     )
@@ -50,7 +50,7 @@ def predicted_cost(eye: Eye, spec: GridSpec, plan: CachePlan) -> dict:
 
 def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
     """States of a plan's PSFs: all of them, or so many spread evenly."""
-    channels = RGB if spec.chromatic else 1
+    channels = RGB if spec.settings.chromatic else 1
     count = channels * len(plan.defocus.values_dpt)
     psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
     nodes, channel = psfs // channels, psfs % channels
@@ -71,7 +71,7 @@ def kernel_radius_px(
     spec: GridSpec, survey: PupilSurvey, *, share: float
 ) -> NDArray[np.int64]:
     """Radii (P,) that hold all but a share of the light that a cache may drop."""
-    if not spec.diffraction:
+    if not spec.settings.diffraction:
         return np.ceil(survey.blur_radius_px + 0.21).astype(np.int64)
     return needed_radius_px(
         survey, lost_energy_ratio=share * (1.0 - spec.kept_energy_ratio)
@@ -97,7 +97,8 @@ def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
 
 
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
-"""Processor time of what `cost_terms` counts, on an AMD EPYC of 2 cores: 36 batches of
+"""Processor time of what `cost_terms` counts, on an AMD EPYC (another machine's is
+scaled by `machine_speed`): 36 batches of
 768 PSFs of three eyes and three image sizes, 56 to 465 us a PSF, are within 0.77 to
 1.19 of it (`python -m tests.benchmarks.bench_plan --calibrate` fits it again)."""
 
@@ -106,7 +107,7 @@ def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.floa
     """Count what takes time in each PSF (P,): itself, its transform and its texels."""
     radius_px = kernel_radius_px(spec, survey, share=COMPUTED_BEYOND)
     count = survey.blur_radius_px.size
-    share = geometric_shares(survey) if spec.diffraction else np.ones(count)
+    share = geometric_shares(survey) if spec.settings.diffraction else np.ones(count)
     samples = np.zeros(count)
     chosen = share < 1.0
     if chosen.any():

@@ -8,8 +8,8 @@ direction move over the image with the gaze.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator import pinhole
-from filter_service.wire.images import Camera
+from estimator.optics import pinhole
+from filter_service.camera import Camera
 
 MAX_FIELD_DEG = 80.0
 """Directions farther from the camera's axis or the gaze have no PSF nodes."""

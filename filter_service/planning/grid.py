@@ -8,23 +8,27 @@ layers wherever the blur changes by more than a step (section 6.2, Eq. 8).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.units import (
-    MRAD_PER_RAD,
+from estimator.optics.units import (
     REFERENCE_WAVELENGTH_NM,
     RGB_WAVELENGTHS_NM,
 )
+from filter_service.camera import Camera, is_same_camera
 from filter_service.planning.field_directions import (
     MAX_FIELD_DEG,
     field_range_deg,
     nearest_inside_deg,
     pixel_from_mrad,
 )
-from filter_service.wire.images import MAX_GAZE_DEG, Camera
+from filter_service.settings import DEFAULTS, FilterSettings
+
+GREEN = 1
+"""Channel that the others are compared with, and that lateral colour leaves."""
 
 PUPIL_RATIO = 1.16
 """Neighbouring pupil nodes differ by at most this factor (tests/benchmarks)."""
@@ -40,15 +44,8 @@ BASE_OBJECT_STEP_DPT = 0.25
 """The paper's object distances: 33 over 8 dpt."""
 
 
-MODES = ("on-axis", "quality", "dynamic")
-"""One kernel set for the whole image; or, over the visual field, the finer and the
-coarser grid (of the planner, or of the paper)."""
-
 PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
 """Azimuth and elevation to both sides (released code)."""
-
-GRIDS = ("planned", "paper")
-TOLERANCES = ("loose", "normal", "fine")
 
 
 @dataclass(frozen=True)
@@ -59,24 +56,10 @@ class GridSpec:
     ----------
     camera : Camera
         Image size and tangents; the on-axis mode uses no more than its pixel pitch.
-    pupil_range_mm, object_range_dpt, focus_range_dpt : (float, float)
-        Entrance pupils, object distances and focus distances that frames may ask for.
+    settings : FilterSettings
+        Pupils, distances, field, and how fine.
     wavelengths_nm : (float, float, float)
         For red, green, blue.
-    diffraction, chromatic : bool
-        Off: geometrical optics; all channels at the reference wavelength.
-    lateral_color : bool
-        The channels' images of a point lie apart, as their chief rays do; green stays.
-    mode : "on-axis", "quality" or "dynamic"
-        Whether PSFs follow the visual field, and over how fine a grid.
-    grid : "planned" or "paper"
-        Nodes where this eye needs them, or the paper's fixed ones (section 7.2).
-    tolerance : "loose", "normal" or "fine"
-        How much interpolation between planned nodes may cost.
-    gaze_deg : (h, v)
-        Where the eye looks within the camera's image.
-    gaze_range_deg : (h, v)
-        How far frames may turn the gaze from there, to either side.
     memory_budget_mb : float
         A larger plan is refused.
     max_blur_step_px : float
@@ -87,39 +70,23 @@ class GridSpec:
         Light within a kernel's box; the rest is spread over it again.  0.99 keeps
         filtered images at 60 dB or more of the uncut kernel's, 0.995 at 65 dB, 0.998
         at 67 dB (240 kernels over the field, 2.5 to 6 mm).
+
+    Raises
+    ------
+    ValueError
+        Pixels too small or too large, or a gaze that turns the image out of all PSFs.
     """
 
     camera: Camera
-    pupil_range_mm: tuple[float, float] = (2.0, 7.0)
-    object_range_dpt: tuple[float, float] = (0.0, 10.0)
-    focus_range_dpt: tuple[float, float] = (0.0, 6.0)
+    settings: FilterSettings = DEFAULTS
     wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
-    diffraction: bool = True
-    chromatic: bool = True
-    lateral_color: bool = False
-    mode: str = "on-axis"
-    grid: str = "planned"
-    tolerance: str = "normal"
-    gaze_deg: tuple[float, float] = (0.0, 0.0)
-    gaze_range_deg: tuple[float, float] = (0.0, 0.0)
     memory_budget_mb: float = 2000.0
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
     kept_energy_ratio: float = 0.99
 
-    def __post_init__(self):
-        _check_range("pupil_range_mm", self.pupil_range_mm, 0.5, 9.0)
-        _check_range("object_range_dpt", self.object_range_dpt, 0.0, 100.0)
-        _check_range("focus_range_dpt", self.focus_range_dpt, 0.0, 20.0)
-        for name, options in (
-            ("mode", MODES),
-            ("grid", GRIDS),
-            ("tolerance", TOLERANCES),
-        ):
-            if getattr(self, name) not in options:
-                raise ValueError(
-                    f"{name} {getattr(self, name)!r}: allowed are {', '.join(options)}"
-                )
+    def __post_init__(self) -> None:
+        """Refuse what no cache can be built for."""
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise ValueError(
@@ -128,43 +95,35 @@ class GridSpec:
         self._check_gaze()
 
     def _check_gaze(self) -> None:
-        """Refuse a gaze no eye has, or one that turns the image out of all PSFs."""
-        for name, low_deg in (("gaze_deg", -MAX_GAZE_DEG), ("gaze_range_deg", 0.0)):
-            values = getattr(self, name)
-            if not all(low_deg <= value <= MAX_GAZE_DEG for value in values):
-                raise ValueError(
-                    f"{name} {values}: allowed are {low_deg:g} to {MAX_GAZE_DEG:g}"
-                )
-        if not (self.follows_field and any(self.gaze_range_deg)):
+        """Refuse a gaze that turns the image out of all PSFs."""
+        if not (self.follows_field and any(self.settings.gaze_range_deg)):
             return
-        seen_deg = field_range_deg(self.camera, gaze_deg=self.gaze_deg)
-        for (low, high), turn in zip(seen_deg, self.gaze_range_deg, strict=True):
+        seen_deg = field_range_deg(self.camera, gaze_deg=self.settings.gaze_deg)
+        turns_deg = self.settings.gaze_range_deg
+        for (low, high), turn in zip(seen_deg, turns_deg, strict=True):
             if turn > 0.0 and max(-low, high) + turn > MAX_FIELD_DEG:
                 raise ValueError(
-                    f"gaze_range_deg {self.gaze_range_deg}: {turn:g} beside a field of "
+                    f"gaze_range_deg {turns_deg}: {turn:g} beside a field of "
                     f"{low:.3g} to {high:.3g} deg; allowed: {MAX_FIELD_DEG:g} together"
                 )
 
-    @classmethod
-    def for_camera(
-        cls, *, width_px: int, height_px: int, tangents: tuple, **settings
-    ) -> "GridSpec":
-        """Spec for a camera given by its parts; other settings as given."""
-        return cls(camera=Camera(width_px, height_px, tuple(tangents)), **settings)
+    def with_settings(self, **changes: Any) -> "GridSpec":
+        """Return the spec with some settings changed."""
+        return replace(self, settings=self.settings.changed(**changes))
 
     @property
     def pixel_pitch_mrad(self) -> tuple[float, float]:
         """Width and height of the pixel on the camera's axis."""
-        return pixel_pitch_mrad(
-            width_px=self.camera.width_px,
-            height_px=self.camera.height_px,
-            tangents=self.camera.tangents,
-        )
+        return self.camera.pixel_pitch_mrad
+
+    def serves(self, camera: Camera) -> bool:
+        """Return whether PSFs for this spec serve a camera."""
+        return is_same_camera(self.camera, camera, follows_field=self.follows_field)
 
     @property
     def follows_field(self) -> bool:
         """Whether PSFs differ over the visual field."""
-        return self.mode != "on-axis"
+        return self.settings.follows_field
 
     @property
     def field_range_deg(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -179,12 +138,12 @@ class GridSpec:
             (min(r[axis][0] for r in ranges), max(r[axis][1] for r in ranges))
             for axis in range(2)
         )
-        if self.grid == "planned":
+        if self.settings.grid == "planned":
             return seen_deg
         return tuple(
             (min(low, -reach), max(high, reach))
             for (low, high), reach in zip(
-                seen_deg, PAPER_REACH_DEG[self.mode], strict=True
+                seen_deg, PAPER_REACH_DEG[self.settings.mode], strict=True
             )
         )
 
@@ -195,12 +154,12 @@ class GridSpec:
         Nodes that the planner chose hold the defocus that their neighbours read; the
         paper's hold nine object distances of their own.
         """
-        return self.grid == "planned"
+        return self.settings.grid == "planned"
 
     @property
     def channel_wavelengths_nm(self) -> NDArray[np.float64]:
         """Wavelengths (3,) of the channels; all the same without chromatic blur."""
-        if not self.chromatic:
+        if not self.settings.chromatic:
             return np.full(len(self.wavelengths_nm), REFERENCE_WAVELENGTH_NM)
         return np.array(self.wavelengths_nm)
 
@@ -212,10 +171,10 @@ class GridSpec:
         """Directions of gaze over the range: its middle, edges and corners."""
         steps = [
             (-reach, 0.0, reach) if reach > 0.0 else (0.0,)
-            for reach in self.gaze_range_deg
+            for reach in self.settings.gaze_range_deg
         ]
         return [
-            (self.gaze_deg[0] + h, self.gaze_deg[1] + v)
+            (self.settings.gaze_deg[0] + h, self.settings.gaze_deg[1] + v)
             for h in steps[0]
             for v in steps[1]
         ]
@@ -227,7 +186,7 @@ class GridSpec:
         if not self.follows_field:
             axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
             return np.broadcast_to(axis, (*np.shape(h_deg), 2, 2))
-        gaze_deg = self.gaze_deg if gaze_deg is None else gaze_deg
+        gaze_deg = self.settings.gaze_deg if gaze_deg is None else gaze_deg
         return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=gaze_deg)
 
     def node_pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
@@ -237,7 +196,7 @@ class GridSpec:
         image has the pixels of its axis, made so much smaller that no place in the
         image has smaller ones: frames then only ever average stored pixels.
         """
-        if not any(self.gaze_range_deg) or not self.follows_field:
+        if not any(self.settings.gaze_range_deg) or not self.follows_field:
             return self.pixel_from_mrad(h_deg, v_deg)
         axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
         finest = np.ones(np.shape(h_deg))
@@ -247,33 +206,6 @@ class GridSpec:
             ratio = np.linalg.norm(np.linalg.solve(axis, local), ord=2, axis=(-2, -1))
             finest = np.maximum(finest, ratio)
         return finest[..., None, None] * axis
-
-
-def _check_range(name: str, values: tuple, low: float, high: float) -> None:
-    first, last = values
-    if not (
-        math.isfinite(first) and math.isfinite(last) and low <= first <= last <= high
-    ):
-        raise ValueError(f"{name} {values}: needs {low:g} <= first <= last <= {high:g}")
-
-
-def pixel_pitch_mrad(
-    *, width_px: int, height_px: int, tangents: tuple[float, float, float, float]
-) -> tuple[float, float]:
-    """Pixel size on the optical axis of a pinhole camera, mrad.
-
-    Parameters
-    ----------
-    tangents : (left, right, up, down)
-        Tangents of the view's edges; left < right, down < up.
-    """
-    left, right, up, down = tangents
-    if not (right > left and up > down):
-        raise ValueError(f"tangents {tangents}: need left < right and down < up")
-    return (
-        MRAD_PER_RAD * (right - left) / width_px,
-        MRAD_PER_RAD * (up - down) / height_px,
-    )
 
 
 def blur_step_px(blur_px: float, max_blur_step_px: float) -> float:

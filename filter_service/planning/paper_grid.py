@@ -12,8 +12,8 @@ Csoba & Kunkli 2023, section 7.2.
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.planning.eye import Eye
-from filter_service.planning.grid import PAPER_REACH_DEG, GridSpec
+from estimator.field.eye_optics import EyeOptics
+from filter_service.planning.grid import GREEN, PAPER_REACH_DEG, GridSpec
 from filter_service.planning.nodes import RaggedNodes
 
 ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
@@ -30,11 +30,9 @@ FOCI_DPT = {
 }
 DISTANCES_DPT = (0.125, 8.125)
 
-GREEN = 1
-
 
 def paper_axes(
-    eye: Eye, spec: GridSpec
+    eye: EyeOptics, spec: GridSpec
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray, NDArray]:
     """Azimuths, elevations, pupils and accommodations.
 
@@ -42,13 +40,14 @@ def paper_axes(
     meets with one and the same accommodation, as a myopic eye beyond its far point,
     are one node.
     """
-    reach_deg = PAPER_REACH_DEG.get(spec.mode, (0.0, 0.0))
+    settings, mode = spec.settings, spec.settings.mode
+    reach_deg = PAPER_REACH_DEG.get(mode, (0.0, 0.0))
     angles_deg = (
         np.linspace(-reach, reach, count)
-        for reach, count in zip(reach_deg, ANGLE_COUNTS[spec.mode], strict=True)
+        for reach, count in zip(reach_deg, ANGLE_COUNTS[mode], strict=True)
     )
-    pupils_mm = np.clip(PUPILS_MM[spec.mode], *spec.pupil_range_mm)
-    foci_dpt = np.clip(FOCI_DPT[spec.mode], *spec.focus_range_dpt)
+    pupils_mm = np.clip(PUPILS_MM[mode], *settings.pupil_range_mm)
+    foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
     return (
         *angles_deg,
         np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm]),
@@ -57,7 +56,7 @@ def paper_axes(
 
 
 def paper_defocus(
-    eye: Eye, spec: GridSpec, axes: tuple[NDArray, NDArray, NDArray, NDArray]
+    eye: EyeOptics, spec: GridSpec, axes: tuple[NDArray, NDArray, NDArray, NDArray]
 ) -> tuple[RaggedNodes, NDArray[np.float64]]:
     """Nodes of total defocus, and the channels' shifts (n_groups, 3) against them."""
     h_deg, v_deg, pupils_mm, used_dpt = axes
@@ -69,7 +68,7 @@ def paper_defocus(
         wavelength_nm=spec.channel_wavelengths_nm,
     ).reshape(-1, 3)
     green_dpt = at_infinity_dpt[:, GREEN, None]
-    count = DISTANCE_COUNTS[spec.mode]
+    count = DISTANCE_COUNTS[spec.settings.mode]
     values = green_dpt + np.linspace(*DISTANCES_DPT, count)
     starts = count * np.arange(len(values) + 1)
     return RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.field.eye_optics import EyeOptics
 from filter_service.constants import RGB
 from filter_service.planning.axis_nodes import (
     axis_nodes,
@@ -18,9 +19,8 @@ from filter_service.planning.axis_nodes import (
 )
 from filter_service.planning.cost import predicted_cost
 from filter_service.planning.error_law import combined_error, equal_share, psnr_db
-from filter_service.planning.eye import Eye
 from filter_service.planning.grid import (
-    TOLERANCES,
+    GREEN,
     GridSpec,
     defocus_nodes_dpt,
     pupil_nodes_mm,
@@ -30,9 +30,8 @@ from filter_service.planning.nodes import (
     PlanPrediction,
     RaggedNodes,
 )
-from filter_service.planning.paper_grid import GREEN, paper_axes, paper_defocus
-from filter_service.planning.slopes import PupilStates
-from filter_service.planning.use import (
+from filter_service.planning.paper_grid import paper_axes, paper_defocus
+from filter_service.planning.sampled_use import (
     AXES,
     Use,
     axis_error,
@@ -40,6 +39,8 @@ from filter_service.planning.use import (
     sample_use,
     unit_px,
 )
+from filter_service.planning.slopes import PupilStates
+from filter_service.settings import TOLERANCES
 
 __all__ = [
     "CachePlan",
@@ -86,7 +87,7 @@ class _Axes:
     accommodations_dpt: NDArray[np.float64]
 
 
-def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
+def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
     """Nodes over field, pupil, accommodation and defocus that frames can read.
 
     Raises
@@ -102,7 +103,7 @@ def plan_cache(eye: Eye, spec: GridSpec) -> CachePlan:
 
 
 def unchecked_plan(
-    eye: Eye, spec: GridSpec, *, target_db: float | None = None
+    eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
 ) -> CachePlan:
     """Plan like `plan_cache`, however large.
 
@@ -116,7 +117,7 @@ def unchecked_plan(
         allowed_error = 10.0 ** (-target_db / 10.0)
     use = sample_use(eye, spec, USE_SAMPLES)
     is_limited = None
-    if spec.grid == "paper":
+    if spec.settings.grid == "paper":
         axes = _Axes(*paper_axes(eye, spec))
         defocus, shift_dpt = paper_defocus(eye, spec, tuple(vars(axes).values()))
     else:
@@ -159,13 +160,13 @@ def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
     return errors | {"defocus": defocus_error(use, plan)}
 
 
-def _central_axes(eye: Eye, spec: GridSpec) -> _Axes:
-    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.pupil_range_mm)
+def _central_axes(eye: EyeOptics, spec: GridSpec) -> _Axes:
+    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
     return _Axes(
         h_deg=np.zeros(1),
         v_deg=np.zeros(1),
         pupils_mm=pupil_nodes_mm((low_mm, high_mm)),
-        accommodations_dpt=eye.accommodation_nodes_dpt(spec.focus_range_dpt),
+        accommodations_dpt=eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt),
     )
 
 
@@ -175,10 +176,10 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
     Axes with few nodes meet their share with some to spare; it goes to the others.
     """
     eye, spec = use.eye, use.spec
-    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
+    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
     ranges = {
         "accommodation": (used_dpt[0], used_dpt[-1]),
-        "pupil": tuple(eye.usable_pupil_mm(p) for p in spec.pupil_range_mm),
+        "pupil": tuple(eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm),
         "v": spec.field_range_deg[1],
         "h": spec.field_range_deg[0],
     }
@@ -197,7 +198,7 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
     return _Axes(*(nodes[axis] for axis in AXES[:-1])), left
 
 
-def _central_defocus(eye: Eye, spec: GridSpec, axes: _Axes) -> RaggedNodes:
+def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: _Axes) -> RaggedNodes:
     """Nodes on axis: by blur radius alone, far closer than any tolerance asks for."""
     ranges_dpt = _readable_ranges_dpt(eye, spec, axes)
     of_group = np.broadcast_to(axes.pupils_mm[:, None], ranges_dpt.shape[:-1])
@@ -217,7 +218,7 @@ def _central_defocus(eye: Eye, spec: GridSpec, axes: _Axes) -> RaggedNodes:
 
 
 def _field_defocus(
-    eye: Eye, spec: GridSpec, axes: _Axes, allowed_error: float
+    eye: EyeOptics, spec: GridSpec, axes: _Axes, allowed_error: float
 ) -> tuple[RaggedNodes, NDArray[np.bool_]]:
     """Nodes, and which groups of them end where kernels are as large as they may be."""
     groups = PupilStates.of(
@@ -254,7 +255,9 @@ def _over_neighbours(values: NDArray, axis: int, extreme) -> NDArray:
     )
 
 
-def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.float64]:
+def _readable_ranges_dpt(
+    eye: EyeOptics, spec: GridSpec, axes: _Axes
+) -> NDArray[np.float64]:
     """Smallest and largest total defocus (n_v, n_h, n_pupils, n_accommodations, 2).
 
     Over objects and channels, and over every accommodation and pupil that reads a node.
@@ -269,7 +272,10 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
     lows, highs = at_infinity_dpt.min(axis=-1), at_infinity_dpt.max(axis=-1)
     used_dpt = axes.accommodations_dpt
     if len(used_dpt) == 1:  # one shape for all: accommodation is defocus alone
-        beyond = [eye.accommodation_dpt(f) - used_dpt[0] for f in spec.focus_range_dpt]
+        beyond = [
+            eye.accommodation_dpt(f) - used_dpt[0]
+            for f in spec.settings.focus_range_dpt
+        ]
         lows, highs = lows - max(beyond), highs - min(beyond)
     else:
         beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
@@ -283,7 +289,11 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
         lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     near_far = np.stack(
-        [lows + spec.object_range_dpt[0], highs + spec.object_range_dpt[1]], axis=-1
+        [
+            lows + spec.settings.object_range_dpt[0],
+            highs + spec.settings.object_range_dpt[1],
+        ],
+        axis=-1,
     )
     # A pupil between two nodes reads both at equal blur, up to the other's own.
     scaled = near_far * axes.pupils_mm[:, None, None]
@@ -295,7 +305,7 @@ def _readable_ranges_dpt(eye: Eye, spec: GridSpec, axes: _Axes) -> NDArray[np.fl
     return ranges
 
 
-def _advice(eye: Eye, spec: GridSpec) -> str:
+def _advice(eye: EyeOptics, spec: GridSpec) -> str:
     """Say which one setting makes the plan fit, and what it then needs."""
     for words, smaller in _smaller_specs(spec):
         found = unchecked_plan(eye, smaller).prediction
@@ -318,23 +328,22 @@ def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
 
     def step(text: str, **settings) -> None:
         words.append(text)
-        steps.append(
-            (" and ".join(words), replace(steps[-1][1] if steps else spec, **settings))
-        )
+        last = steps[-1][1] if steps else spec
+        steps.append((" and ".join(words), last.with_settings(**settings)))
 
-    if spec.grid == "paper":
+    if spec.settings.grid == "paper":
         step('grid "planned"', grid="planned")
-    if spec.mode == "quality":
+    if spec.settings.mode == "quality":
         step('mode "dynamic"', mode="dynamic")
-    for tolerance in reversed(TOLERANCES[: TOLERANCES.index(spec.tolerance)]):
+    for tolerance in reversed(TOLERANCES[: TOLERANCES.index(spec.settings.tolerance)]):
         step(f'tolerance "{tolerance}"', tolerance=tolerance)
     for most_mm in (6.0, 5.0, 4.0):
-        if spec.pupil_range_mm[0] <= most_mm < spec.pupil_range_mm[1]:
+        if spec.settings.pupil_range_mm[0] <= most_mm < spec.settings.pupil_range_mm[1]:
             step(
                 f"pupils up to {most_mm:g} mm",
-                pupil_range_mm=(spec.pupil_range_mm[0], most_mm),
+                pupil_range_mm=(spec.settings.pupil_range_mm[0], most_mm),
             )
-    if spec.mode != "on-axis":
+    if spec.settings.mode != "on-axis":
         step('mode "on-axis"', mode="on-axis")
     if not steps:
         step("the same plan")

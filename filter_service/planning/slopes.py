@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.psf_pupil import PupilFrames, pupil_frames
-from estimator.zernike import EXPONENTS, wavefront_polynomial
-from filter_service.planning.eye import Eye
+from estimator.field.eye_optics import EyeOptics
+from estimator.optics.zernike import EXPONENTS, wavefront_polynomial
+from estimator.psf.pupil import PupilFrames, pupil_frames
 from filter_service.planning.grid import GridSpec
 
 N_RINGS, N_AZIMUTHS = 5, 16
@@ -40,7 +40,7 @@ class PupilStates:
 
 
 def state_frames(
-    eye: Eye,
+    eye: EyeOptics,
     spec: GridSpec,
     states: PupilStates,
     *,

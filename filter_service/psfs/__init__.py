@@ -1,1 +1,22 @@
-"""What the PSF cache of an eye holds, how it is built, kept on disk and read."""
+"""The PSF cache: built, packed, kept on disk, read for a frame.
+
+eye_for_spec         the eye of a profile, for what a cache covers
+build_store          every PSF of a plan, in chunks
+psf_engine           on the CPU or the GPU
+gpu_build            PSFs in compute shaders
+gpu_build_constants  their numbers
+gpu_build_passes     their passes
+gpu_build_records    their records
+pack                 kernels cut to boxes, in 16 bits
+store                the cache, and the layers of a frame
+field_defocus        change of defocus over the field
+read_kernels         which cached kernels a state reads
+store_cache          stores kept on disk
+store_codec          objects as JSON and arrays
+store_file           the file they go to
+picture              a kernel as a picture
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from filter_service.planning.eye import Eye
-from filter_service.planning.grid import GridSpec
+from estimator.field.eye_optics import EyeOptics
+from filter_service.planning.grid import GREEN, GridSpec
 
 COLUMNS, ROWS = 13, 9
 """Directions at which the eye is asked.  Between them, over +-40 x 25 deg at 5 mm, the
 spline is within 0.0025 dpt (emmetropia, myopia, astigmatism), 0.007 (post-LASIK), 0.009
 (keratoconus) and 0.012 (cataract)."""
-
-GREEN = 1
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,9 @@ class EyeDefocus:
         Field nodes.
     """
 
-    def __init__(self, eye: Eye, spec: GridSpec, *, h_deg: NDArray, v_deg: NDArray):
+    def __init__(
+        self, eye: EyeOptics, spec: GridSpec, *, h_deg: NDArray, v_deg: NDArray
+    ):
         wavelengths_nm = spec.channel_wavelengths_nm
         h, v, nm = (
             column.ravel()

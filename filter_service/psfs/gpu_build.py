@@ -6,19 +6,18 @@ at most 16 KiB of shared memory, 256 threads a group, 5 storage blocks a pass.  
 wave method would need a longer FFT than 1024 samples for is computed on the CPU.
 
 On a software renderer the passes take two to four times the processor time of
-`estimator.psf`, whose compiled loops a builder should prefer there.
+`estimator.psf.compute`, whose compiled loops a builder should prefer there.
 """
 
-import os
 from collections import deque
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.psf import (
+from estimator.psf.arguments import checked_choice, checked_zernike_um
+from estimator.psf.compute import (
     ACCURACY,
     MIN_ENERGY_RATIO,
     PsfBatch,
@@ -27,11 +26,11 @@ from estimator.psf import (
     finished_batch,
     plan_psfs,
 )
-from estimator.psf_arguments import checked_choice, checked_zernike_um
-from estimator.psf_fourier import fourier_kernels
-from estimator.psf_types import KernelBuffer, empty_buffer
-from estimator.stiles_crawford import StilesCrawford
-from filter_service.gl.gpu import Buffer, Gpu
+from estimator.psf.fourier import fourier_kernels
+from estimator.psf.kernel_types import KernelBuffer, empty_buffer
+from estimator.psf.stiles_crawford import StilesCrawford
+from estimator.threads import thread_count
+from filter_service.gl.gpu import Gpu
 from filter_service.psfs.gpu_build_passes import PsfPasses
 from filter_service.psfs.gpu_build_records import (
     FIELD_BYTES,
@@ -84,28 +83,6 @@ class _Block:
     plan: PsfPlan
     slabs: list[_Slab]
     cpu_kernels: KernelBuffer | None
-
-
-@dataclass(frozen=True)
-class GpuPsfs:
-    """Finished kernels in a buffer of the GPU, until the next ones are asked for.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first PSF in the call.
-    kernels, totals : Buffer
-        float32: kernels one behind the other; and for each PSF of the block, two
-        numbers whose sum is the light in its disc.
-    offset_count, radius_px : (P,) int64
-        Of these PSFs, as in `PsfBatch`.
-    """
-
-    first: int
-    kernels: Buffer
-    totals: Buffer
-    offset_count: NDArray[np.int64]
-    radius_px: NDArray[np.int64]
 
 
 def _cut_slabs(starts: NDArray[np.int64], limit_count: int) -> list[slice]:
@@ -187,7 +164,7 @@ def _options_of(options: dict, count: int, part: slice) -> dict:
 def _blocks(zernike_um, options, *, accuracy, scratch_bytes, workers):
     """Blocks in their order, planned a few ahead by threads."""
     count = zernike_um.shape[0]
-    threads = workers or len(os.sched_getaffinity(0))
+    threads = workers or thread_count()
     pool, waiting = ThreadPoolExecutor(threads), deque()
     try:
         for first in range(0, max(count, 1), BLOCK_PSFS):
@@ -211,9 +188,7 @@ def _blocks(zernike_um, options, *, accuracy, scratch_bytes, workers):
         pool.shutdown(cancel_futures=True)
 
 
-def _run_slab(
-    passes: PsfPasses, block: _Block, slab: _Slab, diffraction: bool
-) -> GpuPsfs:
+def _run_slab(passes: PsfPasses, block: _Block, slab: _Slab, diffraction: bool) -> None:
     """Compute the kernels of a slab into the GPU's buffers."""
     part = slab.part
     passes.begin(
@@ -228,13 +203,6 @@ def _run_slab(
         passes.put(int(slab.starts[p]), kernel, slot=2 * p, light_ratio=light)
     passes.waves(slab.waves)
     passes.rays(slab.rays, diffraction=diffraction)
-    return GpuPsfs(
-        first=block.first + part.start,
-        kernels=passes.kernels,
-        totals=passes.totals,
-        offset_count=slab.starts[part],
-        radius_px=block.plan.radius_px[part],
-    )
 
 
 def _prepare(gpu: Gpu, zernike_um, options, accuracy, workers):
@@ -249,29 +217,6 @@ def _prepare(gpu: Gpu, zernike_um, options, accuracy, workers):
         scratch_bytes=SOFTWARE_SCRATCH_BYTES if gpu.is_software else SCRATCH_BYTES,
         workers=workers,
     )
-
-
-def gpu_psfs(
-    gpu: Gpu,
-    zernike_um: ArrayLike,
-    *,
-    accuracy: str = "normal",
-    workers: int | None = None,
-    **options,
-) -> Iterator[GpuPsfs]:
-    """Kernels that stay on the GPU, a buffer after the other, in the call's order.
-
-    Arguments and errors are those of `gpu_psf_batch`, except that a kernel without
-    light is not refused: its total is 0.  Each buffer is written over when the next is
-    asked for; closing the iterator ends the build.
-    """
-    diffraction = options.get("diffraction", True)
-    passes = PsfPasses(gpu)
-    for block in _prepare(gpu, zernike_um, options, accuracy, workers):
-        for slab in block.slabs:
-            with gpu.context:
-                psfs = _run_slab(passes, block, slab, diffraction)
-            yield psfs
 
 
 def gpu_psf_batch(
@@ -298,7 +243,7 @@ def gpu_psf_batch(
     ----------
     gpu : Gpu
     zernike_um, pupil_diameter_mm, ..., min_energy_ratio
-        As in `estimator.psf.compute_psf_batch`.
+        As in `estimator.psf.compute.compute_psf_batch`.
     method : "auto", "fourier" or "geometric"
         The wave method takes FFTs of up to 1024 samples here; wavefronts that need
         longer ones (a spot of about 600 to 1000 lambda/D) go through the CPU's, up to
@@ -313,7 +258,7 @@ def gpu_psf_batch(
     Raises
     ------
     PsfTooLarge, ValueError
-        As `estimator.psf.compute_psf_batch`.
+        As `estimator.psf.compute.compute_psf_batch`.
     OutOfGpuMemory, RenderFailed
         The device refused.
     """

@@ -8,9 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from estimator import psf_geometric, psf_geometric_kernels
-from estimator.psf_fourier import edge_response
-from estimator.psf_fourier_kernels import EDGE_HALF_WIDTH, EDGE_STEPS
+from estimator.psf import geometric as psf_geometric
+from estimator.psf import geometric_kernels as psf_geometric_kernels
+from estimator.psf.fourier import edge_response
+from estimator.psf.fourier_kernels import EDGE_HALF_WIDTH, EDGE_STEPS
 
 FFT_RADICES = {
     48: (8, 6),
@@ -46,8 +47,6 @@ least 14,000, and a sum four times the light still fits."""
 RAY_ROWS = 32
 PIXEL_THREADS = 64
 CLEAR_THREADS = 256
-
-_FINE_STEPS = 64
 
 
 @lru_cache(maxsize=1)

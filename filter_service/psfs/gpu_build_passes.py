@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf_geometric import fresnel_table
+from estimator.psf.geometric import fresnel_table
 from filter_service.gl.gpu import Buffer, Gpu
 from filter_service.psfs.gpu_build_constants import (
     CLEAR_THREADS,

@@ -1,6 +1,6 @@
 """Records that tell the GPU passes how to build each PSF: sizes, places, coefficients.
 
-From a plan (`estimator.psf.plan_psfs`) to what `shaders/common/psf_record.glsl` reads.
+From a plan (`psf.compute.plan_psfs`) to what `shaders/common/psf_record.glsl` reads.
 No OpenGL here.
 """
 
@@ -11,18 +11,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf import ACCURACY, PsfPlan
-from estimator.psf_fourier import pixel_filter, plan_grids
-from estimator.psf_fourier_kernels import EDGE_HALF_WIDTH
-from estimator.psf_geometric_kernels import (
+from estimator.optics.zernike import EXPONENTS
+from estimator.psf.compute import ACCURACY, PsfPlan
+from estimator.psf.fourier import pixel_filter, plan_grids
+from estimator.psf.fourier_kernels import EDGE_HALF_WIDTH
+from estimator.psf.geometric_kernels import (
     CELLS_PER_PX,
     EDGE_POINTS_PER_PX,
     MAX_CELLS,
     MIN_CELLS,
     MIN_EDGE_POINTS,
 )
-from estimator.psf_tail import EDGE_STRIDE
-from estimator.zernike import EXPONENTS
+from estimator.psf.tail import EDGE_STRIDE
 from filter_service.psfs.gpu_build_constants import FFT_RADICES, LIGHT_STEP_BITS
 
 MAX_LENGTH = max(FFT_RADICES)

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from estimator.psf import PsfBatch
+from estimator.psf.compute import PsfBatch
 from filter_service.constants import WEIGHT_MAX
 
 MAX_CENTROID_SHIFT_RATIO = 0.005

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.planning.eye import Eye
+from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GridSpec, layer_distances_dpt
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.plan import CachePlan
@@ -52,7 +52,7 @@ class PsfStore:
     """
 
     spec: GridSpec
-    eye: Eye
+    eye: EyeOptics
     plan: CachePlan
     kernels: NDArray[np.uint16]
     offsets: NDArray[np.int64]
@@ -176,7 +176,7 @@ def frame_layers(
     notes += _limit_notes(store, corners)
     reads = _state_reads(plan, pupil_mm, corners)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
-    near_far_dpt = object_range_dpt or store.spec.object_range_dpt
+    near_far_dpt = object_range_dpt or store.spec.settings.object_range_dpt
     layer_dpt = layer_distances_dpt(
         tuple(np.add(near_far_dpt, change.range_dpt)),
         focused_dpt=-layer_zero_dpt[gaze],

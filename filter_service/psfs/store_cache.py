@@ -23,7 +23,8 @@ from typing import Any
 
 import estimator
 import filter_service
-from estimator.profiles import EyeProfile
+from estimator.profiles.parse import EyeProfile
+from filter_service.gl.shader_source import SHADER_ROOT
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.store_codec import NotStorable, pack
 from filter_service.psfs.store_file import (
@@ -64,27 +65,22 @@ def code_version() -> str:
     files = [
         *(path for path in eyes.rglob("*") if path.suffix in (".py", ".json", ".onnx")),
         *ours.rglob("*.py"),
-        *ours.parent.glob("shaders/**/psf*"),
+        *SHADER_ROOT.rglob("psf*"),
     ]
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(files):
-        name = path.relative_to(ours.parent).as_posix()
-        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 
-def store_key(
-    profile: EyeProfile, spec: GridSpec, *, eye_model: str, accuracy: str
-) -> str:
+def store_key(profile: EyeProfile, spec: GridSpec) -> str:
     """Return the name under which the store of an eye and a grid is kept."""
     spec_tree, _ = pack(spec)
     if not spec.follows_field:
         spec_tree["object"][1]["camera"] = list(spec.pixel_pitch_mrad)
     profile_tree, arrays = pack(profile)
     digest = hashlib.blake2b(digest_size=16)
-    text = json.dumps(
-        [code_version(), eye_model, accuracy, spec_tree, profile_tree], sort_keys=True
-    )
+    text = json.dumps([code_version(), spec_tree, profile_tree], sort_keys=True)
     digest.update(text.encode())
     for array in arrays.values():
         digest.update(array.tobytes())

@@ -1,1 +1,17 @@
-"""From a frame and the cache to the image that the eye sees, pass by pass."""
+"""From a frame and the cache to the filtered picture.
+
+engine         what every frame engine offers
+frame          a view made ready: depth filled, colour finite
+gaze           where the eye looks, within what was prepared
+image_cells    cells of the image that share kernels
+cell_maps      from their pixels to those of stored kernels
+frame_states   what stays while pupil, focus and gaze stay
+frame_kernels  recipes of a frame's kernels
+kernel_loops   their compiled loops
+reference      numpy twins of the passes
+gl/            the engine of compute shaders
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

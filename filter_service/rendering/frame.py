@@ -1,122 +1,14 @@
-"""One view of an RGB-D frame: checked, with missing depth filled and counted.
+"""What becomes of a view before it is filtered: depth filled, colour made finite."""
 
-A view may have a second, hidden layer: what the camera would see if what it sees were
-away.  Blurred edges let light of it pass.
-"""
-
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from filter_service.errors import BadMessage
+from filter_service.rgbd_view import RgbdView
 
-MAX_SIDE_PX = 16384
-DEPTH_KINDS = ("planar", "radial")
 IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
-
-
-@dataclass(frozen=True)
-class View:
-    """Colour, depth and camera of one view.
-
-    Attributes
-    ----------
-    color : (height, width, 3)
-        uint8 sRGB; or float32 or float16 linear light, above 1 and below 0 too.
-    depth_m : (height, width), float32
-        +inf is infinity; 0, negative and NaN are missing.
-    tangents : (left, right, up, down)
-    depth_kind : "planar" or "radial"
-        View-space z, or distance from the eye.
-    hidden_color : (height, width, 3), optional
-        Of what is behind, of the same type as `color`.
-    hidden_depth_m : (height, width), float32, optional
-        0, negative and NaN: nothing is hidden here, and nothing is filled in.
-    """
-
-    color: NDArray
-    depth_m: NDArray[np.float32]
-    tangents: tuple[float, float, float, float]
-    depth_kind: str = "planar"
-    hidden_color: NDArray | None = None
-    hidden_depth_m: NDArray[np.float32] | None = None
-
-    @property
-    def surface_count(self) -> int:
-        """1, or 2 with a hidden layer."""
-        return 1 if self.hidden_depth_m is None else 2
-
-    @property
-    def surface_colors(self) -> tuple[NDArray, ...]:
-        """Colour of each surface."""
-        return (self.color, self.hidden_color)[: self.surface_count]
-
-    @property
-    def surface_depths_m(self) -> tuple[NDArray[np.float32], ...]:
-        """Depth of each surface."""
-        return (self.depth_m, self.hidden_depth_m)[: self.surface_count]
-
-    @property
-    def width_px(self) -> int:
-        """Columns."""
-        return self.color.shape[1]
-
-    @property
-    def height_px(self) -> int:
-        """Rows."""
-        return self.color.shape[0]
-
-
-def check_view(view: View) -> None:
-    """Refuse a view whose arrays cannot be filtered.
-
-    Raises
-    ------
-    BadMessage
-        Names the field, the bad value and what is allowed.
-    """
-    color, depth_m = view.color, view.depth_m
-    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
-        raise BadMessage(
-            f"shape {color.shape}", field="color", allowed="(height, width, 3)"
-        )
-    if max(color.shape) > MAX_SIDE_PX:
-        raise BadMessage(
-            f"shape {color.shape}", field="color", allowed=f"sides up to {MAX_SIDE_PX}"
-        )
-    if color.dtype not in (np.uint8, np.float32, np.float16):
-        raise BadMessage(
-            f"dtype {color.dtype}",
-            field="color",
-            allowed="uint8 sRGB, float32 or float16 linear",
-        )
-    if depth_m.shape != color.shape[:2] or depth_m.dtype != np.float32:
-        raise BadMessage(
-            f"{depth_m.dtype} of shape {depth_m.shape}",
-            field="depth",
-            allowed=f"float32 of shape {color.shape[:2]}",
-        )
-    if view.depth_kind not in DEPTH_KINDS:
-        raise BadMessage(
-            f"{view.depth_kind!r}", field="depth.kind", allowed=", ".join(DEPTH_KINDS)
-        )
-    _check_hidden(view)
-
-
-def _check_hidden(view: View) -> None:
-    """Refuse a hidden layer that is not of the kind of what is seen."""
-    if view.hidden_color is None and view.hidden_depth_m is None:
-        return
-    for field, image, seen in (
-        ("hidden_color", view.hidden_color, view.color),
-        ("hidden_depth", view.hidden_depth_m, view.depth_m),
-    ):
-        wanted = f"{seen.dtype} of shape {seen.shape}"
-        found = "missing" if image is None else f"{image.dtype} of shape {image.shape}"
-        if found != wanted:
-            raise BadMessage(found, field=field, allowed=wanted)
 
 
 def fill_missing_depth(
@@ -139,7 +31,7 @@ def fill_missing_depth(
     return depth_m[rows, columns], count
 
 
-def extended(view: View, border_px: int) -> View:
+def extended(view: RgbdView, border_px: int) -> RgbdView:
     """Repeat the edge of a view's images all around."""
     if border_px == 0:
         return view
@@ -171,7 +63,7 @@ def finite_color(color: NDArray) -> tuple[NDArray, int]:
     return np.where(finite, color, color.dtype.type(0.0)), count
 
 
-def with_clean_hidden(view: View) -> tuple[View, int]:
+def with_clean_hidden(view: RgbdView) -> tuple[RgbdView, int]:
     """Set hidden depth to 0 where nothing is hidden, and count non-finite colours.
 
     A hidden layer that holds nothing at all is left out.
@@ -188,7 +80,7 @@ def with_clean_hidden(view: View) -> tuple[View, int]:
     return clean, int(np.count_nonzero(bad))
 
 
-def radial_stretch(view: View) -> NDArray[np.float64]:
+def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
     """Distance from the eye per unit of planar depth, (height, width)."""
     left, right, up, down = view.tangents
     x = left + (right - left) * (np.arange(view.width_px) + 0.5) / view.width_px
@@ -196,7 +88,7 @@ def radial_stretch(view: View) -> NDArray[np.float64]:
     return np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
 
 
-def object_dpt(view: View, depth_m: NDArray[np.float32]) -> NDArray[np.float64]:
+def object_dpt(view: RgbdView, depth_m: NDArray[np.float32]) -> NDArray[np.float64]:
     """Object distance in dioptres (height, width) of valid depths."""
     with np.errstate(divide="ignore"):
         inverse = 1.0 / depth_m.astype(np.float64)

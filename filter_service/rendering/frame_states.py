@@ -79,7 +79,7 @@ class FrameStates:
         """Cells of a gaze."""
         self._forget_others(handle)
         spec, state = handle.store.spec, (gaze_deg, self._cell_px)
-        if state == (spec.gaze_deg, None):
+        if state == (spec.settings.gaze_deg, None):
             return handle.image
         if self._image is None or self._image[0] != state:
             with timer.wall("psf_plan_ms"):

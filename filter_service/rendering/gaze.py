@@ -24,7 +24,7 @@ def usable_gaze(
         Not two finite angles.
     """
     if gaze_deg is None:
-        return spec.gaze_deg, ()
+        return spec.settings.gaze_deg, ()
     asked_deg = tuple(float(angle) for angle in gaze_deg)
     if len(asked_deg) != 2 or not all(math.isfinite(angle) for angle in asked_deg):
         raise BadMessage(
@@ -33,11 +33,11 @@ def usable_gaze(
     used_deg = tuple(
         min(max(angle, middle - reach), middle + reach)
         for angle, middle, reach in zip(
-            asked_deg, spec.gaze_deg, spec.gaze_range_deg, strict=True
+            asked_deg, spec.settings.gaze_deg, spec.settings.gaze_range_deg, strict=True
         )
     )
     if not spec.follows_field:
-        used_deg = spec.gaze_deg
+        used_deg = spec.settings.gaze_deg
     if math.dist(asked_deg, used_deg) <= ROUNDING_DEG:
         return used_deg, ()
     reason = (

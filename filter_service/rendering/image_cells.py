@@ -64,11 +64,6 @@ class ImageCells:
         """Number of cells."""
         return self.grid[0] * self.grid[1]
 
-    @property
-    def is_single_node(self) -> bool:
-        """Whether the whole image has the kernels of one field node."""
-        return self.count == 1 and self.weight_ratio[0, 0] == 1.0
-
 
 def image_cells(
     spec: GridSpec,
@@ -99,7 +94,7 @@ def image_cells(
             corner_h_deg=np.zeros((2, 2)),
             corner_v_deg=np.zeros((2, 2)),
         )
-    gaze_deg = spec.gaze_deg if gaze_deg is None else gaze_deg
+    gaze_deg = spec.settings.gaze_deg if gaze_deg is None else gaze_deg
     cell_px = cell_px or _cell_px(spec)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
@@ -160,5 +155,5 @@ def _node_from_cell(
 
 def _cell_px(spec: GridSpec) -> int:
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
-    power = math.floor(math.log2(max(CELL_DEG[spec.mode] / pixel_deg, 1.0)))
+    power = math.floor(math.log2(max(CELL_DEG[spec.settings.mode] / pixel_deg, 1.0)))
     return min(max(2**power, MIN_CELL_PX), MAX_CELL_PX)

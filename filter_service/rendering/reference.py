@@ -22,12 +22,7 @@ from filter_service.constants import (
 )
 from filter_service.psfs.pack import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
-from filter_service.rendering.frame import (
-    View,
-    extended,
-    fill_missing_depth,
-    object_dpt,
-)
+from filter_service.rendering.frame import extended, fill_missing_depth, object_dpt
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     NodeKernels,
@@ -35,6 +30,7 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
+from filter_service.rgbd_view import RgbdView
 
 NOTHING = -1
 """Stands for the kernel of a pixel that holds nothing."""
@@ -130,7 +126,9 @@ def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
     return np.moveaxis(light, 1, -1)
 
 
-def cell_index(view: View, image: ImageCells, border_px: int = 0) -> NDArray[np.int64]:
+def cell_index(
+    view: RgbdView, image: ImageCells, border_px: int = 0
+) -> NDArray[np.int64]:
     """Cell (height, width) of each pixel; that of the edge in a border."""
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px), np.int64)
@@ -142,7 +140,7 @@ def cell_index(view: View, image: ImageCells, border_px: int = 0) -> NDArray[np.
 
 
 def field_change_dpt(
-    view: View, layers: FrameLayers, image: ImageCells, border_px: int = 0
+    view: RgbdView, layers: FrameLayers, image: ImageCells, border_px: int = 0
 ) -> NDArray[np.float64]:
     """Change of defocus (height, width) over the field, bilinear within cells.
 
@@ -164,7 +162,7 @@ def field_change_dpt(
 
 
 def gather(
-    view: View,
+    view: RgbdView,
     store: PsfStore,
     layers: FrameLayers,
     *,
@@ -214,7 +212,7 @@ def gather(
     return out[rows, columns]
 
 
-def surface_distances_dpt(view: View, layers: FrameLayers) -> NDArray[np.float64]:
+def surface_distances_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:
     """Object distance (surfaces, height, width); NaN where nothing is hidden.
 
     Nothing that blurs like the surface before it counts as hidden.

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.constants import PSF_ENGINES
 from filter_service.messages import DEFAULT_ENDPOINT, Limits
-from filter_service.service.build_job import BuildLimits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
-MB = 2**20
-
-
-def default_cache_dir() -> str:
-    """Return where finished PSFs are kept if nothing else is said."""
-    own = os.environ.get("OCUFILTER_CACHE_DIR")
-    if own is not None:
-        return own
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(base) / "ocufilter")
+MB = 10**6
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ HEARTBEAT_INTERVAL_MS = 1000
 HEARTBEAT_TIMEOUT_MS = 4000
 RETRY_S = 0.001
 
+Tracker = zmq.MessageTracker
+
 
 def _check_path_is_free(bind: str) -> None:
     """Refuse an ``ipc://`` path that holds a file or a live endpoint.

@@ -11,10 +11,16 @@ import logging
 import socket
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
+from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession, TooManySessions
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
+from filter_service.filtering.workshop import Workshop
 from filter_service.messages import (
+    Accepted,
     Alive,
     Bye,
     Dropped,
@@ -25,8 +31,9 @@ from filter_service.messages import (
     Ping,
     Pong,
     ProfileRequest,
+    Progress,
+    Ready,
     Reply,
-    Request,
     Result,
     Welcome,
     decode_request,
@@ -34,18 +41,15 @@ from filter_service.messages import (
     peek_ids,
 )
 from filter_service.service.config import ServiceConfig
-from filter_service.service.eye_builds import EyeBuilds
-from filter_service.service.frame_work import filter_frame
+from filter_service.service.frame_reply import frame_reply
 from filter_service.service.mailbox import Mailbox, Outcome
 from filter_service.service.process_info import package_version, resident_memory_mb
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.service.worker_handle import WorkerHandle
+from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep the loop from rendering
 MAX_UNSENT_RESULTS = 4  # large replies a client has not taken; bounds memory
 MARK_SENT_S = 0.03  # less than most frames take to filter
-LOAD_RANGE_S = (0.004, 0.03)  # for copying a new store to the GPU between two frames
-LOAD_SHARE = 0.5  # of a frame's time: the stream is never late by a whole frame
 IDLE_WAIT_S = 1.0
 ATTENTION_WAIT_S = 0.1
 
@@ -58,33 +62,27 @@ class FilterServer:
     Parameters
     ----------
     config : ServiceConfig
-    renderer : FilterRenderer, or another with its ``load_steps`` and ``render``
-    worker : WorkerHandle
-        Started, or to be started; the server closes it.
-    check_profile : callable
-        ``check_profile(body, settings)`` raises a FilterError for a wrong profile.
-    gl_renderer : str
-        Told to clients.
+    workshop : Workshop
+        Where all sessions' eyes are made; the server closes it.
+    read_profile : callable
+        ``read_profile(body)`` gives what the workshop takes, or raises a FilterError.
     """
 
     def __init__(
         self,
         config: ServiceConfig,
         *,
-        renderer: Any,
-        worker: WorkerHandle,
-        check_profile: Callable[[dict, Any], object],
-        gl_renderer: str,
+        workshop: Workshop,
+        read_profile: Callable[[dict[str, Any]], EyeProfile],
     ) -> None:
         self.config = config
         self._limits = config.limits
-        self._renderer = renderer
-        self._gl_renderer = gl_renderer
+        self._workshop = workshop
+        self._read_profile = read_profile
         self._sessions: dict[bytes, Session] = {}
         self._next_session_id = 1
         self._n_rendered = 0
         self._n_dropped = 0
-        self._frame_s = 0.0  # what the last frame took to filter
         self._next_alive_s = time.monotonic() + config.alive_interval_s
         self._is_stopping = False
         self._mailbox = Mailbox(config.bind, config.max_message_part_bytes)
@@ -92,21 +90,13 @@ class FilterServer:
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_writer.setblocking(False)
         self._wake_reader.setblocking(False)
-        self._worker = worker
-        self._builds = EyeBuilds(
-            self._worker,
-            renderer=renderer,
-            check_profile=check_profile,
-            send=self._send,
-            limits=config.build_limits,
-        )
 
     # The loop
 
     def run(self) -> None:
         """Serve until `stop`; everything is closed at the end."""
         try:
-            self._worker.start()
+            self._workshop.worker.start()
             while not self._is_stopping:
                 self._turn()
         finally:
@@ -127,30 +117,28 @@ class FilterServer:
 
     def _turn(self) -> None:
         watched = {self._wake_reader.fileno()}
-        if self._worker.file_descriptor is not None:
-            watched.add(self._worker.file_descriptor)
+        if self._workshop.worker.file_descriptor is not None:
+            watched.add(self._workshop.worker.file_descriptor)
         self._mailbox.watch(watched)
         self._mailbox.wait(self._wait_s())
         self._take_in_messages()
         self._filter_one_frame()
-        low_s, high_s = LOAD_RANGE_S
-        load_s = min(max(LOAD_SHARE * self._frame_s, low_s), high_s)
-        self._builds.advance(self._sessions.values(), load_s=load_s)
+        self._workshop.advance()
         self._probe_clients()
 
     def _wait_s(self) -> float:
-        if self._builds.is_loading:
+        if self._workshop.is_loading:
             return 0.0
         if any(session.waiting for session in self._sessions.values()):
             return 0.0
-        if self._worker.needs_attention_soon:
+        if self._workshop.worker.needs_attention_soon:
             return ATTENTION_WAIT_S
         return min(IDLE_WAIT_S, max(0.0, self._next_alive_s - time.monotonic()))
 
     def _close(self) -> None:
         for identity in list(self._sessions):
             self._end_session(identity)
-        self._worker.close()
+        self._workshop.close()
         self._mailbox.close()
         self._wake_reader.close()
         self._wake_writer.close()
@@ -192,7 +180,7 @@ class FilterServer:
     def _handle(
         self,
         identity: bytes,
-        request: Request,
+        request: Message,
         received_s: float,
         answers: list[tuple[Session, Dropped | ErrorReply]],
     ) -> None:
@@ -205,7 +193,7 @@ class FilterServer:
         elif identity not in self._sessions:
             raise NoSession("hello was not said", allowed="hello before anything else")
         elif isinstance(request, ProfileRequest):
-            self._builds.take_profile(self._sessions[identity], request)
+            self._take_profile(self._sessions[identity], request)
         elif isinstance(request, Frame):
             session = self._sessions[identity]
             waiting = WaitingFrame(request, received_s, time.monotonic())
@@ -229,7 +217,11 @@ class FilterServer:
                 identity=identity,
                 client=hello.client,
                 credit=self.config.credit,
-                max_cameras=self.config.max_cameras,
+                eye_filter=EyeFilter(
+                    workshop=self._workshop,
+                    max_cameras=self.config.max_cameras,
+                    on_event=partial(self._tell, identity),
+                ),
             )
             self._next_session_id += 1
             self._sessions[identity] = session
@@ -237,7 +229,7 @@ class FilterServer:
         server = {
             "name": "ocufilter",
             "version": package_version(),
-            "gl_renderer": self._gl_renderer,
+            "gl_renderer": self._workshop.engine.name,
         }
         transport = self.endpoint.split("://", 1)[0]
         self._send(
@@ -247,6 +239,43 @@ class FilterServer:
             ),
         )
 
+    def _take_profile(self, session: Session, request: ProfileRequest) -> None:
+        """Accept a profile; what becomes of it is told as events."""
+        eye = session.eye_filter.set_profile(
+            self._read_profile(request.body),
+            settings=request.settings,
+            cameras=request.views,
+            profile_id=request.profile_id,
+        )
+        accepted = Accepted(
+            request.profile_id,
+            eye.generation,
+            is_building=bool(eye.wanted),
+            n_cameras=len(eye.wanted),
+        )
+        self._send(session.identity, accepted)
+
+    def _tell(self, identity: bytes, event: EyeEvent) -> None:
+        """Tell a client what happens to its profile."""
+        profile_id, generation = event.eye.profile_id, event.eye.generation
+        reply: Reply
+        if isinstance(event, BuildingEye):
+            reply = Progress(profile_id, generation, event.stage, event.fraction)
+        elif isinstance(event, EyeReady):
+            reply = Ready(
+                profile_id,
+                generation,
+                build_ms=event.build_ms,
+                psf_count=event.psf_count,
+                memory_mb=event.memory_mb,
+                pixel_pitch_mrad=event.camera.pixel_pitch_mrad,
+                notes=event.notes,
+                is_complete=event.is_complete,
+            )
+        else:
+            reply = ErrorReply.from_exception(event.error, profile_id=profile_id)
+        self._send(identity, reply)
+
     def _pong(self, ping: Ping) -> Pong:
         return Pong(
             t=ping.t,
@@ -255,7 +284,7 @@ class FilterServer:
             n_sessions=len(self._sessions),
             n_rendered=self._n_rendered,
             n_dropped=self._n_dropped,
-            is_building=self._worker.is_busy,
+            is_building=self._workshop.worker.is_busy,
         )
 
     def _send(self, identity: bytes, reply: Reply) -> None:
@@ -278,9 +307,7 @@ class FilterServer:
         session = self._sessions.pop(identity, None)
         if session is None:
             return
-        self._builds.cancel(session)
-        session.end()
-        self._builds.free_retired(session)
+        session.eye_filter.close()
         why = "" if outcome is None else f": the client is {outcome.value}"
         log.info("session %d ends%s", session.session_id, why)
 
@@ -308,20 +335,7 @@ class FilterServer:
         if self._is_slow_consumer(session):
             self._answer_frame(session, Dropped(frame_id, "slow_consumer"))
             return
-        try:
-            plan = session.plan(waiting.frame)
-        except FilterError as error:
-            reply = ErrorReply.from_exception(error, frame_id=frame_id)
-            self._answer_frame(session, reply)
-            return
-        self._builds.free_retired(session)
-        if plan is None:
-            self._answer_frame(session, Dropped(frame_id, "preparing"))
-        else:
-            started_s = time.monotonic()
-            reply = filter_frame(self._renderer, waiting, plan)
-            self._frame_s = time.monotonic() - started_s
-            self._answer_frame(session, reply)
+        self._answer_frame(session, frame_reply(session.eye_filter, waiting))
 
     def _is_slow_consumer(self, session: Session) -> bool:
         """Return whether a client has left too many large replies with the service.

@@ -1,1 +1,9 @@
-"""Fields, requests and replies of the messages, one kind each."""
+"""Messages, field by field; `filter_service.messages` is their face.
+
+message    what every message has in common
+images     images, formats, views
+requests   what a client says
+replies    what the service answers
+unpacking  bounded unpacking of untrusted bytes
+schema     the headers as JSON Schema
+"""

@@ -1,203 +1,133 @@
-"""Images and cameras on the wire, and the limits of one message."""
+"""Images on the wire: their formats, what a header says of them, their parts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.camera import Camera, SidePx, Tangents
+from filter_service.checked import Record
 from filter_service.errors import BadMessage
-from filter_service.wire.checks import (
-    check_float,
-    show,
-    take_bool,
-    take_choice,
-    take_int,
-    take_list,
-    take_map,
-)
+from filter_service.rgbd_view import ColorImage, RgbdView
+from filter_service.settings import DepthKind, Output
+from filter_service.wire.message import Limits, Part, expect_parts
 
-Part = bytes | bytearray | memoryview
+DType = Literal["uint8", "float32", "float16"]
+Space = Literal["srgb", "linear"]
 
-MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
-MAX_PUPIL_MM = 9.0
-MAX_PREPARED_PUPIL_MM = 9.0
-MAX_VERGENCE_DPT = 20.0
-MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
-MAX_IMAGE_SIDE_PX = 16384
-
-COLOR_SPACE_OF_DTYPE = {"uint8": "srgb", "float32": "linear", "float16": "linear"}
-DEPTH_KINDS = ("planar", "radial")
+SPACE_OF_DTYPE: dict[DType, Space] = {
+    "uint8": "srgb",
+    "float32": "linear",
+    "float16": "linear",
+}
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What one service accepts; it is published in ``welcome``."""
-
-    max_width_px: int = 4096
-    max_height_px: int = 4096
-    max_views: int = 2
-    max_part_bytes: int = 100 * 2**20  # 3840 x 2160 linear float32 colour fits
-    max_profile_bytes: int = 2**20
-
-    def fields(self) -> dict[str, int]:
-        """Return the map that travels in ``welcome``."""
-        return dict(vars(self))
-
-    @classmethod
-    def parse(cls, source: Mapping[str, Any]) -> Limits:
-        """Return the limits of a ``welcome``."""
-        return cls(
-            **{
-                name: take_int(source, name, low=1, high=2**40, path=f"limits.{name}")
-                for name in cls.__dataclass_fields__
-            }
-        )
-
-
-@dataclass(frozen=True)
-class ImageFormat:
+class ImageFormat(Record):
     """How colour is stored: 8-bit sRGB, or linear float32 or float16."""
 
-    dtype: str = "uint8"
-    space: str = "srgb"
+    dtype: DType
+    space: Space
+
+    def __post_init__(self) -> None:
+        """Refuse other pairs: 8 bits are sRGB and floats linear, nothing else."""
+        wanted = SPACE_OF_DTYPE[self.dtype]
+        if self.space != wanted:
+            raise BadMessage(
+                f"it is {self.space!r}", field="space", allowed=f"one of {wanted}"
+            )
 
     @property
     def bytes_per_pixel(self) -> int:
         """Return the size of one RGB pixel."""
         return 3 * np.dtype(self.dtype).itemsize
 
-    def fields(self) -> dict[str, str]:
-        """Return the map that travels."""
-        return {"dtype": self.dtype, "space": self.space}
-
-    @classmethod
-    def parse(cls, source: Mapping[str, Any], path: str) -> ImageFormat:
-        """Return the format; 8 bits are sRGB and floats linear, nothing else."""
-        dtype = take_choice(
-            source, "dtype", choices=tuple(COLOR_SPACE_OF_DTYPE), path=f"{path}.dtype"
-        )
-        space = take_choice(
-            source,
-            "space",
-            choices=(COLOR_SPACE_OF_DTYPE[dtype],),
-            path=f"{path}.space",
-        )
-        return cls(dtype, space)
-
 
 SRGB8 = ImageFormat("uint8", "srgb")
 LINEAR = ImageFormat("float32", "linear")
 LINEAR16 = ImageFormat("float16", "linear")
 
+FORMATS: dict[Output, ImageFormat] = {
+    "srgb8": SRGB8,
+    "linear": LINEAR,
+    "linear16": LINEAR16,
+}
+"""Formats by the names that settings and renderers give them."""
 
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole: image size, tangents to the left, right, upper and lower edge."""
+FORMAT_OF_DTYPE = {color.dtype: color for color in FORMATS.values()}
 
-    width_px: int
-    height_px: int
-    tangents: tuple[float, float, float, float]
-
-    @property
-    def pixel_pitch_mrad(self) -> tuple[float, float]:
-        """Return the angle of one pixel on the axis, (x, y), in mrad."""
-        left, right, up, down = self.tangents
-        return (
-            1000.0 * (right - left) / self.width_px,
-            1000.0 * (up - down) / self.height_px,
-        )
-
-    @property
-    def pixel_count(self) -> int:
-        """Return width times height."""
-        return self.width_px * self.height_px
-
-    def fields(self) -> dict[str, Any]:
-        """Return the map that travels."""
-        return {
-            "width_px": self.width_px,
-            "height_px": self.height_px,
-            "tangents": list(self.tangents),
-        }
-
-    @classmethod
-    def parse(cls, source: object, path: str, limits: Limits) -> Camera:
-        """Return the camera of one item of a ``views`` list."""
-        if not isinstance(source, dict):
-            raise BadMessage(f"it is {show(source)}", field=path, allowed="a map")
-        width_px, height_px = (
-            take_int(source, name, low=1, high=high, path=f"{path}.{name}")
-            for name, high in (
-                ("width_px", limits.max_width_px),
-                ("height_px", limits.max_height_px),
-            )
-        )
-        tangents = _parse_tangents(source, f"{path}.tangents")
-        return cls(width_px, height_px, tangents)
-
-
-def _parse_tangents(
-    source: Mapping[str, Any], path: str
-) -> tuple[float, float, float, float]:
-    items = take_list(source, "tangents", min_items=4, max_items=4, path=path)
-    left, right, up, down = (
-        check_float(item, low=-MAX_TANGENT, high=MAX_TANGENT, path=f"{path}[{i}]")
-        for i, item in enumerate(items)
-    )
-    if right - left < 1e-6 or up - down < 1e-6:
-        raise BadMessage(
-            f"they are {show(items)}",
-            field=path,
-            allowed="(left, right, up, down) with left < right and down < up",
-        )
-    return left, right, up, down
+OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
+    color: name for name, color in FORMATS.items()
+}
 
 
 @dataclass(frozen=True)
-class ViewHeader:
+class DepthFormat(Record):
+    """What depth means: view-space z or distance."""
+
+    kind: DepthKind = "planar"
+
+
+@dataclass(frozen=True)
+class ViewHeader(Record):
     """One view of a frame as its header describes it."""
 
-    camera: Camera
-    color: ImageFormat = SRGB8
-    depth_kind: str = "planar"
+    width_px: SidePx
+    height_px: SidePx
+    tangents: Tangents
+    color: ImageFormat
+    depth: DepthFormat = DepthFormat()
     has_hidden: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse a camera that is none."""
+        _ = self.camera
+
+    @classmethod
+    def of(
+        cls,
+        camera: Camera,
+        color: ImageFormat = SRGB8,
+        depth_kind: DepthKind = "planar",
+        *,
+        has_hidden: bool = False,
+    ) -> ViewHeader:
+        """Return the header of a camera's view."""
+        size_px = (camera.width_px, camera.height_px)
+        depth = DepthFormat(depth_kind)
+        return cls(*size_px, camera.tangents, color, depth, has_hidden)
+
+    @classmethod
+    def describing(cls, view: RgbdView) -> ViewHeader:
+        """Return what a frame's header says about a view."""
+        color = FORMAT_OF_DTYPE[view.color.dtype.name]
+        has_hidden = view.surface_count > 1
+        return cls.of(view.camera, color, view.depth_kind, has_hidden=has_hidden)
+
+    def view(self, images: ViewImages) -> RgbdView:
+        """Return the view of these images."""
+        return RgbdView(
+            images.color,
+            images.depth_m,
+            self.tangents,
+            self.depth.kind,
+            images.hidden_color,
+            images.hidden_depth_m,
+        )
+
+    @property
+    def camera(self) -> Camera:
+        """Return the view's camera."""
+        return Camera(self.width_px, self.height_px, self.tangents)
 
     @property
     def part_count(self) -> int:
         """Return how many parts follow for this view."""
         return 4 if self.has_hidden else 2
-
-    def fields(self) -> dict[str, Any]:
-        """Return the map that travels."""
-        return self.camera.fields() | {
-            "color": self.color.fields(),
-            "depth": {"kind": self.depth_kind},
-            "has_hidden": self.has_hidden,
-        }
-
-    @classmethod
-    def parse(cls, source: object, path: str, limits: Limits) -> ViewHeader:
-        """Return one item of a frame's ``views`` list."""
-        camera = Camera.parse(source, path, limits)
-        color = ImageFormat.parse(
-            take_map(source, "color", path=f"{path}.color"), f"{path}.color"
-        )
-        depth = take_map(source, "depth", path=f"{path}.depth", default={})
-        kind = take_choice(
-            depth,
-            "kind",
-            choices=DEPTH_KINDS,
-            path=f"{path}.depth.kind",
-            default="planar",
-        )
-        has_hidden = take_bool(
-            source, "has_hidden", path=f"{path}.has_hidden", default=False
-        )
-        return cls(camera, color, kind, has_hidden)
 
 
 @dataclass(frozen=True)
@@ -212,15 +142,56 @@ class ViewImages:
         Depth of 0, negative or NaN: nothing is hidden here.
     """
 
-    color: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
+    color: ColorImage
     depth_m: NDArray[np.float32]
-    hidden_color: NDArray[np.uint8] | NDArray[np.float32] | None = None
+    hidden_color: ColorImage | None = None
     hidden_depth_m: NDArray[np.float32] | None = None
 
     @property
     def has_hidden(self) -> bool:
         """Return whether there is a hidden layer."""
         return self.hidden_color is not None and self.hidden_depth_m is not None
+
+    def parts(self, view: ViewHeader) -> list[NDArray[Any]]:
+        """Return the images as they are sent.
+
+        Raises
+        ------
+        ValueError
+            They are not what the header says.
+        """
+        if view.has_hidden != self.has_hidden:
+            raise ValueError(
+                f"has_hidden is {view.has_hidden}, but there is "
+                f"{'a' if self.has_hidden else 'no'} hidden layer"
+            )
+        parts = [as_sent(self.color, view.color), self.depth_m]
+        if self.hidden_color is not None and self.hidden_depth_m is not None:
+            parts += [as_sent(self.hidden_color, view.color), self.hidden_depth_m]
+        return parts
+
+
+if TYPE_CHECKING:
+    Images = tuple[ViewImages, ...]
+    Pictures = tuple[NDArray[Any], ...]
+else:  # they travel in parts of their own, of which msgspec reads nothing
+    Images = Pictures = tuple
+
+
+def as_sent(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
+    """Return the image contiguous and little-endian, in the format it claims.
+
+    Raises
+    ------
+    ValueError
+        It is of another shape or type.
+    """
+    if image.dtype != np.dtype(color.dtype) or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(
+            f"an image of shape {image.shape} and {image.dtype} was to be sent as "
+            f"(height, width, 3) {color.dtype}"
+        )
+    return np.ascontiguousarray(image, dtype=np.dtype(color.dtype).newbyteorder("<"))
 
 
 def image_from_part(
@@ -236,16 +207,60 @@ def image_from_part(
             allowed=f"{expected_bytes} bytes, shape {shape} of {dtype}",
         )
     little_endian = np.dtype(dtype).newbyteorder("<")
-    image = np.frombuffer(part, dtype=little_endian).reshape(shape)
+    image: NDArray[Any] = np.frombuffer(part, dtype=little_endian).reshape(shape)
     image.flags.writeable = False
     return image
 
 
-def expect_parts(parts: Sequence[Part], count: int) -> None:
-    """Raise unless exactly ``count`` parts follow the header."""
-    if len(parts) != count:
+def images_from_parts(
+    views: Sequence[ViewHeader], parts: Sequence[Part], limits: Limits
+) -> tuple[ViewImages, ...]:
+    """Return arrays over the parts of a frame's views; nothing is copied."""
+    expect_parts(parts, sum(view.part_count for view in views))
+    waiting = iter(parts)
+    images = []
+    for i, view in enumerate(views):
+        path = f"views[{i}]"
+        check_part_size(view.camera, view.color, path, limits)
+        shape = (view.height_px, view.width_px)
+        kinds = (
+            ("color", (*shape, 3), view.color.dtype),
+            ("depth", shape, "float32"),
+            ("hidden_color", (*shape, 3), view.color.dtype),
+            ("hidden_depth", shape, "float32"),
+        )[: view.part_count]
+        found = [
+            image_from_part(next(waiting), wanted, dtype, f"{path}.{name}")
+            for name, wanted, dtype in kinds
+        ]
+        images.append(ViewImages(*found))
+    return tuple(images)
+
+
+def check_camera(camera: Camera, path: str, limits: Limits) -> None:
+    """Refuse an image larger than a service takes."""
+    for name, largest in (
+        ("width_px", limits.max_width_px),
+        ("height_px", limits.max_height_px),
+    ):
+        side_px = getattr(camera, name)
+        if side_px > largest:
+            raise BadMessage(
+                f"it is {side_px}",
+                field=f"{path}.{name}",
+                allowed=f"an integer 1 to {largest}",
+            )
+
+
+def check_part_size(
+    camera: Camera, color: ImageFormat, path: str, limits: Limits
+) -> None:
+    """Refuse an image whose part would be larger than a service takes."""
+    size_bytes = camera.pixel_count * color.bytes_per_pixel
+    if size_bytes > limits.max_part_bytes:
         raise BadMessage(
-            f"{len(parts)} parts follow the header",
-            field="parts",
-            allowed=f"{count} parts",
+            f"{camera.width_px} x {camera.height_px} {color.dtype} pixels "
+            f"are {size_bytes} bytes",
+            field=path,
+            allowed=f"images of at most {limits.max_part_bytes} bytes",
         )

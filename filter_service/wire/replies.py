@@ -1,233 +1,224 @@
-"""What the service answers: welcome, result, dropped, error, pong, alive.
-
-The same shape as `wire.requests`: frozen dataclasses with ``fields()`` and ``parse()``.
-"""
+"""What the service answers: to hello, to a profile, to frames, to ping."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
+from msgspec import Meta
 
-from filter_service.errors import BadMessage, FilterError, error_from_code
-from filter_service.wire.checks import (
-    MAX_ID,
-    check_float,
-    show,
-    take_bool,
-    take_float,
-    take_int,
-    take_list,
-    take_map,
-    take_pair,
-    take_text,
-)
+from filter_service.checked import Record
+from filter_service.errors import FilterError, error_from_code
 from filter_service.wire.images import (
     SRGB8,
     ImageFormat,
-    Limits,
-    Part,
-    expect_parts,
+    Pictures,
+    as_sent,
     image_from_part,
 )
-from filter_service.wire.text import (
-    MAX_ALLOWED_BYTES,
+from filter_service.wire.message import (
     MAX_NOTE_BYTES,
-    MAX_TEXT_BYTES,
+    Count,
+    Id,
+    Limits,
+    Megabytes,
+    Message,
+    Milliseconds,
+    Moment,
+    Notes,
+    Part,
+    Text,
+    Word,
     clip,
     clip_notes,
-    take_notes,
+    expect_parts,
 )
 
 DROP_REASONS = ("superseded", "preparing", "slow_consumer", "connection_lost")
 
+MAX_TEXT_BYTES = 1600
+MAX_ALLOWED_BYTES = 1000
+MAX_SERVER_BYTES = 160
+MAX_STAGE_BYTES = 100
+
+
+def _clipped(reply: Message, /, **limits: int) -> None:
+    """Cut texts to what a header holds, as the message is made."""
+    for name, max_bytes in limits.items():
+        value = getattr(reply, name)
+        if value is not None:
+            object.__setattr__(reply, name, clip(str(value), max_bytes))
+
 
 @dataclass(frozen=True)
-class Welcome:
+class Welcome(Message):
     """The answer to hello: who serves, what it accepts, how many frames may wait."""
 
-    session_id: int
-    server: dict[str, str]
+    session_id: Id
+    server: dict[str, Text]
     limits: Limits
-    credit: int
-    transports: tuple[str, ...] = ("tcp",)
+    credit: Annotated[int, Meta(ge=1, le=1000)]
+    transports: Annotated[tuple[Word, ...], Meta(max_length=8)] = ("tcp",)
 
     type_name: ClassVar[str] = "welcome"
 
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
-        return {
-            "session_id": self.session_id,
-            "server": {key: clip(text, 160) for key, text in self.server.items()},
-            "limits": self.limits.fields(),
-            "credit": self.credit,
-            "transports": list(self.transports),
+    def __post_init__(self) -> None:
+        """Cut what the service says of itself to what a header holds."""
+        server = {
+            key: clip(text, MAX_SERVER_BYTES) for key, text in self.server.items()
         }
-
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> Welcome:
-        """Return the checked message."""
-        expect_parts(parts, 0)
-        server = take_map(header, "server", default={})
-        transports = take_list(
-            header, "transports", min_items=0, max_items=8, default=[]
-        )
-        return cls(
-            session_id=take_int(header, "session_id", low=0, high=MAX_ID),
-            server={key: str(text) for key, text in server.items()},
-            limits=Limits.parse(take_map(header, "limits")),
-            credit=take_int(header, "credit", low=1, high=1000),
-            transports=tuple(str(item) for item in transports),
-        )
+        object.__setattr__(self, "server", server)
 
 
 @dataclass(frozen=True)
-class ResultView:
+class Accepted(Message):
+    """A profile is well formed; ``is_building`` is false while no camera is known.
+
+    ``n_cameras`` counts the cameras that it is being prepared for.
+    """
+
+    profile_id: Id
+    generation: Id
+    is_building: bool = True
+    n_cameras: Annotated[int, Meta(ge=0, le=1000)] = 1
+
+    type_name: ClassVar[str] = "accepted"
+
+
+@dataclass(frozen=True)
+class Progress(Message):
+    """How far the PSFs of a profile are."""
+
+    profile_id: Id
+    generation: Id
+    stage: Word
+    fraction: Annotated[float, Meta(ge=0.0, le=1.0)]
+
+    type_name: ClassVar[str] = "progress"
+
+    def __post_init__(self) -> None:
+        """Cut the stage to what a header holds."""
+        _clipped(self, stage=MAX_STAGE_BYTES)
+
+
+@dataclass(frozen=True)
+class Ready(Message):
+    """The PSFs of a profile are in place; frames are filtered with them from now on.
+
+    ``is_complete`` is false for a preview: good for what the last frame looked at, and
+    followed by another Ready.
+    """
+
+    profile_id: Id
+    generation: Id
+    build_ms: Milliseconds
+    psf_count: Count
+    memory_mb: Megabytes
+    pixel_pitch_mrad: tuple[
+        Annotated[float, Meta(ge=0.0, le=1e6)], Annotated[float, Meta(ge=0.0, le=1e6)]
+    ]
+    notes: Notes = ()
+    is_complete: bool = True
+
+    type_name: ClassVar[str] = "ready"
+
+    def __post_init__(self) -> None:
+        """Keep the notes that fit into a header."""
+        object.__setattr__(self, "notes", clip_notes(self.notes))
+
+
+@dataclass(frozen=True)
+class ResultView(Record):
     """Size and format of one filtered view."""
 
-    width_px: int
-    height_px: int
+    width_px: Annotated[int, Meta(ge=1, le=2**20)]
+    height_px: Annotated[int, Meta(ge=1, le=2**20)]
     color: ImageFormat = SRGB8
 
-    def fields(self) -> dict[str, Any]:
-        """Return the map that travels."""
-        return {
-            "width_px": self.width_px,
-            "height_px": self.height_px,
-            "color": self.color.fields(),
-        }
 
-    @classmethod
-    def parse(cls, source: object, path: str) -> ResultView:
-        """Return one item of a result's ``views`` list."""
-        if not isinstance(source, dict):
-            raise BadMessage(f"it is {show(source)}", field=path, allowed="a map")
-        color = take_map(source, "color", path=f"{path}.color")
-        return cls(
-            width_px=take_int(source, "width_px", low=1, high=2**20),
-            height_px=take_int(source, "height_px", low=1, high=2**20),
-            color=ImageFormat.parse(color, f"{path}.color"),
-        )
+Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
 
 @dataclass(frozen=True)
-class Result:
+class Result(Message):
     """A filtered frame, with everything that decided how it looks."""
 
-    frame_id: int
-    profile_id: int
-    generation: int
-    views: tuple[ResultView, ...]
-    pupil_diameter_mm: float
-    focus_dpt: float
-    missing_depth_count: int
-    clamped_depth_count: int
-    total_ms: float
-    stage_times_ms: dict[str, float]
-    gaze_deg: tuple[float, float] = (0.0, 0.0)
-    overflow_count: int = 0
-    notes: tuple[str, ...] = ()
+    frame_id: Id
+    profile_id: Id
+    generation: Id
+    views: Annotated[tuple[ResultView, ...], Meta(min_length=1, max_length=16)]
+    pupil_diameter_mm: Annotated[float, Meta(ge=0.0, le=100.0)]
+    focus_dpt: Annotated[float, Meta(ge=-100.0, le=100.0)]
+    missing_depth_count: Count
+    clamped_depth_count: Count
+    total_ms: Milliseconds
+    stage_times_ms: dict[str, Annotated[float, Meta(ge=-1e12, le=1e12)]]
+    gaze_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    overflow_count: Count = 0
+    notes: Notes = ()
     is_complete: bool = True
-    colors: tuple[NDArray[Any], ...] = field(default=(), compare=False, repr=False)
+    colors: Pictures = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"
+    payload: ClassVar[str] = "colors"
 
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
-        header = {name: value for name, value in vars(self).items() if name != "colors"}
-        return header | {
-            "views": [view.fields() for view in self.views],
-            "gaze_deg": list(self.gaze_deg),
-            "notes": clip_notes(self.notes),
-        }
+    def __post_init__(self) -> None:
+        """Keep the notes that fit into a header."""
+        object.__setattr__(self, "notes", clip_notes(self.notes))
 
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> Result:
-        """Return the checked message with arrays over its parts."""
-        items = take_list(header, "views", min_items=1, max_items=16)
-        views = tuple(
-            ResultView.parse(item, f"views[{i}]") for i, item in enumerate(items)
-        )
-        expect_parts(parts, len(views))
-        stages = take_map(header, "stage_times_ms")
-        return cls(
-            frame_id=take_int(header, "frame_id", low=0, high=MAX_ID),
-            profile_id=take_int(header, "profile_id", low=0, high=MAX_ID),
-            generation=take_int(header, "generation", low=0, high=MAX_ID),
-            views=views,
-            pupil_diameter_mm=take_float(header, "pupil_diameter_mm", low=0, high=100),
-            focus_dpt=take_float(header, "focus_dpt", low=-100, high=100),
-            missing_depth_count=take_int(
-                header, "missing_depth_count", low=0, high=MAX_ID
-            ),
-            clamped_depth_count=take_int(
-                header, "clamped_depth_count", low=0, high=MAX_ID
-            ),
-            total_ms=take_float(header, "total_ms", low=0, high=1e12),
-            stage_times_ms={
-                name: check_float(
-                    value, low=-1e12, high=1e12, path=f"stage_times_ms.{name}"
-                )
-                for name, value in stages.items()
-            },
-            gaze_deg=take_pair(
-                header, "gaze_deg", low=-360, high=360, default=(0.0, 0.0)
-            ),
-            overflow_count=take_int(
-                header, "overflow_count", low=0, high=MAX_ID, default=0
-            ),
-            notes=take_notes(header),
-            is_complete=take_bool(header, "is_complete", default=True),
-            colors=tuple(
+    def parts(self) -> list[Any]:
+        """Return the images of all views."""
+        pairs = zip(self.colors, self.views, strict=True)
+        return [as_sent(color, view.color) for color, view in pairs]
+
+    def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
+        """Return the result with arrays over its parts."""
+        expect_parts(parts, len(self.views))
+        return self._with_payload(
+            tuple(
                 image_from_part(
                     part,
                     (view.height_px, view.width_px, 3),
                     view.color.dtype,
                     f"views[{i}].color",
                 )
-                for i, (view, part) in enumerate(zip(views, parts, strict=True))
-            ),
+                for i, (view, part) in enumerate(zip(self.views, parts, strict=True))
+            )
         )
 
 
 @dataclass(frozen=True)
-class Dropped:
-    """A frame that was not filtered, and why."""
+class Dropped(Message):
+    """A frame that was not filtered, and why; reasons of later versions pass."""
 
-    frame_id: int
-    reason: str
+    frame_id: Id
+    reason: Word
 
     type_name: ClassVar[str] = "dropped"
 
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
-        return dict(vars(self))
-
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> Dropped:
-        """Return the checked message; reasons of later versions pass."""
-        expect_parts(parts, 0)
-        return cls(
-            frame_id=take_int(header, "frame_id", low=0, high=MAX_ID),
-            reason=take_text(header, "reason", max_characters=100),
-        )
-
 
 @dataclass(frozen=True)
-class ErrorReply:
+class ErrorReply(Message):
     """What was wrong, where, and what would have been accepted."""
 
-    code: str
-    message: str
-    field: str | None = None
-    allowed: str | None = None
-    frame_id: int | None = None
-    profile_id: int | None = None
+    code: Word
+    message: Text
+    field: Text | None = None
+    allowed: Text | None = None
+    frame_id: Id | None = None
+    profile_id: Id | None = None
 
     type_name: ClassVar[str] = "error"
+
+    def __post_init__(self) -> None:
+        """Cut the texts to what a header holds."""
+        _clipped(
+            self,
+            message=MAX_TEXT_BYTES,
+            field=MAX_NOTE_BYTES,
+            allowed=MAX_ALLOWED_BYTES,
+        )
 
     @classmethod
     def from_exception(
@@ -248,97 +239,24 @@ class ErrorReply:
             self.code, self.message, field=self.field, allowed=self.allowed
         )
 
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields; what is None does not travel."""
-        header = {
-            name: value for name, value in vars(self).items() if value is not None
-        }
-        for name, limit in (
-            ("message", MAX_TEXT_BYTES),
-            ("field", MAX_NOTE_BYTES),
-            ("allowed", MAX_ALLOWED_BYTES),
-        ):
-            if name in header:
-                header[name] = clip(str(header[name]), limit)
-        return header
-
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> ErrorReply:
-        """Return the checked message."""
-        expect_parts(parts, 0)
-        texts = {
-            name: take_text(header, name, max_characters=2048, default=None)
-            for name in ("field", "allowed")
-        }
-        ids = {
-            name: take_int(header, name, low=0, high=MAX_ID, default=None)
-            for name in ("frame_id", "profile_id")
-        }
-        return cls(
-            code=take_text(header, "code", max_characters=100),
-            message=take_text(header, "message", max_characters=2048),
-            **texts,
-            **ids,
-        )
-
 
 @dataclass(frozen=True)
-class Pong:
+class Pong(Message):
     """The render loop's answer to ping, with the state of the service."""
 
-    t: float
-    server_time_s: float
-    memory_mb: float
-    n_sessions: int
-    n_rendered: int
-    n_dropped: int
-    is_building: bool
+    t: Moment
+    server_time_s: Moment
+    memory_mb: Megabytes = 0.0
+    n_sessions: Count = 0
+    n_rendered: Count = 0
+    n_dropped: Count = 0
+    is_building: bool = False
 
     type_name: ClassVar[str] = "pong"
 
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
-        return dict(vars(self))
-
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> Pong:
-        """Return the checked message."""
-        expect_parts(parts, 0)
-        counts = {
-            name: take_int(header, name, low=0, high=MAX_ID, default=0)
-            for name in ("n_sessions", "n_rendered", "n_dropped")
-        }
-        return cls(
-            t=take_float(header, "t", low=-1e18, high=1e18),
-            server_time_s=take_float(header, "server_time_s", low=-1e18, high=1e18),
-            memory_mb=take_float(header, "memory_mb", low=0, high=1e9, default=0.0),
-            is_building=take_bool(header, "is_building", default=False),
-            **counts,
-        )
-
 
 @dataclass(frozen=True)
-class Alive:
+class Alive(Message):
     """Sent now and then to every client: the service finds out who is gone."""
 
     type_name: ClassVar[str] = "alive"
-
-    def fields(self) -> dict[str, Any]:
-        """Return the header fields."""
-        return {}
-
-    @classmethod
-    def parse(cls, header: Mapping[str, Any], parts: Sequence[Part]) -> Alive:
-        """Return the checked message."""
-        expect_parts(parts, 0)
-        return cls()
-
-
-def check_output(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
-    """Return the image contiguous and little-endian, in the format it claims."""
-    if image.dtype != np.dtype(color.dtype) or image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(
-            f"an image of shape {image.shape} and {image.dtype} was to be sent as "
-            f"(height, width, 3) {color.dtype}"
-        )
-    return np.ascontiguousarray(image, dtype=np.dtype(color.dtype).newbyteorder("<"))

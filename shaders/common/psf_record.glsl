@@ -1,6 +1,6 @@
 // One PSF on its way through the passes `psf_*`; psfs/gpu_build_records.py writes it.  Pupil
 // coordinates x, y in -1..1 over the bounding box, pixels x right, y up, as
-// estimator/psf_pupil.py has them.
+// estimator/psf/pupil.py has them.
 
 struct PsfRecord {
     vec4 polynomial[7];  // of W, by powers of x, then of y; waves: turns, rays: um

@@ -1,5 +1,5 @@
 // Mean light that the pupil's edge sends far outside the geometric spot.
-// Twin: estimator.psf_tail.add_tail, where the formula is explained.
+// Twin: estimator.psf.tail.add_tail, where the formula is explained.
 
 const float PSF_TAIL_CONSTANT = 4.0 * 31.00627668029982;  // 4 pi³
 

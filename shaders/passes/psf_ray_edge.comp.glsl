@@ -2,7 +2,7 @@
 // In:  PSF_RECORDS, PSF_TABLES (Fresnel's edge less its step, integrated).
 // Out: PSF_IMAGES (light in steps, added; it may be negative).
 // Dispatch: x over points on the edge / PSF_ROWS, y = PSF.
-// Twin: estimator.psf_geometric_kernels.add_edge_light, where the formula is explained.
+// Twin: estimator.psf.geometric_kernels.add_edge_light, where the formula is explained.
 
 #include "common/psf_record.glsl"
 #include "common/psf_pupil.glsl"

@@ -3,7 +3,7 @@
 // In:  PSF_RECORDS, PSF_IMAGES (steps of light; used as scratch).
 // Out: PSF_KERNELS (added to where waves came before), PSF_TOTALS (share times the light).
 // Dispatch: y = PSF.   Variants: DIFFRACTING.
-// Twin: estimator.psf_geometric_kernels.trace_batch, its end.
+// Twin: estimator.psf.geometric_kernels.trace_batch, its end.
 
 #include "common/psf_record.glsl"
 #include "common/psf_tail.glsl"

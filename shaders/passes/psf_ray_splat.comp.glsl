@@ -1,7 +1,7 @@
 // Spreads the light of every pupil cell over the pixels that its footprint covers.
 // In:  PSF_RECORDS.   Out: PSF_IMAGES (light in steps, added).
 // Dispatch: x over rows of cells / PSF_ROWS, y = PSF; a thread traces one row.
-// Twin: estimator.psf_geometric_kernels.splat_pupil.
+// Twin: estimator.psf.geometric_kernels.splat_pupil.
 
 #include "common/psf_record.glsl"
 #include "common/psf_pupil.glsl"

@@ -3,7 +3,7 @@
 // In:  PSF_RECORDS, PSF_FIELD (see psf_wave_rows), PSF_TABLES (pixel filters).
 // Out: PSF_STRIPES (a line of angular samples, ascending, for every pixel row).
 // Dispatch: x over pairs of columns / FFT_LINES, y = PSF.
-// Twin: estimator.psf_fourier_kernels.integrate_pixels, its rows.
+// Twin: estimator.psf.fourier_kernels.integrate_pixels, its rows.
 
 #include "common/psf_record.glsl"
 #include "common/fft.glsl"

@@ -3,7 +3,7 @@
 // In:  PSF_RECORDS, PSF_STRIPES (see psf_wave_columns), PSF_TABLES (pixel filters).
 // Out: PSF_KERNELS, PSF_TOTALS (share times the light in the disc).
 // Dispatch: y = PSF.
-// Twin: estimator.psf_fourier_kernels.integrate_batch.
+// Twin: estimator.psf.fourier_kernels.integrate_batch.
 
 #include "common/psf_record.glsl"
 #include "common/psf_tail.glsl"

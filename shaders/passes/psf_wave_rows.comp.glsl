@@ -2,7 +2,7 @@
 // In:  PSF_RECORDS (common/psf_record.glsl).
 // Out: PSF_FIELD (vec4: frequencies c and c + FFT_LENGTH/2 of a row, row after row).
 // Dispatch: x over pairs of lit rows / FFT_LINES, y = PSF.
-// Twin: estimator.psf_fourier_kernels.fill_pupils and a row FFT.
+// Twin: estimator.psf.fourier_kernels.fill_pupils and a row FFT.
 
 #include "common/psf_record.glsl"
 #include "common/psf_pupil.glsl"

@@ -5,18 +5,20 @@ and colours for every setting, each with its own accommodation and defocus.
 """
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.traced_eye import TracedEye
+from estimator.field.traced_eye import TracedEye
+from filter_service.camera import Camera
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.eye_model import prepare_eye
-from filter_service.wire.images import Camera
-from filter_service.wire.profiles import ACCURACIES
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.settings import Accuracy
 from tests.benchmarks import eye_ways
 from tests.benchmarks.harness import Row, memory_mb, time_calls
 from tests.benchmarks.network_nodes import product_rows
+from tests.grid_specs import grid_spec
 
 VERTICAL_TANGENT = np.tan(np.radians(25.0))
 SIZE_PX = (1280, 720)
@@ -36,18 +38,18 @@ def dynamic_spec(size_px: tuple[int, int] = SIZE_PX, **more) -> GridSpec:
     up = float(VERTICAL_TANGENT)
     right = up * size_px[0] / size_px[1]
     camera = Camera(*size_px, (-right, right, up, -up))
-    return GridSpec(camera, mode="dynamic", **more)
+    return grid_spec(camera, mode="dynamic", **more)
 
 
 def asked_states(spec: GridSpec, *, max_pupil_mm: float) -> NDArray[np.float64]:
     """Fixed states (n, 5): azimuth, elevation, pupil, focus distance, wavelength."""
     (h_low, h_high), (v_low, v_high) = spec.field_range_deg
-    low_mm, high_mm = spec.pupil_range_mm
+    low_mm, high_mm = spec.settings.pupil_range_mm
     return product_rows(
         np.linspace(h_low, h_high, N_H),
         np.linspace(v_low, v_high, N_V),
         np.linspace(low_mm, min(high_mm, max_pupil_mm), N_PUPILS),
-        np.linspace(*spec.focus_range_dpt, N_FOCUSES),
+        np.linspace(*spec.settings.focus_range_dpt, N_FOCUSES),
         np.unique(spec.wavelengths_nm),
     )
 
@@ -79,12 +81,12 @@ def accuracy_rows(case: str, *, repeats: int, spec: GridSpec) -> list[AccuracyRo
     profile = eye_ways.preset_profile(case)
 
     def prepared(accuracy: str):
-        return prepare_eye(profile, spec, eye_model="traced", accuracy=accuracy)
+        return eye_for_spec(profile, spec.with_settings(accuracy=accuracy))
 
     exact, _ = prepared(REFERENCE_ACCURACY)
     size = f"dynamic {spec.camera.width_px}x{spec.camera.height_px}"
     rows = []
-    for accuracy in ACCURACIES:
+    for accuracy in get_args(Accuracy):
         eye, notes = prepared(accuracy)
         error_um, n_states = mean_difference_um(eye, exact, spec)
         times_ms = time_calls(lambda a=accuracy: prepared(a), repeats=repeats)

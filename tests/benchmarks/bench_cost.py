@@ -23,16 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
 from filter_service.constants import THREADS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
 from tests.benchmarks.dense_reference import EyeState, dense_reference, linear_color
 from tests.benchmarks.field_pictures import plot_costs
@@ -44,6 +43,7 @@ from tests.benchmarks.harness import (
     write_report,
 )
 from tests.benchmarks.image_measures import channel_psnr_db
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_view
 
@@ -80,7 +80,7 @@ SEED = 7
 OCTAVES_PX = (2, 4, 8, 16, 32, 64)
 
 
-def plane_view(width_px: int, height_px: int, pixel_mrad: float) -> View:
+def plane_view(width_px: int, height_px: int, pixel_mrad: float) -> RgbdView:
     """Plane at infinity whose picture has the spectrum of natural ones, 1 / f."""
     rng = np.random.default_rng(SEED)
     light = np.zeros((height_px, width_px, 3))
@@ -93,7 +93,7 @@ def plane_view(width_px: int, height_px: int, pixel_mrad: float) -> View:
     light = 0.2 * np.exp(0.4 * light)
     srgb = reference.srgb_from_linear(np.clip(light, 0.0, 1.0))
     depth_m = np.full((height_px, width_px), np.inf, np.float32)
-    return View(srgb, depth_m, tangents(width_px, height_px, pixel_mrad), "radial")
+    return RgbdView(srgb, depth_m, tangents(width_px, height_px, pixel_mrad), "radial")
 
 
 def _bilinear(grid: NDArray, y: NDArray, x: NDArray) -> NDArray:
@@ -109,7 +109,7 @@ def tangents(width_px: int, height_px: int, pixel_mrad: float) -> tuple:
     return -right, right, up, -up
 
 
-def courtyard_view(width_px: int, height_px: int, pixel_mrad: float) -> View:
+def courtyard_view(width_px: int, height_px: int, pixel_mrad: float) -> RgbdView:
     """*Courtyard*, with the camera's angles scaled but its distances kept."""
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
     own = tangents(width_px, height_px, pixel_mrad)
@@ -122,11 +122,11 @@ VIEWS = {"plane": plane_view, "courtyard": courtyard_view}
 class CostBench:
     """One view before the eye of -6 dpt, on axis."""
 
-    def __init__(self, renderer: FilterRenderer, gpu: Gpu, view: View, **settings):
+    def __init__(self, renderer: FilterRenderer, gpu: Gpu, view: RgbdView, **settings):
         self.renderer, self.gpu, self.view = renderer, gpu, view
         with np.errstate(divide="ignore"):
             nearest_dpt = float(np.nanmax(1.0 / view.depth_m))
-        self.spec = GridSpec.for_camera(
+        self.spec = grid_spec(
             width_px=view.width_px,
             height_px=view.height_px,
             tangents=view.tangents,
@@ -158,7 +158,7 @@ class FieldBench(CostBench):
         self.renderer, self.gpu = renderer, gpu
         up = math.tan(math.radians(VERTICAL_FOV_DEG / 2))
         self.view = courtyard_view(*size, 2000.0 * up / size[1])
-        self.spec = GridSpec.for_camera(
+        self.spec = grid_spec(
             width_px=size[0],
             height_px=size[1],
             tangents=self.view.tangents,

@@ -13,11 +13,11 @@ import time
 
 import numpy as np
 
-from estimator.accommodation import AccommodatingEye
-from estimator.estimation import estimate_eye
-from estimator.eye_parameters import random_vectors
-from estimator.eye_wavefront import zernike_of_vectors
-from estimator.profiles import preset_names
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.accommodation import AccommodatingEye
+from estimator.eye.parameters import random_vectors
+from estimator.eye.tracing import zernike_of_vectors
+from estimator.profiles.parse import preset_names
 from tests.benchmarks.eye_ways import (
     ERROR_NAME,
     REFERENCE,

@@ -18,8 +18,8 @@ import numpy as np
 
 from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.build import build_psf_store
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.harness import (
     Row,
     machine_info,

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 
-from estimator.network_card import DamagedWeights, WeightsMissing
-from estimator.networks import load_network
+from estimator.networks.card import DamagedWeights, WeightsMissing
+from estimator.networks.inference import load_network
 from tests.benchmarks.accuracy_rows import AccuracyRow, accuracy_rows, dynamic_spec
 from tests.benchmarks.first_guess import GuessRow, guess_rows
 from tests.benchmarks.harness import (

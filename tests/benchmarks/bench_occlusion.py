@@ -15,11 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.profiles import parse_profile
+from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.harness import (
     Row,
     machine_info,
@@ -31,6 +30,7 @@ from tests.benchmarks.harness import (
 )
 from tests.benchmarks.lens_reference import RAY_COUNT
 from tests.benchmarks.occlusion_scenes import Scene, client_scene, synthetic_scenes
+from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import psnr_db
 
 EYE = {"kind": "prescription", "sphere_dpt": 0.0}
@@ -100,7 +100,7 @@ def scene_rows(renderer, gpu, scene: Scene, repeats: int, ray_count: int) -> lis
 
 def _store(scene: Scene):
     held = [d[d >= 0.0] for d in scene.distances_dpt]
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=scene.view.width_px,
         height_px=scene.view.height_px,
         tangents=scene.view.tangents,

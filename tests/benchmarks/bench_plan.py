@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from estimator.psf_survey import survey_pupils
+from estimator.psf.survey import survey_pupils
 from filter_service.planning.cost import cost_terms, sampled_states
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import unchecked_plan

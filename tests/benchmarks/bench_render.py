@@ -11,13 +11,12 @@ import time
 
 import numpy as np
 
-from estimator.profiles import parse_profile
+from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.harness import (
     Row,
     machine_info,
@@ -27,6 +26,7 @@ from tests.benchmarks.harness import (
     time_calls,
     write_report,
 )
+from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db
 
@@ -49,7 +49,7 @@ VARIANTS = {
 def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
     """Rows of one scene, size and eye."""
     view = scene_view(scene, width_px=size[0], height_px=size[1])
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=size[0],
         height_px=size[1],
         tangents=view.tangents,

@@ -16,7 +16,6 @@ what a change removes is its mechanism's share.
 """
 
 import argparse
-import inspect
 import json
 import sys
 import time
@@ -26,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from filter_service.gl.gpu import Gpu
-from filter_service.psfs.build import build_psf_store
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.harness import (
     OUT,
     RESULTS,
@@ -68,8 +67,6 @@ half of that."""
 
 MAX_POPPING_RATIO = 2.0
 """Bound on a change against its neighbours', where it could be seen at all."""
-
-RENDER_TAKES_GAZE = "gaze_deg" in inspect.signature(FilterRenderer.render).parameters
 
 
 @dataclass(frozen=True)
@@ -307,9 +304,6 @@ def main() -> None:
     for mode in arguments.modes:
         for motion in arguments.motions:
             if motion == "gaze" and mode == "on-axis":
-                continue
-            if motion == "gaze" and not RENDER_TAKES_GAZE:
-                notes.append("the renderer takes no gaze: left out")
                 continue
             eyes = FOCUSING_EYES if motion == "focus" else EYES
             bench = benches.setdefault(

@@ -12,14 +12,18 @@ import json
 
 import numpy as np
 
-from estimator.eye import pack_eyes
-from estimator.eye_parameters import random_vectors
-from estimator.eye_wavefront import eye_indices
-from estimator.raytrace import trace_rays
-from estimator.surfaces import media_indices, pack_eye
-from estimator.wavefront import on_axis_zernike, wavefront_aberrations, wavefront_grid
-from estimator.wavefront_nodes import N_AZIMUTHS, N_REFERENCE_RINGS, N_RINGS
-from estimator.zernike import rescale_pupil
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import random_vectors
+from estimator.eye.tracing import eye_indices
+from estimator.optics.raytrace import trace_rays
+from estimator.optics.surfaces import media_indices, pack_eye
+from estimator.optics.zernike import rescale_pupil
+from estimator.wavefront.aberrations import (
+    on_axis_zernike,
+    wavefront_aberrations,
+    wavefront_grid,
+)
+from estimator.wavefront.nodes import N_AZIMUTHS, N_REFERENCE_RINGS, N_RINGS
 from tests.benchmarks.harness import (
     Row,
     memory_mb,
@@ -176,8 +180,8 @@ def circle_rows(repeats):
     """Estimation's evaluation: many eyes on one circle on axis."""
     packed = np.repeat(pack_eye(irregular_eye())[None], N_BATCH, axis=0)
     indices = media_indices(irregular_eye(), 555.0)
-    import estimator.wavefront as wavefront
-    from estimator.wavefront_nodes import circle_nodes
+    import estimator.wavefront.aberrations as wavefront
+    from estimator.wavefront.nodes import circle_nodes
 
     view = {"zernike_radius_mm": CIRCLE_MM}
     found, _ = on_axis_zernike(packed[:1], indices, **view)

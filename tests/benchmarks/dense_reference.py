@@ -23,13 +23,14 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from estimator.psf import PsfBatch, compute_psf_batch
+from estimator.field.eye_optics import EyeOptics
+from estimator.psf.compute import PsfBatch, compute_psf_batch
 from filter_service.constants import DISCONTINUITY_PX, MIN_COVERAGE
-from filter_service.planning.eye import Eye
 from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
+from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rendering.reference import linear_from_srgb
+from filter_service.rgbd_view import RgbdView
 
 ANGLE_BIN_DEG = 0.2
 DISTANCE_BIN_DPT = 0.005
@@ -51,14 +52,14 @@ class EyeState:
 
     Attributes
     ----------
-    eye : Eye
+    eye : EyeOptics
     spec : GridSpec
         Camera, gaze, wavelengths, and whether PSFs follow the field; its grid settings
         do not matter here.
     pupil_diameter_mm, focus_dpt : float
     """
 
-    eye: Eye
+    eye: EyeOptics
     spec: GridSpec
     pupil_diameter_mm: float
     focus_dpt: float
@@ -66,7 +67,7 @@ class EyeState:
     def wavefront_arguments(
         self, h_deg: NDArray, v_deg: NDArray, distance_dpt: NDArray
     ) -> dict[str, NDArray]:
-        """Arguments (3 n) of `Eye.wavefronts` for n places, channel fastest."""
+        """Arguments (3 n) of `EyeOptics.wavefronts` for n places, channel fastest."""
         h_deg, v_deg, distance_dpt = (
             np.repeat(np.ravel(values).astype(float), 3)
             for values in np.broadcast_arrays(h_deg, v_deg, distance_dpt)
@@ -108,7 +109,7 @@ class EyeState:
             pupil_ellipse=found.pupil_ellipse,
             wavelength_nm=arguments["wavelength_nm"],
             pixel_from_mrad=samples_per_px * scale,
-            diffraction=self.spec.diffraction,
+            diffraction=self.spec.settings.diffraction,
             max_radius_px=max_radius_px * samples_per_px,
         )
 
@@ -135,14 +136,14 @@ class Sources:
         return np.argsort(-self.distance_dpt, kind="stable")
 
 
-def linear_color(view: View) -> NDArray[np.float64]:
+def linear_color(view: RgbdView) -> NDArray[np.float64]:
     """Linear light (height, width, 3) of a view."""
     if view.color.dtype == np.uint8:
         return linear_from_srgb(view.color)
     return view.color.astype(np.float64)
 
 
-def view_sources(view: View, spec: GridSpec) -> Sources:
+def view_sources(view: RgbdView, spec: GridSpec) -> Sources:
     """Colour, direction and distance of every pixel."""
     depth_m, _ = fill_missing_depth(view.depth_m)
     distance_dpt = object_dpt(view, depth_m).ravel()
@@ -152,7 +153,7 @@ def view_sources(view: View, spec: GridSpec) -> Sources:
         h_deg, v_deg = (
             angle.ravel()
             for angle in field_deg(
-                spec.camera, x + 0.5, y + 0.5, gaze_deg=spec.gaze_deg
+                spec.camera, x + 0.5, y + 0.5, gaze_deg=spec.settings.gaze_deg
             )
         )
     return Sources(linear_color(view).reshape(-1, 3), h_deg, v_deg, distance_dpt)
@@ -173,7 +174,7 @@ def binned(sources: Sources) -> Sources:
 
 
 def dense_reference(
-    view: View,
+    view: RgbdView,
     state: EyeState,
     *,
     bins: bool,
@@ -209,7 +210,7 @@ def dense_reference(
 
 
 def _filtered(
-    view: View, state: EyeState, bins: bool, accumulation: str
+    view: RgbdView, state: EyeState, bins: bool, accumulation: str
 ) -> NDArray[np.float64]:
     sources = view_sources(view, state.spec)
     order = sources.near_first()
@@ -349,7 +350,7 @@ def add_sources(
                         coverage[c, to_y, to_x] += weight
 
 
-def _key(view: View, state: EyeState, bins: bool, accumulation: str) -> str:
+def _key(view: RgbdView, state: EyeState, bins: bool, accumulation: str) -> str:
     """Digest of all that a reference depends on, the PSF engine's answers included."""
     digest = hashlib.sha256()
     for array in (view.color, view.depth_m):
@@ -363,9 +364,14 @@ def _key(view: View, state: EyeState, bins: bool, accumulation: str) -> str:
             bins,
             accumulation,
             spec.camera,
-            spec.gaze_deg,
+            spec.settings.gaze_deg,
         ),
-        (spec.wavelengths_nm, spec.diffraction, spec.chromatic, spec.follows_field),
+        (
+            spec.wavelengths_nm,
+            spec.settings.diffraction,
+            spec.settings.chromatic,
+            spec.follows_field,
+        ),
         (state.pupil_diameter_mm, state.focus_dpt),
         DISCONTINUITY_PX if accumulation == "coverage" else None,
     )

@@ -6,8 +6,8 @@ the 25 terms without piston and tilt.
 
 from dataclasses import dataclass
 
-from estimator.estimation import EstimatedEye, estimate_eye
-from estimator.profiles import EyeProfile, parse_profile
+from estimator.estimate.estimation import EstimatedEye, estimate_eye
+from estimator.profiles.parse import EyeProfile, parse_profile
 from tests.benchmarks.harness import time_calls
 
 REFERENCE = "exact ray trace, 25 terms"

@@ -8,9 +8,10 @@ import numpy as np
 
 from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
-from filter_service.rendering.frame import View, fill_missing_depth, object_dpt
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.rendering.frame import fill_missing_depth, object_dpt
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered
 from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
@@ -21,6 +22,7 @@ from tests.benchmarks.paper_baselines import (
     predecessor,
 )
 from tests.benchmarks.published_figures import OFF_AXIS, ON_AXIS
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 
 PUPIL_RANGE_MM = (2.0, 7.0)
@@ -76,7 +78,7 @@ class Method:
 class EyeBench:
     """One eye before one camera: states for references, and stores for the renderer."""
 
-    def __init__(self, gpu: Gpu, name: str, views: list[View]):
+    def __init__(self, gpu: Gpu, name: str, views: list[RgbdView]):
         self._gpu, self._name = gpu, name
         self._camera = {
             "width_px": views[0].width_px,
@@ -94,7 +96,7 @@ class EyeBench:
     def spec(self, mode: str, **settings) -> GridSpec:
         """Spec for this camera and these depths."""
         settings = {"object_range_dpt": self._object_range_dpt, **settings}
-        return GridSpec.for_camera(**self._camera, mode=mode, **settings)
+        return grid_spec(**self._camera, mode=mode, **settings)
 
     def exact_state(self, state: State, *, on_axis: bool) -> EyeState:
         """Eye traced for this very pupil and focus."""
@@ -157,7 +159,7 @@ class Ours(Method):
             }
         return {"mode": self.mode, "grid": self.grid, **ranges}
 
-    def run(self, bench: EyeBench, view: View, state: State, repeats: int) -> list:
+    def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
         handle, build_ms = bench.store(self, state)
         results = []
@@ -190,7 +192,7 @@ class Baseline(Method):
     options: tuple = ()
     needs_whole_grid: bool = False
 
-    def run(self, bench: EyeBench, view: View, state: State, repeats: int) -> list:
+    def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter once: preparation and frame are timed apart, and take long."""
         del repeats
         if self.needs_whole_grid:
@@ -227,7 +229,7 @@ FIELD_BASELINES = (
 METHODS = (*OURS, *ON_AXIS_BASELINES, *FIELD_BASELINES)
 
 
-def warmed_up(gpu: Gpu, view: View) -> None:
+def warmed_up(gpu: Gpu, view: RgbdView) -> None:
     """Run every baseline once on a corner of a view, so that all is compiled."""
     left, right, up, down = view.tangents
     share = (48 / view.width_px, 32 / view.height_px)

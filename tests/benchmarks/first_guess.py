@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.bounded_fit import FitFailed
-from estimator.estimation import POOR_FIT_UM, EstimatedEye, estimate_eye
+from estimator.estimate.bounded_fit import FitFailed
+from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye, estimate_eye
 from tests.benchmarks import eye_ways
 from tests.benchmarks.harness import Row, memory_mb
 from tests.numerical.eye_cases import random_eye_profiles

@@ -18,10 +18,10 @@ from scipy import fft
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from estimator.psf import PsfBatch
+from estimator.psf.compute import PsfBatch
 from filter_service.constants import MIN_COVERAGE
 from filter_service.planning.nodes import bracket_axis
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import (
     EyeState,
@@ -41,7 +41,7 @@ BYTES_PER_WEIGHT = 4
 
 
 def barsky(
-    view: View,
+    view: RgbdView,
     state: EyeState,
     *,
     slice_count: int = BARSKY_SLICE_COUNT,
@@ -93,7 +93,7 @@ def barsky(
 
 
 def celaya(
-    view: View, state: EyeState, *, grid: tuple[int, int, int] = CELAYA_GRID
+    view: RgbdView, state: EyeState, *, grid: tuple[int, int, int] = CELAYA_GRID
 ) -> Filtered:
     """Gather with a PSF interpolated for each output pixel over angles and distance.
 
@@ -128,7 +128,7 @@ def celaya(
 
 
 def gonzalez(
-    view: View, state: EyeState, *, grid: tuple[int, int, int] = GONZALEZ_GRID
+    view: RgbdView, state: EyeState, *, grid: tuple[int, int, int] = GONZALEZ_GRID
 ) -> Filtered:
     """Three depth layers, each gathered with off-axis PSFs interpolated per pixel.
 
@@ -180,7 +180,9 @@ class _Places:
     nodes_dpt: NDArray
 
     @classmethod
-    def of(cls, view: View, state: EyeState, grid: tuple[int, int, int]) -> "_Places":
+    def of(
+        cls, view: RgbdView, state: EyeState, grid: tuple[int, int, int]
+    ) -> "_Places":
         shape = view.depth_m.shape
         sources = view_sources(view, state.spec)
         return cls(

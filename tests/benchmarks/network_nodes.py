@@ -1,6 +1,6 @@
 """The nodes of the paper's tables 4 and 5, and what tracing and networks say of them.
 
-A step's nodes are rows in the columns of its network (`network_card.INPUTS`), so that
+A step's nodes are rows in the columns of its network (`networks.card.INPUTS`), so that
 every method answers exactly the same questions: 42 foci (6 pupils x 7 distances), 126
 wavefronts on the axis of the focused eyes (x 3 wavelengths), 627 of the relaxed eye
 over the field (3 wavelengths x 19 azimuths x 11 elevations, 5 mm).
@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from estimator import networks
-from estimator.accommodation import (
+from estimator.eye.accommodation import (
     AQUEOUS,
     DIAMETER,
     AccommodatingEye,
     accommodated_vectors,
 )
-from estimator.accommodation_spot import focus_by_spot
-from estimator.eye import pack_eyes
-from estimator.eye_parameters import N_PARAMETERS, EyeParameters
-from estimator.eye_wavefront import eye_indices, refraction_of_vectors
-from estimator.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
-from estimator.wavefront import FieldResults, eyes_aberrations
-from estimator.wavefront_kernels import magnifications
-from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import N_PARAMETERS, EyeParameters
+from estimator.eye.tracing import eye_indices, refraction_of_vectors
+from estimator.networks import inference as networks
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
+from estimator.wavefront.aberrations import FieldResults, eyes_aberrations
+from estimator.wavefront.kernels import magnifications
+from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
+from tests.numerical.spot_focus import focus_by_spot
 
 PUPILS_MM = np.linspace(2.0, 7.0, 6)
 FOCUSES_DPT = np.linspace(0.125, 8.125, 7)

@@ -16,10 +16,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimation import estimate_eye
-from estimator.field_interpolation import OPEN_RATIO
-from estimator.traced_eye import FIELD_AZIMUTHS, FIELD_RINGS
-from estimator.wavefront_nodes import N_AZIMUTHS, N_RINGS
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.interpolation import OPEN_RATIO
+from estimator.field.traced_eye import FIELD_AZIMUTHS, FIELD_RINGS
+from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 from tests.benchmarks import eye_ways, network_nodes
 from tests.benchmarks.harness import Row, memory_mb, time_calls
 from tests.benchmarks.published_networks import published_step

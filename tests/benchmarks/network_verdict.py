@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.estimation import POOR_FIT_UM
-from estimator.grid_source import LARGEST_CHEAP_UM, LEAST_GAIN_MS
-from estimator.units import SPHERE_PER_C20
-from estimator.zernike import N_TERMS
+from estimator.estimate.estimation import POOR_FIT_UM
+from estimator.field.grid_source import LARGEST_CHEAP_UM, LEAST_GAIN_MS
+from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.zernike import N_TERMS
 from tests.benchmarks.accuracy_rows import AccuracyRow
 from tests.benchmarks.first_guess import STARTS, GuessRow
 from tests.benchmarks.harness import Row

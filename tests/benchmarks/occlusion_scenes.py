@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from filter_service.rendering.frame import View, object_dpt
+from filter_service.rendering.frame import object_dpt
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.dense_reference import linear_color
 from tests.benchmarks.lens_reference import NOTHING, STEP_PX, Lens, lens_picture
 from tests.numerical.scene_frames import scene_view
@@ -21,7 +22,7 @@ class Scene:
     """A view with its hidden layer, and the eye that looks at it."""
 
     name: str
-    view: View
+    view: RgbdView
     pupil_diameter_mm: float
     focus_dpt: float
 
@@ -50,7 +51,7 @@ class Scene:
         """What the lens sees of both layers."""
         view = self.view
         colors = [
-            linear_color(View(color, depth_m, view.tangents))
+            linear_color(RgbdView(color, depth_m, view.tangents))
             for color, depth_m in zip(
                 view.surface_colors, view.surface_depths_m, strict=True
             )
@@ -94,7 +95,7 @@ def synthetic_scenes(*, width_px: int, height_px: int) -> list[Scene]:
             np.broadcast_to(1.0 / np.asarray(d, float), mask.shape)
             for d in (near_dpt, far_dpt)
         )
-        view = View(
+        view = RgbdView(
             np.where(mask[..., None], near, far).astype(np.float32),
             np.where(mask, near_m, far_m).astype(np.float32),
             tangents(width_px, height_px, SYNTHETIC_FOV_DEG),

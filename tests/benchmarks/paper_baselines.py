@@ -14,7 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from filter_service.planning.nodes import bracket_axis
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import (
     BAND_ROWS,
@@ -44,7 +44,7 @@ DYNAMIC_FOCI_DPT = 0.125 + np.arange(5.0)
 
 
 def predecessor(
-    view: View,
+    view: RgbdView,
     state: EyeState,
     *,
     grid: PaperGrid = ON_AXIS,
@@ -97,7 +97,9 @@ def predecessor(
     )
 
 
-def paper_on_axis(view: View, state: EyeState, *, paper_rule: bool = False) -> Filtered:
+def paper_on_axis(
+    view: RgbdView, state: EyeState, *, paper_rule: bool = False
+) -> Filtered:
     """Layers by distance with transitional ones between: one sample (Eq. 8, 6.1-6.2).
 
     33 distances; pupil and focus are the frame's, not between nodes.
@@ -110,7 +112,7 @@ def paper_on_axis(view: View, state: EyeState, *, paper_rule: bool = False) -> F
 
 
 def paper_quality(
-    view: View,
+    view: RgbdView,
     state: EyeState,
     *,
     grid: PaperGrid = QUALITY,
@@ -126,7 +128,7 @@ def paper_quality(
 
 
 def paper_dynamic(
-    view: View,
+    view: RgbdView,
     state: EyeState,
     *,
     grid: PaperGrid = DYNAMIC,
@@ -192,7 +194,7 @@ def _ends(nodes: NDArray, value: float) -> list[tuple[float, float]]:
 
 
 def _splat_texture(
-    view: View, state: EyeState, texture: PaperTexture, paper_rule: bool
+    view: RgbdView, state: EyeState, texture: PaperTexture, paper_rule: bool
 ) -> tuple[NDArray, int]:
     """Splat every pixel with two layers of each of the blocks around its direction."""
     sources = view_sources(view, state.spec)
@@ -231,7 +233,7 @@ def _splat_texture(
 
 
 def _splat(
-    view: View,
+    view: RgbdView,
     sources: Sources,
     texture: NDArray,
     layers: NDArray,

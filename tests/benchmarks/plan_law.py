@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from filter_service.planning import error_law as law
+from filter_service.planning.sampled_use import moved, sample_use
 from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
-from filter_service.planning.use import moved, sample_use
 from tests.benchmarks.harness import commit_id, machine_info, write_report
 from tests.numerical.plan_cases import (
     exact_kernels,
@@ -84,11 +84,11 @@ def measured(name, width_px, axis, rng, count, spectrum):
     eye = traced_eye(name, spec)
     use = sample_use(eye, spec, 4096)
     use = use.taken(rng.choice(4096, count, replace=False))
-    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
+    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
     limits = {
         "h": spec.field_range_deg[0],
         "v": spec.field_range_deg[1],
-        "pupil": [eye.usable_pupil_mm(p) for p in spec.pupil_range_mm],
+        "pupil": [eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm],
         "accommodation": (used_dpt[0], used_dpt[-1]),
     }
     pair, good = neighbours(use, axis, rng, limits)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.aberration_grid import aberration_grid
-from estimator.estimation import estimate_eye
-from estimator.pinhole import pixel_from_mrad
-from estimator.profile_files import load_profile
-from estimator.psf import compute_psf_batch, plan_psfs
-from estimator.units import RGB_WAVELENGTHS_NM, SPHERE_PER_C20
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.aberration_grid import aberration_grid
+from estimator.optics.pinhole import pixel_from_mrad
+from estimator.optics.units import RGB_WAVELENGTHS_NM, SPHERE_PER_C20
+from estimator.profiles.files import load_profile
+from estimator.psf.compute import compute_psf_batch, plan_psfs
 from tests.benchmarks.harness import Row, memory_mb
 from tests.benchmarks.psf_table import REFERENCE
 from tests.numerical.psf_cases import (

@@ -1,9 +1,9 @@
-"""How often images filtered by ray optics are better than `psf_switch` predicts."""
+"""How often images filtered by ray optics are better than `psf.switch` predicts."""
 
 import numpy as np
 
-from estimator.psf import compute_psf_batch, plan_psfs
-from estimator.psf_switch import predicted_psnr_db
+from estimator.psf.compute import compute_psf_batch, plan_psfs
+from estimator.psf.switch import predicted_psnr_db
 from tests.numerical.psf_cases import filter_psnr_db, zernike_from_terms
 
 PIXELS_MRAD = (0.499, 0.873, 1.295)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.psf import compute_psf_batch, plan_psfs
+from estimator.psf.compute import compute_psf_batch, plan_psfs
 from tests.benchmarks.harness import Row, memory_mb, time_calls
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,

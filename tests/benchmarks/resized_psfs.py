@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from estimator.psf import PsfBatch
+from estimator.psf.compute import PsfBatch
 from tests.benchmarks.dense_reference import EyeState
 
 KEPT_ENERGY_RATIO = 0.99

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.dense_reference import EyeState, dense_reference
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_views
 
@@ -48,7 +49,7 @@ NEIGHBOURS = 4
 class Moment:
     """One frame of a path."""
 
-    view: View
+    view: RgbdView
     pupil_mm: float = PUPIL_MM
     focus_dpt: float = FOCUS_DPT
     gaze_deg: tuple[float, float] = (0.0, 0.0)
@@ -91,14 +92,14 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return float(ends[0] + (ends[1] - ends[0]) * share)
 
 
-def eye_spec(view: View, mode: str, **settings) -> GridSpec:
+def eye_spec(view: RgbdView, mode: str, **settings) -> GridSpec:
     """Spec for everything that paths but the gaze's ask for."""
     settings = {
         "pupil_range_mm": PUPIL_RANGE_MM,
         "focus_range_dpt": FOCUS_RANGE_DPT,
         **settings,
     }
-    return GridSpec.for_camera(
+    return grid_spec(
         width_px=view.width_px,
         height_px=view.height_px,
         tangents=view.tangents,
@@ -139,7 +140,7 @@ def exact_state(eye: str, moment: Moment, mode: str) -> EyeState:
     return EyeState(traced_eye(eye, spec), spec, moment.pupil_mm, moment.focus_dpt)
 
 
-def cropped(view: View, window: tuple[slice, slice]) -> tuple[View, tuple]:
+def cropped(view: RgbdView, window: tuple[slice, slice]) -> tuple[RgbdView, tuple]:
     """A window with its halo as a view of its own, and the window within it."""
     sizes = (view.height_px, view.width_px)
     rows, columns = (

@@ -89,7 +89,7 @@ class RawClient:
         welcome = self.ask(Hello("raw"))
         body = {"kind": "double", "mark": mark}
         camera = small_frame(0, **frame_size).views[0].camera
-        accepted = self.ask(ProfileRequest(mark, body, cameras=(camera,)))
+        accepted = self.ask(ProfileRequest(mark, body, views=(camera,)))
         assert accepted.type_name == "accepted"
         assert self.receive().type_name == "ready"
         return welcome
@@ -118,7 +118,7 @@ def small_frame(frame_id, *, width_px=16, height_px=8, **changes):
     depth_m = np.full((height_px, width_px), 2.0, np.float32)
     fields = {
         "frame_id": frame_id,
-        "views": (ViewHeader(camera),),
+        "views": (ViewHeader.of(camera),),
         "pupil_diameter_mm": 4.0,
         "focus_dpt": 0.0,
         "images": (ViewImages(color, depth_m),),

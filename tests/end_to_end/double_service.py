@@ -4,10 +4,11 @@ import argparse
 import logging
 from pathlib import Path
 
+from filter_service.building.worker_handle import WorkerHandle
+from filter_service.filtering.workshop import Workshop
 from filter_service.service.config import load_config
-from filter_service.service.serving import serve
-from filter_service.service.worker_handle import WorkerHandle
-from tests.end_to_end.doubles import RendererDouble, check_profile
+from filter_service.service.launch import serve
+from tests.end_to_end.doubles import EngineDouble, read_profile
 
 
 def main():
@@ -18,13 +19,12 @@ def main():
     logging.basicConfig(level=logging.INFO)
     config = load_config(arguments.config)
     build = "tests.end_to_end.doubles:build"
-    serve(
-        config,
-        renderer=RendererDouble(arguments.filter_ms),
-        worker=WorkerHandle(build, config.build_niceness, config.cancel_grace_s),
-        check_profile=check_profile,
-        gl_renderer="numpy double",
+    worker = WorkerHandle(
+        build, config.build_niceness, config.cancel_grace_s, warm_up=""
     )
+    engine = EngineDouble(arguments.filter_ms)
+    workshop = Workshop(worker, engine, config.build_limits)
+    serve(config, workshop=workshop, read_profile=read_profile)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from filter_service.building.jobs import BuiltStore
+from filter_service.camera import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
-from filter_service.psfs.camera_match import is_same_camera
-from filter_service.service.build_job import BuiltStore
 
 SLICE_BYTES = 4 * 2**20
 
@@ -44,8 +44,10 @@ class RenderedDouble:
     notes: list = field(default_factory=list)
 
 
-class RendererDouble:
+class EngineDouble:
     """Inverts colours and takes the time it is told to take."""
+
+    name = "numpy double"
 
     def __init__(self, filter_ms: float):
         self.filter_ms = filter_ms
@@ -110,12 +112,18 @@ def _as_floats(color):
     return color.astype(np.float32) / 255 if color.dtype == np.uint8 else color
 
 
-def check_profile(body, settings):
+@dataclass(frozen=True)
+class ProfileDouble:
+    body: dict
+
+
+def read_profile(body):
     if body.get("kind") != "double":
         raise UnknownProfile(f"it is {body.get('kind')!r}", field="kind")
     mark = body.get("mark")
     if not isinstance(mark, int) or not 0 <= mark <= 255:
         raise UnknownProfile(f"it is {mark!r}", field="mark", allowed="0 to 255")
+    return ProfileDouble(body)
 
 
 def build(job, *, progress, cancelled):
@@ -124,7 +132,7 @@ def build(job, *, progress, cancelled):
     With ``preview_mark`` there is a preview of that mark after ``preview_s``; its first
     note says which pupil it is for.
     """
-    body = job.body
+    body = job.profile.body
     if body.get("crash"):
         os.kill(os.getpid(), signal.SIGKILL)
     if "preview_mark" in body:
@@ -147,7 +155,8 @@ def _work(build_s, body, progress, cancelled):
 
 
 def _store(job, mark, note, *, is_complete):
-    ballast = np.full(int(job.body.get("ballast_mb", 0.1) * 1e6), mark, np.uint8)
+    body = job.profile.body
+    ballast = np.full(int(body.get("ballast_mb", 0.1) * 1e6), mark, np.uint8)
     store = StoreDouble(mark, job.camera, job.settings.follows_field, ballast)
-    build_ms = 1000 * job.body.get("build_s", 0.0)
+    build_ms = 1000 * body.get("build_s", 0.0)
     return BuiltStore(store, build_ms, 1, ballast.nbytes / 1e6, (note,), is_complete)

@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from estimator.network_card import NETWORK_NAMES
+from estimator.networks.card import NETWORK_NAMES
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 120

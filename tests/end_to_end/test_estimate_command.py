@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from estimator.eye_parameters import PARAMETER_NAMES
+from estimator.eye.parameters import PARAMETER_NAMES
 from tests.end_to_end.test_cli import refusal, run, run_json
 
 

@@ -116,8 +116,8 @@ def test_a_frame_that_cannot_be_filtered_is_an_error_and_the_next_one_works(clie
 
 
 def test_images_too_large_for_the_service_are_refused_by_the_client(client):
-    with pytest.raises(ValueError, match="4097 x 1"):
-        client.submit(make_view(4097, 1), **SEE)
+    with pytest.raises(ValueError, match="4097 x 300"):
+        client.submit(make_view(4097, 300), **SEE)
 
 
 def test_a_frame_before_hello_and_before_a_profile_is_answered(

@@ -118,7 +118,7 @@ def test_every_profile_of_a_burst_has_an_ending(shared_service, raw_client):
     burst = range(200, 212)
     for profile_id in burst:
         body = {"kind": "double", "mark": 1, "build_s": 0.05}
-        raw.send(encode(ProfileRequest(profile_id, body, cameras=(camera,))))
+        raw.send(encode(ProfileRequest(profile_id, body, views=(camera,))))
     endings = {}
     while set(endings) != set(burst):
         reply = raw.receive()
@@ -308,7 +308,7 @@ def test_over_the_field_a_shifted_camera_is_prepared_for_anew(client):
         assert {e.reason for _, e in events if isinstance(e, Dropped)} == reasons
     with pytest.raises(errors.BadMessage) as caught:
         client.set_profile(double(61), settings={"mode": "sideways"}, views=[first])
-    assert caught.value.field == "settings.mode"
+    assert caught.value.field == "mode"
     assert "dynamic" in caught.value.allowed
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
-from clients.rgbd_view import tangents_from_fov
 from clients.service_process import CHECKOUT, ServiceProcess
-from estimator.network_card import INPUTS, read_card
+from estimator.networks.card import INPUTS, read_card
 from filter_service import errors
+from filter_service.camera import tangents_from_fov
 from filter_service.messages import Camera, Dropped
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
@@ -214,7 +214,7 @@ def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_cli
     workers = [
         pid
         for pid in pids
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"building.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     assert len(workers) == 1
 

@@ -13,10 +13,10 @@ from clients.scene_renderer import (
     _mean_color,
     _sample_depth,
 )
+from clients.scenes.catalogue import build_scene
 from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
-from clients.scenes.scene import build_scene
 
 UNITS_PER_M = 180.0
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
-from clients.rgbd_view import tangents_from_fov
 from clients.service_process import ServiceProcess
+from filter_service.camera import tangents_from_fov
 from filter_service.messages import Dropped, Ready
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}

@@ -12,7 +12,7 @@ from clients.service_process import CHECKOUT, ServiceProcess
 SHOW_AND_READ_BACK = """
 import glfw, numpy as np
 from clients.scene_renderer import SceneRenderer
-from clients.scenes.scene import build_scene
+from clients.scenes.catalogue import build_scene
 from clients.window import LiveWindow, _close_on_escape
 
 scene = build_scene("primitives")

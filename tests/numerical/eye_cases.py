@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from estimator.eye_parameters import random_vectors
-from estimator.eye_wavefront import zernike_of_vectors
-from estimator.prescription import zernike_from_power_vector
-from estimator.profiles import EyeProfile, Measurement
-from estimator.zernike import N_TERMS, nm_from_index
+from estimator.eye.parameters import random_vectors
+from estimator.eye.tracing import zernike_of_vectors
+from estimator.optics.prescription import zernike_from_power_vector
+from estimator.optics.zernike import N_TERMS, nm_from_index
+from estimator.profiles.parse import EyeProfile, Measurement
 
 POPULATION_UM = {
     # pupil, mm: {index: (mean, standard deviation)}, um (Thibos 2002; optics.md 3.4)
@@ -36,7 +36,6 @@ def as_profile(zernike_um, *, pupil_diameter_mm, wavelength_nm, name):
         name=name,
         kind="zernike",
         eye_side="OD",
-        zernike_um=zernike_um,
         pupil_diameter_mm=pupil_diameter_mm,
         wavelength_nm=wavelength_nm,
         max_pupil_diameter_mm=pupil_diameter_mm,

@@ -3,14 +3,14 @@
 import numpy as np
 from scipy.signal import fftconvolve
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
 from filter_service.constants import RGB, WEIGHT_MAX
-from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 
 PUPIL_MM = 3.0
 PITCH_RAD = 1e-3
@@ -38,7 +38,7 @@ class OneKernelBench:
 
     def render(self, color, depth_m=1.0, **options):
         depth_m = np.broadcast_to(np.float32(depth_m), self.size)
-        view = View(color, depth_m.astype(np.float32), self.tangents, "radial")
+        view = RgbdView(color, depth_m.astype(np.float32), self.tangents, "radial")
         return self.renderer.render(
             view, self.handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0, **options
         )
@@ -52,7 +52,7 @@ class OneKernelBench:
 
 
 def _store(kernel, tangents, width_px, height_px, spread_px):
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=width_px,
         height_px=height_px,
         tangents=tangents,
@@ -72,7 +72,9 @@ def _store(kernel, tangents, width_px, height_px, spread_px):
             h_deg=np.zeros(1),
             v_deg=np.zeros(1),
             pupils_mm=np.array([PUPIL_MM]),
-            accommodations_dpt=eye.accommodation_nodes_dpt(spec.focus_range_dpt),
+            accommodations_dpt=eye.accommodation_nodes_dpt(
+                spec.settings.focus_range_dpt
+            ),
             defocus=RaggedNodes.of([np.zeros(1)]),
             channel_shift_dpt=np.zeros((1, RGB)),
             prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),

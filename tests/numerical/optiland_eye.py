@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.explicit_eye import parse_explicit_eye
+from estimator.eye.explicit import parse_explicit_eye
 
 FROZEN = Path(__file__).parents[1] / "data" / "optiland_eye.json"
 SEED = 20231

@@ -11,16 +11,17 @@ from functools import cache
 
 import numpy as np
 
-from estimator.estimation import estimate_eye
-from estimator.profile_files import load_profile
-from estimator.psf import compute_psf_batch
-from estimator.traced_eye import TracedEye
-from filter_service.planning.grid import GridSpec, pupil_nodes_mm
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.traced_eye import TracedEye
+from estimator.profiles.files import load_profile
+from estimator.psf.compute import compute_psf_batch
+from filter_service.planning.grid import pupil_nodes_mm
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.paper_grid import DISTANCES_DPT
+from filter_service.planning.sampled_use import FIELD_OF_AXIS, sample_use
 from filter_service.planning.slopes import PupilStates
-from filter_service.planning.use import FIELD_OF_AXIS, sample_use
 from filter_service.psfs.pack import pack_kernels, square_kernel
+from tests.grid_specs import grid_spec
 
 SPECTRUM_SIDE_PX = 256
 
@@ -35,7 +36,7 @@ COURTYARD_SPECTRUM = (
 def spec_for(width_px=480, height_px=270, vertical_fov_deg=50.0, **settings):
     up = math.tan(math.radians(vertical_fov_deg) / 2)
     right = up * width_px / height_px
-    return GridSpec.for_camera(
+    return grid_spec(
         width_px=width_px,
         height_px=height_px,
         tangents=(-right, right, up, -up),
@@ -47,8 +48,8 @@ def traced_eye(name, spec):
     """The traced eye of a preset for all that a spec asks for."""
     return _traced(
         name,
-        tuple(pupil_nodes_mm(spec.pupil_range_mm)),
-        spec.focus_range_dpt,
+        tuple(pupil_nodes_mm(spec.settings.pupil_range_mm)),
+        spec.settings.focus_range_dpt,
         spec.field_range_deg,
         tuple(spec.channel_wavelengths_nm),
     )
@@ -105,7 +106,7 @@ def exact_kernels(eye, spec, states):
         pupil_ellipse=found.pupil_ellipse,
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
-        diffraction=spec.diffraction,
+        diffraction=spec.settings.diffraction,
         min_energy_ratio=1.0 - 0.2 * (1.0 - spec.kept_energy_ratio),
         workers=2,
     )

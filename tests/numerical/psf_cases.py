@@ -15,14 +15,14 @@ import numpy as np
 import scipy.fft
 from PIL import Image, ImageDraw, ImageFont
 
-from estimator import psf_reference
-from estimator.pinhole import pixel_from_mrad
-from estimator.psf import plan_psfs
-from estimator.psf_arguments import checked_scale
-from estimator.psf_reference import reference_kernel
-from estimator.psf_survey import RADIUS_LIMIT_PX
-from estimator.psf_types import disc_mask
-from estimator.zernike import index_from_nm, remove_central_tilt, rescale_pupil
+from estimator.optics.pinhole import pixel_from_mrad
+from estimator.optics.zernike import index_from_nm, remove_central_tilt, rescale_pupil
+from estimator.psf import reference as psf_reference
+from estimator.psf.arguments import checked_scale
+from estimator.psf.compute import plan_psfs
+from estimator.psf.kernel_types import disc_mask
+from estimator.psf.reference import reference_kernel
+from estimator.psf.survey import RADIUS_LIMIT_PX
 
 CASES = json.loads(
     (Path(__file__).parents[1] / "data" / "psf_cases.json").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 
 _SCRIPT = """
 import json
@@ -46,7 +46,7 @@ SCENES = ("courtyard", "primitives")
 @cache
 def scene_view(
     name: str, *, width_px: int, height_px: int, with_hidden: bool = False
-) -> View:
+) -> RgbdView:
     """Middle frame of a scene's own camera path."""
     return _rendered(name, width_px, height_px, 5, 2, 3, with_hidden=with_hidden)[0]
 
@@ -61,7 +61,7 @@ def scene_views(
     path: tuple = (),
     first: int = 0,
     end: int | None = None,
-) -> tuple[View, ...]:
+) -> tuple[RgbdView, ...]:
     """Frames of a camera path, the scene's own where it is empty.
 
     Parameters
@@ -91,6 +91,6 @@ def _rendered(
             tangents = tuple(float(t) for t in data["tangents"])
             images = {name: data[name] for name in data.files if name != "tangents"}
     return tuple(
-        View(tangents=tangents, **{name: images[name][k] for name in images})
+        RgbdView(tangents=tangents, **{name: images[name][k] for name in images})
         for k in range(end - first)
     )

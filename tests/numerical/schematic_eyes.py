@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
-from estimator.zernike import (
+from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
+from estimator.optics.zernike import (
     N_TERMS,
     flip_horizontal,
     rescale_pupil,

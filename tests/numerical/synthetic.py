@@ -5,12 +5,12 @@ import math
 import numpy as np
 from scipy.ndimage import zoom
 
-from estimator.profiles import parse_profile
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
+from estimator.profiles.parse import parse_profile
+from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_twin import layer_blur_px
 
 
@@ -39,7 +39,7 @@ class Bench:
     def __init__(self, gpu, profile, *, width_px, height_px, vertical_fov_deg, **spec):
         self.width_px, self.height_px = width_px, height_px
         self.tangents = tangents(width_px, height_px, vertical_fov_deg)
-        self.spec = GridSpec.for_camera(
+        self.spec = grid_spec(
             width_px=width_px, height_px=height_px, tangents=self.tangents, **spec
         )
         self.store = build_psf_store(parse_profile(profile), self.spec)
@@ -51,7 +51,7 @@ class Bench:
         depth_m = np.broadcast_to(
             np.float32(depth_m), (self.height_px, self.width_px)
         ).astype(np.float32)
-        return View(color, depth_m, self.tangents, depth_kind)
+        return RgbdView(color, depth_m, self.tangents, depth_kind)
 
     def render(self, view, **options):
         options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0, **options}

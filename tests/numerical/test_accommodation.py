@@ -6,26 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.accommodation import (
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.accommodation import (
     SMALLEST_DIAMETER_RATIO,
     AccommodatingEye,
     accommodated,
 )
-from estimator.accommodation_spot import (
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.lens_shape import lens_shape
+from estimator.eye.parameters import EyeParameters, RetinaShape
+from estimator.eye.tracing import refraction_of_vectors
+from estimator.optics.prescription import C20, Prescription
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.wavefront.aberrations import wavefront_aberrations
+from tests.numerical.spot_focus import (
     SPOT_DIAMETER_RATIO,
     focus_by_spot,
     hexagonal_disc,
     spot_radius_mm,
 )
-from estimator.estimation import estimate_eye
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters, RetinaShape
-from estimator.eye_wavefront import refraction_of_vectors
-from estimator.lens_shape import lens_shape
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.prescription import C20, Prescription
-from estimator.profiles import parse_profile, preset_names
-from estimator.wavefront import wavefront_aberrations
 
 
 @pytest.fixture(scope="module")

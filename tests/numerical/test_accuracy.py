@@ -4,19 +4,21 @@ The networks here trace, see `traced_networks`: their answers are perfect.
 """
 
 import re
+from typing import get_args
 
 import numpy as np
 import pytest
 
-from estimator.estimation import estimate_eye
-from estimator.eye_parameters import column
-from estimator.network_card import WeightsMissing
-from estimator.profiles import parse_profile
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs import eye_model, eye_notes
-from filter_service.psfs.eye_model import prepare_eye
-from filter_service.wire.images import Camera
-from filter_service.wire.profiles import ACCURACIES, DEFAULT_ACCURACY
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.parameters import column
+from estimator.field import notes as eye_notes
+from estimator.field import prepare
+from estimator.networks.card import WeightsMissing
+from estimator.profiles.parse import parse_profile
+from filter_service.camera import Camera
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.settings import DEFAULTS, Accuracy
+from tests.grid_specs import grid_spec
 from tests.numerical.eye_cases import as_profile
 from tests.numerical.traced_networks import (
     USERS,
@@ -27,7 +29,7 @@ from tests.numerical.traced_networks import (
 )
 
 MYOPIA = {"kind": "prescription", "sphere_dpt": -2.0}
-SPEC = GridSpec(
+SPEC = grid_spec(
     Camera(64, 48, (-0.2, 0.2, 0.15, -0.15)),
     pupil_range_mm=(4.0, 4.5),
     focus_range_dpt=(0.0, 3.0),
@@ -50,7 +52,7 @@ def trace_eye(row):
     return vector
 
 
-ASKING = (*USERS, eye_notes, eye_model)
+ASKING = (*USERS, eye_notes, prepare)
 
 
 @pytest.fixture
@@ -70,7 +72,7 @@ def place(monkeypatch):
 
 
 def prepared(accuracy, body=MYOPIA, spec=SPEC):
-    return prepare_eye(parse_profile(body), spec, eye_model="traced", accuracy=accuracy)
+    return eye_for_spec(parse_profile(body), spec.with_settings(accuracy=accuracy))
 
 
 def said(notes, start):
@@ -100,7 +102,7 @@ def test_an_eye_far_off_its_wavefront_is_refined(place):
 
 def test_balanced_refines_the_eye(place, monkeypatch):
     place()
-    monkeypatch.setattr("estimator.grid_source.LEAST_GAIN_MS", 0.0)
+    monkeypatch.setattr("estimator.field.grid_source.LEAST_GAIN_MS", 0.0)
     eye, notes = prepared("balanced")
     assert "refined from" in notes[0]
     assert float(re.search(r"error (\S+) um", notes[0])[1]) < 1e-3
@@ -112,7 +114,7 @@ def test_balanced_refines_the_eye(place, monkeypatch):
 
 def test_balanced_traces_what_costs_little(place, monkeypatch):
     place()
-    monkeypatch.setattr("estimator.grid_source.LEAST_GAIN_MS", 1e9)
+    monkeypatch.setattr("estimator.field.grid_source.LEAST_GAIN_MS", 1e9)
     _, notes = prepared("balanced")
     assert said(notes, "aberrations ").startswith("aberrations traced to about 1e-03")
     assert not any("by network" in note for note in notes)
@@ -133,7 +135,7 @@ def test_what_is_out_of_the_domain_is_traced_and_named(place, monkeypatch, accur
         focus={"focus_dpt": (-1.0, 1.0)},
         aberration={"h_deg": (-5.0, 5.0)},
     )
-    monkeypatch.setattr("estimator.grid_source.LEAST_GAIN_MS", 0.0)
+    monkeypatch.setattr("estimator.field.grid_source.LEAST_GAIN_MS", 0.0)
     eye, notes = prepared(accuracy)
     exact, _ = prepared("exact")
     assert "zernike_j4_um 2.59" in said(notes, "eye not by network")
@@ -146,7 +148,7 @@ def test_what_is_out_of_the_domain_is_traced_and_named(place, monkeypatch, accur
     assert all(len(note.encode()) <= 200 for note in notes) and len(notes) <= 8
 
 
-@pytest.mark.parametrize("accuracy", ACCURACIES)
+@pytest.mark.parametrize("accuracy", get_args(Accuracy))
 def test_without_weights_everything_is_traced(monkeypatch, accuracy):
     def missing(name):
         raise WeightsMissing(f"{name}.onnx is missing")
@@ -171,6 +173,6 @@ def test_a_given_eye_needs_no_estimate(place):
 
 
 def test_an_unknown_accuracy_is_refused():
-    with pytest.raises(ValueError, match="fast, balanced, exact"):
+    with pytest.raises(ValueError, match="balanced, exact, fast"):
         prepared("precise")
-    assert DEFAULT_ACCURACY in ACCURACIES
+    assert DEFAULTS.accuracy in get_args(Accuracy)

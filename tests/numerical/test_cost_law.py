@@ -6,7 +6,7 @@ from PIL import Image
 
 from filter_service.constants import THREADS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.benchmarks.bench_cost import BLUR_MRAD, CostBench, bench, plane_view
 from tests.benchmarks.cost_law import CostRow, bounds, exponent, laws
 from tests.benchmarks.field_pictures import plot_costs

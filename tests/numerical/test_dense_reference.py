@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.dense_reference import EyeState, dense_reference, view_sources
 from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
@@ -22,6 +21,7 @@ from tests.benchmarks.paper_layout import (
     interval_count,
     paper_texture,
 )
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.synthetic import psnr_db, tangents, texture
 from tests.numerical.test_renderer_field import (
@@ -45,7 +45,7 @@ class ExactBench(FieldBench):
 def eye_state(
     name, view_tangents, mode="quality", size=(WIDTH, HEIGHT), focus_dpt=FOCUS_DPT
 ):
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=size[0],
         height_px=size[1],
         tangents=view_tangents,
@@ -59,7 +59,7 @@ def eye_state(
 def radial_view(state, color, distance_dpt):
     shape = color.shape[:2]
     distance_m = 1.0 / np.broadcast_to(np.asarray(distance_dpt, float), shape)
-    return View(
+    return RgbdView(
         color.astype(np.float32),
         distance_m.astype(np.float32),
         state.spec.camera.tangents,
@@ -239,7 +239,7 @@ def test_off_axis_baselines_turn_kernels_the_right_way(rng):
 
 
 def test_textures_blend_over_pupil_and_focus(rng):
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=WIDTH,
         height_px=HEIGHT,
         tangents=tangents_of(10, 13, 5, 7.25),

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from estimator.bounded_fit import FitFailed, box_minimum, fit_bounded
-from estimator.estimation import POOR_FIT_UM, estimate_eye
-from estimator.estimation_prior import prior_for_refraction
-from estimator.estimation_problem import compared_terms
-from estimator.eye_parameters import (
+from estimator.estimate.bounded_fit import FitFailed, box_minimum, fit_bounded
+from estimator.estimate.estimation import POOR_FIT_UM, estimate_eye
+from estimator.estimate.pattern_search import search_loss, search_weights
+from estimator.estimate.prior import prior_for_refraction
+from estimator.estimate.problem import compared_terms
+from estimator.estimate.table import table_vectors
+from estimator.eye.parameters import (
     PARAMETER_NAMES,
     PARAMETERS,
     EyeParameters,
@@ -17,13 +19,11 @@ from estimator.eye_parameters import (
     mean_vector,
     random_vectors,
 )
-from estimator.eye_table import table_vectors
-from estimator.eye_wavefront import on_axis_zernike_um, zernike_of_vectors
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.pattern_search import search_loss, search_weights
-from estimator.profiles import parse_profile, preset_names
-from estimator.wavefront import wavefront_aberrations
-from estimator.zernike import nm_from_index, rescale_pupil
+from estimator.eye.tracing import on_axis_zernike_um, zernike_of_vectors
+from estimator.optics.zernike import nm_from_index, rescale_pupil
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.wavefront.aberrations import wavefront_aberrations
 from tests.numerical.eye_cases import population_profiles, random_eye_profiles
 
 PRESET_LIMIT_UM = 5e-4
@@ -133,7 +133,7 @@ def test_100000_random_eyes_are_traced_on_axis_or_say_why_not(rng):
 
 
 def _reason(vector):
-    from estimator.eye import eye_surfaces
+    from estimator.eye.assembly import eye_surfaces
 
     found = wavefront_aberrations(
         eye_surfaces(EyeParameters.from_vector(vector)),

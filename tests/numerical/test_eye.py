@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.eye import eye_surfaces, pack_eyes
-from estimator.eye_parameters import (
+from estimator.eye.assembly import eye_surfaces, pack_eyes
+from estimator.eye.lens_shape import compat_lens_shape, lens_shape
+from estimator.eye.parameters import (
     N_PARAMETERS,
     PARAMETER_NAMES,
     PARAMETERS,
@@ -20,11 +21,10 @@ from estimator.eye_parameters import (
     parse_parameters,
     random_vectors,
 )
-from estimator.lens_shape import compat_lens_shape, lens_shape
-from estimator.profiles import ProfileError
-from estimator.raytrace import trace_rays
-from estimator.surfaces import pack_eye
-from estimator.zernike import nm_from_index, zernike_values
+from estimator.optics.raytrace import trace_rays
+from estimator.optics.surfaces import pack_eye
+from estimator.optics.zernike import nm_from_index, zernike_values
+from estimator.profiles.parse import ProfileError
 
 LENS_ROWS = json.loads(
     (Path(__file__).parents[1] / "data" / "lens_rules.json").read_text("utf-8")

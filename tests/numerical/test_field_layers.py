@@ -1,22 +1,20 @@
 """Layers over the field, mapped kernels, and kernels that would grow too large."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from estimator.profiles import parse_profile
-from estimator.psf_survey import survey_pupils
-from filter_service.planning.grid import GridSpec
+from estimator.profiles.parse import parse_profile
+from estimator.psf.survey import survey_pupils
 from filter_service.planning.plan import plan_cache
 from filter_service.planning.slopes import PupilStates, state_frames
-from filter_service.psfs.build import build_psf_store
-from filter_service.psfs.eye_model import prepare_eye
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.store import frame_layers
-from filter_service.rendering import kernel_passes
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl import kernel_passes
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.synthetic import psnr_db, tangents, texture
 from tests.numerical.test_renderer_field import FieldBench, splat_exactly
@@ -74,19 +72,19 @@ def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, gaze_
     color = texture(rng, height, width, cell_px=3)
     depth_m = np.broadcast_to(np.float32(1.5), (height, width))
     result = bench.renderer.render(
-        View(color, depth_m.copy(), bench.spec.camera.tangents),
+        RgbdView(color, depth_m.copy(), bench.spec.camera.tangents),
         bench.handle,
         gaze_deg=gaze_deg,
         **STATE,
     )
-    bench.spec = replace(bench.spec, gaze_deg=gaze_deg, gaze_range_deg=(0.0, 0.0))
+    bench.spec = bench.spec.with_settings(gaze_deg=gaze_deg, gaze_range_deg=(0.0, 0.0))
     truth = splat_exactly(bench, color, depth_m)
     assert psnr_db(result.color, truth) >= 44.0
 
 
 def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
     width, height = 128, 72
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=width,
         height_px=height,
         tangents=tangents(width, height, 70.0),
@@ -99,14 +97,14 @@ def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
         gaze_range_deg=(15.0, 8.0),
     )
     profile = parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
-    eye, _ = prepare_eye(profile, spec, eye_model="wavefront", accuracy="exact")
+    eye, _ = eye_for_spec(profile, spec.with_settings(eye_model="wavefront"))
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))
     image = texture(rng, height, width, cell_px=1)
     far_m = np.full(image.shape[:2], np.inf, np.float32)
     for gaze_deg in ((0.0, 0.0), (15.0, 8.0), (-15.0, 0.0)):
         seen = renderer.render(
-            View(image, far_m, spec.camera.tangents),
+            RgbdView(image, far_m, spec.camera.tangents),
             handle,
             pupil_diameter_mm=3.0,
             focus_dpt=0.0,
@@ -162,12 +160,12 @@ def test_plans_end_where_kernels_may_not_grow():
 
 def test_a_frame_says_where_its_blur_is_limited():
     spec = spec_for(
-        160,
-        90,
+        320,
+        180,
         mode="dynamic",
         tolerance="loose",
         max_blur_radius_px=6,
-        object_range_dpt=(0.0, 40.0),
+        object_range_dpt=(0.0, 20.0),
         **STILL,
     )
     eye = traced_eye("emmetropia", spec)

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.aberration_grid import aberration_grid
-from estimator.estimation import estimate_eye
-from estimator.field_interpolation import FieldInterpolation, field_nodes_deg
-from estimator.field_wavefronts import (
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.aberration_grid import aberration_grid
+from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.traced_eye import TracedEye
+from estimator.optics.prescription import power_vector, zernike_from_power_vector
+from estimator.optics.zernike import flip_horizontal, zernike_values
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.psf.compute import compute_psf_batch
+from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     ellipse_from_rim,
     polynomial_in_mm,
     rim_from_ellipse,
     zernike_from_polynomial,
 )
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.prescription import power_vector, zernike_from_power_vector
-from estimator.profiles import parse_profile, preset_names
-from estimator.psf import compute_psf_batch
-from estimator.traced_eye import TracedEye
-from estimator.wavefront import wavefront_grid
-from estimator.zernike import flip_horizontal, zernike_values
 
 WIDE_DEG = ((-45.0, 45.0), (-25.0, 25.0))
 BLUE_NM = 464.0

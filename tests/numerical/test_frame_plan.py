@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
 from filter_service.constants import MAX_LEVEL, RECIPE_TAPS, RGB, THREADS
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.read_kernels import layer_blur_px

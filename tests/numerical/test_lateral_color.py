@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from estimator.chief_ray_kernels import fill_chief_shifts
-from estimator.chief_rays import chief_shift_mrad
-from estimator.estimation import estimate_eye
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile
-from estimator.raytrace import trace_rays
-from estimator.surfaces import media_indices, pack_eye
-from estimator.traced_eye import TracedEye
-from estimator.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.traced_eye import TracedEye
+from estimator.optics.raytrace import trace_rays
+from estimator.optics.surfaces import media_indices, pack_eye
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
+from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
+from estimator.wavefront.chief_rays import chief_shift_mrad
 from filter_service.planning.field_directions import field_deg
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
-from filter_service.psfs.eye_model import NO_LATERAL_COLOR, prepare_eye
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.eye_for_spec import NO_LATERAL_COLOR, eye_for_spec
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 from tests.numerical.schematic_eyes import (
     case_eye,
     field_axes,
@@ -177,7 +177,7 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
     """Centroids (3, 2) of a white point from itself, x to the right and y up, px."""
     half = 0.5e-3 * SIZE * PITCH_MRAD
     middle = np.tan(np.radians(h_deg))
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=SIZE,
         height_px=SIZE,
         tangents=(middle - half, middle + half, half, -half),
@@ -189,8 +189,8 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
         kept_energy_ratio=0.998,
         lateral_color=lateral_color,
     )
-    eye, notes = prepare_eye(
-        parse_profile(profile), spec, eye_model=eye_model, accuracy="exact"
+    eye, notes = eye_for_spec(
+        parse_profile(profile), spec.with_settings(eye_model=eye_model)
     )
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))
@@ -199,7 +199,7 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
     color[row, column] = 1000.0
     depth_m = np.full((SIZE, SIZE), np.inf, np.float32)
     seen = renderer.render(
-        View(color, depth_m, spec.camera.tangents),
+        RgbdView(color, depth_m, spec.camera.tangents),
         handle,
         pupil_diameter_mm=3.0,
         focus_dpt=0.0,

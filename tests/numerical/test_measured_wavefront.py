@@ -7,12 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.chromatic import chromatic_refraction_dpt
-from estimator.measured_wavefront import (
-    MeasuredWavefront,
-    accommodation_amplitude_dpt,
-)
-from estimator.prescription import (
+from estimator.optics.chromatic import chromatic_refraction_dpt
+from estimator.optics.prescription import (
     C2M2,
     C20,
     C22,
@@ -22,8 +18,12 @@ from estimator.prescription import (
     power_vector_from_zernike,
     prescription_from_power_vector,
 )
-from estimator.profiles import parse_profile, preset_names
-from estimator.zernike import rescale_pupil, zernike_gradient
+from estimator.optics.zernike import rescale_pupil, zernike_gradient
+from estimator.profiles.measured_wavefront import (
+    MeasuredWavefront,
+    accommodation_amplitude_dpt,
+)
+from estimator.profiles.parse import parse_profile, preset_names
 
 DATA = Path(__file__).parents[1] / "data"
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from estimator.estimation import estimate_eye
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters, mean_vector
-from estimator.network_card import WeightsMissing
-from estimator.profiles import parse_profile
-from estimator.traced_eye import TracedEye
-from estimator.wavefront import wavefront_grid
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import EyeParameters, mean_vector
+from estimator.field.traced_eye import TracedEye
+from estimator.networks.card import WeightsMissing
+from estimator.profiles.parse import parse_profile
+from estimator.wavefront.aberrations import wavefront_grid
+from filter_service.camera import Camera
 from filter_service.planning.grid import pupil_nodes_mm
-from filter_service.wire.images import Camera
 from tests.benchmarks import bench_networks, network_nodes, network_steps
 from tests.benchmarks.accuracy_rows import (
     asked_states,
@@ -271,8 +271,8 @@ def traced(sphere_dpt, spec):
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
     return TracedEye.trace(
         estimate_eye(parse_profile(body), starts=("table",)),
-        pupil_diameters_mm=pupil_nodes_mm(spec.pupil_range_mm),
-        focus_range_dpt=spec.focus_range_dpt,
+        pupil_diameters_mm=pupil_nodes_mm(spec.settings.pupil_range_mm),
+        focus_range_dpt=spec.settings.focus_range_dpt,
         wavelengths_nm=spec.wavelengths_nm,
         field_range_deg=spec.field_range_deg,
     )

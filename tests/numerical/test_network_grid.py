@@ -9,14 +9,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from estimator.aberration_grid import aberration_grid
-from estimator.estimation import estimate_eye
-from estimator.eye_parameters import RetinaShape
-from estimator.grid_source import GridSource, network_pays
-from estimator.network_card import NetworkUnfit, OutOfDomain
-from estimator.network_grid import network_focused, network_grid
-from estimator.profiles import parse_profile
-from estimator.traced_eye import TracedEye
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.parameters import RetinaShape
+from estimator.field.aberration_grid import aberration_grid
+from estimator.field.grid_source import GridSource, network_pays
+from estimator.field.network_grid import network_focused, network_grid
+from estimator.field.traced_eye import TracedEye
+from estimator.networks.card import NetworkUnfit, OutOfDomain
+from estimator.profiles.parse import parse_profile
 from tests.numerical.traced_networks import (
     TracedNetwork,
     put_in_place,
@@ -184,7 +184,8 @@ def test_a_network_pays_for_many_nodes_and_few_weights():
 def test_cheaper_traces_few_nodes_and_asks_the_network_for_many(monkeypatch, eye):
     put_in_place(monkeypatch, aberration(p95_um=0.01))
     monkeypatch.setattr(
-        "estimator.grid_source.network_pays", lambda n_nodes, **sizes: n_nodes > 50
+        "estimator.field.grid_source.network_pays",
+        lambda n_nodes, **sizes: n_nodes > 50,
     )
     source = GridSource(aberrations="cheaper")
     traced_eye(eye, source)

@@ -1,4 +1,4 @@
-"""The trained networks in estimator/weights, judged by ray tracing on fresh eyes.
+"""The trained networks in networks/weights, judged by ray tracing on fresh eyes.
 
 What a card states is what fresh eyes must show; no figure here is a network's own.
 """
@@ -9,30 +9,30 @@ import sys
 import numpy as np
 import pytest
 
-from estimator import networks
-from estimator.accommodation import AccommodatingEye, accommodated_vectors
-from estimator.estimation import GOOD_FIT_UM, estimate_eye
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters, column, random_vectors
-from estimator.eye_wavefront import TraceFailed, zernike_of_vectors
-from estimator.field_wavefronts import rim_from_ellipse
-from estimator.network_card import (
+from estimator.estimate.estimation import GOOD_FIT_UM, estimate_eye
+from estimator.estimate.network_guess import network_guess
+from estimator.eye.accommodation import AccommodatingEye, accommodated_vectors
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import EyeParameters, column, random_vectors
+from estimator.eye.tracing import TraceFailed, zernike_of_vectors
+from estimator.networks import inference as networks
+from estimator.networks.card import (
     INPUTS,
     NETWORK_NAMES,
     OutOfDomain,
     WeightsMissing,
 )
-from estimator.network_guess import network_guess
-from estimator.networks import (
+from estimator.networks.inference import (
     load_network,
     network_aberrations,
     network_eye,
     network_focus,
     network_zernike,
 )
-from estimator.profiles import parse_profile, preset_names
-from estimator.wavefront import wavefront_grid
-from estimator.zernike import nm_from_index
+from estimator.optics.zernike import nm_from_index
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.field_wavefronts import rim_from_ellipse
 from tests.numerical.eye_cases import as_profile, random_eye_profiles
 from tests.source_tree import ROOT
 from training.population import population_eyes
@@ -329,9 +329,9 @@ def test_everything_runs_with_torch_absent_and_without_a_warning():
     script = (
         "import sys\n"
         "sys.modules['torch'] = sys.modules['onnx'] = None\n"
-        "import estimator.networks, filter_service.service.serving\n"
-        "from estimator.estimation import estimate_eye\n"
-        "from estimator.profiles import parse_profile\n"
+        "import estimator.networks.inference, filter_service.service.launch\n"
+        "from estimator.estimate.estimation import estimate_eye\n"
+        "from estimator.profiles.parse import parse_profile\n"
         "profile = parse_profile({'kind': 'preset', 'name': 'myopia'})\n"
         "found = estimate_eye(profile, method='network')\n"
         "assert found.method == 'network', found.notes\n"

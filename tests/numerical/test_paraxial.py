@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.paraxial import cardinal_points, refraction_dpt
-from estimator.raytrace import trace_rays
-from estimator.wavefront import pupil_magnification
+from estimator.optics.paraxial import cardinal_points, refraction_dpt
+from estimator.optics.raytrace import trace_rays
+from estimator.wavefront.aberrations import pupil_magnification
 from tests.numerical.schematic_eyes import irregular_eye, navarro, reference
 
 REFERENCE = reference()

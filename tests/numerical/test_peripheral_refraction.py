@@ -9,13 +9,13 @@ the model must show.  Retinas by refraction: Atchison 2006 (optics.md 1.4).
 import numpy as np
 import pytest
 
-from estimator.estimation import estimate_eye
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import RetinaShape
-from estimator.prescription import C20
-from estimator.profiles import parse_profile
-from estimator.units import SPHERE_PER_C20
-from estimator.wavefront import wavefront_grid
+from estimator.estimate.estimation import estimate_eye
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import RetinaShape
+from estimator.optics.prescription import C20
+from estimator.optics.units import SPHERE_PER_C20
+from estimator.profiles.parse import parse_profile
+from estimator.wavefront.aberrations import wavefront_grid
 
 ANGLES_DEG = np.arange(0.0, 50.0, 5.0)
 PUPIL_MM = 2.0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from estimator.pinhole import direction_deg, pixel_from_mrad, tangents_at
+from estimator.optics.pinhole import direction_deg, pixel_from_mrad, tangents_at
 
 TANGENTS = (-0.9, 0.7, 0.5, -0.45)
 SIZE_PX = (1280, 720)

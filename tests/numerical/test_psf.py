@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from estimator.psf import (
+from estimator.optics.zernike import flip_horizontal, index_from_nm, nm_from_index
+from estimator.psf.compute import (
     compute_psfs,
 )
-from estimator.psf_reference import reference_kernel
-from estimator.psf_types import disc_mask
-from estimator.zernike import flip_horizontal, index_from_nm, nm_from_index
+from estimator.psf.kernel_types import disc_mask
+from estimator.psf.reference import reference_kernel
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,
     case_zernike_um,

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from estimator.psf import PsfTooLarge, compute_psfs
+from estimator.psf.compute import PsfTooLarge, compute_psfs
 from tests.numerical.psf_cases import case_zernike_um
 
 PITCH_MRAD = 1.295

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import eval_legendre, jv, spherical_jn
 
-from estimator.psf import EnzOutsideDomain, compute_psf_batch, compute_psfs
-from estimator.psf_enz_series import enz_function, radial_polynomial, zernike_betas
+from estimator.psf.compute import EnzOutsideDomain, compute_psf_batch, compute_psfs
+from estimator.psf.enz_series import enz_function, radial_polynomial, zernike_betas
 from tests.numerical.psf_cases import (
     CASE_NAMES,
     case_zernike_um,

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from estimator.pinhole import pixel_from_mrad
-from estimator.psf import compute_psfs
-from estimator.psf_reference import reference_kernel
-from estimator.stiles_crawford import StilesCrawford
+from estimator.optics.pinhole import pixel_from_mrad
+from estimator.psf.compute import compute_psfs
+from estimator.psf.reference import reference_kernel
+from estimator.psf.stiles_crawford import StilesCrawford
 from tests.numerical.psf_cases import (
     Window,
     case_zernike_um,

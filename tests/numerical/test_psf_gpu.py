@@ -5,24 +5,24 @@ import math
 import numpy as np
 import pytest
 
-from estimator.profiles import parse_profile
-from estimator.psf import PsfTooLarge, compute_psf_batch
-from estimator.psf_fourier import edge_response
-from estimator.psf_fourier_kernels import EDGE_HALF_WIDTH
-from estimator.psf_reference import reference_kernel
-from estimator.psf_types import disc_mask
-from estimator.stiles_crawford import StilesCrawford
+from estimator.profiles.parse import parse_profile
+from estimator.psf.compute import PsfTooLarge, compute_psf_batch
+from estimator.psf.fourier import edge_response
+from estimator.psf.fourier_kernels import EDGE_HALF_WIDTH
+from estimator.psf.kernel_types import disc_mask
+from estimator.psf.reference import reference_kernel
+from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.constants import WEIGHT_MAX
-from filter_service.planning.grid import GridSpec
 from filter_service.psfs import (
     gpu_build,
     gpu_build_constants,
     gpu_build_records,
 )
-from filter_service.psfs.build import build_psf_store
-from filter_service.psfs.engine import psf_engine
-from filter_service.psfs.gpu_build import gpu_psf_batch, gpu_psfs
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.gpu_build import gpu_psf_batch
 from filter_service.psfs.pack import square_kernel
+from filter_service.psfs.psf_engine import psf_engine
+from tests.grid_specs import grid_spec
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,
     case_zernike_um,
@@ -344,27 +344,6 @@ def test_results_do_not_depend_on_how_a_call_is_cut(gpu, monkeypatch):
     np.testing.assert_allclose(cut.lost_energy_ratio, whole.lost_energy_ratio)
 
 
-def test_kernels_that_stay_on_the_gpu_are_those_of_the_batch(gpu, monkeypatch):
-    zernike_um, options = _mixed_batch()
-    batch = gpu_psf_batch(gpu, zernike_um, **options)
-    _small_limits(monkeypatch)
-    seen = 0
-    for psfs in gpu_psfs(gpu, zernike_um, **options):
-        assert psfs.first == seen
-        sizes = (2 * psfs.radius_px + 1) ** 2
-        with gpu.context:
-            flat = gpu.read(psfs.kernels, (int(sizes.sum()),), np.float32)
-        start = batch.offset_count[seen]
-        np.testing.assert_array_equal(
-            psfs.offset_count, batch.offset_count[seen : seen + sizes.size] - start
-        )
-        np.testing.assert_allclose(
-            flat, batch.flat_kernels[start : start + flat.size], atol=1e-9
-        )
-        seen += sizes.size
-    assert seen == len(batch)
-
-
 def test_refusals_name_the_psf_of_the_call(gpu, monkeypatch):
     zernike_um, options = _mixed_batch()
     _small_limits(monkeypatch)
@@ -412,7 +391,7 @@ def test_a_hardware_gpu_computes_what_the_cpu_does(gpu):
 
 
 def test_a_store_is_the_same_from_either_engine():
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=160,
         height_px=120,
         tangents=(-0.3, 0.3, 0.2, -0.2),

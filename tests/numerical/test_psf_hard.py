@@ -7,17 +7,17 @@ import pytest
 import scipy.fft
 from scipy.special import j0, j1
 
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters, mean_vector
-from estimator.pinhole import pixel_from_mrad
-from estimator.prescription import zernike_from_power_vector
-from estimator.psf import PsfTooLarge, compute_psfs
-from estimator.psf_fourier import edge_response
-from estimator.psf_fourier_kernels import EDGE_HALF_WIDTH, fill_pupils
-from estimator.psf_pupil import pupil_frames
-from estimator.psf_reference import reference_kernel
-from estimator.wavefront import wavefront_grid
-from estimator.zernike import EXPONENTS, wavefront_polynomial, zernike_values
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import EyeParameters, mean_vector
+from estimator.optics.pinhole import pixel_from_mrad
+from estimator.optics.prescription import zernike_from_power_vector
+from estimator.optics.zernike import EXPONENTS, wavefront_polynomial, zernike_values
+from estimator.psf.compute import PsfTooLarge, compute_psfs
+from estimator.psf.fourier import edge_response
+from estimator.psf.fourier_kernels import EDGE_HALF_WIDTH, fill_pupils
+from estimator.psf.pupil import pupil_frames
+from estimator.psf.reference import reference_kernel
+from estimator.wavefront.aberrations import wavefront_grid
 from tests.numerical.psf_cases import (
     case_zernike_um,
     compared_radius_px,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profile_files import load_profile
+from estimator.profiles.files import load_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
 from filter_service.planning.axis_nodes import TOLERANCE_DB
 from filter_service.planning.error_law import (
     allowed_difference_px,
@@ -21,8 +21,8 @@ from filter_service.planning.nodes import (
     bracket_axis,
 )
 from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
-from filter_service.planning.use import sample_use
-from filter_service.psfs.build import build_psf_store
+from filter_service.planning.sampled_use import sample_use
+from filter_service.psfs.build_store import build_psf_store
 from tests.numerical.plan_cases import (
     mean_db,
     node_errors,
@@ -71,8 +71,10 @@ def test_groups_that_are_no_nodes_are_refused(groups):
 
 def expected_defocus(eye, spec):
     """Nodes on axis, by the rule in words: what frames read, pupil by pupil."""
-    pupils_mm = pupil_nodes_mm([eye.usable_pupil_mm(p) for p in spec.pupil_range_mm])
-    used_dpt = eye.accommodation_nodes_dpt(spec.focus_range_dpt)
+    pupils_mm = pupil_nodes_mm(
+        [eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm]
+    )
+    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
     groups = []
     for i, pupil_mm in enumerate(pupils_mm):
         for j in range(len(used_dpt)):
@@ -81,14 +83,16 @@ def expected_defocus(eye, spec):
                 read_dpt = (
                     used_dpt[max(j - 1, 0) : j + 2]
                     if len(used_dpt) > 1
-                    else [eye.accommodation_dpt(f) for f in spec.focus_range_dpt]
+                    else [
+                        eye.accommodation_dpt(f) for f in spec.settings.focus_range_dpt
+                    ]
                 )
                 at_infinity_dpt = eye.total_defocus_dpt(
                     pupil_diameter_mm=other_mm,
                     accommodation_dpt=np.array(read_dpt)[:, None],
                     wavelength_nm=spec.channel_wavelengths_nm,
                 )
-                for d in spec.object_range_dpt:
+                for d in spec.settings.object_range_dpt:
                     ends.append((at_infinity_dpt + d) * other_mm / pupil_mm)
             groups.append(
                 defocus_nodes_dpt(
@@ -156,9 +160,9 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
 
 
 def test_field_nodes_span_the_image_where_the_eye_looks_aside():
-    spec = replace(spec_for(mode="dynamic"), gaze_deg=(15.0, 5.0))
+    spec = spec_for(mode="dynamic").with_settings(gaze_deg=(15.0, 5.0))
     camera = replace(spec.camera, **GAZE_CAMERA)
-    spec = replace(spec, camera=camera, **ONE_STATE)
+    spec = replace(spec, camera=camera).with_settings(**ONE_STATE)
     plan = plan_cache(traced_eye("emmetropia", spec), spec)
     (h_low, h_high), (v_low, v_high) = spec.field_range_deg
     assert (plan.h_deg[0], plan.h_deg[-1]) == pytest.approx((h_low, h_high))
@@ -253,7 +257,7 @@ def test_a_plan_beyond_its_budget_is_refused_with_one_that_fits():
     spec = spec_for(mode="dynamic", tolerance="normal", **ONE_STATE)
     eye = traced_eye("emmetropia", spec)
     needed, smaller = (
-        unchecked_plan(eye, replace(spec, tolerance=tolerance)).prediction
+        unchecked_plan(eye, spec.with_settings(tolerance=tolerance)).prediction
         for tolerance in ("normal", "loose")
     )
     budget_mb = 0.5 * (needed.memory_mb + smaller.memory_mb)
@@ -265,7 +269,7 @@ def test_a_plan_beyond_its_budget_is_refused_with_one_that_fits():
     assert f"need {needed.memory_mb:.2g} MB for {needed.psf_count} PSFs" in text
     smaller_words = f"{smaller.memory_mb:.2g} MB for {smaller.psf_count} PSFs"
     assert f'tolerance "loose" needs {smaller_words}' in text
-    fitting = replace(spec, memory_budget_mb=budget_mb, tolerance="loose")
+    fitting = replace(spec, memory_budget_mb=budget_mb).with_settings(tolerance="loose")
     assert plan_cache(eye, fitting).prediction == smaller
 
 
@@ -300,7 +304,7 @@ def test_degenerate_ranges_are_planned(settings, shape, model):
     plan = plan_cache(eye, spec)
     for found, expected in zip(plan.group_shape, shape, strict=True):
         assert found == expected if expected else found >= 1
-    channels = 3 if spec.chromatic else 1
+    channels = 3 if spec.settings.chromatic else 1
     assert plan.prediction.psf_count == channels * len(plan.defocus.values_dpt)
     assert len(plan.defocus.starts) == 1 + math.prod(plan.group_shape)
     assert plan.prediction.memory_mb > 0.0

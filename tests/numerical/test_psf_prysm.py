@@ -6,8 +6,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from estimator.psf import compute_psfs
-from estimator.psf_reference import reference_kernel
+from estimator.psf.compute import compute_psfs
+from estimator.psf.reference import reference_kernel
 from tests.numerical.prysm_psf import (
     CASES,
     FROZEN,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from estimator.psf_reference import reference_field, reference_kernel
-from estimator.zernike import zernike_values
+from estimator.optics.zernike import zernike_values
+from estimator.psf.reference import reference_field, reference_kernel
 from tests.numerical.psf_cases import case_zernike_um
 
 DIRECTIONS_MRAD = np.linspace(-6.0, 6.0, 25)

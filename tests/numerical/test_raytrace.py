@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.explicit_eye import parse_explicit_eye
-from estimator.media import refractive_index
-from estimator.raytrace import RayStatus, trace_rays
-from estimator.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
+from estimator.eye.explicit import parse_explicit_eye
+from estimator.optics.media import refractive_index
+from estimator.optics.raytrace import RayStatus, trace_rays
+from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
 from tests.numerical.optiland_eye import (
     FROZEN,
     WAVELENGTH_NM,

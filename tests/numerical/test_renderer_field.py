@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from estimator.profiles import parse_profile
-from estimator.psf import compute_psf_batch
+from estimator.profiles.parse import parse_profile
+from estimator.psf.compute import compute_psf_batch
 from filter_service.planning.field_directions import (
     angles_deg,
     field_deg,
@@ -12,11 +12,11 @@ from filter_service.planning.field_directions import (
     pixel_from_mrad,
     unit_direction,
 )
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
-from filter_service.psfs.eye_model import prepare_eye
-from filter_service.rendering.frame import View
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import psnr_db, tangents, texture
 
 WIDTH, HEIGHT = 160, 120
@@ -32,7 +32,7 @@ class FieldBench:
     """A traced eye before a camera, ready to render."""
 
     def __init__(self, gpu, name, view_tangents, size=(WIDTH, HEIGHT), **settings):
-        self.spec = GridSpec.for_camera(
+        self.spec = grid_spec(
             width_px=size[0],
             height_px=size[1],
             tangents=view_tangents,
@@ -42,26 +42,21 @@ class FieldBench:
             **{"mode": "quality", "tolerance": "fine", **settings},
         )
         profile = parse_profile({"kind": "preset", "name": name})
-        self.eye, _ = prepare_eye(
-            profile,
-            self.spec,
-            eye_model="traced",
-            accuracy="exact",
-        )
+        self.eye, _ = eye_for_spec(profile, self.spec)
         self.store = build_psf_store(self.eye, self.spec)
         self.renderer = FilterRenderer(gpu)
         self.handle = self.renderer.load(self.store)
 
     def render(self, color, depth_m):
         depth_m = np.broadcast_to(np.float32(depth_m), color.shape[:2])
-        view = View(color, depth_m.astype(np.float32), self.spec.camera.tangents)
+        view = RgbdView(color, depth_m.astype(np.float32), self.spec.camera.tangents)
         return self.renderer.render(
             view, self.handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT
         )
 
     def exact_kernels(self, x, y, distance_m, radius_px=None):
         """PSFs (3 n) of the directions of n pixels, channel fastest."""
-        gaze_deg = self.spec.gaze_deg
+        gaze_deg = self.spec.settings.gaze_deg
         h, v = field_deg(self.spec.camera, x + 0.5, y + 0.5, gaze_deg=gaze_deg)
         h, v, distance_m = (np.repeat(np.ravel(a), 3) for a in (h, v, distance_m))
         wavelengths_nm = np.tile(self.spec.channel_wavelengths_nm, h.size // 3)
@@ -161,7 +156,7 @@ def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, name):
 
 
 def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         width_px=WIDTH,
         height_px=HEIGHT,
         tangents=tangents(WIDTH, HEIGHT, 90.0),
@@ -172,16 +167,14 @@ def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
         diffraction=False,
         chromatic=False,
     )
-    eye, _ = prepare_eye(
+    eye, _ = eye_for_spec(
         parse_profile({"kind": "prescription", "sphere_dpt": 0.0}),
-        spec,
-        eye_model="wavefront",
-        accuracy="exact",
+        spec.with_settings(eye_model="wavefront"),
     )
     renderer = FilterRenderer(gpu)
     handle = renderer.load(build_psf_store(eye, spec))
     image = texture(rng, HEIGHT, WIDTH, cell_px=1)
-    view = View(
+    view = RgbdView(
         image, np.full(image.shape[:2], np.inf, np.float32), spec.camera.tangents
     )
     result = renderer.render(view, handle, pupil_diameter_mm=3.0, focus_dpt=0.0)
@@ -190,9 +183,7 @@ def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
 
 
 def test_gaze_turns_the_field_the_way_the_eye_turns():
-    spec = GridSpec.for_camera(
-        width_px=200, height_px=100, tangents=(-1.0, 1.0, 0.5, -0.5)
-    )
+    spec = grid_spec(width_px=200, height_px=100, tangents=(-1.0, 1.0, 0.5, -0.5))
     gaze_deg = (20.0, -10.0)
     direction = gaze_rotation(gaze_deg) @ unit_direction(0.0, 0.0)
     assert np.allclose(angles_deg(direction), gaze_deg)

@@ -1,14 +1,12 @@
 """A gaze that frames turn: the visual field goes with it, as far as was prepared."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage
-from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame import View
 from filter_service.rendering.gaze import usable_gaze
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import tangents, texture
 from tests.numerical.test_renderer_field import (
     OBJECT_M,
@@ -36,7 +34,7 @@ def bench(gpu):
 def see(bench, color, gaze_deg=None):
     depth_m = radial_depth_m(bench.spec, OBJECT_M).astype(np.float32)
     return bench.renderer.render(
-        View(color, depth_m, bench.spec.camera.tangents),
+        RgbdView(color, depth_m, bench.spec.camera.tangents),
         bench.handle,
         pupil_diameter_mm=5.0,
         focus_dpt=0.5,
@@ -56,7 +54,7 @@ def test_a_point_of_light_becomes_the_psf_of_its_direction_from_the_gaze(
     seen = see(bench, point, gaze_deg).color[part].astype(float)
     errors, straight = [], bench.spec
     for turned in (gaze_deg, (0.0, 0.0)):
-        bench.spec = replace(straight, gaze_deg=turned)
+        bench.spec = straight.with_settings(gaze_deg=turned)
         psfs = bench.exact_kernels(np.array(x), np.array(y), OBJECT_M, radius)
         exact = np.stack([psf.kernel for psf in psfs], axis=-1)
         errors.append(np.linalg.norm(seen - exact) / np.linalg.norm(exact))
@@ -87,7 +85,7 @@ def test_a_gaze_that_is_no_direction_is_refused(bench, gaze_deg):
 
 def spec_of(h_half_deg, **settings):
     right = float(np.tan(np.radians(h_half_deg)))
-    return GridSpec.for_camera(
+    return grid_spec(
         width_px=64,
         height_px=32,
         tangents=(-right, right, right / 2, -right / 2),

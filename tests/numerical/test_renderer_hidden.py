@@ -8,7 +8,7 @@ import pytest
 from filter_service import constants
 from filter_service.errors import BadMessage
 from filter_service.rendering import reference
-from filter_service.rendering.frame import View
+from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
@@ -35,7 +35,7 @@ def layered(bench, mask, near, far, *, near_dpt=NEAR_DPT, far_dpt=FAR_DPT):
     )
     color = np.where(mask[..., None], near, far).astype(np.float32)
     far = np.broadcast_to(far, color.shape).astype(np.float32)
-    return View(
+    return RgbdView(
         color,
         np.where(mask, near_m, far_m),
         bench.tangents,
@@ -193,9 +193,9 @@ def test_strips_change_nothing(bench, rng, monkeypatch):
     ],
 )
 def test_a_hidden_layer_that_does_not_fit_is_refused(bench, rng, changes, field):
-    view = replace(disc_view(bench, rng), **changes)
+    view = disc_view(bench, rng)
     with pytest.raises(BadMessage) as caught:
-        bench.render(view, **STATE)
+        bench.render(replace(view, **changes), **STATE)
     assert caught.value.field == field
     assert caught.value.allowed
 

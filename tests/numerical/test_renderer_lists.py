@@ -5,7 +5,7 @@ import pytest
 
 from filter_service import constants
 from filter_service.gl.gpu import StageTimer
-from filter_service.rendering import frame_passes, list_bands
+from filter_service.rendering.gl import frame_passes, list_bands
 from filter_service.rendering.image_cells import image_cells
 from tests.numerical import tile_lists
 from tests.numerical.synthetic import Bench, texture

@@ -5,13 +5,10 @@ import pytest
 
 from filter_service import constants
 from filter_service.errors import BadMessage, CameraMismatch
-from filter_service.rendering import (
-    frame_kernels,
-    kernel_passes,
-    reference,
-)
-from filter_service.rendering.frame import View
+from filter_service.rendering import frame_kernels, reference
+from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rgbd_view import RgbdView
 from tests.numerical.synthetic import Bench, psnr_db, tangents, texture
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
@@ -222,7 +219,7 @@ def test_missing_depth_takes_the_nearest_and_is_counted(bench, rng, fill):
     whole = bench.view(image, np.where(np.arange(150) < 75, 0.5, 4.0)[None, :])
     holes = whole.depth_m.copy()
     holes[20:30, 10:14] = fill
-    result = bench.render(View(image, holes, whole.tangents))
+    result = bench.render(RgbdView(image, holes, whole.tangents))
     assert result.missing_depth_count == 40
     assert result.color.tobytes() == bench.render(whole).color.tobytes()
 
@@ -254,16 +251,16 @@ def test_depth_nearer_than_prepared_is_counted(gpu, rng):
 def test_wrong_arrays_and_cameras_are_refused(bench, rng):
     image, depth_m = texture(rng, 101, 150), depth_scene()
     bad = [
-        View(image[..., :2], depth_m, bench.tangents),
-        View(image.astype(np.float64), depth_m, bench.tangents),
-        View(image, depth_m[:50], bench.tangents),
-        View(image, depth_m, bench.tangents, "sideways"),
+        (image[..., :2], depth_m, bench.tangents),
+        (image.astype(np.float64), depth_m, bench.tangents),
+        (image, depth_m[:50], bench.tangents),
+        (image, depth_m, bench.tangents, "sideways"),
     ]
-    for view in bad:
+    for parts in bad:
         with pytest.raises(BadMessage):
-            bench.render(view)
+            bench.render(RgbdView(*parts))
     with pytest.raises(CameraMismatch):
-        bench.render(View(image, depth_m, tangents(150, 101, 20.0)))
+        bench.render(RgbdView(image, depth_m, tangents(150, 101, 20.0)))
     with pytest.raises(BadMessage, match="accumulation"):
         bench.render(bench.view(image, depth_m), accumulation="average")
 

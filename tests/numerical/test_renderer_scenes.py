@@ -4,12 +4,12 @@ from functools import cache
 
 import pytest
 
-from estimator.profiles import parse_profile, preset_names
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
+from estimator.profiles.parse import parse_profile, preset_names
+from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
 
@@ -22,7 +22,7 @@ MERGING = [(eye, scene) for eye in ("myopia", "astigmatism") for scene in SCENES
 @cache
 def eye_store(eye, scene):
     view = scene_view(scene, **SIZE)
-    spec = GridSpec.for_camera(
+    spec = grid_spec(
         **SIZE,
         tangents=view.tangents,
         pupil_range_mm=(5.0, 5.0),

@@ -7,11 +7,11 @@ import pytest
 from scipy.signal import fftconvolve
 from scipy.special import j1
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile, preset_names
-from estimator.psf import compute_psfs
-from estimator.units import RGB_WAVELENGTHS_NM
-from estimator.zernike import zernike_gradient
+from estimator.optics.units import RGB_WAVELENGTHS_NM
+from estimator.optics.zernike import zernike_gradient
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.psf.compute import compute_psfs
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
 SIZE = {"width_px": 160, "height_px": 120}
@@ -23,7 +23,9 @@ PURE = {"diffraction": False, "chromatic": False}
 
 def exact_kernels(eye, bench, *, d, f=0.0, pupil=5.0, radius_px=24):
     """Kernels (size, size, 3) of the exact state, wide enough for all their light."""
-    wavelengths_nm = RGB_WAVELENGTHS_NM if bench.spec.chromatic else (555.0,) * 3
+    wavelengths_nm = (
+        RGB_WAVELENGTHS_NM if bench.spec.settings.chromatic else (555.0,) * 3
+    )
     states = [
         eye.state(pupil_diameter_mm=pupil, object_dpt=d, focus_dpt=f, wavelength_nm=w)
         for w in wavelengths_nm

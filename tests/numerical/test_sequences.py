@@ -10,7 +10,6 @@ from tests.benchmarks.bench_sequence import (
     FOCUSING_EYES,
     MAX_POPPING_RATIO,
     MIN_FLICKER_DB,
-    RENDER_TAKES_GAZE,
     VARIANTS,
     SequenceBench,
     path_errors,
@@ -107,6 +106,5 @@ def test_errors_change_steadily_over_the_field(sequence_bench, motion):
     check_steady(sequence_bench("dynamic", motion), motion, FRAMES)
 
 
-@pytest.mark.skipif(not RENDER_TAKES_GAZE, reason="the renderer takes no gaze yet")
 def test_errors_change_steadily_while_the_gaze_turns(sequence_bench):
     check_steady(sequence_bench("dynamic", "gaze"), "gaze", 4)

@@ -3,22 +3,23 @@
 import numpy as np
 import pytest
 
-from estimator.estimation import estimate_eye
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.prescription import C20
-from estimator.profiles import parse_profile, preset_names
-from estimator.psf import compute_psfs
-from estimator.traced_eye import TracedEye
-from estimator.units import RGB_WAVELENGTHS_NM
-from estimator.wavefront import wavefront_aberrations
-from estimator.zernike import remove_central_tilt, rescale_pupil
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build import build_psf_store
+from estimator.estimate.estimation import estimate_eye
+from estimator.field.traced_eye import TracedEye
+from estimator.optics.prescription import C20
+from estimator.optics.units import RGB_WAVELENGTHS_NM
+from estimator.optics.zernike import remove_central_tilt, rescale_pupil
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.psf.compute import compute_psfs
+from estimator.wavefront.aberrations import wavefront_aberrations
+from filter_service.camera import Camera
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.image_cells import image_cells
-from filter_service.wire.images import Camera
+from tests.grid_specs import grid_spec
 
 PUPILS_MM = (3.0, 4.0, 5.0, 6.0)
 AXIS = {"h_deg": 0.0, "v_deg": 0.0}
@@ -113,16 +114,13 @@ def test_accommodation_makes_spherical_aberration_more_negative():
 def test_blended_kernels_equal_traced_ones_between_nodes():
     body = {"kind": "preset", "name": "emmetropia"}
     estimated, _ = traced(body)
-    spec = GridSpec(
+    spec = grid_spec(
         camera=Camera(1000, 1000, (-0.65, 0.65, 0.65, -0.65)),
         pupil_range_mm=(4.0, 5.0),
         focus_range_dpt=(0, 6),
     )
-    from filter_service.psfs.eye_model import prepare_eye
 
-    eye, notes = prepare_eye(
-        parse_profile(body), spec, eye_model="traced", accuracy="exact"
-    )
+    eye, notes = eye_for_spec(parse_profile(body), spec)
     assert "estimated" in notes[0]
     store = build_psf_store(eye, spec)
     pupil_mm, focus_dpt, object_dpt = 4.5, 3.37, 4.2

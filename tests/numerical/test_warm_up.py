@@ -6,8 +6,8 @@ from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs import store
 from filter_service.rendering import frame_kernels
-from filter_service.rendering.renderer import FilterRenderer
-from filter_service.rendering.warm_up import warm_up
+from filter_service.rendering.gl.compile_passes import compile_passes
+from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.numerical.synthetic import Bench, texture
 
 
@@ -23,7 +23,7 @@ def compiled_loops():
 
 def test_no_program_is_compiled_by_the_first_frames(rng):
     gpu = Gpu()
-    warm_up(FilterRenderer(gpu))
+    compile_passes(FilterRenderer(gpu))
     compiled = gpu.program_count
     sorts = sum(name == "sort_bins" for name, *_ in gpu._programs)
     assert sorts == 2 * (len(SORT_CAPACITIES) + 1)

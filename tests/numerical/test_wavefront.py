@@ -7,17 +7,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from estimator.paraxial import entrance_pupil_mm
-from estimator.surfaces import (
+from estimator.optics.paraxial import entrance_pupil_mm
+from estimator.optics.surfaces import (
     EyeSurfaces,
     Retina,
     Surface,
 )
-from estimator.units import ASTIGMATISM_PER_C22, SPHERE_PER_C20
-from estimator.wavefront import (
+from estimator.optics.units import ASTIGMATISM_PER_C22, SPHERE_PER_C20
+from estimator.optics.zernike import flip_horizontal, zernike_gradient
+from estimator.wavefront.aberrations import (
     wavefront_aberrations,
 )
-from estimator.zernike import flip_horizontal, zernike_gradient
 from tests.numerical.schematic_eyes import (
     cartesian_eye,
     case_eye,

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.raytrace import RayStatus
-from estimator.surfaces import Surface
-from estimator.wavefront import wavefront_aberrations
+from estimator.optics.raytrace import RayStatus
+from estimator.optics.surfaces import Surface
+from estimator.wavefront.aberrations import wavefront_aberrations
 from tests.numerical.schematic_eyes import irregular_eye, navarro, on_radius, reference
 
 REFERENCE = reference()

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.eye import pack_eyes
-from estimator.eye_parameters import random_vectors
-from estimator.eye_wavefront import eye_indices
-from estimator.raytrace import RayStatus
-from estimator.surfaces import media_indices, pack_eye
-from estimator.wavefront import (
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import random_vectors
+from estimator.eye.tracing import eye_indices
+from estimator.optics.raytrace import RayStatus
+from estimator.optics.surfaces import media_indices, pack_eye
+from estimator.optics.zernike import rescale_pupil
+from estimator.wavefront.aberrations import (
     eyes_aberrations,
     on_axis_zernike,
     pupil_magnification,
     wavefront_aberrations,
     wavefront_grid,
 )
-from estimator.zernike import rescale_pupil
 from tests.numerical.schematic_eyes import (
     cartesian_eye,
     irregular_eye,

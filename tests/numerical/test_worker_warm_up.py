@@ -7,9 +7,10 @@ SCRIPT = """
 import sys
 from dataclasses import replace
 from numba.core.registry import CPUDispatcher
-from filter_service.messages import Camera, ProfileSettings
-from filter_service.service.profile_build import build
-from filter_service.service.worker_warm_up import FEW_PSFS, build_a_few
+from estimator.profiles.parse import parse_profile
+from filter_service.messages import Camera, FilterSettings
+from filter_service.building.from_profile import build
+from filter_service.building.compile_builds import FEW_PSFS, build_a_few
 
 def compiled():
     modules = [m for name, m in sys.modules.items()
@@ -30,8 +31,9 @@ for sphere_dpt in (0.0, -6.0):
                      dict(mode="quality", lateral_color=True), dict(diffraction=False),
                      dict(chromatic=False), dict(accuracy="fast"),
                      dict(gaze_range_deg=(5.0, 5.0))):
-        settings = ProfileSettings(**dict(tolerance="loose") | settings)
-        job = replace(FEW_PSFS, body=body, settings=settings, camera=camera)
+        settings = FilterSettings(**dict(tolerance="loose") | settings)
+        job = replace(FEW_PSFS, profile=parse_profile(body), settings=settings,
+                      camera=camera)
         for _ in build(job, progress=lambda *_: None, cancelled=lambda: False):
             pass
 for missed in sorted(compiled() - before):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.zernike import (
+from estimator.optics.zernike import (
     N_TERMS,
     flip_horizontal,
     index_from_nm,

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from estimator import grid_source, network_grid, networks
-from estimator.accommodation import AccommodatingEye
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters
-from estimator.field_wavefronts import rim_from_ellipse
-from estimator.network_card import INPUTS, OUTPUTS, Card, ExpectedError
-from estimator.wavefront import wavefront_grid
+from estimator.eye.accommodation import AccommodatingEye
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import EyeParameters
+from estimator.field import grid_source, network_grid
+from estimator.networks import inference as networks
+from estimator.networks.card import INPUTS, OUTPUTS, Card, ExpectedError
+from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.field_wavefronts import rim_from_ellipse
 
 FAR = 1e9
 USERS = (networks, network_grid, grid_source)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from estimator.accommodation import AccommodatingEye, smallest_diameter_mm
-from estimator.estimation_prior import prior_for_refraction
-from estimator.eye import eye_surfaces
-from estimator.eye_parameters import EyeParameters, column
-from estimator.wavefront import wavefront_aberrations
+from estimator.estimate.prior import prior_for_refraction
+from estimator.eye.accommodation import AccommodatingEye, smallest_diameter_mm
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.parameters import EyeParameters, column
+from estimator.wavefront.aberrations import wavefront_aberrations
 from training.datasets import (
     DataError,
     Recipe,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from estimator.estimation_prior import deviations, mean_eyes
-from estimator.eye_parameters import column, mean_vector
-from estimator.eye_wavefront import refraction_of_vectors
-from estimator.network_card import FIRST_TERM
-from estimator.prescription import C20
-from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
-from estimator.zernike import nm_from_index, zernike_values
+from estimator.estimate.prior import deviations, mean_eyes
+from estimator.eye.parameters import column, mean_vector
+from estimator.eye.tracing import refraction_of_vectors
+from estimator.networks.card import FIRST_TERM
+from estimator.optics.prescription import C20
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.optics.zernike import nm_from_index, zernike_values
 from training.datasets import Recipe, draw
 from training.eye_features import Shift, Turn
 from training.eye_prior import squared_deviation

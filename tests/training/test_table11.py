@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimator.zernike import zernike_gradient
+from estimator.optics.zernike import zernike_gradient
 from training.datasets import Recipe, draw
 from training.published_chain import (
     FIELD_STEPS,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from estimator.eye_parameters import column, mean_vector, random_vectors, sampled_ranges
-from estimator.eye_wavefront import refraction_of_vectors, zernike_of_vectors
-from estimator.media import refractive_index
+from estimator.eye.parameters import column, mean_vector, random_vectors, sampled_ranges
+from estimator.eye.tracing import refraction_of_vectors, zernike_of_vectors
+from estimator.optics.media import refractive_index
 
 torch = pytest.importorskip("torch")
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from estimator.eye import pack_eyes
-from estimator.eye_parameters import column, mean_vector, random_vectors, sampled_ranges
-from estimator.eye_wavefront import eye_indices
-from estimator.units import REFERENCE_WAVELENGTH_NM
-from estimator.wavefront import eyes_aberrations
-from estimator.wavefront_kernels import magnification
-from estimator.zernike import zernike_values
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import column, mean_vector, random_vectors, sampled_ranges
+from estimator.eye.tracing import eye_indices
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import zernike_values
+from estimator.wavefront.aberrations import eyes_aberrations
+from estimator.wavefront.kernels import magnification
 
 torch = pytest.importorskip("torch")
 

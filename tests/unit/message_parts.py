@@ -6,10 +6,10 @@ import numpy as np
 from filter_service import messages
 from filter_service.messages import (
     Camera,
+    FilterSettings,
     Frame,
     Limits,
     ProfileRequest,
-    ProfileSettings,
     ViewHeader,
     ViewImages,
     encode,
@@ -30,7 +30,7 @@ def view_images(color_dtype=np.uint8):
 def frame(**changes):
     fields = {
         "frame_id": 7,
-        "views": (ViewHeader(CAMERA),),
+        "views": (ViewHeader.of(CAMERA),),
         "pupil_diameter_mm": 4.0,
         "focus_dpt": 0.5,
         "images": (view_images(),),
@@ -50,7 +50,7 @@ def frame_parts(**changes):
 
 
 def view_map(**changes):
-    return ViewHeader(CAMERA).fields() | changes
+    return ViewHeader.of(CAMERA).fields() | changes
 
 
 REQUESTS = [
@@ -62,7 +62,7 @@ REQUESTS = [
     ProfileRequest(
         3,
         {"kind": "preset"},
-        ProfileSettings(
+        FilterSettings(
             age_years=40.0, gaze_deg=(-5.0, 2.0), gaze_range_deg=(10.0, 0.0)
         ),
         (CAMERA, CAMERA),

@@ -1,39 +1,71 @@
 """Who may import whom, and which file is the home of which library."""
 
+import importlib
+import re
 import subprocess
 import sys
 from fnmatch import fnmatch
 
 import pytest
 
-from tests.source_tree import PACKAGES, ROOT, imports_of, package_imports
+import filter_service
+from tests.source_tree import (
+    PACKAGES,
+    ROOT,
+    imports_of,
+    package_imports,
+    python_files,
+)
+
+FACE = tuple(f"filter_service.{name}" for name in filter_service.__all__)
+"""What `filter_service` shows to researchers and clients."""
 
 MAY_IMPORT = {
     "estimator": ("estimator",),
     "filter_service": ("filter_service", "estimator"),
     "training": ("training", "estimator"),
-    "clients": ("clients", "filter_service.messages", "filter_service.errors"),
+    "clients": ("clients", "filter_service.messages", "filter_service.errors", *FACE),
 }
 """Ours that each package may import, as dotted prefixes."""
 
-LAYERS = {
-    # package of the service: those of its own packages that it may import
+EYE_ROOMS = {
+    # room of the estimator: the other rooms that it may import
+    "optics": (),
+    "wavefront": ("optics",),
+    "psf": ("optics",),
+    "eye": ("wavefront", "optics"),
+    "profiles": ("eye", "wavefront", "optics"),
+    "networks": ("eye", "optics"),
+    "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
+    "field": ("estimate", "networks", "profiles", "eye", "wavefront", "optics"),
+}
+"""From light to an eye over its field: each room knows only those before it."""
+
+FILTER_ROOMS = {
     "gl": (),
     "wire": (),
-    "planning": ("wire",),
-    "psfs": ("planning", "wire", "gl"),
-    "rendering": ("psfs", "planning", "wire", "gl"),
-    "service": ("rendering", "psfs", "planning", "wire", "gl"),
-    "commands": ("service", "rendering", "psfs", "planning", "wire", "gl"),
+    "planning": (),
+    "psfs": ("planning", "gl"),
+    "rendering": ("psfs", "planning", "gl"),
+    "building": ("psfs", "planning"),
+    "filtering": ("building", "rendering", "psfs", "planning", "gl"),
+    "service": ("filtering", "building", "wire"),
+    "commands": ("service", "filtering", "rendering", "psfs", "planning", "gl"),
 }
-"""A frame's data runs one way; each layer knows only those before it."""
+"""A frame's data runs one way; each room knows only those before it."""
+
+ROOMS = {"estimator": EYE_ROOMS, "filter_service": FILTER_ROOMS}
+
+
+KNOW_MESSAGES = ("service", "wire")
+"""Everyone else works on settings, cameras and views, not on what travels."""
 
 HOME = {
     # library: files that may import it, each with its reason
     "torch": ("training/*",),  # the service must run without it
     "onnx": ("training/*",),
     "onnxruntime": (
-        "estimator/networks.py",
+        "estimator/networks/inference.py",
         "training/export.py",  # judges the file that it wrote
     ),
     "moderngl": (
@@ -42,23 +74,28 @@ HOME = {
     ),
     "glfw": ("clients/window.py",),
     "zmq": (
-        "filter_service/service/server.py",
         "filter_service/service/mailbox.py",  # the server's socket and nothing else
         "clients/connection.py",  # the client's socket and nothing else
     ),
-    "msgpack": ("filter_service/messages.py", "filter_service/wire/checks.py"),
+    "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
+    "msgspec": (
+        "filter_service/checked.py",  # values against annotated types
+        "filter_service/settings.py",  # their limits
+        "filter_service/camera.py",
+        "filter_service/wire/*",
+    ),
+    "lazy_loader": ("*/__init__.py",),  # names without what they load
     "numba": (
-        "estimator/psf_*.py",  # kernels of the PSF engines
-        "estimator/raytrace_kernels.py",
-        "estimator/chief_ray_kernels.py",
-        "estimator/wavefront_*.py",  # aiming and fitting
+        "estimator/psf/*",  # kernels of the PSF engines
+        "estimator/optics/raytrace_kernels.py",
+        "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
         "filter_service/psfs/read_kernels.py",  # planning a frame
         "filter_service/rendering/cell_maps.py",
         "filter_service/rendering/kernel_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
-        "filter_service/service/threads.py",
+        "filter_service/threads.py",
     ),
     "pyrender": ("clients/*",),
     "trimesh": ("clients/*",),
@@ -69,7 +106,7 @@ HOME = {
     "matplotlib": (
         "clients/*",
         "tests/*",  # plots of measurements
-        "estimator/eye_plot.py",  # `ocufilter estimate --plot`
+        "estimator/estimate/plot.py",  # `ocufilter estimate --plot`
         "training/learning_curve.py",
     ),
     "OpenEXR": ("filter_service/commands/image_files.py",),
@@ -112,21 +149,113 @@ def test_packages_import_only_in_the_allowed_direction(package):
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_layers_of_the_service_import_only_those_before_them(layer):
-    allowed = [f"filter_service.{name}" for name in (layer, *LAYERS[layer])]
-    layers = [f"filter_service.{name}" for name in LAYERS]
+def _rooms():
+    return [(package, room) for package, rooms in ROOMS.items() for room in rooms]
+
+
+@pytest.mark.parametrize(("package", "room"), _rooms())
+def test_rooms_import_only_those_before_them(package, room):
+    rooms = ROOMS[package]
+    allowed = tuple(f"{package}.{name}" for name in (room, *rooms[room]))
+    all_rooms = tuple(f"{package}.{name}" for name in rooms)
     wrong = [
         f"{entry.file}:{entry.line} imports {entry.module}"
-        for entry in package_imports(f"filter_service/{layer}")
-        if _may(entry.module, tuple(layers)) and not _may(entry.module, tuple(allowed))
+        for entry in package_imports(f"{package}/{room}")
+        if _may(entry.module, all_rooms) and not _may(entry.module, allowed)
     ]
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_folder_of_the_service_is_a_layer():
-    folders = (ROOT / "filter_service").glob("*/__init__.py")
-    assert {path.parent.name for path in folders} == set(LAYERS)
+def test_only_the_service_knows_messages():
+    wrong = [
+        f"{entry.file}:{entry.line} imports {entry.module}"
+        for room in FILTER_ROOMS
+        if room not in KNOW_MESSAGES
+        for entry in package_imports(f"filter_service/{room}")
+        if _may(entry.module, ("filter_service.messages", "filter_service.wire"))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_every_folder_is_a_room(package):
+    folders = (ROOT / package).glob("*/__init__.py")
+    assert {path.parent.name for path in folders} == set(ROOMS[package])
+
+
+def _graph():
+    """Return the modules that each module of ours imports."""
+    modules = {}
+    for package in PACKAGES:
+        for path in python_files(package):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            modules[name.removesuffix(".__init__")] = path
+    return {
+        name: {
+            found
+            for entry in imports_of(path)
+            for found in (entry.module, entry.module.rpartition(".")[0])
+            if found in modules and found != name
+        }
+        for name, path in modules.items()
+    }
+
+
+def test_no_module_imports_itself_by_a_detour():
+    with pytest.raises(StopIteration):
+        next(circles(_graph()))
+
+
+def circles(graph):
+    """Yield the circles of a graph {node: its followers}."""
+    open_, done = [], set()
+
+    def visit(node):
+        if node in open_:
+            yield open_[open_.index(node) :]
+            return
+        if node in done:
+            return
+        open_.append(node)
+        for following in sorted(graph.get(node, ())):
+            yield from visit(following)
+        open_.pop()
+        done.add(node)
+
+    for node in graph:
+        yield from visit(node)
+
+
+def test_circles_are_found():
+    assert list(circles({"a": {"b"}, "b": {"c"}, "c": set()})) == []
+    assert list(circles({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == [["b", "c"]]
+
+
+def _packages():
+    return [
+        path.parent
+        for package in ("estimator", "filter_service", "clients")
+        for path in sorted((ROOT / package).rglob("__init__.py"))
+    ]
+
+
+@pytest.mark.parametrize("folder", _packages(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_room_lists_its_files_and_shows_what_it_says(folder):
+    name = ".".join(folder.relative_to(ROOT).parts)
+    face = importlib.import_module(name)
+    if folder.name == "scenes":
+        return  # a handful of plain modules
+    files = {p.stem for p in folder.glob("*.py")} - {"__init__", "__main__"}
+    rooms = {p.parent.name + "/" for p in folder.glob("*/__init__.py")}
+    text = (folder / "__init__.py").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^ *([\w./]+)  +\S", text, flags=re.MULTILINE))
+    if name != "clients":  # its list names what to start with
+        assert files | rooms <= listed, sorted((files | rooms) - listed)
+    for entry in listed:
+        path = folder / entry
+        assert path.exists() or path.with_suffix(".py").is_file(), entry
+    for public in getattr(face, "__all__", ()):
+        assert getattr(face, public) is not None
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -145,8 +274,10 @@ def test_every_library_is_imported_in_its_home_only(package):
     assert not wrong, "\n".join(wrong)
 
 
-def test_filter_service_init_imports_nothing_so_that_clients_stay_light():
-    assert imports_of(ROOT / "filter_service" / "__init__.py") == []
+def test_the_faces_import_no_more_than_names():
+    for package in ("filter_service", "estimator", "clients"):
+        found = imports_of(ROOT / package / "__init__.py")
+        assert [entry.module for entry in found] == ["lazy_loader"]
 
 
 def test_the_client_library_loads_neither_opengl_nor_the_eye_model():

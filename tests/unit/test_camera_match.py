@@ -2,9 +2,8 @@
 
 import pytest
 
-from filter_service.messages import Camera
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.camera_match import distinct_cameras, is_same_camera, serves
+from filter_service.camera import Camera, distinct_cameras, is_same_camera
+from tests.grid_specs import grid_spec
 
 CAMERA = Camera(200, 100, (-0.5, 0.5, 0.25, -0.25))  # 5 mrad
 
@@ -27,8 +26,8 @@ CROPPED = Camera(100, 100, (-0.25, 0.25, 0.25, -0.25))
 def test_what_a_store_serves_depends_on_its_mode(other, on_axis, over_the_field):
     assert is_same_camera(CAMERA, other, follows_field=False) == on_axis
     assert is_same_camera(CAMERA, other, follows_field=True) == over_the_field
-    assert serves(GridSpec(CAMERA), other) == on_axis
-    assert serves(GridSpec(CAMERA, mode="dynamic"), other) == over_the_field
+    assert grid_spec(CAMERA).serves(other) == on_axis
+    assert grid_spec(CAMERA, mode="dynamic").serves(other) == over_the_field
 
 
 def test_cameras_that_share_a_store_are_counted_once():

@@ -10,8 +10,8 @@ from filter_service.service.config import ServiceConfig, default_cache_dir, load
 def test_the_defaults_listen_on_loopback_only():
     config = load_config()
     assert config.bind == "tcp://127.0.0.1:5577"
-    assert config.limits.max_part_bytes == 100 * 2**20
-    assert config.max_message_part_bytes == 100 * 2**20
+    assert config.limits.max_part_bytes == 100_000_000
+    assert config.max_message_part_bytes == 100_000_000
 
 
 def test_a_file_is_read_and_the_command_line_wins(tmp_path):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from estimator.eye_parameters import EyeParameters, RetinaShape
-from estimator.profiles import ProfileError, parse_profile, preset_names
-from estimator.zernike import flip_horizontal
+from estimator.eye.parameters import EyeParameters, RetinaShape
+from estimator.optics.zernike import flip_horizontal
+from estimator.profiles.parse import ProfileError, parse_profile, preset_names
 
 ONE = {"pupil_diameter_mm": 4, "wavelength_nm": 555, "zernike_um": {"2,0": 1.0}}
 EYE = {"kind": "eye", "parameters": EyeParameters.mean_eye().to_mapping()}

@@ -4,9 +4,9 @@ import threading
 
 import pytest
 
+from filter_service.building import head_start
+from filter_service.building.head_start import COMPILING_STAGE, HeadStart
 from filter_service.errors import BuildCancelled
-from filter_service.service import head_start
-from filter_service.service.head_start import COMPILING_STAGE, HeadStart
 
 
 @pytest.fixture(autouse=True)

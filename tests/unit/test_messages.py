@@ -49,7 +49,7 @@ def test_what_the_service_says_arrives_unchanged(message):
 )
 def test_images_of_two_views_arrive_bit_for_bit(color, dtype):
     images = (view_images(dtype), ViewImages(*reversed_images(dtype)))
-    views = (ViewHeader(CAMERA, color), ViewHeader(CAMERA, color, "radial"))
+    views = (ViewHeader.of(CAMERA, color), ViewHeader.of(CAMERA, color, "radial"))
     sent = frame(views=views, images=images)
     received = decode_request(as_bytes(encode(sent)))
     assert received == sent
@@ -69,7 +69,10 @@ def hidden_frame(dtype=np.uint8):
     color = SRGB8 if dtype == np.uint8 else LINEAR
     seen, behind = view_images(dtype), ViewImages(*reversed_images(dtype))
     layered = ViewImages(seen.color, seen.depth_m, behind.color, behind.depth_m)
-    views = (ViewHeader(CAMERA, color, has_hidden=True), ViewHeader(CAMERA, color))
+    views = (
+        ViewHeader.of(CAMERA, color, has_hidden=True),
+        ViewHeader.of(CAMERA, color),
+    )
     return frame(views=views, images=(layered, seen))
 
 

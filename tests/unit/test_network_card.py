@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from estimator import network_card, networks
-from estimator.estimation_problem import FIRST_COMPARED
-from estimator.eye_parameters import PARAMETER_NAMES
-from estimator.network_card import (
+from estimator.estimate.problem import FIRST_COMPARED
+from estimator.eye.parameters import PARAMETER_NAMES
+from estimator.networks import card as network_card
+from estimator.networks import inference as networks
+from estimator.networks.card import (
     INPUTS,
     NETWORK_NAMES,
     OUTPUTS,
@@ -40,7 +41,7 @@ def card_json(name="focus", **changes):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """An empty folder in the place of the weights."""
-    folder = tmp_path / "estimator" / "weights"
+    folder = tmp_path / "estimator" / "networks" / "weights"
     folder.mkdir(parents=True)
     monkeypatch.setattr(network_card, "WEIGHTS_FOLDER", folder)
     networks.load_network.cache_clear()
@@ -118,7 +119,9 @@ def test_a_card_of_another_network_or_version_is_refused(folder, change):
 
 
 def test_missing_weights_are_named_with_what_to_do(folder):
-    with pytest.raises(WeightsMissing, match=r"estimator/weights/focus\.json is miss"):
+    with pytest.raises(
+        WeightsMissing, match=r"estimator/networks/weights/focus\.json is miss"
+    ):
         networks.load_network("focus")
     (folder / "focus.json").write_text(json.dumps(card_json()))
     with pytest.raises(WeightsMissing, match=r"focus\.onnx is missing.*training\.expo"):

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from estimator.profile_files import load_profile
-from estimator.profiles import ProfileError, parse_profile
-from estimator.zernike import flip_horizontal, index_from_nm
+from estimator.optics.zernike import flip_horizontal, index_from_nm
+from estimator.profiles.files import load_profile
+from estimator.profiles.parse import ProfileError, parse_profile
 
 GOOD = {
     "kind": "zernike",

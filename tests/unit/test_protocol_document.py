@@ -8,7 +8,7 @@ import msgpack
 import pytest
 
 from filter_service import errors, messages
-from filter_service.wire import replies
+from filter_service.wire import replies, schema
 
 PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
 
@@ -41,14 +41,14 @@ def parts_of(header):
 def decode(header):
     decoder = (
         messages.decode_request
-        if header["type"] in messages._REQUESTS
+        if header["type"] in messages.REQUESTS
         else messages.decode_reply
     )
     return decoder([msgpack.packb(header), *parts_of(header)])
 
 
 def test_every_message_type_is_shown():
-    assert set(EXAMPLES) == {*messages._REQUESTS, *messages._REPLIES}
+    assert set(EXAMPLES) == {*messages.REQUESTS, *messages.REPLIES}
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -63,7 +63,7 @@ def test_an_example_is_read_and_shows_every_field(name):
 def test_the_settings_shown_are_the_defaults():
     shown = dict(EXAMPLES["profile"]["settings"])
     shown.pop("age_years")
-    defaults = messages.ProfileSettings().fields()
+    defaults = messages.FilterSettings().fields()
     assert json.loads(json.dumps(defaults)) == shown
 
 
@@ -97,3 +97,15 @@ def test_every_drop_reason_is_explained():
 
 def test_the_page_states_the_version():
     assert f"**Version {messages.PROTOCOL_VERSION}.**" in PAGE
+
+
+def test_the_schema_beside_the_page_is_that_of_the_code():
+    assert schema.SCHEMA_FILE.read_text(encoding="utf-8") == schema.schema_text()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_schema_has_the_fields_that_the_page_shows(name):
+    kind = {**messages.REQUESTS, **messages.REPLIES}[name]
+    properties = schema.protocol_schema()["$defs"][kind.__name__]["properties"]
+    assert set(EXAMPLES[name]) == set(properties)
+    assert properties["type"] == {"const": name}

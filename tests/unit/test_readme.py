@@ -7,7 +7,7 @@ import shlex
 import pytest
 from typer.testing import CliRunner
 
-from estimator.profiles import parse_profile, preset_names
+from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.__main__ import app
 from tests.source_tree import ROOT
 

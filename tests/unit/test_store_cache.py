@@ -11,18 +11,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from estimator.measured_wavefront import MeasuredWavefront
-from estimator.profiles import parse_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
-from filter_service.planning.grid import GridSpec
 from filter_service.psfs import store_cache, store_codec, store_file
-from filter_service.psfs.build import build_psf_store
+from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store_cache import StoreCache, Stored, store_key
+from tests.grid_specs import grid_spec
 
 PROFILE = parse_profile({"kind": "prescription", "sphere_dpt": -1.0})
 CAMERA = Camera(96, 54, (-0.5, 0.5, 0.28, -0.28))
-SPEC = GridSpec(
+SPEC = grid_spec(
     CAMERA,
     pupil_range_mm=(4.0, 4.0),
     focus_range_dpt=(0.0, 0.0),
@@ -237,35 +237,35 @@ def test_two_processes_share_a_folder(tmp_path, caplog):
 
 
 def test_the_key_tells_apart_what_changes_a_store():
-    def key(profile=PROFILE, spec=SPEC, eye_model="traced", accuracy="balanced"):
-        return store_key(profile, spec, eye_model=eye_model, accuracy=accuracy)
+    def key(profile=PROFILE, spec=SPEC, **settings):
+        return store_key(profile, spec.with_settings(**settings))
 
     same_again = parse_profile({"sphere_dpt": -1, "kind": "prescription"})
     assert key(profile=same_again) == key()
     shifted = replace(SPEC, camera=Camera(96, 54, (-0.4, 0.6, 0.28, -0.28)))
     assert key(spec=shifted) == key(), "on axis a store knows the pixel size only"
-    field = replace(SPEC, mode="dynamic")
+    field = SPEC.with_settings(mode="dynamic")
     others = [
         key(profile=parse_profile({"kind": "prescription", "sphere_dpt": -1.25})),
         key(eye_model="wavefront"),
         key(accuracy="fast"),
-        key(accuracy="exact"),
-        key(spec=replace(SPEC, tolerance="fine")),
-        key(spec=replace(SPEC, pupil_range_mm=(4.0, 4.5))),
+        key(accuracy="balanced"),
+        key(tolerance="fine"),
+        key(pupil_range_mm=(4.0, 4.5)),
         key(spec=field),
         key(spec=replace(field, camera=shifted.camera)),
-        key(spec=replace(field, gaze_deg=(1.0, 0.0))),
-        key(spec=replace(field, gaze_range_deg=(1.0, 0.0))),
-        key(spec=replace(field, lateral_color=True)),
+        key(spec=field, gaze_deg=(1.0, 0.0)),
+        key(spec=field, gaze_range_deg=(1.0, 0.0)),
+        key(spec=field, lateral_color=True),
+        key(age_years=50.0),
     ]
     assert len({key(), *others}) == 1 + len(others)
 
 
 def test_other_code_means_other_keys(monkeypatch):
-    made = {"eye_model": "traced", "accuracy": "balanced"}
-    before = store_key(PROFILE, SPEC, **made)
+    before = store_key(PROFILE, SPEC)
     monkeypatch.setattr(store_cache, "code_version", lambda: "another")
-    assert store_key(PROFILE, SPEC, **made) != before
+    assert store_key(PROFILE, SPEC) != before
 
 
 def test_the_code_version_follows_every_file(tmp_path, monkeypatch):
@@ -276,6 +276,7 @@ def test_the_code_version_follows_every_file(tmp_path, monkeypatch):
         source.write_text("")
         module = getattr(store_cache, package)
         monkeypatch.setattr(module, "__file__", str(source))
+    monkeypatch.setattr(store_cache, "SHADER_ROOT", tmp_path / "shaders")
     shader = tmp_path / "shaders" / "passes" / "psf_sum.comp.glsl"
     shader.parent.mkdir(parents=True)
     for path in (

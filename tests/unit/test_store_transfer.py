@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from filter_service.rendering.store_upload import Upload
-from filter_service.service.worker import _run_nicely
-from filter_service.wire.shared_buffers import map_shared, write_shared
+from filter_service.building.shared_buffers import map_shared, write_shared
+from filter_service.building.worker import _run_nicely
+from filter_service.filtering.upload import Upload
 
 
 class Loaded:

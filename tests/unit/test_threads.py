@@ -4,7 +4,7 @@ import subprocess
 import sys
 import textwrap
 
-from filter_service.service.threads import (
+from filter_service.threads import (
     UNSAFE_THREADING_LAYER,
     require_safe_threading_layer,
 )
@@ -14,7 +14,7 @@ WITHOUT_SAFE_LAYERS = """
     sys.modules["numba.np.ufunc.omppool"] = None
     sys.modules["numba.np.ufunc.tbbpool"] = None
     from filter_service.errors import RenderFailed
-    from filter_service.service.threads import require_safe_threading_layer
+    from filter_service.threads import require_safe_threading_layer
     try:
         require_safe_threading_layer()
     except RenderFailed as error:

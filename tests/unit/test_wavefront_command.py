@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from estimator.zernike import rescale_pupil
+from estimator.optics.zernike import rescale_pupil
 from filter_service.__main__ import _exit_code
 from tests.numerical.schematic_eyes import reference
 
@@ -131,7 +131,7 @@ def test_a_lost_chief_ray_is_a_failure_in_words(eye_file, capsys):
 
 
 def test_the_45_parameters_are_an_eye_too(tmp_path, capsys):
-    from estimator.eye_parameters import EyeParameters
+    from estimator.eye.parameters import EyeParameters
 
     path = tmp_path / "mean.json"
     body = {"kind": "eye", "parameters": EyeParameters.mean_eye().to_mapping()}

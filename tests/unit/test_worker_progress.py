@@ -2,7 +2,7 @@
 
 from multiprocessing import Pipe
 
-from filter_service.service.worker import _throttled_progress
+from filter_service.building.worker import _throttled_progress
 
 
 def test_every_stage_is_reported_once_however_short_it_is():

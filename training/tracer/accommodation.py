@@ -1,6 +1,6 @@
 """The lens diameter and chamber depth that focus eyes at distances, in batches.
 
-What `estimator.accommodation.AccommodatingEye` does with unlimited amplitude: the lens
+What `accommodation.AccommodatingEye` does with unlimited amplitude: the lens
 shrinks at constant volume until the least-squares refraction at 555 nm meets the focus;
 an eye that cannot do so stays relaxed, or goes as far as its lens reaches.
 """
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from estimator.accommodation import (
+from estimator.eye.accommodation import (
     AQUEOUS,
     DIAMETER,
     MAX_REFINEMENTS,
@@ -20,7 +20,7 @@ from estimator.accommodation import (
     SMALLEST_DIAMETER_RATIO,
     VOLUME,
 )
-from estimator.lens_shape import ANTERIOR_THICKNESS_RATIO, CAP_VOLUME_RATIO
+from estimator.eye.lens_shape import ANTERIOR_THICKNESS_RATIO, CAP_VOLUME_RATIO
 from training.tracer.circle import refraction_of_eyes
 from training.tracer.eye import lens_shape
 
@@ -61,7 +61,7 @@ def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
 
 
 def smallest_diameters_mm(vectors: Tensor) -> Tensor:
-    """See `estimator.accommodation.smallest_diameter_mm`."""
+    """See `estimator.eye.accommodation.smallest_diameter_mm`."""
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
     c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3

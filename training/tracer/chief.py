@@ -158,7 +158,7 @@ def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
 def magnification(eye: Eye) -> Tensor:
     """Entrance pupil over stop (B,), about the axial chief ray; nan where none.
 
-    As `estimator.wavefront_kernels.magnification`, whose differences it shares.
+    As `estimator.wavefront.kernels.magnification`, whose differences it shares.
     """
     zero = torch.zeros_like(eye.indices[:, 0])
     axes = field_axes(zero, zero)

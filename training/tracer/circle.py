@@ -1,6 +1,6 @@
 """Aberrations on axis, on the circle of a measurement, for a batch of eyes.
 
-What `estimator.eye_wavefront.zernike_of_vectors` gives on axis: the wavefront of the
+What `estimator.eye.tracing.zernike_of_vectors` gives on axis: the wavefront of the
 chief ray's retinal point on the filled circle of half the pupil diameter, whatever the
 stop.  Here rays start at the nodes of that circle and are aimed at the retinal point;
 what they miss it by hardly matters (see `paths`).
@@ -9,9 +9,9 @@ what they miss it by hardly matters (see `paths`).
 import torch
 from torch import Tensor
 
-from estimator.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20, UM_PER_MM
-from estimator.wavefront_nodes import circle_nodes
-from estimator.zernike import N_TERMS, index_from_nm
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20, UM_PER_MM
+from estimator.optics.zernike import N_TERMS, index_from_nm
+from estimator.wavefront.nodes import circle_nodes
 from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
 from training.tracer.aim import broyden

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from estimator import eye_parameters as parameters
-from estimator import lens_shape as rule
-from estimator.surfaces import horner_order, offset_monomials
-from estimator.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
+from estimator.eye import lens_shape as rule
+from estimator.eye import parameters
+from estimator.optics.surfaces import horner_order, offset_monomials
+from estimator.optics.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
 from training.tracer.batches import constant
 from training.tracer.media import refractive_indices
 
@@ -82,7 +82,7 @@ def _offset_map(device: torch.device) -> Tensor:
 
 
 def lens_shape(diameter_mm: Tensor, volume_mm3: Tensor) -> tuple[Tensor, ...]:
-    """Rule C of `estimator.lens_shape`: radii anterior, posterior and thickness, mm."""
+    """Rule C of `lens_shape`: radii anterior, posterior and thickness, mm."""
     cap_mm3 = rule.CAP_VOLUME_RATIO * volume_mm3
     heights_mm = 8.0 * cap_mm3 / (torch.pi * diameter_mm**2)
     posterior_mm = (

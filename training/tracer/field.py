@@ -1,6 +1,6 @@
 """Aberrations of any field through the stop of an eye, for a batch of eyes.
 
-What `estimator.wavefront.eyes_aberrations` gives: rays from the chief ray's retinal
+What `aberrations.eyes_aberrations` gives: rays from the chief ray's retinal
 point are aimed at the nodes of the stop and followed out of the eye; the wavefront is
 fitted on the circle about their rim.  Eye, field, wavelength and pupil are per row.
 """
@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from estimator.units import REFERENCE_WAVELENGTH_NM, UM_PER_MM
-from estimator.wavefront_nodes import stop_nodes
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, UM_PER_MM
+from estimator.wavefront.nodes import stop_nodes
 from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
 from training.tracer.aim import broyden

@@ -5,7 +5,12 @@ import math
 import torch
 from torch import Tensor
 
-from estimator.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS, monomial_matrix
+from estimator.optics.zernike import (
+    EXPONENTS,
+    MAX_RADIAL_ORDER,
+    N_TERMS,
+    monomial_matrix,
+)
 from training.tracer.batches import constant
 
 _FINER = 8

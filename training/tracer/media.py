@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from estimator import media
-from estimator.eye_wavefront import MEDIA_INWARDS
-from estimator.units import NM_PER_UM
+from estimator.eye.tracing import MEDIA_INWARDS
+from estimator.optics import media
+from estimator.optics.units import NM_PER_UM
 from training.tracer.batches import constant
 
 _POLE_UM2 = 0.028

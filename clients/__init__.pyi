@@ -1,0 +1,3 @@
+from .filter_client import FilterClient as FilterClient
+from .filter_client import FilteredFrame as FilteredFrame
+from .service_process import ServiceProcess as ServiceProcess

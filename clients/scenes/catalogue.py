@@ -1,0 +1,27 @@
+"""The scenes by name."""
+
+from collections.abc import Callable
+
+from clients.scenes import courtyard, primitives
+from clients.scenes.scene import Scene
+
+SCENE_BUILDERS: dict[str, Callable[[], Scene]] = {
+    "primitives": primitives.build,
+    "courtyard": courtyard.build,
+}
+"""A scene is built when its function is called."""
+
+
+def build_scene(name: str) -> Scene:
+    """Build a scene.
+
+    Raises
+    ------
+    ValueError
+        No scene has that name.
+    """
+    if name not in SCENE_BUILDERS:
+        raise ValueError(
+            f"scene {name!r} is unknown; choose from {sorted(SCENE_BUILDERS)}"
+        )
+    return SCENE_BUILDERS[name]()

@@ -1,0 +1,13 @@
+from .estimate.estimation import EstimatedEye as EstimatedEye
+from .estimate.estimation import estimate_eye as estimate_eye
+from .eye.checked_fields import ProfileError as ProfileError
+from .eye.parameters import EyeParameters as EyeParameters
+from .field.eye_optics import EyeOptics as EyeOptics
+from .field.prepare import prepare_eye as prepare_eye
+from .profiles.files import load_profile as load_profile
+from .profiles.parse import EyeProfile as EyeProfile
+from .profiles.parse import parse_profile as parse_profile
+from .profiles.parse import preset_names as preset_names
+from .psf.compute import compute_psf_batch as compute_psf_batch
+from .psf.compute import compute_psfs as compute_psfs
+from .wavefront.aberrations import wavefront_aberrations as wavefront_aberrations

@@ -1,0 +1,377 @@
+"""Which eye has this wavefront: 45 parameters from one or several measurements.
+
+``refined``: bounded least squares on exactly ray-traced coefficients, with a weak prior
+towards the mean eye of the measured refraction, from the nearest of a table of eyes and
+the eye network's guess.  ``network``: that guess alone, judged by one trace.
+``search``: the pattern search of the earlier work.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.estimate.bounded_fit import BoundedFit
+from estimator.estimate.network_guess import network_guess
+from estimator.estimate.pattern_search import pattern_search
+from estimator.estimate.problem import EstimationProblem
+from estimator.estimate.table import table_vectors
+from estimator.eye.accommodation import AccommodatingEye, FocusedEye
+from estimator.eye.parameters import (
+    PARAMETER_NAMES,
+    EyeParameters,
+    RetinaShape,
+    allowed_ranges,
+)
+from estimator.networks.card import (
+    DamagedWeights,
+    NetworkUnavailable,
+    NetworkUnfit,
+    WeightsMissing,
+)
+from estimator.optics.zernike import N_TERMS, remove_central_tilt
+from estimator.profiles.measured_wavefront import accommodation_amplitude_dpt
+from estimator.profiles.parse import EyeProfile
+
+METHODS = ("network", "refined", "search")
+STARTS = ("table", "network")
+"""Where ``refined`` may start: the built-in eyes, the network's guess."""
+
+GOOD_FIT_UM = 5e-4
+"""Mean error above which a fit that began at one kind of start is tried from another:
+from the network's eye, keratoconus ends at 7e-3 um, from the table's at 3e-5."""
+
+POOR_FIT_UM = 0.01
+"""Mean error above which the answer says that the model does not reach the data."""
+
+SEARCH_TIME_S = 60.0
+"""Time given to the pattern search; the published runs took one to three hours."""
+
+
+@dataclass(frozen=True)
+class EstimatedEye:
+    """An eye that reproduces a measurement, and how well.
+
+    Attributes
+    ----------
+    zernike_um, residual_um : (28,), um
+        Of the eye, and of the eye less the measurement, on the measured circle
+        (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements, the
+        first.  The residual's tilt is against the measurement shifted to zero central
+        slope.
+    mean_abs_error_um : float
+        Over the 25 terms without piston and tilt, and over all measurements.
+    method : str
+        How the eye was found in the end: ``network`` falls back to ``refined``.
+    start : str
+        Where ``refined`` started, of `STARTS` or ``given``; empty for other methods.
+    network_reason : str
+        Why the network did not answer where it was asked; empty where it did.
+    on_bound : tuple of str
+        Parameters that sit on a bound of their allowed range.
+    """
+
+    name: str
+    method: str
+    parameters: EyeParameters
+    profile: EyeProfile
+    zernike_um: NDArray[np.float64]
+    residual_um: NDArray[np.float64]
+    zernike_radius_mm: float
+    wavelength_nm: float
+    mean_abs_error_um: float
+    time_ms: float
+    n_iterations: int
+    n_evaluations: int
+    on_bound: tuple[str, ...]
+    notes: tuple[str, ...]
+    start: str = ""
+    network_reason: str = ""
+
+    @property
+    def retina(self) -> RetinaShape | None:
+        """Return the retina of the profile, None for a sphere."""
+        return self.profile.retina
+
+    @cached_property
+    def determined_ratio(self) -> dict[str, float]:
+        """Return how well each parameter is determined; costs one Jacobian.
+
+        The share of the prior variance that a measurement with 0.01 um noise per
+        coefficient takes away: 0 is the prior alone, 1 is known.
+        """
+        if self.profile.eye is not None:
+            return dict.fromkeys(PARAMETER_NAMES, 1.0)
+        problem = EstimationProblem(self.profile)
+        return problem.determined_ratio(self.parameters.to_vector())
+
+    @cached_property
+    def accommodating(self) -> AccommodatingEye:
+        """Return the eye as one that can be asked to focus, correction worn."""
+        return accommodating_eye(self.parameters, self.profile)
+
+    @property
+    def refraction_dpt(self) -> float:
+        """Return M at 555 nm and the measured pupil, through the worn correction."""
+        return self.accommodating.refraction_dpt
+
+    @property
+    def amplitude_dpt(self) -> float:
+        """Return the largest accommodation, by age, addition and lens."""
+        return self.accommodating.amplitude_dpt
+
+    def focused(self, focus_dpt: float = 0.0) -> FocusedEye:
+        """Return the eye focused as near to ``focus_dpt`` as it can."""
+        return self.accommodating.focused(focus_dpt)
+
+    def surfaces(self, focus_dpt: float = 0.0):
+        """Return the surfaces of the eye focused as near to ``focus_dpt`` as it can."""
+        return self.focused(focus_dpt).surfaces
+
+
+def accommodating_eye(
+    parameters: EyeParameters, profile: EyeProfile
+) -> AccommodatingEye:
+    """Return an eye with the age, addition and correction of its profile."""
+    return AccommodatingEye(
+        parameters,
+        retina=profile.retina,
+        pupil_diameter_mm=profile.pupil_diameter_mm,
+        amplitude_dpt=accommodation_amplitude_dpt(
+            age_years=profile.age_years, add_dpt=profile.add_dpt
+        ),
+        correction=profile.correction,
+    )
+
+
+def estimate_eye(
+    profile: EyeProfile,
+    *,
+    method: str = "refined",
+    max_time_s: float = SEARCH_TIME_S,
+    starts: tuple[str, ...] = ("table",),
+    start_vectors: NDArray[np.float64] | None = None,
+) -> EstimatedEye:
+    """Estimate the eye behind a profile.
+
+    Parameters
+    ----------
+    profile : EyeProfile
+        A profile that is an eye already is returned as it is, with method ``given``.
+    method : {"network", "refined", "search"}
+        Where the wavefront is out of the network's training ranges, or light does not
+        pass its eye, ``network`` becomes ``refined`` from the table, with a note.
+    max_time_s : float
+        For ``search`` only.
+    starts : of {"table", "network"}
+        Eyes of which ``refined`` starts at the one whose traced wavefront is nearest.
+        A network that cannot answer is left out.  Where a fit ends above
+        `GOOD_FIT_UM`, the other kind is tried, too.
+    start_vectors : (P, 45), optional
+        Instead of those.
+
+    Raises
+    ------
+    ValueError
+        An unknown method or start.
+    WeightsMissing, DamagedWeights
+        For ``network``.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method '{method}': allowed are {', '.join(METHODS)}")
+    if not starts or not set(starts) <= set(STARTS):
+        raise ValueError(f"starts {starts}: allowed are {', '.join(STARTS)}")
+    start_s = time.perf_counter()
+    if profile.eye is not None:
+        return _given(profile, start_s)
+    problem = EstimationProblem(profile)
+    if method == "search":
+        return _searched(problem, start_s, max_time_s)
+    reason = ""
+    if method == "network":
+        try:
+            return _guessed(problem, start_s)
+        except (WeightsMissing, DamagedWeights):
+            raise
+        except NetworkUnavailable as error:
+            starts, reason = ("table",), str(error)
+    if start_vectors is None:
+        start_vectors, labels, why = _start_vectors(profile, starts)
+        reason = reason or why
+    else:
+        labels = ("given",) * len(start_vectors)
+    found = _refined(problem, start_s, start_vectors, labels, reason)
+    if method == "network":
+        found = replace(found, notes=(f"not by network: {reason}", *found.notes))
+    return found
+
+
+def _answer(
+    problem: EstimationProblem,
+    method: str,
+    *,
+    vector: NDArray[np.float64],
+    values_um: NDArray[np.float64],
+    start_s: float,
+    counts: tuple[int, int],
+    start: str = "",
+    network_reason: str = "",
+) -> EstimatedEye:
+    error_um = float(np.mean(np.abs(values_um - problem.target_um)))
+    on_bound = problem.on_bound(vector)
+    vector = np.clip(vector, *allowed_ranges().T)  # rounding may overstep a bound
+    zernike_um = problem.zernike_of(problem.measurements[0])(vector[None])[0]
+    zernike_um[0] = 0.0
+    measured_um = remove_central_tilt(problem.profile.zernike_um)
+    residual_um = zernike_um - measured_um
+    residual_um[0] = 0.0
+    return EstimatedEye(
+        name=problem.profile.name,
+        method=method,
+        parameters=EyeParameters.from_vector(vector),
+        profile=problem.profile,
+        zernike_um=zernike_um,
+        residual_um=residual_um,
+        zernike_radius_mm=problem.profile.pupil_diameter_mm / 2.0,
+        wavelength_nm=problem.profile.wavelength_nm,
+        mean_abs_error_um=error_um,
+        time_ms=1000.0 * (time.perf_counter() - start_s),
+        n_iterations=counts[0],
+        n_evaluations=counts[1],
+        on_bound=on_bound,
+        notes=_notes(error_um, method),
+        start=start,
+        network_reason=network_reason,
+    )
+
+
+def _notes(error_um: float, method: str) -> tuple[str, ...]:
+    if error_um <= POOR_FIT_UM:
+        return ()
+    which = "network's eye" if method == "network" else "eye model"
+    return (f"the {which} reaches this wavefront only to {error_um:.2g} um on average",)
+
+
+def _start_vectors(
+    profile: EyeProfile, starts: tuple[str, ...]
+) -> tuple[NDArray[np.float64], tuple[str, ...], str]:
+    """Eyes (P, 45), where each comes from, and why the network has none."""
+    vectors, labels, reason = np.empty((0, len(PARAMETER_NAMES))), (), ""
+    if "network" in starts:
+        try:
+            vectors, labels = network_guess(profile)[None], ("network",)
+        except NetworkUnavailable as error:
+            reason = str(error)
+    if "table" in starts or not labels:
+        table = table_vectors()
+        vectors = np.concatenate([vectors, table])
+        labels += ("table",) * len(table)
+    return vectors, labels, reason
+
+
+def _refined(
+    problem: EstimationProblem,
+    start_s: float,
+    start_vectors: NDArray[np.float64],
+    labels: tuple[str, ...],
+    reason: str,
+) -> EstimatedEye:
+    fit, label = _best_fit(problem, start_vectors, np.array(labels))
+    return _answer(
+        problem,
+        "refined",
+        vector=problem.prior.from_unit(fit.position_ratio),
+        values_um=fit.values_um,
+        start_s=start_s,
+        counts=(fit.n_iterations, fit.n_evaluations),
+        start=label,
+        network_reason=reason,
+    )
+
+
+def _best_fit(
+    problem: EstimationProblem, vectors: NDArray[np.float64], labels: NDArray
+) -> tuple[BoundedFit, str]:
+    """Fit from the nearest start; where that ends poorly, from the next kind of start.
+
+    The counts are those of both.
+    """
+    best, used = None, ""
+    while len(vectors):
+        nearest = problem.nearest(vectors)
+        fit, label = problem.refine(vectors[nearest]), str(labels[nearest])
+        if best is not None:
+            steps = best.n_iterations + fit.n_iterations
+            traced = best.n_evaluations + fit.n_evaluations
+            best, fit = (
+                replace(f, n_iterations=steps, n_evaluations=traced)
+                for f in (best, fit)
+            )
+        if best is None or problem.error_um(fit) < problem.error_um(best):
+            best, used = fit, label
+        if problem.error_um(best) <= GOOD_FIT_UM:
+            break
+        vectors, labels = vectors[labels != label], labels[labels != label]
+    return best, used
+
+
+def _guessed(problem: EstimationProblem, start_s: float) -> EstimatedEye:
+    """Give the network's eye, with the error that tracing it shows.
+
+    Raises
+    ------
+    NetworkUnavailable
+        The network's, or light does not pass its eye.
+    """
+    vector = network_guess(problem.profile)
+    values_um = problem.compared_um(vector[None])[0]
+    if not np.all(np.isfinite(values_um)):
+        raise NetworkUnfit("light does not pass the network's eye")
+    return _answer(
+        problem,
+        "network",
+        vector=vector,
+        values_um=values_um,
+        start_s=start_s,
+        counts=(0, 1),
+    )
+
+
+def _searched(
+    problem: EstimationProblem, start_s: float, max_time_s: float
+) -> EstimatedEye:
+    first = problem.measurements[0]
+    zernike_of = problem.zernike_of(first)
+    found = pattern_search(
+        zernike_of, target_um=first.zernike_um, max_time_s=max_time_s
+    )
+    vector = found.parameters.to_vector()
+    return _answer(
+        problem,
+        "search",
+        vector=vector,
+        values_um=problem.compared_um(vector[None])[0],
+        start_s=start_s,
+        counts=(found.n_iterations, found.n_evaluations),
+    )
+
+
+def _given(profile: EyeProfile, start_s: float) -> EstimatedEye:
+    return EstimatedEye(
+        name=profile.name,
+        method="given",
+        parameters=profile.eye,
+        profile=profile,
+        zernike_um=profile.zernike_um,
+        residual_um=np.zeros(N_TERMS),
+        zernike_radius_mm=profile.pupil_diameter_mm / 2.0,
+        wavelength_nm=profile.wavelength_nm,
+        mean_abs_error_um=0.0,
+        time_ms=1000.0 * (time.perf_counter() - start_s),
+        n_iterations=0,
+        n_evaluations=0,
+        on_bound=(),
+        notes=(),
+    )

@@ -1,0 +1,26 @@
+"""The eye network's answer to a profile: an eye of about the measured wavefront."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.eye.parameters import allowed_ranges
+from estimator.networks.inference import network_eye
+from estimator.profiles.parse import EyeProfile
+
+
+def network_guess(profile: EyeProfile) -> NDArray[np.float64]:
+    """Parameters (45,) within their allowed ranges.
+
+    Of several measurements the profile's leading one is used, which is on the axis.
+
+    Raises
+    ------
+    NetworkUnavailable
+        No weights, or a wavefront out of the training ranges.
+    """
+    vector = network_eye(
+        profile.zernike_um,
+        pupil_diameter_mm=profile.pupil_diameter_mm,
+        wavelength_nm=profile.wavelength_nm,
+    )
+    return np.clip(vector, *allowed_ranges().T)

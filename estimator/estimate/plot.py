@@ -1,0 +1,152 @@
+"""Cross-section of an estimated eye with traced rays, as a picture."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.estimate.estimation import EstimatedEye
+from estimator.optics.raytrace import RayStatus, trace_rays
+from estimator.optics.surfaces import EyeSurfaces, Surface, rotation_matrix
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+
+HALF_HEIGHTS_MM = (5.5, 5.2, 4.5, 4.5)
+"""How far from its axis each surface is drawn."""
+
+N_POINTS = 201
+N_RAYS = 11
+OBJECT_SIDE_MM = 5.0
+"""How far before the cornea rays are drawn."""
+
+
+def surface_line_mm(
+    surface: Surface, *, half_height_mm: float, n_points: int = N_POINTS
+) -> NDArray[np.float64]:
+    """Points (n, 2) of a surface in the plane x = 0 of its own axes, as (z, y).
+
+    Points beyond a closed conic's rim are left out.
+    """
+    y_mm = np.linspace(-half_height_mm, half_height_mm, n_points)
+    x_mm = np.zeros_like(y_mm)
+    radius_y_mm = surface.radius_mm[1]
+    root = 1.0 - (1.0 + surface.conic_constant) * (y_mm / radius_y_mm) ** 2
+    inside = root >= 0.0
+    x_mm, y_mm, root = x_mm[inside], y_mm[inside], root[inside]
+    sag_mm = y_mm**2 / radius_y_mm / (1.0 + np.sqrt(root))
+    sag_mm = sag_mm + _offset_mm(surface, y_mm)
+    turn = rotation_matrix(rotation_deg=0.0, tilt_deg=surface.tilt_deg)
+    points = np.stack([x_mm, y_mm, sag_mm], axis=-1) @ turn.T
+    return np.stack(
+        [points[:, 2] + surface.z_mm, points[:, 1] + surface.decentration_mm[1]],
+        axis=-1,
+    )
+
+
+def _offset_mm(surface: Surface, y_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    if surface.offset_mm is None:
+        return np.zeros_like(y_mm)
+    from estimator.optics.zernike import N_TERMS, nm_from_index, zernike_values
+
+    norms = [
+        math.sqrt((2 - (m == 0)) * (n + 1))
+        for n, m in (nm_from_index(j) for j in range(N_TERMS))
+    ]
+    angle_rad = math.radians(surface.rotation_deg)
+    heights = y_mm / surface.offset_radius_mm
+    values = zernike_values(
+        heights * math.sin(angle_rad), heights * math.cos(angle_rad)
+    )
+    return values @ (np.asarray(surface.offset_mm) / norms)
+
+
+def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None:
+    """Draw the eye's vertical section, rays from infinity, and its coefficients.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure  # loads slowly
+
+    focused = found.focused(focus_dpt)
+    figure = Figure(figsize=(11.0, 5.2), layout="constrained")
+    section, bars = figure.subplots(1, 2, width_ratios=(3, 2))
+    _draw_section(section, focused.surfaces, found.profile.pupil_diameter_mm)
+    section.set_title(
+        f"{found.name}: {focused.parameters.eye_length_mm:.2f} mm long, "
+        f"M {found.refraction_dpt:+.2f} dpt, focus {focused.focus_dpt:.2f} dpt"
+    )
+    _draw_coefficients(bars, found)
+    figure.savefig(path, dpi=130)
+
+
+def _draw_section(axes, eye: EyeSurfaces, pupil_diameter_mm: float) -> None:
+    for surface, half_height_mm in zip(eye.surfaces, HALF_HEIGHTS_MM, strict=True):
+        line = surface_line_mm(surface, half_height_mm=half_height_mm)
+        axes.plot(line[:, 0], line[:, 1], color="0.2", lw=1.3)
+    _draw_retina(axes, eye)
+    for sign in (-1.0, 1.0):
+        y_mm = sign * np.array([pupil_diameter_mm / 2.0 / 1.13, 5.6])
+        axes.plot([eye.stop_z_mm] * 2, y_mm, color="tab:brown", lw=2.5)
+    for path in ray_paths_mm(eye, pupil_diameter_mm=pupil_diameter_mm):
+        axes.plot(path[:, 2], path[:, 1], color="tab:red", lw=0.6)
+    axes.set_aspect("equal")
+    axes.set_xlabel("z, mm (into the eye)")
+    axes.set_ylabel("y, mm (up)")
+
+
+def _draw_retina(axes, eye: EyeSurfaces) -> None:
+    retina = eye.retina
+    radius_mm = abs(float(np.ravel(retina.radius_mm)[-1]))
+    stretch = 1.0 + retina.conic_constant
+    if stretch <= 0.0:
+        y_mm = np.linspace(-11.0, 11.0, N_POINTS)
+        root = np.sqrt(1.0 - stretch * (y_mm / radius_mm) ** 2)
+        z_mm = retina.z_mm - y_mm**2 / radius_mm / (1.0 + root)
+    else:
+        angles = np.linspace(-0.7 * math.pi, 0.7 * math.pi, N_POINTS)
+        along_mm, across_mm = radius_mm / stretch, radius_mm / math.sqrt(stretch)
+        z_mm = retina.z_mm - along_mm * (1.0 - np.cos(angles))
+        y_mm = across_mm * np.sin(angles)
+    axes.plot(z_mm, y_mm, color="0.2", lw=1.3)
+
+
+def _draw_coefficients(axes, found: EstimatedEye) -> None:
+    from estimator.optics.zernike import N_TERMS, nm_from_index
+
+    index = np.arange(3, N_TERMS)
+    measured_um = found.zernike_um - found.residual_um
+    axes.bar(index - 0.2, measured_um[3:], 0.4, label="measured", color="0.6")
+    axes.bar(index + 0.2, found.zernike_um[3:], 0.4, label="eye", color="tab:blue")
+    labels = ["{},{}".format(*nm_from_index(int(j))) for j in index]
+    axes.set_xticks(index, labels, rotation=90, fontsize=7)
+    axes.set_ylabel("um")
+    axes.set_title(f"mean error {found.mean_abs_error_um:.1e} um")
+    axes.legend()
+
+
+def ray_paths_mm(
+    eye: EyeSurfaces, *, pupil_diameter_mm: float, n_rays: int = N_RAYS
+) -> list[NDArray[np.float64]]:
+    """Paths (n_points, 3) of rays from infinity in the plane x = 0, to the retina.
+
+    Rays that do not get through are left out.
+    """
+    heights_mm = np.linspace(-0.5, 0.5, n_rays) * pupil_diameter_mm
+    start_mm = np.zeros((n_rays, 3))
+    start_mm[:, 1], start_mm[:, 2] = heights_mm, -OBJECT_SIDE_MM
+    traced = trace_rays(
+        eye,
+        start_mm=start_mm,
+        direction=(0.0, 0.0, 1.0),
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+    )
+    passed = traced.status_index == RayStatus.TRACED
+    return [
+        np.concatenate([start[None], points])
+        for start, points in zip(
+            start_mm[passed], traced.points_mm[passed], strict=True
+        )
+    ]

@@ -1,0 +1,256 @@
+"""Accommodation: the lens diameter and chamber depth that focus an eye at a distance.
+
+The lens shrinks at constant volume, which steepens both surfaces (rule C); its anterior
+pole, and the stop with it, moves forward by the growth of the thickness before the
+equator, so the aqueous thins; the eye's length stays.  The eye is focused at f dpt when
+its ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm, is
+-f.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BarycentricInterpolator
+
+from estimator.eye.assembly import eye_surfaces
+from estimator.eye.focusing import Focusing
+from estimator.eye.lens_shape import (
+    ANTERIOR_THICKNESS_RATIO,
+    CAP_VOLUME_RATIO,
+    lens_shape,
+)
+from estimator.eye.parameters import EyeParameters, RetinaShape, column
+from estimator.eye.tracing import TraceFailed, refraction_of_vectors
+from estimator.optics import prescription as rx
+from estimator.optics.surfaces import EyeSurfaces
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+
+SMALLEST_DIAMETER_RATIO = 0.84
+"""Smallest lens diameter over the relaxed one.  The earlier search stopped at 0.91, on
+which most of its targets then sat (optics.md 0, defect 4)."""
+
+SMALLEST_AQUEOUS_MM = 1.0
+"""Depth of the anterior chamber below which the lens would press on the cornea."""
+
+N_TABLE = 10
+"""Lens diameters at which the refraction is traced before the root is refined."""
+
+REFRACTION_TOLERANCE_DPT = 1e-6
+MAX_REFINEMENTS = 6
+
+DIAMETER = column("lens_diameter_mm")
+VOLUME = column("lens_volume_mm3")
+AQUEOUS = column("aqueous_thickness_mm")
+
+
+def accommodated_vectors(
+    vector: NDArray[np.float64], *, lens_diameter_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Vectors (P, 45) of one relaxed eye with these lens diameters (P,)."""
+    lens_diameter_mm = np.atleast_1d(np.asarray(lens_diameter_mm, dtype=np.float64))
+    vectors = np.repeat(vector[None], lens_diameter_mm.size, axis=0)
+    return accommodated_eyes(vectors, lens_diameter_mm)
+
+
+def accommodated_eyes(
+    vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Relaxed eyes (P, 45) with other lens diameters (P,), their volumes kept."""
+    volume_mm3 = vectors[:, VOLUME]
+    relaxed = lens_shape(diameter_mm=vectors[:, DIAMETER], volume_mm3=volume_mm3)
+    shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=volume_mm3)
+    focused = vectors.copy()
+    focused[:, DIAMETER] = lens_diameter_mm
+    focused[:, AQUEOUS] -= shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
+    return focused
+
+
+def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
+    """Return the same eye with another lens diameter, its volume kept.
+
+    Raises
+    ------
+    ValueError
+        A diameter that is not positive.
+    """
+    vectors = accommodated_vectors(
+        parameters.to_vector(), lens_diameter_mm=lens_diameter_mm
+    )
+    return replace(
+        parameters,
+        lens_diameter_mm=float(vectors[0, DIAMETER]),
+        aqueous_thickness_mm=float(vectors[0, AQUEOUS]),
+    )
+
+
+def smallest_diameter_mm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lens diameters (...) to which relaxed eyes (..., 45) can shrink their lens.
+
+    `SMALLEST_DIAMETER_RATIO` of the relaxed one, or where the chamber is
+    `SMALLEST_AQUEOUS_MM` deep: the lens thickens before its equator by
+    c (1/D² - 1/D0²), c = 8 eta V tau / (pi (1 + tau)), see `lens_shape`.
+    """
+    relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
+    room_mm = np.maximum(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, 0.0)
+    c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
+    fitting_mm = (relaxed_mm**-2 + room_mm / c_mm3) ** -0.5
+    return np.maximum(fitting_mm, SMALLEST_DIAMETER_RATIO * relaxed_mm)
+
+
+@dataclass(frozen=True)
+class FocusedEye:
+    """One eye at one focus.
+
+    ``focus_dpt`` is where it is really focused; ``notes`` say where that differs from
+    what was asked.
+    """
+
+    parameters: EyeParameters
+    surfaces: EyeSurfaces
+    focus_dpt: float
+    accommodation_dpt: float
+    lens_diameter_change_mm: float
+    aqueous_thickness_change_mm: float
+    notes: tuple[str, ...]
+
+
+class AccommodatingEye(Focusing):
+    """An eye that can be asked to focus.
+
+    Attributes
+    ----------
+    refraction_dpt : float
+        M of the relaxed eye at 555 nm and ``pupil_diameter_mm``, as seen through the
+        worn correction: its far point is at -M.
+    bare_refraction_dpt : float
+        The same without the correction.
+    lens_range_dpt : float
+        Accommodation that the lens model itself can reach.
+    amplitude_dpt : float
+        The smaller of that and the amplitude given (by age).
+    """
+
+    def __init__(
+        self,
+        parameters: EyeParameters,
+        *,
+        retina: RetinaShape | None = None,
+        pupil_diameter_mm: float = 4.0,
+        amplitude_dpt: float = math.inf,
+        correction: rx.Prescription | None = None,
+    ):
+        self.parameters = parameters
+        self.retina = retina
+        self.pupil_diameter_mm = pupil_diameter_mm
+        self._vector = parameters.to_vector()
+        diameters_mm, refractions_dpt = self._refraction_table()
+        correction_dpt = rx.power_vector(correction)[0] if correction else 0.0
+        self.bare_refraction_dpt = float(refractions_dpt[0])
+        self.refraction_dpt = self.bare_refraction_dpt - correction_dpt
+        self._diameters_mm = diameters_mm
+        self._accommodations_dpt = self.bare_refraction_dpt - refractions_dpt
+        self.lens_range_dpt = float(self._accommodations_dpt[-1])
+        self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
+
+    def _refraction_table(self):
+        """Lens diameters, falling, and the refraction at each, as far as it falls."""
+        relaxed_mm = self._vector[DIAMETER]
+        smallest_mm = smallest_diameter_mm(self._vector)
+        diameters_mm = np.linspace(relaxed_mm, smallest_mm, N_TABLE)
+        vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
+        refractions_dpt = self._refractions_dpt(vectors)
+        if not np.isfinite(refractions_dpt[0]):
+            raise TraceFailed(
+                f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
+            )
+        usable = np.isfinite(refractions_dpt)
+        usable[1:] &= np.diff(refractions_dpt) < 0.0
+        usable[0] = True
+        count = int(np.argmin(usable)) if not usable.all() else usable.size
+        return diameters_mm[:count], refractions_dpt[:count]
+
+    def _refractions_dpt(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        return refraction_of_vectors(
+            vectors,
+            retina=self.retina,
+            pupil_diameter_mm=self.pupil_diameter_mm,
+            wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        )
+
+    def lens_diameters_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
+        """Lens diameters (P,) for accommodations (P,) within the amplitude.
+
+        Inverse interpolation in the table by one polynomial, then secant steps, all in
+        batches, until the traced refraction is met to `REFRACTION_TOLERANCE_DPT`.
+        """
+        wanted_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
+        known_dpt, known_mm = self._accommodations_dpt, self._diameters_mm
+        if known_mm.size == 1:
+            return np.full(wanted_dpt.shape, known_mm[0])
+        # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
+        # and every further step costs a trace for each focus.
+        curve = BarycentricInterpolator(known_dpt, known_mm)
+        diameters_mm = np.clip(curve(wanted_dpt), known_mm[-1], known_mm[0])
+        slopes = np.gradient(known_mm, known_dpt)
+        slope_mm_dpt = np.interp(wanted_dpt, known_dpt, slopes)
+        for _ in range(MAX_REFINEMENTS):
+            vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
+            reached_dpt = self.bare_refraction_dpt - self._refractions_dpt(vectors)
+            error_dpt = wanted_dpt - reached_dpt
+            if np.max(np.abs(error_dpt)) < REFRACTION_TOLERANCE_DPT:
+                break
+            step_mm = slope_mm_dpt * error_dpt
+            diameters_mm = np.clip(diameters_mm + step_mm, known_mm[-1], known_mm[0])
+        return diameters_mm
+
+    def changes_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
+        """Change (P, 2) of lens diameter and aqueous thickness for accommodations."""
+        vectors = accommodated_vectors(
+            self._vector, lens_diameter_mm=self.lens_diameters_mm(accommodations_dpt)
+        )
+        return (vectors - self._vector)[:, [DIAMETER, AQUEOUS]]
+
+    def focused(self, focus_dpt: float) -> FocusedEye:
+        """Eye focused as near to ``focus_dpt`` as it can."""
+        return self.focused_at([focus_dpt])[0]
+
+    def focused_at(self, focuses_dpt: ArrayLike) -> list[FocusedEye]:
+        """Focus at many distances in one batch of traces.
+
+        Raises
+        ------
+        ValueError
+            A distance that is not finite.
+        """
+        focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
+        if not np.all(np.isfinite(focuses_dpt)):
+            raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
+        used_dpt = np.array([self.accommodation_dpt(f) for f in focuses_dpt.tolist()])
+        diameters_mm = self.lens_diameters_mm(used_dpt)
+        return self.with_diameters(focuses_dpt, used_dpt, diameters_mm)
+
+    def with_diameters(
+        self, focuses_dpt: ArrayLike, used_dpt: ArrayLike, diameters_mm: ArrayLike
+    ) -> list[FocusedEye]:
+        """States (P,) with the lens diameters that a focus and accommodation need."""
+        states = zip(*map(np.ravel, (focuses_dpt, used_dpt, diameters_mm)), strict=True)
+        return [self._state(*map(float, state)) for state in states]
+
+    def _state(
+        self, focus_dpt: float, accommodation_dpt: float, diameter_mm: float
+    ) -> FocusedEye:
+        relaxed = self.parameters
+        eye = accommodated(relaxed, lens_diameter_mm=diameter_mm)
+        return FocusedEye(
+            parameters=eye,
+            surfaces=eye_surfaces(eye, retina=self.retina),
+            focus_dpt=accommodation_dpt - self.refraction_dpt,
+            accommodation_dpt=accommodation_dpt,
+            lens_diameter_change_mm=diameter_mm - relaxed.lens_diameter_mm,
+            aqueous_thickness_change_mm=(
+                eye.aqueous_thickness_mm - relaxed.aqueous_thickness_mm
+            ),
+            notes=self.focus_notes(focus_dpt),
+        )

@@ -1,0 +1,255 @@
+"""From the 45 parameters to surfaces, one eye at a time or packed in batches."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.eye.lens_shape import compat_lens_shape, lens_shape
+from estimator.eye.parameters import (
+    OFFSET_RADIUS_MM,
+    OFFSET_SLICE,
+    EyeParameters,
+    RetinaShape,
+    column,
+)
+from estimator.optics import surfaces as packing
+from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, offset_monomials
+
+N_SURFACES = 4
+CORNEA_ANTERIOR, CORNEA_POSTERIOR, LENS_ANTERIOR, LENS_POSTERIOR, RETINA = range(5)
+
+
+def eye_surfaces(
+    parameters: EyeParameters,
+    *,
+    retina: RetinaShape | None = None,
+    lens_rule: str = "C",
+) -> EyeSurfaces:
+    """Surfaces of one eye.
+
+    Parameters
+    ----------
+    parameters : EyeParameters
+        Relaxed, or with the lens diameter and aqueous of an accommodated state.
+    retina : RetinaShape, optional
+        Instead of the sphere of radius eye length / 2.
+    lens_rule : {"C", "compat"}
+        ``compat`` is the rule of the published data sets (optics.md 4, rule A).
+
+    Raises
+    ------
+    ValueError
+        An unknown lens rule.
+
+    Notes
+    -----
+    The stop is the plane of the lens' undisplaced anterior pole and stays centred; the
+    lens is decentred and tilted as one body about its anterior vertex.
+    """
+    p = parameters
+    anterior_mm = p.cornea_anterior_radius_mm
+    posterior_mm = anterior_mm * p.cornea_posterior_radius_ratio
+    cornea = (
+        Surface(
+            radius_mm=(anterior_mm, anterior_mm),
+            conic_constant=p.cornea_anterior_conic_constant,
+            z_mm=0.0,
+            medium_after="cornea",
+            rotation_deg=p.cornea_anterior_rotation_deg,
+            offset_mm=p.cornea_offset_mm,
+            offset_radius_mm=OFFSET_RADIUS_MM,
+        ),
+        Surface(
+            radius_mm=(
+                posterior_mm,
+                posterior_mm * p.cornea_posterior_astigmatism_ratio,
+            ),
+            conic_constant=p.cornea_posterior_conic_constant,
+            z_mm=p.cornea_thickness_mm,
+            medium_after="aqueous",
+            rotation_deg=p.cornea_posterior_rotation_deg,
+        ),
+    )
+    stop_z_mm = p.cornea_thickness_mm + p.aqueous_thickness_mm
+    shape = retina or RetinaShape(radius_mm=p.eye_length_mm / 2.0)
+    return EyeSurfaces(
+        surfaces=cornea + _lens_surfaces(p, stop_z_mm, lens_rule),
+        stop_z_mm=stop_z_mm,
+        retina=Retina(
+            radius_mm=shape.radius_mm,
+            conic_constant=shape.conic_constant,
+            z_mm=p.eye_length_mm,
+        ),
+    )
+
+
+def _lens_surfaces(
+    p: EyeParameters, pole_z_mm: float, lens_rule: str
+) -> tuple[Surface, Surface]:
+    size = {"diameter_mm": p.lens_diameter_mm, "volume_mm3": p.lens_volume_mm3}
+    if lens_rule == "C":
+        shape = lens_shape(**size)
+    elif lens_rule == "compat":
+        shape = compat_lens_shape(
+            **size,
+            anterior_conic_constant=p.lens_anterior_conic_constant,
+            posterior_conic_constant=p.lens_posterior_conic_constant,
+        )
+    else:
+        raise ValueError(f"lens rule '{lens_rule}': allowed are C and compat")
+    tilt_deg = (p.lens_tilt_about_x_deg, p.lens_tilt_about_y_deg)
+    axis = packing.rotation_matrix(rotation_deg=0.0, tilt_deg=tilt_deg)[:, 2]
+    vertex_mm = np.array(
+        [p.lens_decentration_x_mm, p.lens_decentration_y_mm, pole_z_mm]
+    )
+    rear_mm = vertex_mm + float(shape.thickness_mm) * axis
+    anterior = Surface(
+        radius_mm=(float(shape.anterior_radius_mm),) * 2,
+        conic_constant=p.lens_anterior_conic_constant,
+        z_mm=pole_z_mm,
+        medium_after="lens",
+        decentration_mm=(p.lens_decentration_x_mm, p.lens_decentration_y_mm),
+        tilt_deg=tilt_deg,
+    )
+    posterior = Surface(
+        radius_mm=(float(shape.posterior_radius_mm),) * 2,
+        conic_constant=p.lens_posterior_conic_constant,
+        z_mm=float(rear_mm[2]),
+        medium_after="vitreous",
+        decentration_mm=(float(rear_mm[0]), float(rear_mm[1])),
+        tilt_deg=tilt_deg,
+    )
+    return anterior, posterior
+
+
+def pack_eyes(
+    vectors: NDArray[np.float64], *, retina: RetinaShape | None = None
+) -> NDArray[np.float64]:
+    """Pack many eyes at once: `pack_eye` of `eye_surfaces`, without the objects.
+
+    Parameters
+    ----------
+    vectors : (P, 45)
+        Parameters in table order; lens rule C.
+
+    Returns
+    -------
+    packed : (P, 5, 48)
+        As `estimator.optics.surfaces.pack_eye` lays them out.
+    """
+
+    def given(name: str) -> NDArray[np.float64]:
+        return vectors[:, column(name)]
+
+    packed = np.zeros((len(vectors), N_SURFACES + 1, packing.N_COLUMNS))
+    packed[:, :, packing.ROTATION : packing.ROTATION + 9] = np.eye(3).ravel()
+    packed[:, :, packing.CLEAR_SQUARED] = math.inf
+    packed[:, RETINA, packing.CLEAR_SQUARED] = math.inf
+    anterior_mm = given("cornea_anterior_radius_mm")
+    posterior_mm = anterior_mm * given("cornea_posterior_radius_ratio")
+    across_mm = posterior_mm * given("cornea_posterior_astigmatism_ratio")
+    _set_shape(
+        packed[:, CORNEA_ANTERIOR],
+        (anterior_mm, anterior_mm),
+        given("cornea_anterior_conic_constant"),
+    )
+    _set_shape(
+        packed[:, CORNEA_POSTERIOR],
+        (posterior_mm, across_mm),
+        given("cornea_posterior_conic_constant"),
+    )
+    _set_offsets(packed[:, CORNEA_ANTERIOR], vectors[:, OFFSET_SLICE])
+    for surface, name in (
+        (CORNEA_ANTERIOR, "cornea_anterior_rotation_deg"),
+        (CORNEA_POSTERIOR, "cornea_posterior_rotation_deg"),
+    ):
+        turns = _turn_about_z(given(name))
+        packed[:, surface, packing.ROTATION : packing.ROTATION + 9] = turns
+        packed[:, surface, packing.IS_TURNED] = given(name) != 0.0
+    packed[:, CORNEA_POSTERIOR, packing.VERTEX + 2] = given("cornea_thickness_mm")
+    stop_z_mm = given("cornea_thickness_mm") + given("aqueous_thickness_mm")
+    _set_lens(packed, given, stop_z_mm)
+    _set_retina(packed[:, RETINA], given("eye_length_mm"), stop_z_mm, retina)
+    return packed
+
+
+def _set_shape(rows, radii_mm, conic_constant):
+    rows[:, packing.CURVATURE_X] = 1.0 / radii_mm[0]
+    rows[:, packing.CURVATURE_Y] = 1.0 / radii_mm[1]
+    rows[:, packing.CONIC] = conic_constant
+    rows[:, packing.FORM] = np.where(
+        radii_mm[0] == radii_mm[1], packing.REVOLVED, packing.BICONIC
+    )
+
+
+def _set_offsets(rows, offsets_mm):
+    terms_mm = np.concatenate([np.zeros((len(rows), 1)), offsets_mm], axis=1)
+    rows[:, packing.OFFSET : packing.OFFSET + terms_mm.shape[1]] = offset_monomials(
+        terms_mm, offset_radius_mm=OFFSET_RADIUS_MM
+    )
+    rows[:, packing.FORM] = np.where(
+        np.any(offsets_mm != 0.0, axis=1), packing.WITH_OFFSET, rows[:, packing.FORM]
+    )
+
+
+def _turn_about_z(angles_deg):
+    """Row-major rotation matrices (P, 9)."""
+    cosine, sine = np.cos(np.radians(angles_deg)), np.sin(np.radians(angles_deg))
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    rows = (cosine, -sine, zero, sine, cosine, zero, zero, zero, one)
+    return np.stack(rows, axis=-1)
+
+
+def _lens_turns(about_x_deg, about_y_deg):
+    """Row-major matrices (P, 9) of a turn about x, then about y."""
+    cx, sx = np.cos(np.radians(about_x_deg)), np.sin(np.radians(about_x_deg))
+    cy, sy = np.cos(np.radians(about_y_deg)), np.sin(np.radians(about_y_deg))
+    zero = np.zeros_like(cx)
+    rows = (cy, sy * sx, sy * cx, zero, cx, -sx, -sy, cy * sx, cy * cx)
+    return np.stack(rows, axis=-1)
+
+
+def _set_lens(packed, given, stop_z_mm):
+    shape = lens_shape(
+        diameter_mm=given("lens_diameter_mm"), volume_mm3=given("lens_volume_mm3")
+    )
+    about_x_deg, about_y_deg = (
+        given("lens_tilt_about_x_deg"),
+        given("lens_tilt_about_y_deg"),
+    )
+    turns = _lens_turns(about_x_deg, about_y_deg)
+    axis = turns.reshape(-1, 3, 3)[:, :, 2]
+    vertex_mm = np.stack(
+        [
+            given("lens_decentration_x_mm"),
+            given("lens_decentration_y_mm"),
+            stop_z_mm,
+        ],
+        axis=-1,
+    )
+    for surface, radius_mm, conic, depth_mm in (
+        (LENS_ANTERIOR, shape.anterior_radius_mm, "lens_anterior_conic_constant", 0.0),
+        (
+            LENS_POSTERIOR,
+            shape.posterior_radius_mm,
+            "lens_posterior_conic_constant",
+            shape.thickness_mm[:, None],
+        ),
+    ):
+        rows = packed[:, surface]
+        _set_shape(rows, (radius_mm, radius_mm), given(conic))
+        rows[:, packing.VERTEX : packing.VERTEX + 3] = vertex_mm + depth_mm * axis
+        rows[:, packing.ROTATION : packing.ROTATION + 9] = turns
+        rows[:, packing.IS_TURNED] = (about_x_deg != 0.0) | (about_y_deg != 0.0)
+
+
+def _set_retina(rows, eye_length_mm, stop_z_mm, retina):
+    shape = retina or RetinaShape(radius_mm=math.nan)
+    radius_mm = -(eye_length_mm / 2.0 if retina is None else shape.radius_mm)
+    radius_mm = np.broadcast_to(radius_mm, eye_length_mm.shape)
+    conic_constant = 0.0 if retina is None else shape.conic_constant
+    _set_shape(rows, (radius_mm, radius_mm), conic_constant)
+    rows[:, packing.VERTEX + 2] = eye_length_mm
+    rows[:, packing.STOP_Z] = stop_z_mm
+    rows[:, packing.N_BEFORE_STOP] = 2.0

@@ -1,0 +1,113 @@
+"""Traced coefficients and refractions of many parameter vectors at once.
+
+On axis, coefficients are those on the given circle outside the eye, filled whatever
+the stop: what an aberrometer measures.  Off axis, the model's stop is the measured
+entrance pupil over its magnification, the fit is that of the part of the circle which
+the projected pupil fills, and the set is rescaled from that circle to the measured one.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.parameters import EyeParameters, RetinaShape
+from estimator.optics.media import refractive_index
+from estimator.optics.prescription import C20
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.optics.zernike import N_TERMS, rescale_pupil
+from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
+from estimator.wavefront.kernels import magnifications
+
+MEDIA_INWARDS = ("air", "cornea", "aqueous", "lens", "vitreous")
+
+
+class TraceFailed(ValueError):
+    """Light does not pass this eye as asked."""
+
+
+def eye_indices(wavelength_nm: float) -> NDArray[np.float64]:
+    """Refractive indices (5,) from air inwards."""
+    return np.array([float(refractive_index(m, wavelength_nm)) for m in MEDIA_INWARDS])
+
+
+def zernike_of_vectors(
+    vectors: NDArray[np.float64],
+    *,
+    pupil_diameter_mm: float,
+    wavelength_nm: float,
+    retina: RetinaShape | None = None,
+    h_deg: float = 0.0,
+    v_deg: float = 0.0,
+) -> NDArray[np.float64]:
+    """Coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
+
+    They are on the circle of ``pupil_diameter_mm`` about the chief ray; object at
+    infinity; a row is nan where light does not pass.
+    """
+    packed = pack_eyes(vectors, retina=retina)
+    indices = eye_indices(wavelength_nm)
+    radius_mm = pupil_diameter_mm / 2.0
+    if h_deg == 0.0 and v_deg == 0.0:
+        zernike_um, _ = on_axis_zernike(packed, indices, zernike_radius_mm=radius_mm)
+        return zernike_um
+    reference = eye_indices(REFERENCE_WAVELENGTH_NM)
+    ratios = magnifications(packed, reference)
+    zernike_um = np.full((len(vectors), N_TERMS), np.nan)
+    usable = ratios > 0.0
+    found = eyes_aberrations(
+        packed[usable],
+        indices,
+        stop_diameters_mm=pupil_diameter_mm / ratios[usable],
+        h_deg=h_deg,
+        v_deg=v_deg,
+    )
+    traced = np.isfinite(found.zernike_radius_mm)
+    rows = np.flatnonzero(usable)[traced]
+    zernike_um[rows] = rescale_pupil(
+        found.zernike_um[traced],
+        radius_ratio=radius_mm / found.zernike_radius_mm[traced],
+    )
+    zernike_um[:, 0] = np.where(np.isnan(zernike_um[:, 1]), np.nan, 0.0)
+    return zernike_um
+
+
+def refraction_of_vectors(
+    vectors: NDArray[np.float64],
+    *,
+    pupil_diameter_mm: float,
+    wavelength_nm: float = REFERENCE_WAVELENGTH_NM,
+    retina: RetinaShape | None = None,
+) -> NDArray[np.float64]:
+    """Least-squares M (P,), dpt, from C(2,0) on the pupil's circle; nan as above."""
+    zernike_um = zernike_of_vectors(
+        vectors,
+        pupil_diameter_mm=pupil_diameter_mm,
+        wavelength_nm=wavelength_nm,
+        retina=retina,
+    )
+    return -SPHERE_PER_C20 * zernike_um[:, C20] / (pupil_diameter_mm / 2.0) ** 2
+
+
+def on_axis_zernike_um(
+    parameters: EyeParameters,
+    *,
+    pupil_diameter_mm: float,
+    wavelength_nm: float,
+    retina: RetinaShape | None = None,
+) -> NDArray[np.float64]:
+    """Coefficients (28,), um, of one eye on axis, on the circle of the pupil.
+
+    Raises
+    ------
+    TraceFailed
+        Light does not pass this eye at this pupil.
+    """
+    zernike_um = zernike_of_vectors(
+        parameters.to_vector()[None],
+        pupil_diameter_mm=pupil_diameter_mm,
+        wavelength_nm=wavelength_nm,
+        retina=retina,
+    )[0]
+    if not np.all(np.isfinite(zernike_um)):
+        raise TraceFailed(f"light does not pass the eye at {pupil_diameter_mm:g} mm")
+    return zernike_um

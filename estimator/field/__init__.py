@@ -1,0 +1,16 @@
+"""An eye over its whole visual field, as the PSF cache asks for it.
+
+eye_optics       what the cache asks of any eye
+aberration_grid  wavefronts traced at the nodes of a grid
+network_grid     the same by network
+grid_source      which of the two, by cost and error
+interpolation    between the nodes
+traced_fields    fixed fields, changing pupil and focus
+traced_eye       an estimated eye, ray-traced over the field
+prepare          from a profile to such an eye: the entry
+notes            what is said of how it was made
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

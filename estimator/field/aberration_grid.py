@@ -1,0 +1,130 @@
+"""Wavefronts of an estimated eye over field, pupil, accommodation and wavelength."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.estimate.estimation import EstimatedEye
+from estimator.eye.accommodation import FocusedEye
+from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.chief_rays import chief_shift_mrad
+from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
+
+
+@dataclass(frozen=True)
+class AberrationGrid:
+    """Aberrations for an object at infinity, traced or by network; no worn correction.
+
+    Attributes
+    ----------
+    h_deg, v_deg, pupil_diameters_mm, accommodations_dpt, wavelengths_nm : (n,)
+        Axes; pupils are entrance pupils at 555 nm.
+    zernike_um : (n_h, n_v, n_pupils, n_accommodations, n_wavelengths, 28), um
+        nan where no light passes.
+    zernike_radius_mm, rms_residual_um, open_ratio : the same without the last axis
+    ellipse_mm : the same with 5 last, see `wavefront.FieldResults`
+    chief_shift_mrad : (n_h, n_v, n_accommodations, n_wavelengths, 2)
+        Lateral colour, see `chief_rays`.
+    """
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    pupil_diameters_mm: NDArray[np.float64]
+    accommodations_dpt: NDArray[np.float64]
+    wavelengths_nm: NDArray[np.float64]
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    rms_residual_um: NDArray[np.float64]
+    open_ratio: NDArray[np.float64]
+    ellipse_mm: NDArray[np.float64]
+    chief_shift_mrad: NDArray[np.float64]
+
+
+def aberration_grid(
+    eye: EstimatedEye,
+    *,
+    pupil_diameters_mm: ArrayLike,
+    accommodations_dpt: ArrayLike,
+    wavelengths_nm: ArrayLike,
+    h_deg: ArrayLike = (0.0,),
+    v_deg: ArrayLike = (0.0,),
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
+    states: Sequence[FocusedEye] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> AberrationGrid:
+    """Trace every combination of the axes.
+
+    Parameters
+    ----------
+    accommodations_dpt : (n_accommodations,)
+        Within the eye's amplitude.
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront.nodes`.
+    states : (n_accommodations,), optional
+        The eye at each accommodation, where that is known already.
+    progress : callable, optional
+        Called with a fraction after each accommodation; may raise to cancel.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, section 5.1: the inputs of the aberration estimator.
+    """
+    h_deg, v_deg, pupils_mm, used_dpt, wavelengths_nm = (
+        np.atleast_1d(np.asarray(axis, dtype=np.float64))
+        for axis in (
+            h_deg,
+            v_deg,
+            pupil_diameters_mm,
+            accommodations_dpt,
+            wavelengths_nm,
+        )
+    )
+    fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
+    parts, shifts = [], []
+    if states is None:
+        states = eye.accommodating.focused_at(used_dpt - eye.refraction_dpt)
+    for k, state in enumerate(states):
+        found = wavefront_grid(
+            state.surfaces,
+            fields_deg=fields_deg.reshape(-1, 2),
+            wavelengths_nm=wavelengths_nm,
+            pupil_diameters_mm=pupils_mm,
+            n_rings=n_rings,
+            n_azimuths=n_azimuths,
+        )
+        parts.append(found)
+        shifts.append(
+            chief_shift_mrad(
+                state.surfaces,
+                fields_deg=fields_deg.reshape(-1, 2),
+                wavelengths_nm=wavelengths_nm,
+            )
+        )
+        if progress is not None:
+            progress((k + 1) / len(used_dpt))
+
+    def stacked(name: str) -> NDArray:
+        # (accommodation, field, wavelength, pupil, ...) to the order of the axes
+        values = np.stack([getattr(part, name) for part in parts])
+        values = np.moveaxis(values, (1, 3, 0, 2), (0, 1, 2, 3))
+        return values.reshape(len(h_deg), len(v_deg), *values.shape[1:])
+
+    shift_mrad = np.moveaxis(np.stack(shifts), 0, 1)
+    return AberrationGrid(
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameters_mm=pupils_mm,
+        accommodations_dpt=used_dpt,
+        wavelengths_nm=wavelengths_nm,
+        zernike_um=stacked("zernike_um"),
+        zernike_radius_mm=stacked("zernike_radius_mm"),
+        rms_residual_um=stacked("rms_residual_um"),
+        open_ratio=stacked("open_ratio"),
+        ellipse_mm=stacked("ellipse_mm"),
+        chief_shift_mrad=shift_mrad.reshape(
+            len(h_deg), len(v_deg), *shift_mrad.shape[1:]
+        ),
+    )

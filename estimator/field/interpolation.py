@@ -1,0 +1,337 @@
+"""Traced wavefronts between the nodes of a grid over field, pupil and accommodation.
+
+Interpolated are polynomials in mm of the pupil plane and rims as centre and matrix:
+over the field by the polynomial through Chebyshev nodes in the stretched angles of
+`stretched`, over accommodation by the one through its nodes, over the pupil by the law
+of what a sixth-order fit leaves out.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.field.aberration_grid import AberrationGrid
+from estimator.optics.zernike import N_TERMS
+from estimator.wavefront.field_wavefronts import (
+    DEGREE,
+    N_RIM,
+    distinct_rows,
+    polynomial_in_mm,
+    rim_from_ellipse,
+)
+
+OPEN_RATIO = 0.999
+"""Share of the stop from which a pupil counts as open."""
+
+NODES_PER_EXTENT = 7.7
+"""Field nodes per half extent in stretched angle: 10 for 40 deg, 8 for 25 deg; fewer
+where the range does not lie about the axis."""
+
+FAR_DEG, FAR_NODES = 48.0, 9.0
+"""The same for the part of the extent beyond this angle, where wavefronts change fast.
+"""
+
+STRETCH = 1.75
+
+DPT_PER_NODE = 2.0
+"""Largest mean distance between traced accommodations."""
+
+_CHUNK = 16384
+_RIM_SCALE = np.array([2, 2, 1, 1, 1])
+"""A rim's centre goes with the square of the pupil, its axes with the pupil."""
+
+_POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.6)])
+"""How coefficients change with the pupil A: a term of order 8 (7 for the odd) that a
+fit of order 6 leaves out adds a share that goes with A^(8 - degree) to a coefficient of
+its parity; a rim departs from its paraxial form with A² and a little A⁴."""
+
+
+def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
+    """Variable in which wavefronts over the field are polynomials of low degree.
+
+    They change slowly near the axis and ever faster outside, as cos and tan of the
+    angle do: the angle itself needs two nodes more.
+    """
+    return np.arcsinh(STRETCH * np.radians(angle_deg))
+
+
+def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
+    """Chebyshev nodes in stretched angle, ascending; one for a range of one."""
+    low, high = stretched([low_deg, high_deg])
+    half = 0.5 * (high - low)
+    if half < 1e-9:
+        return np.array([low_deg])
+    outer = max(abs(low), abs(high))
+    far = max(outer - stretched(FAR_DEG), 0.0)
+    wanted = 2.0 + NODES_PER_EXTENT * math.sqrt(half * outer) + FAR_NODES * far
+    count = math.ceil(wanted)
+    unit = -np.cos(math.pi * (np.arange(count) + 0.5) / count)
+    return np.degrees(np.sinh(0.5 * (low + high) + half * unit) / STRETCH)
+
+
+def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float64]:
+    """Chebyshev-Lobatto nodes, the ends among them; one for a range of one."""
+    if high_dpt - low_dpt < 1e-9:
+        return np.array([low_dpt])
+    last = max(math.ceil((high_dpt - low_dpt) / DPT_PER_NODE), 2)
+    unit = 0.5 - 0.5 * np.cos(math.pi * np.arange(last + 1) / last)
+    return low_dpt + (high_dpt - low_dpt) * unit
+
+
+def lagrange_weights(
+    nodes: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Weights (n, n_nodes) of the polynomial through the nodes; exact at a node."""
+    weights = np.ones((at.size, nodes.size))
+    for i, node in enumerate(nodes):
+        for other in np.delete(nodes, i):
+            weights[:, i] *= (at - other) / (node - other)
+    return weights
+
+
+def _linear(nodes: NDArray, at: NDArray) -> NDArray[np.float64]:
+    """Weights (n, n_nodes) of linear interpolation, constant beyond the ends."""
+    return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
+
+
+def _for_distinct(function: Callable, values: NDArray):
+    """Array or arrays (n, ...) of a function that many of the values (n,) share."""
+    distinct, place = np.unique(values, return_inverse=True)
+    found = function(distinct)
+    if isinstance(found, tuple):
+        return tuple(array[place] for array in found)
+    return found[place]
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """A grid's values at the fields and wavelengths of n states.
+
+    All that is left open is pupil and accommodation.
+
+    Attributes
+    ----------
+    values : (n_fields, n_channels, n_pupils, n_accommodations, 33)
+    first_pupil : int
+        Which of the grid's pupils comes first in `values`.
+    field, channel : (n,)
+        Of each state.
+    """
+
+    values: NDArray[np.float64]
+    first_pupil: int
+    field: NDArray[np.int64]
+    channel: NDArray[np.int64]
+
+    def of(self, states: NDArray[np.int64]) -> "FieldValues":
+        """Values of some of the states."""
+        return replace(self, field=self.field[states], channel=self.channel[states])
+
+
+class FieldInterpolation:
+    """Wavefronts and rims of one grid, anywhere between its nodes.
+
+    Where a pupil is not open, its wavefront is that of the next smaller open pupil,
+    continued: the fit to a part of a pupil would not join on to its neighbours.
+
+    Attributes
+    ----------
+    grid : AberrationGrid
+    passes : bool
+        Whether the smallest pupil is open at all nodes; nothing else is of use.
+    open_pupil_mm : (n_h, n_v)
+        Pupil of the area that light passes, least over those.
+    """
+
+    def __init__(self, grid: AberrationGrid):
+        self.grid = grid
+        pupils_mm = grid.pupil_diameters_mm[:, None, None, None]
+        values = np.concatenate(
+            [
+                polynomial_in_mm(grid.zernike_um, grid.zernike_radius_mm),
+                rim_from_ellipse(grid.ellipse_mm) / pupils_mm**_RIM_SCALE,
+            ],
+            axis=-1,
+        )
+        is_open = self.is_open(grid)
+        for i in range(1, len(pupils_mm)):
+            closed = ~is_open[:, :, i]
+            values[:, :, i][closed] = values[:, :, i - 1][closed]
+        passed_mm = pupils_mm[..., 0] * np.sqrt(grid.open_ratio)
+        has_chief_rays = np.isfinite(grid.chief_shift_mrad).all()
+        self.passes = bool(is_open[:, :, 0].all() and has_chief_rays)
+        self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
+        self.all_open = bool(is_open.all())
+        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), in one piece: it is
+        # multiplied at every call.
+        self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
+
+    @staticmethod
+    def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
+        """Whether light passes the whole pupil, at all nodes of a grid."""
+        is_finite = np.isfinite(grid.zernike_um).all(axis=-1)
+        is_finite &= np.isfinite(grid.ellipse_mm).all(axis=-1)
+        return is_finite & (grid.open_ratio > OPEN_RATIO)
+
+    def open_pupils_mm(
+        self, h_deg: NDArray, v_deg: NDArray
+    ) -> NDArray[np.float64] | None:
+        """Pupils (n,) that light passes at fields; None where it passes them all."""
+        if self.all_open:
+            return None
+        return np.einsum(
+            "nh,nv,hv->n",
+            _linear(self.grid.h_deg, h_deg),
+            _linear(self.grid.v_deg, v_deg),
+            self.open_pupil_mm,
+        )
+
+    def at(
+        self,
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        pupil_diameter_mm: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, at states (n,).
+
+        Raises
+        ------
+        ValueError
+            A wavelength that is not among the traced ones.
+        """
+        values = self.values(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            wavelength_nm=wavelength_nm,
+            pupil_diameter_mm=pupil_diameter_mm,
+        )
+        return self.between(
+            values,
+            pupil_diameter_mm=pupil_diameter_mm,
+            accommodation_dpt=accommodation_dpt,
+        )
+
+    def values(
+        self,
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+        pupil_diameter_mm: NDArray[np.float64] | None = None,
+    ) -> FieldValues:
+        """Values at the fields and wavelengths (n,) of states, for `between`.
+
+        Parameters
+        ----------
+        pupil_diameter_mm : (n,), optional
+            Pupils that will be asked for; any at all where it is None.
+
+        Raises
+        ------
+        ValueError
+            A wavelength that is not among the traced ones.
+        """
+        channels, channel = np.unique(
+            self._channels(wavelength_nm), return_inverse=True
+        )
+        first, field = distinct_rows(h_deg, v_deg)
+        pupils = slice(0, None)
+        if pupil_diameter_mm is not None:
+            # Only what is asked for: few calls need all wavelengths and pupils.
+            lower, _ = self._pupil_shares(pupil_diameter_mm)
+            pupils = slice(int(lower.min()), int(lower.max()) + 2)
+        values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
+        return FieldValues(values, pupils.start, field, channel)
+
+    def between(
+        self,
+        states: FieldValues,
+        *,
+        pupil_diameter_mm: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, at states (n,)."""
+        used = _for_distinct(
+            lambda dpt: lagrange_weights(self.grid.accommodations_dpt, dpt),
+            accommodation_dpt,
+        )
+        lower, share = _for_distinct(self._pupil_shares, pupil_diameter_mm)
+        lower = lower - states.first_pupil
+        upper = np.minimum(lower + 1, states.values.shape[2] - 1)
+        found = np.empty((lower.size, N_TERMS + N_RIM))
+        for start in range(0, lower.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            at = states.field[part], states.channel[part]
+            low, high = (
+                np.einsum("na,nac->nc", used[part], states.values[*at, pupil[part]])
+                for pupil in (lower, upper)
+            )
+            found[part] = low + share[part] * (high - low)
+        rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
+        return found[:, :N_TERMS], rim_mm
+
+    def chief_shift_mrad(
+        self,
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Lateral colour (n, 2) at states (n,), mrad, see `chief_rays`."""
+        over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
+        over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
+        used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
+        channel = self._channels(wavelength_nm)
+        found = np.empty((h_deg.size, 2))
+        for c in np.unique(channel):
+            at = channel == c
+            found[at] = np.einsum(
+                "nh,nv,na,hvak->nk",
+                *(over_h[at], over_v[at], used[at]),
+                self.grid.chief_shift_mrad[:, :, :, c],
+                optimize=True,
+            )
+        return found
+
+    def _over_field(
+        self, h_deg: NDArray, v_deg: NDArray, channels: NDArray, pupils: slice
+    ) -> NDArray[np.float64]:
+        """Values (n, n_channels, n_pupils, n_accommodations, 33) at fields (n,)."""
+        over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
+        over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
+        weights = (over_h[:, :, None] * over_v[:, None, :]).reshape(h_deg.size, -1)
+        values = self._values[:, :, channels, pupils]
+        found = weights @ values.reshape(weights.shape[1], -1)
+        return found.reshape(h_deg.size, *values.shape[2:])
+
+    def _pupil_shares(self, pupil_mm: NDArray) -> tuple[NDArray, NDArray]:
+        """Index (n,) of the lower pupil, and share (n, 33) of the one above it.
+
+        Below the smallest traced pupil the first two are continued.
+        """
+        nodes_mm = self.grid.pupil_diameters_mm
+        if nodes_mm.size == 1:
+            return np.zeros(pupil_mm.size, np.int64), np.zeros((pupil_mm.size, 1))
+        lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
+        lower = np.clip(lower, 0, nodes_mm.size - 2)
+        high_mm = nodes_mm[lower + 1]
+        lowest = (nodes_mm[lower] / high_mm)[:, None] ** _POWER
+        share = ((pupil_mm / high_mm)[:, None] ** _POWER - lowest) / (1.0 - lowest)
+        return lower, share
+
+    def _channels(self, wavelength_nm: NDArray) -> NDArray[np.int64]:
+        nodes_nm = self.grid.wavelengths_nm
+        index = np.abs(wavelength_nm[:, None] - nodes_nm).argmin(axis=1)
+        if not np.allclose(nodes_nm[index], wavelength_nm, rtol=1e-6, atol=0.0):
+            raise ValueError(
+                f"wavelength_nm {np.unique(wavelength_nm).tolist()}: traced are "
+                f"{nodes_nm.tolist()}"
+            )
+        return index

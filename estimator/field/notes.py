@@ -1,0 +1,84 @@
+"""What a reply says of how its eye was made: by network, refined, traced, how exactly.
+
+A part that fell back from a network says which input left its training range.
+"""
+
+from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye
+from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
+from estimator.field.grid_source import GridSource, GridUse
+from estimator.field.traced_eye import TRACED_ERROR_UM
+from estimator.networks.inference import load_network
+
+_STARTS = {"network": "the network's guess", "table": "a table's eye"}
+
+
+def eye_notes(
+    estimated: EstimatedEye, source: GridSource, *, network_reason: str = ""
+) -> tuple[str, ...]:
+    """Say how the eye, its focus and its aberrations were found, in that order.
+
+    Parameters
+    ----------
+    network_reason : str
+        Why the eye network was not asked, where it should have been.
+    """
+    reason = network_reason or estimated.network_reason
+    fallen = [f"eye not by network: {reason}"] if reason else []
+    said = [note for note in estimated.notes if reason not in note or not reason]
+    return (
+        _of_eye(estimated),
+        *fallen,
+        *_of_focus(source),
+        *_of_aberrations(source.uses),
+        *said,
+    )
+
+
+def _of_eye(estimated: EstimatedEye) -> str:
+    if estimated.method == "given":
+        return "eye as given by its parameters"
+    poor = "poorly " if estimated.mean_abs_error_um > POOR_FIT_UM else ""
+    found = (
+        f"in {estimated.time_ms:.0f} ms, mean error "
+        f"{estimated.mean_abs_error_um:.1e} um over 25 terms"
+    )
+    if estimated.method == "network":
+        expected = load_network("eye").card.error
+        return f"eye estimated {poor}by network {found}; expected {expected}"
+    start = _STARTS.get(estimated.start)
+    return f"eye estimated {poor}{found}" + (f", refined from {start}" if start else "")
+
+
+def _of_focus(source: GridSource) -> list[str]:
+    if source.focus_by_network:
+        return [f"focus by network, expected error {load_network('focus').card.error}"]
+    traced = f"focus traced to {REFRACTION_TOLERANCE_DPT:.0e} dpt"
+    if source.focus_reason:
+        return [f"{traced}, not by network: {source.focus_reason}"]
+    return [traced]
+
+
+def _of_aberrations(uses: list[GridUse]) -> list[str]:
+    """Say it of the last grid of the field and of the axis, or of both at once."""
+    last = {use.is_field: use for use in uses}
+    alike = len({(use.by_network, use.reason) for use in last.values()}) == 1
+    if alike:
+        return _of_grid(last.get(True, last.get(False)), "")
+    return [
+        note
+        for is_field, where in ((True, " over the field"), (False, " on the axis"))
+        for note in _of_grid(last[is_field], where)
+    ]
+
+
+def _of_grid(use: GridUse, where: str) -> list[str]:
+    if use.by_network:
+        expected = load_network("aberration").card.error
+        return [
+            f"aberrations{where} by network, expected error {expected}; "
+            f"{use.checked_error_um:.2g} um at {use.n_checked} traced nodes"
+        ]
+    traced = f"aberrations{where} traced to about {TRACED_ERROR_UM:.0e} um"
+    if use.reason:
+        return [f"{traced}, not by network: {use.reason}"]
+    return [traced]

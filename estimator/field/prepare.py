@@ -1,0 +1,121 @@
+"""From a profile to the eye whose PSFs are computed: measured wavefront or traced."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from estimator.estimate.estimation import EstimatedEye, estimate_eye
+from estimator.field.eye_optics import EyeOptics
+from estimator.field.grid_source import GridSource
+from estimator.field.notes import eye_notes
+from estimator.field.traced_eye import ON_AXIS_DEG, FieldRange, TracedEye
+from estimator.networks.card import NetworkUnavailable
+from estimator.networks.inference import load_network
+from estimator.optics.units import RGB_WAVELENGTHS_NM
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import EyeProfile
+
+EYE_MODELS = ("traced", "wavefront")
+
+ESTIMATION_SHARE = 0.5
+"""Progress at which the eye is estimated."""
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Where an accuracy takes each part from, in the words of the estimator."""
+
+    method: str
+    starts: tuple[str, ...]
+    focus: str
+    aberrations: str
+
+
+WAYS = {
+    "fast": _Way("network", ("table",), "network", "network"),
+    "balanced": _Way("refined", ("table", "network"), "traced", "cheaper"),
+    "exact": _Way("refined", ("table",), "traced", "traced"),
+}
+"""A network that cannot answer gives way to tracing, part by part, with a note."""
+
+
+def prepare_eye(
+    profile: EyeProfile,
+    *,
+    pupil_diameters_mm: ArrayLike = (3.0, 4.0, 5.0, 6.0),
+    focus_range_dpt: tuple[float, float] = (0.0, 0.0),
+    wavelengths_nm: ArrayLike = RGB_WAVELENGTHS_NM,
+    field_range_deg: FieldRange = ON_AXIS_DEG,
+    eye_model: str = "traced",
+    accuracy: str = "exact",
+    progress: Callable[[float, str], None] | None = None,
+) -> tuple[EyeOptics, tuple[str, ...]]:
+    """Return the eye of a profile over its visual field, and what to say about it.
+
+    Parameters
+    ----------
+    pupil_diameters_mm : (n,)
+        Entrance pupils to trace on axis; those between follow, over the field too.
+    focus_range_dpt : (low, high)
+        Focus distances that will be asked for.
+    wavelengths_nm : (n,)
+    field_range_deg : ((h_low, h_high), (v_low, v_high))
+        Azimuths and elevations.
+    eye_model : {"traced", "wavefront"}
+        Estimate a 45-parameter eye and trace every wavefront; or use the measurement
+        by closed formulas, which knows no larger pupil and no change of shape with
+        accommodation, and costs nothing.
+    accuracy : {"fast", "balanced", "exact"}
+        Of the traced model: the networks; a refined eye, its wavefronts from whichever
+        of the two pays; everything traced.
+    progress : callable, optional
+        Called with a fraction and a stage; may raise to cancel.
+
+    Raises
+    ------
+    ValueError
+        An unknown model or accuracy, or an eye that light does not pass.
+    """
+    if eye_model not in EYE_MODELS:
+        raise ValueError(
+            f"eye_model '{eye_model}': allowed are {', '.join(EYE_MODELS)}"
+        )
+    if accuracy not in WAYS:
+        raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(WAYS)}")
+    if eye_model == "wavefront" and profile.eye is None:
+        return MeasuredWavefront.from_profile(profile), ()
+
+    def report(fraction: float, stage: str) -> None:
+        if progress is not None:
+            progress(fraction, stage)
+
+    report(0.0, "eye")
+    way = WAYS[accuracy]
+    estimated, network_reason = _estimated(profile, way)
+    source = GridSource(aberrations=way.aberrations, focus=way.focus)
+    report(ESTIMATION_SHARE, "aberrations")
+    eye = TracedEye.trace(
+        estimated,
+        pupil_diameters_mm=pupil_diameters_mm,
+        focus_range_dpt=focus_range_dpt,
+        wavelengths_nm=wavelengths_nm,
+        field_range_deg=field_range_deg,
+        make_grid=source,
+        progress=lambda done: report(
+            ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"
+        ),
+    )
+    return eye, eye_notes(estimated, source, network_reason=network_reason)
+
+
+def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:
+    """Return the eye, and why there is no network for it where one was wanted."""
+    try:
+        found = estimate_eye(profile, method=way.method, starts=way.starts)
+        if found.method == "network":
+            error_um = found.mean_abs_error_um
+            load_network("eye").card.check_error(error_um, "in its eye")
+        return found, ""
+    except NetworkUnavailable as error:
+        return estimate_eye(profile, starts=("table",)), str(error)

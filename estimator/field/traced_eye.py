@@ -1,0 +1,391 @@
+"""An estimated eye as the PSF cache asks for it: every wavefront ray-traced.
+
+Answers the same questions as `measured_wavefront.MeasuredWavefront`, without its
+limits: pupils larger than the measured one are traced, not extrapolated, accommodation
+changes the lens and with it all aberrations, and every field has its own.  Its grids
+may be made by network instead, see `grid_source`.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.estimate.estimation import EstimatedEye
+from estimator.eye.focusing import FocusingEye
+from estimator.eye.tracing import TraceFailed
+from estimator.field.aberration_grid import AberrationGrid, aberration_grid
+from estimator.field.interpolation import (
+    FieldInterpolation,
+    accommodation_nodes_dpt,
+    field_nodes_deg,
+)
+from estimator.field.traced_fields import TracedFields, check_limits
+from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
+from estimator.wavefront.field_wavefronts import (
+    FieldWavefronts,
+    correction_polynomial,
+    distinct_rows,
+    total_defocus_dpt,
+    with_defocus,
+)
+
+MAX_PUPIL_MM = 8.0
+"""Largest pupil an iris opens to."""
+
+ACCOMMODATION_STEP_DPT = 1.0
+"""Largest step between accommodations whose PSFs are blended; blending is at equal
+defocus, so only the slow change of the other aberrations is interpolated."""
+
+FIELD_PUPIL_RATIOS = (0.64, 1.0)
+"""Pupils traced over the field, of the largest one."""
+
+LARGE_PUPIL_MM = 7.2
+LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
+"""The same where the largest pupil is larger than that."""
+
+FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
+"""Rays per wavefront over the field: 70, 1e-3 um from many at 7 mm, 0.013 at worst."""
+
+TRACED_ERROR_UM = 1e-3
+"""What a reply states of them."""
+
+ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
+SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
+"""Step by which the traced field is made smaller until light passes all of it."""
+
+AXIS_PROGRESS = 0.1
+
+FieldRange = tuple[tuple[float, float], tuple[float, float]]
+
+
+class TracedEye(FocusingEye):
+    """Wavefronts of an estimated eye over a range of fields, pupils and foci.
+
+    On axis the circle circumscribed about the pupil is the pupil asked for: the traced
+    rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
+    and at other fields by the same factor.  The worn correction is taken off at every
+    field alike, see `field_wavefronts.correction_polynomial`.
+
+    Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
+    the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
+    open area.  Fields that light does not pass answer as the nearest of the traced
+    fields, whose range is made smaller until all of its nodes pass.
+
+    Attributes
+    ----------
+    grid : AberrationGrid
+        On axis.
+    field_range_deg : ((h_low, h_high), (v_low, v_high))
+        Fields that may be asked for.
+    traced_range_deg : the same
+        Fields beyond it answer as its edge.
+    """
+
+    pupil_limit = "traced"
+
+    def __init__(
+        self,
+        eye: EstimatedEye,
+        axis: FieldInterpolation,
+        field: FieldInterpolation | None = None,
+        *,
+        field_range_deg: FieldRange = ON_AXIS_DEG,
+        traced_range_deg: FieldRange = ON_AXIS_DEG,
+    ):
+        self.grid = axis.grid
+        self.refraction_dpt = eye.refraction_dpt
+        self.amplitude_dpt = eye.amplitude_dpt
+        self.max_pupil_diameter_mm = largest_open_pupil_mm(axis.grid)
+        self.field_range_deg = field_range_deg
+        self.traced_range_deg = traced_range_deg
+        self._field = field or axis
+        has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
+        self._on_axis = self._field if has_axis else axis
+        self._correction = correction_polynomial(eye.profile.correction)
+
+    @classmethod
+    def trace(
+        cls,
+        eye: EstimatedEye,
+        *,
+        pupil_diameters_mm: ArrayLike,
+        focus_range_dpt: tuple[float, float],
+        wavelengths_nm: ArrayLike,
+        field_range_deg: FieldRange = ON_AXIS_DEG,
+        make_grid: Callable[..., AberrationGrid] = aberration_grid,
+        progress: Callable[[float], None] | None = None,
+    ) -> "TracedEye":
+        """Trace what a range of pupils, foci and fields needs.
+
+        Parameters
+        ----------
+        pupil_diameters_mm : (n,)
+            On axis each of them is traced; elsewhere only the largest and one or two
+            smaller, from which all others follow.
+        field_range_deg : ((h_low, h_high), (v_low, v_high))
+            Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
+        make_grid : callable, optional
+            What fills the grids, where it is not tracing: a `grid_source.GridSource`.
+        progress : callable, optional
+            Called with a fraction; may raise to cancel.
+
+        Raises
+        ------
+        TraceFailed
+            No light passes on axis.
+        ValueError
+            A field range that is not ascending.
+        """
+        _check_field_range(field_range_deg)
+        used_dpt = [eye.accommodating.accommodation_dpt(f) for f in focus_range_dpt]
+        states = {
+            "accommodations_dpt": accommodation_nodes_dpt(min(used_dpt), max(used_dpt)),
+            "wavelengths_nm": np.unique(wavelengths_nm),
+        }
+        on_axis_only = not np.any(field_range_deg)
+        axis_share = 1.0 if on_axis_only else AXIS_PROGRESS
+        axis_grid = make_grid(
+            eye,
+            pupil_diameters_mm=np.unique(pupil_diameters_mm),
+            **states,
+            progress=_share(progress, 0.0, axis_share),
+        )
+        axis = FieldInterpolation(axis_grid)
+        if on_axis_only:
+            return cls(eye, axis)
+        field, traced_range_deg = _trace_field(
+            eye,
+            axis,
+            field_range_deg,
+            make_grid,
+            pupil_diameters_mm=field_pupils_mm(
+                axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
+            ),
+            **states,
+            progress=_share(progress, axis_share, 1.0),
+        )
+        return cls(
+            eye,
+            axis,
+            field,
+            field_range_deg=field_range_deg,
+            traced_range_deg=traced_range_deg,
+        )
+
+    def accommodation_nodes_dpt(
+        self, focus_range_dpt: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """Accommodations (n,), ascending, between which PSFs may be blended."""
+        used_dpt = [self.accommodation_dpt(f) for f in focus_range_dpt]
+        low_dpt, high_dpt = min(used_dpt), max(used_dpt)
+        count = 1 + int(np.ceil((high_dpt - low_dpt) / ACCOMMODATION_STEP_DPT - 1e-9))
+        return np.linspace(low_dpt, high_dpt, max(count, 1))
+
+    def total_defocus_dpt(
+        self,
+        *,
+        h_deg: ArrayLike = 0.0,
+        v_deg: ArrayLike = 0.0,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction, dpt, on the pupil's circle; object at infinity.
+
+        All arguments broadcast, and the result has their shape.
+        """
+        states = np.broadcast_arrays(
+            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
+        )
+        zernike_um, _, radius_mm, number = self._distinct(states)
+        return total_defocus_dpt(zernike_um, radius_mm)[number].reshape(states[0].shape)
+
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[..., NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        Returns
+        -------
+        callable
+            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
+            arguments' broadcast shape.
+        """
+        states = np.broadcast_arrays(h_deg, v_deg, wavelength_nm)
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h_deg, v_deg, wavelength_nm = (column[first] for column in columns)
+        self._check_fields(h_deg, v_deg)
+        fields = self._fields(h_deg, v_deg, wavelength_nm)
+        return partial(self._defocus_dpt, fields, number.reshape(states[0].shape))
+
+    def _defocus_dpt(
+        self, fields: TracedFields, number: NDArray, **state: float
+    ) -> NDArray[np.float64]:
+        states = {name: np.full(fields.count, value) for name, value in state.items()}
+        self._check_states(**states)
+        zernike_um, _, radius_mm = fields.wavefronts(**states)
+        return total_defocus_dpt(zernike_um, radius_mm)[number]
+
+    def wavefronts(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+        total_defocus_dpt: ArrayLike,
+    ) -> FieldWavefronts:
+        """Wavefronts with the given total defocus; P in C order of the broadcast.
+
+        Raises
+        ------
+        ValueError
+            A state outside of what was traced.
+        """
+        *states, total_dpt = np.broadcast_arrays(
+            *(h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm),
+            total_defocus_dpt,
+        )
+        zernike_um, rim_mm, radius_mm, number = self._distinct(states)
+        return with_defocus(
+            zernike_um[number],
+            rim_mm[number],
+            radius_mm[number],
+            total_defocus_dpt=total_dpt,
+        )
+
+    def chief_ray_shift_mrad(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Lateral colour against 555 nm along the pupil axes, mrad; see `chief_rays`.
+
+        All arguments broadcast, and the result has their shape with 2 last.  What a
+        worn correction adds is not in it.
+        """
+        states = np.broadcast_arrays(h_deg, v_deg, accommodation_dpt, wavelength_nm)
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h, v, used_dpt, nm = (column[first] for column in columns)
+        h, v = (
+            np.clip(angle, *limits)
+            for angle, limits in zip((h, v), self.traced_range_deg, strict=True)
+        )
+        found = self._field.chief_shift_mrad(
+            h_deg=h, v_deg=v, accommodation_dpt=used_dpt, wavelength_nm=nm
+        )
+        return found[number].reshape(*states[0].shape, 2)
+
+    def _distinct(self, states: list[NDArray]) -> tuple[NDArray, ...]:
+        """Coefficients, rims and radii of distinct states, and the number of each."""
+        columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
+        first, number = distinct_rows(*columns)
+        h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
+        self._check_fields(h_deg, v_deg)
+        rest = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": used_dpt}
+        self._check_states(**rest)
+        fields = self._fields(h_deg, v_deg, wavelength_nm, pupil_diameter_mm=pupil_mm)
+        return *fields.wavefronts(**rest), number
+
+    def _fields(
+        self, h_deg, v_deg, wavelength_nm, *, pupil_diameter_mm=None
+    ) -> TracedFields:
+        h_deg, v_deg = (
+            np.clip(angle, *limits)
+            for angle, limits in zip((h_deg, v_deg), self.traced_range_deg, strict=True)
+        )
+        return TracedFields(
+            self._field,
+            self._on_axis,
+            self._correction,
+            h_deg=h_deg,
+            v_deg=v_deg,
+            wavelength_nm=wavelength_nm,
+            pupil_diameter_mm=pupil_diameter_mm,
+        )
+
+    def _check_fields(self, h_deg, v_deg) -> None:
+        check_limits("h_deg", h_deg, *self.field_range_deg[0])
+        check_limits("v_deg", v_deg, *self.field_range_deg[1])
+
+    def _check_states(self, *, pupil_diameter_mm, accommodation_dpt) -> None:
+        largest_mm = self.max_pupil_diameter_mm
+        check_limits("pupil_diameter_mm", pupil_diameter_mm, 0.1, largest_mm)
+        low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]]
+        check_limits("accommodation_dpt", accommodation_dpt, low_dpt, high_dpt)
+
+
+def largest_open_pupil_mm(grid: AberrationGrid) -> float:
+    """Largest pupil of an on-axis grid that is open at all its states.
+
+    Raises
+    ------
+    TraceFailed
+        There is none.
+    """
+    is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
+    if not is_open.any():
+        raise TraceFailed(
+            f"no light passes the eye at {grid.pupil_diameters_mm[0]:g} mm"
+        )
+    return float(grid.pupil_diameters_mm[is_open][-1])
+
+
+def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
+    """Pupils (n,) to trace over the field for a range of them."""
+    large = high_mm > LARGE_PUPIL_MM
+    ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
+    pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
+    return np.unique(pupils_mm)
+
+
+def _trace_field(
+    eye: EstimatedEye,
+    axis: FieldInterpolation,
+    field_range_deg: FieldRange,
+    make_grid: Callable[..., AberrationGrid],
+    **axes,
+) -> tuple[FieldInterpolation, FieldRange]:
+    """Trace a range of fields, drawn in towards the axis until light passes it all."""
+    limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
+    share = 1.0
+    while share > SMALLEST_SHARE:
+        (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
+        field = FieldInterpolation(
+            make_grid(
+                eye,
+                h_deg=field_nodes_deg(h_low, h_high),
+                v_deg=field_nodes_deg(v_low, v_high),
+                n_rings=FIELD_RINGS,
+                n_azimuths=FIELD_AZIMUTHS,
+                **axes,
+            )
+        )
+        if field.passes:
+            return field, tuple(map(tuple, traced))
+        share *= SHRINK_RATIO
+    return axis, ON_AXIS_DEG
+
+
+def _share(
+    progress: Callable[[float], None] | None, low: float, high: float
+) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    return lambda done: progress(low + (high - low) * done)
+
+
+def _check_field_range(field_range_deg: FieldRange) -> None:
+    for low, high in field_range_deg:
+        if not -90.0 < low <= high < 90.0:
+            raise ValueError(
+                f"field_range_deg {field_range_deg}: needs -90 < low <= high < 90 twice"
+            )

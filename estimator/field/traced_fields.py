@@ -1,0 +1,121 @@
+"""Wavefronts of a traced eye where only its pupil and its accommodation change.
+
+What depends on field and wavelength alone is interpolated once, see `FieldValues`: a
+stream of frames asks for the same fields again and again.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.interpolation import FieldInterpolation
+from estimator.wavefront.field_wavefronts import (
+    circumscribed_radius_mm,
+    distinct_rows,
+    zernike_from_polynomial,
+)
+
+MARGIN = 1e-3
+"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
+
+
+def check_limits(name: str, values: NDArray, low: float, high: float) -> None:
+    """Refuse values that were not traced.
+
+    Raises
+    ------
+    ValueError
+    """
+    if values.size and not (
+        values.min() >= low - MARGIN and values.max() <= high + MARGIN
+    ):
+        raise ValueError(
+            f"{name} {values.min():g} to {values.max():g}: traced are "
+            f"{low:g} to {high:g}"
+        )
+
+
+class TracedFields:
+    """Wavefronts at the fields and wavelengths of n states.
+
+    Parameters
+    ----------
+    field, on_axis : FieldInterpolation
+        That of the states, and one that holds the axis.
+    correction_um : (28,), um/mm^degree
+        What a worn correction takes off.
+    h_deg, v_deg, wavelength_nm : (n,)
+        Within what was traced.
+    pupil_diameter_mm : (n,), optional
+        Pupils that will be asked for; any at all where it is None.
+    """
+
+    def __init__(
+        self,
+        field: FieldInterpolation,
+        on_axis: FieldInterpolation,
+        correction_um: NDArray[np.float64],
+        *,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+        pupil_diameter_mm: NDArray[np.float64] | None = None,
+    ):
+        self._field, self._on_axis = field, on_axis
+        self._correction_um = correction_um
+        self._open_mm = field.open_pupils_mm(h_deg, v_deg)
+        pupils = {}
+        if pupil_diameter_mm is not None:
+            pupils["pupil_diameter_mm"] = self._usable_mm(pupil_diameter_mm)
+        self._states = field.values(
+            h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm, **pupils
+        )
+        zeros = np.zeros(h_deg.size)
+        self._axis_states = on_axis.values(
+            h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of states."""
+        return self._states.field.size
+
+    def wavefronts(
+        self,
+        *,
+        pupil_diameter_mm: NDArray[np.float64],
+        accommodation_dpt: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients (n, 28), um, rims (n, 5), mm, and radii (n,), mm, of states.
+
+        Parameters
+        ----------
+        pupil_diameter_mm, accommodation_dpt : (n,)
+        """
+        pupil_mm, used_dpt = self._usable_mm(pupil_diameter_mm), accommodation_dpt
+        polynomial_um, rim_mm = self._field.between(
+            self._states, pupil_diameter_mm=pupil_mm, accommodation_dpt=used_dpt
+        )
+        rim_mm = rim_mm * self._rim_scale(pupil_mm, used_dpt)[:, None]
+        radius_mm = circumscribed_radius_mm(rim_mm)
+        zernike_um = zernike_from_polynomial(
+            polynomial_um - self._correction_um, radius_mm
+        )
+        return zernike_um, rim_mm, radius_mm
+
+    def _rim_scale(self, pupil_mm: NDArray, used_dpt: NDArray) -> NDArray[np.float64]:
+        """Pupils (n,) asked for over the traced ones, on axis."""
+        channel = self._axis_states.channel
+        first, number = distinct_rows(channel, pupil_mm, used_dpt)
+        _, rim_mm = self._on_axis.between(
+            self._axis_states.of(first),
+            pupil_diameter_mm=pupil_mm[first],
+            accommodation_dpt=used_dpt[first],
+        )
+        scale = pupil_mm[first] / 2.0 / circumscribed_radius_mm(rim_mm)
+        return scale[number]
+
+    def _usable_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
+        """Pupils (n,), smaller at fields where light passes only a part of them."""
+        if self._open_mm is None:
+            return pupil_mm
+        return np.minimum(pupil_mm, self._open_mm)

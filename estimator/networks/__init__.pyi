@@ -1,0 +1,9 @@
+from .card import Card as Card
+from .card import NetworkUnavailable as NetworkUnavailable
+from .card import OutOfDomain as OutOfDomain
+from .inference import Network as Network
+from .inference import load_network as load_network
+from .inference import network_aberrations as network_aberrations
+from .inference import network_eye as network_eye
+from .inference import network_focus as network_focus
+from .inference import network_zernike as network_zernike

@@ -1,0 +1,218 @@
+"""The trained networks: what they say of an eye, in microseconds instead of a trace.
+
+Each is evaluated by onnxruntime on the processor, loaded when it is first asked, once
+in a process.  Inputs outside of the training ranges are refused, never extrapolated:
+whoever asks falls back to ray tracing.  Trained by `training`, which this knows nothing
+of but the two files of each network, see `networks.card`.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.networks.card import (
+    FIRST_TERM,
+    INPUTS,
+    Card,
+    DamagedWeights,
+    WeightsMissing,
+    missing_text,
+    read_card,
+    weights_path,
+)
+from estimator.optics.zernike import N_TERMS
+from estimator.threads import thread_count
+
+BATCH = 2048
+"""Rows at a time: what lies between the layers then stays in the cache."""
+
+ERRORS_ONLY = 3
+"""onnxruntime's severity from which it logs: it warns of what does not concern us."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """One loaded network; call it with inputs in physical units."""
+
+    card: Card
+    _session: Any
+
+    def __call__(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Give the outputs (P, n_outputs) of inputs (P, n_inputs).
+
+        Raises
+        ------
+        OutOfDomain
+            An input column leaves its training range.
+        """
+        self.card.check(features)
+        features = np.ascontiguousarray(features, dtype=np.float32)
+        found = [
+            self._session.run(None, {"features": features[start : start + BATCH]})[0]
+            for start in range(0, len(features), BATCH)
+        ]
+        return np.concatenate(found).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class PupilAberrations:
+    """Wavefronts with their pupils, as the aberration network gives them.
+
+    ``zernike_um`` (P, 28) on the circumscribed circles ``zernike_radius_mm`` (P,),
+    piston zero; ``rim_mm`` (P, 5) as in `field_wavefronts.rim_from_ellipse`.
+    """
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    rim_mm: NDArray[np.float64]
+
+
+@cache
+def load_network(name: str) -> Network:
+    """Load a network and its card, or return what is loaded.
+
+    Raises
+    ------
+    WeightsMissing
+        Names the file, or the package, that is not there.
+    DamagedWeights
+    """
+    card = read_card(name)
+    path = weights_path(name)
+    if not path.is_file():
+        raise WeightsMissing(missing_text(path))
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise WeightsMissing(
+            "onnxruntime, which evaluates the networks, is missing: sh setup.sh"
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = thread_count()
+    options.inter_op_num_threads = 1
+    options.log_severity_level = ERRORS_ONLY
+    # Waiting threads would take the cores that frames are rendered on.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = onnxruntime.InferenceSession(
+            path, options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # its errors have no common class
+        raise DamagedWeights(
+            f"{path.name} cannot be loaded ({type(error).__name__}): restore it "
+            "from the repository, or make it anew with python -m training.export"
+        ) from error
+    return Network(card, session)
+
+
+def network_eye(
+    zernike_um: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
+) -> NDArray[np.float64]:
+    """Parameters (..., 45) of relaxed eyes that have about these wavefronts.
+
+    Parameters
+    ----------
+    zernike_um : (..., 28)
+        Measured on axis, on the circle of the pupil; piston and tilt are not used.
+    pupil_diameter_mm, wavelength_nm : (...)
+
+    Raises
+    ------
+    OutOfDomain, WeightsMissing, DamagedWeights
+    """
+    zernike_um = np.asarray(zernike_um, dtype=np.float64)
+    features = _features(zernike_um[..., FIRST_TERM:], pupil_diameter_mm, wavelength_nm)
+    return _shaped(load_network("eye"), features)
+
+
+def network_zernike(
+    vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
+) -> NDArray[np.float64]:
+    """Coefficients (..., 28), um, of eyes (..., 45) on axis, by the discriminator.
+
+    What `eye.tracing.zernike_of_vectors` traces; piston zero.
+
+    Raises
+    ------
+    OutOfDomain, WeightsMissing, DamagedWeights
+    """
+    features = _features(vectors, pupil_diameter_mm, wavelength_nm)
+    return _with_piston(_shaped(load_network("discriminator"), features))
+
+
+def network_focus(
+    vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, focus_dpt: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give the changes (...) of lens and chamber, mm, that focus an eye.
+
+    Of the lens diameter, and of the aqueous thickness.
+
+    Parameters
+    ----------
+    vectors : (..., 45)
+        Relaxed eyes.
+    pupil_diameter_mm : (...)
+        Pupil at which the eye is then in focus.
+    focus_dpt : (...)
+        Distance, without a worn correction.
+
+    Raises
+    ------
+    OutOfDomain, WeightsMissing, DamagedWeights
+    """
+    features = _features(vectors, pupil_diameter_mm, focus_dpt)
+    changes_mm = _shaped(load_network("focus"), features)
+    return changes_mm[..., 0], changes_mm[..., 1]
+
+
+def network_aberrations(
+    vectors: ArrayLike,
+    *,
+    pupil_diameter_mm: ArrayLike,
+    wavelength_nm: ArrayLike,
+    h_deg: ArrayLike = 0.0,
+    v_deg: ArrayLike = 0.0,
+) -> PupilAberrations:
+    """Aberrations of focused eyes (..., 45) over the field, object at infinity.
+
+    What `aberrations.wavefront_grid` traces; all arguments broadcast, and the leading
+    axes of the result are theirs.
+
+    Raises
+    ------
+    OutOfDomain, WeightsMissing, DamagedWeights
+    """
+    features = _features(vectors, pupil_diameter_mm, wavelength_nm, h_deg, v_deg)
+    found = _shaped(load_network("aberration"), features)
+    n_zernike = N_TERMS - 1
+    return PupilAberrations(
+        zernike_um=_with_piston(found[..., :n_zernike]),
+        zernike_radius_mm=found[..., n_zernike],
+        rim_mm=found[..., n_zernike + 1 :],
+    )
+
+
+def _features(first: ArrayLike, *columns: ArrayLike) -> NDArray[np.float64]:
+    """Join (..., n) and columns that broadcast with it to (..., n + n_columns)."""
+    first = np.asarray(first, dtype=np.float64)
+    columns = [np.asarray(column, dtype=np.float64) for column in columns]
+    shape = np.broadcast_shapes(first.shape[:-1], *(c.shape for c in columns))
+    n = first.shape[-1]
+    features = np.empty((*shape, n + len(columns)))
+    features[..., :n] = first
+    for i, column in enumerate(columns):
+        features[..., n + i] = column
+    return features
+
+
+def _shaped(network: Network, features: NDArray) -> NDArray[np.float64]:
+    n_inputs = len(INPUTS[network.card.network])
+    found = network(features.reshape(-1, n_inputs))
+    return found.reshape(*features.shape[:-1], found.shape[-1])
+
+
+def _with_piston(zernike_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([np.zeros((*zernike_um.shape[:-1], 1)), zernike_um], axis=-1)

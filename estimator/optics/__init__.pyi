@@ -1,0 +1,16 @@
+from .media import refractive_index as refractive_index
+from .paraxial import entrance_pupil_mm as entrance_pupil_mm
+from .prescription import Prescription as Prescription
+from .prescription import power_vector as power_vector
+from .prescription import power_vector_from_zernike as power_vector_from_zernike
+from .prescription import zernike_from_power_vector as zernike_from_power_vector
+from .raytrace import RayStatus as RayStatus
+from .raytrace import trace_rays as trace_rays
+from .surfaces import EyeSurfaces as EyeSurfaces
+from .surfaces import Retina as Retina
+from .surfaces import Surface as Surface
+from .zernike import index_from_nm as index_from_nm
+from .zernike import nm_from_index as nm_from_index
+from .zernike import rescale_pupil as rescale_pupil
+from .zernike import zernike_gradient as zernike_gradient
+from .zernike import zernike_values as zernike_values

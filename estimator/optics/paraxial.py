@@ -1,0 +1,165 @@
+"""First-order optics of an eye about its axis: power, cardinal points, entrance pupil.
+
+Mean curvatures are used where a surface is astigmatic; conic constants, tilts and
+decentrations do not matter at first order, and corneal offsets enter by their mean
+curvature and height at the vertex.  Lengths are mm from the corneal apex, powers dpt.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.optics.surfaces import (
+    CURVATURE_X,
+    CURVATURE_Y,
+    FORM,
+    N_BEFORE_STOP,
+    OFFSET,
+    VERTEX,
+    WITH_OFFSET,
+    EyeSurfaces,
+    check_eye,
+    horner_order,
+    media_indices,
+    pack_eye,
+)
+from estimator.optics.units import MM_PER_M
+from estimator.optics.zernike import EXPONENTS
+
+
+@dataclass(frozen=True)
+class CardinalPoints:
+    """First-order description of an eye.
+
+    Attributes
+    ----------
+    power_dpt, cornea_power_dpt, lens_power_dpt : float
+        Whole eye; the surfaces before and behind the stop, each in its own media.
+    object_focal_length_mm, image_focal_length_mm : float
+        From the principal points; the first is negative.
+    object_focus_mm, image_focus_mm, object_principal_mm, image_principal_mm,
+    object_nodal_mm, image_nodal_mm : float
+        Positions on the axis.
+    entrance_pupil_mm : float
+        Position of the stop's image in the air.
+    entrance_pupil_ratio : float
+        Entrance pupil over stop.
+    refraction_dpt : float
+        Refraction at the cornea: vergence there of the far point; negative: myopic.
+    """
+
+    power_dpt: float
+    cornea_power_dpt: float
+    lens_power_dpt: float
+    object_focal_length_mm: float
+    image_focal_length_mm: float
+    object_focus_mm: float
+    image_focus_mm: float
+    object_principal_mm: float
+    image_principal_mm: float
+    object_nodal_mm: float
+    image_nodal_mm: float
+    entrance_pupil_mm: float
+    entrance_pupil_ratio: float
+    refraction_dpt: float
+
+
+def _offset_part(packed: NDArray, *exponents: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum of some monomial coefficients of the offsets, zero where there are none."""
+    order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
+    total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
+    return np.where(packed[:, FORM] == WITH_OFFSET, total, 0.0)
+
+
+def _mean_curvatures(packed: NDArray) -> NDArray[np.float64]:
+    curvature = 0.5 * (packed[:, CURVATURE_X] + packed[:, CURVATURE_Y])
+    return curvature + _offset_part(packed, (2, 0), (0, 2))
+
+
+def _vertices_mm(packed: NDArray) -> NDArray[np.float64]:
+    """Where the surfaces cross the axis; an offset may shift its surface there."""
+    return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
+
+
+def system_matrix(
+    packed: NDArray, indices: NDArray, *, first: int, last: int
+) -> NDArray[np.float64]:
+    """Matrix (2, 2) on (height, index times slope) over surfaces first to last - 1."""
+    curvature, z_mm = _mean_curvatures(packed), _vertices_mm(packed)
+    matrix = np.eye(2)
+    for i in range(first, last):
+        if i > first:
+            gap = (z_mm[i] - z_mm[i - 1]) / indices[i]
+            matrix = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix
+        power = (indices[i + 1] - indices[i]) * curvature[i]
+        matrix = np.array([[1.0, 0.0], [-power, 1.0]]) @ matrix
+    return matrix
+
+
+def _entrance_pupil(
+    packed: NDArray, indices: NDArray, stop_z_mm: float
+) -> tuple[float, float]:
+    """Position and magnification of the image of the stop in the air."""
+    n_before = int(packed[-1, N_BEFORE_STOP])
+    matrix = system_matrix(packed, indices, first=0, last=n_before)
+    z_mm = _vertices_mm(packed)
+    gap = (stop_z_mm - z_mm[n_before - 1]) / indices[n_before]
+    to_stop = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix
+    # Object plane at z: height at the stop must not depend on the slope there.
+    back_mm = -indices[0] * to_stop[0, 1] / to_stop[0, 0]
+    return float(z_mm[0] - back_mm), float(1.0 / to_stop[0, 0])
+
+
+def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints:
+    """Cardinal points of an eye at one wavelength.
+
+    Raises
+    ------
+    ValueError
+        An eye that cannot be traced, or a wavelength out of range.
+    """
+    check_eye(eye)
+    packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
+    n_surfaces = len(eye.surfaces)
+    n_before = int(packed[-1, N_BEFORE_STOP])
+    whole = system_matrix(packed, indices, first=0, last=n_surfaces)
+    cornea = system_matrix(packed, indices, first=0, last=n_before)
+    lens = system_matrix(packed, indices, first=n_before, last=n_surfaces)
+    (a, b), (c, d) = whole
+    n_air, n_last = indices[0], indices[n_surfaces]
+    z_mm = _vertices_mm(packed)
+    front_mm, back_mm, retina_mm = z_mm[0], z_mm[n_surfaces - 1], z_mm[-1]
+    object_focus, image_focus = front_mm + n_air * d / c, back_mm - n_last * a / c
+    object_focal, image_focal = n_air / c, -n_last / c
+    pupil_mm, ratio = _entrance_pupil(packed, indices, eye.stop_z_mm)
+    # Rays that the whole eye brings to the retina's pole: slope over height in the air.
+    reach = (retina_mm - back_mm) / n_last
+    refraction = MM_PER_M * (a + c * reach) / (b + d * reach)
+    return CardinalPoints(
+        power_dpt=float(-c * MM_PER_M),
+        cornea_power_dpt=float(-cornea[1, 0] * MM_PER_M),
+        lens_power_dpt=float(-lens[1, 0] * MM_PER_M),
+        object_focal_length_mm=float(object_focal),
+        image_focal_length_mm=float(image_focal),
+        object_focus_mm=float(object_focus),
+        image_focus_mm=float(image_focus),
+        object_principal_mm=float(object_focus - object_focal),
+        image_principal_mm=float(image_focus - image_focal),
+        object_nodal_mm=float(object_focus + image_focal),
+        image_nodal_mm=float(image_focus + object_focal),
+        entrance_pupil_mm=pupil_mm,
+        entrance_pupil_ratio=ratio,
+        refraction_dpt=float(refraction),
+    )
+
+
+def entrance_pupil_mm(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
+    """Position on the axis of the stop's image in the air."""
+    packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
+    return _entrance_pupil(packed, indices, eye.stop_z_mm)[0]
+
+
+def refraction_dpt(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
+    """Paraxial refraction at the cornea, dpt: negative where the eye is myopic."""
+    return cardinal_points(eye, wavelength_nm=wavelength_nm).refraction_dpt

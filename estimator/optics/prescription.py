@@ -1,0 +1,87 @@
+"""Spectacle prescriptions and power vectors to and from Zernike coefficients."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.optics.units import ASTIGMATISM_PER_C22, MM_PER_M, SPHERE_PER_C20
+from estimator.optics.zernike import N_TERMS, index_from_nm
+
+C20 = index_from_nm(2, 0)
+C22 = index_from_nm(2, 2)
+C2M2 = index_from_nm(2, -2)
+
+
+@dataclass(frozen=True)
+class Prescription:
+    """Sphere and cylinder at the spectacle plane, axis in the examiner's frame.
+
+    ``vertex_mm`` is the distance from lens to cornea; 0 means powers are already
+    those at the cornea (as a contact lens, or the paper's conditions).
+    """
+
+    sphere_dpt: float
+    cylinder_dpt: float = 0.0
+    axis_deg: float = 0.0
+    vertex_mm: float = 0.0
+
+
+def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
+    """Move a thin lens power to the cornea: F / (1 - d F)."""
+    return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
+
+
+def power_vector(prescription: Prescription) -> tuple[float, float, float]:
+    """M, J0 and J45 in dpt at the cornea, in the eye frame (x to the person's right).
+
+    The examiner sees the eye mirrored, so the axis A becomes 180 - A (DESIGN 3),
+    which changes the sign of J45 alone.  Thibos, Wheeler & Horner 1997.
+    """
+    vertex_mm = prescription.vertex_mm
+    sphere = power_at_cornea_dpt(prescription.sphere_dpt, vertex_mm=vertex_mm)
+    other = prescription.sphere_dpt + prescription.cylinder_dpt
+    cylinder = power_at_cornea_dpt(other, vertex_mm=vertex_mm) - sphere
+    axis_rad = math.radians(180.0 - prescription.axis_deg)
+    j0 = -0.5 * cylinder * math.cos(2.0 * axis_rad)
+    j45 = -0.5 * cylinder * math.sin(2.0 * axis_rad)
+    return sphere + 0.5 * cylinder, j0, j45
+
+
+def zernike_from_power_vector(
+    m_dpt: float, j0_dpt: float, j45_dpt: float, *, zernike_radius_mm: float
+) -> NDArray[np.float64]:
+    """Coefficients (28,), um, of a sphero-cylindrical refraction on a circle."""
+    zernike_um = np.zeros(N_TERMS)
+    area = zernike_radius_mm**2
+    zernike_um[C20] = -m_dpt * area / SPHERE_PER_C20
+    zernike_um[C22] = -j0_dpt * area / ASTIGMATISM_PER_C22
+    zernike_um[C2M2] = -j45_dpt * area / ASTIGMATISM_PER_C22
+    return zernike_um
+
+
+def power_vector_from_zernike(
+    zernike_um: NDArray[np.float64], *, zernike_radius_mm: float
+) -> tuple[float, float, float]:
+    """Least-squares M, J0, J45 in dpt: from the second-order coefficients alone."""
+    area = zernike_radius_mm**2
+    return (
+        float(-SPHERE_PER_C20 * zernike_um[C20] / area),
+        float(-ASTIGMATISM_PER_C22 * zernike_um[C22] / area),
+        float(-ASTIGMATISM_PER_C22 * zernike_um[C2M2] / area),
+    )
+
+
+def prescription_from_power_vector(
+    m_dpt: float, j0_dpt: float, j45_dpt: float
+) -> Prescription:
+    """Minus-cylinder prescription at the cornea, axis in the examiner's frame."""
+    cylinder_dpt = -2.0 * math.hypot(j0_dpt, j45_dpt)
+    axis_deg = 180.0 - math.degrees(math.atan2(j45_dpt, j0_dpt)) / 2.0
+    axis_deg = axis_deg % 180.0
+    return Prescription(
+        sphere_dpt=m_dpt - cylinder_dpt / 2.0,
+        cylinder_dpt=cylinder_dpt,
+        axis_deg=axis_deg if axis_deg > 0.0 else 180.0,
+    )

@@ -1,0 +1,115 @@
+"""Exact ray tracing through an eye, in both directions, with a status per ray."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics import raytrace_kernels as kernels
+from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
+
+
+class RayStatus(IntEnum):
+    """How a ray fared; data, never an exception."""
+
+    TRACED = kernels.TRACED
+    MISSED = kernels.MISSED
+    CLIPPED = kernels.CLIPPED
+    TOTAL_REFLECTION = kernels.TOTAL_REFLECTION
+    OUT_OF_ORDER = kernels.OUT_OF_ORDER
+    NOT_CONVERGED = kernels.NOT_CONVERGED
+
+
+STATUS_WORDS = {
+    RayStatus.TRACED: "traced",
+    RayStatus.MISSED: "missed a surface",
+    RayStatus.CLIPPED: "outside a clear radius",
+    RayStatus.TOTAL_REFLECTION: "total reflection",
+    RayStatus.OUT_OF_ORDER: "surfaces cross there",
+    RayStatus.NOT_CONVERGED: "not converged",
+}
+
+
+@dataclass(frozen=True)
+class TracedRays:
+    """Rays through an eye; element e counts inwards, the stop and the retina included.
+
+    Attributes
+    ----------
+    points_mm : (n_rays, n_elements, 3)
+        Where each ray met each element; nan from the first failure on.
+    direction_ratio : (n_rays, n_elements, 3)
+        Direction cosines behind the element, as the ray travels.
+    path_mm : (n_rays, n_elements)
+        Optical path from the start.
+    status_index : (n_rays,) int
+        `RayStatus`.
+    stop_index : int
+        Which element the stop is.
+    """
+
+    points_mm: NDArray[np.float64]
+    direction_ratio: NDArray[np.float64]
+    path_mm: NDArray[np.float64]
+    status_index: NDArray[np.int64]
+    stop_index: int
+
+
+def trace_rays(
+    eye: EyeSurfaces,
+    *,
+    start_mm: ArrayLike,
+    direction: ArrayLike,
+    wavelength_nm: float,
+    reverse: bool = False,
+) -> TracedRays:
+    """Trace rays from the air to the retina, or from the retina to the air.
+
+    Parameters
+    ----------
+    eye : EyeSurfaces
+    start_mm : (n_rays, 3) or (3,)
+        Before the eye; with ``reverse``, on the retina.
+    direction : (n_rays, 3) or (3,)
+        Need not be normalised; z positive forwards, negative in reverse.
+    wavelength_nm : float
+    reverse : bool
+
+    Returns
+    -------
+    TracedRays
+        With ``reverse`` the path counts from the retina; the order of elements stays.
+
+    Raises
+    ------
+    ValueError
+        An eye that cannot be traced, directions along no z, or a wavelength outside
+        the range of the media.
+    """
+    check_eye(eye)
+    start_mm, direction = np.broadcast_arrays(
+        np.atleast_2d(np.asarray(start_mm, dtype=np.float64)),
+        np.atleast_2d(np.asarray(direction, dtype=np.float64)),
+    )
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    along = -direction[:, 2] if reverse else direction[:, 2]
+    if not (np.all(np.isfinite(start_mm)) and np.all(along > 0.0)):
+        wanted = "negative" if reverse else "positive"
+        raise ValueError(f"ray directions must have a {wanted} z, starts be finite")
+    packed = pack_eye(eye)
+    shape = (len(start_mm), len(packed) + 1)
+    points_mm, cosines = np.empty((*shape, 3)), np.empty((*shape, 3))
+    path_mm, status = np.empty(shape), np.empty(len(start_mm), np.int64)
+    kernels.trace_bundle(
+        packed,
+        media_indices(eye, wavelength_nm),
+        np.concatenate([start_mm, direction / length], axis=1),
+        reverse,
+        points_mm,
+        cosines,
+        path_mm,
+        status,
+    )
+    stop_index = int(packed[-1, kernels.N_BEFORE_STOP])
+    return TracedRays(points_mm, cosines, path_mm, status, stop_index)

@@ -1,0 +1,6 @@
+from .files import load_profile as load_profile
+from .measured_wavefront import MeasuredWavefront as MeasuredWavefront
+from .parse import EyeProfile as EyeProfile
+from .parse import Measurement as Measurement
+from .parse import parse_profile as parse_profile
+from .parse import preset_names as preset_names

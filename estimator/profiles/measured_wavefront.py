@@ -1,0 +1,269 @@
+"""A profile used as the measured wavefront: the light option, with no eye model.
+
+Pupil, object, focus and wavelength act on the measurement by closed formulas
+(DESIGN 4): coefficients rescale downwards, defocus shifts by vergence,
+accommodation and chromatic difference.  It knows one field, and takes it for all.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.eye.focusing import FocusingEye
+from estimator.optics import prescription as rx
+from estimator.optics.chromatic import chromatic_refraction_dpt
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.optics.zernike import remove_central_tilt, rescale_pupil
+from estimator.profiles.parse import EyeProfile
+from estimator.wavefront.field_wavefronts import (
+    N_RIM,
+    FieldWavefronts,
+    polynomial_in_mm,
+    total_defocus_dpt,
+    with_defocus,
+    zernike_from_polynomial,
+)
+
+DEFAULT_AMPLITUDE_DPT = 10.0
+"""Amplitude of accommodation of an eye whose age is not given."""
+
+
+def accommodation_amplitude_dpt(
+    *, age_years: float | None, add_dpt: float = 0.0
+) -> float:
+    """Largest accommodation in dpt.
+
+    By age: objective amplitude 7.33 - 0.0035 (age - 3)² (Anderson et al. 2008), zero
+    from 49 years on.  A near addition says that half the amplitude and the addition
+    make up the 2.5 dpt of a reading distance.  The smaller of the two holds.
+    """
+    amplitude_dpt = DEFAULT_AMPLITUDE_DPT
+    if age_years is not None:
+        amplitude_dpt = max(0.0, 7.33 - 0.0035 * (age_years - 3.0) ** 2)
+    if add_dpt > 0.0:
+        amplitude_dpt = min(amplitude_dpt, max(0.0, 2.0 * (2.5 - add_dpt)))
+    return amplitude_dpt
+
+
+@dataclass(frozen=True)
+class WavefrontState:
+    """Wavefront of the eye at one pupil, object, focus and wavelength.
+
+    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm``; ``notes`` say what
+    could not be met as asked.
+    """
+
+    zernike_um: NDArray[np.float64]
+    pupil_diameter_mm: float
+    notes: tuple[str, ...]
+
+
+class MeasuredWavefront(FocusingEye):
+    """Wavefront-only eye: measured coefficients plus defocus by formula.
+
+    Its M is from C(2,0) on the measured pupil.
+    """
+
+    pupil_limit = "measured"
+
+    def __init__(self, profile: EyeProfile):
+        radius_mm = profile.pupil_diameter_mm / 2.0
+        zernike_um = remove_central_tilt(profile.zernike_um)
+        if profile.correction is not None:
+            zernike_um = zernike_um - rx.zernike_from_power_vector(
+                *rx.power_vector(profile.correction), zernike_radius_mm=radius_mm
+            )
+        self.zernike_um = zernike_um
+        self.zernike_radius_mm = radius_mm
+        self.wavelength_nm = profile.wavelength_nm
+        self.max_pupil_diameter_mm = profile.max_pupil_diameter_mm
+        self.amplitude_dpt = accommodation_amplitude_dpt(
+            age_years=profile.age_years, add_dpt=profile.add_dpt
+        )
+        self.refraction_dpt = self.refraction_at_dpt(REFERENCE_WAVELENGTH_NM)
+
+    @classmethod
+    def from_profile(cls, profile: EyeProfile) -> "MeasuredWavefront":
+        """Build from a parsed profile."""
+        return cls(profile)
+
+    def refraction_at_dpt(self, wavelength_nm: float) -> float:
+        """M(lambda) = M(lambda_0) + Rx(lambda) - Rx(lambda_0), dpt."""
+        m_dpt, _, _ = rx.power_vector_from_zernike(
+            self.zernike_um, zernike_radius_mm=self.zernike_radius_mm
+        )
+        return m_dpt + self.chromatic_shift_dpt(wavelength_nm)
+
+    def chromatic_shift_dpt(self, wavelength_nm: float) -> float:
+        """Refraction at this wavelength less that at the measured one, dpt."""
+        return float(
+            chromatic_refraction_dpt(wavelength_nm)
+            - chromatic_refraction_dpt(self.wavelength_nm)
+        )
+
+    def zernike_with_defocus(
+        self, *, pupil_diameter_mm: float, added_defocus_dpt: float
+    ) -> NDArray[np.float64]:
+        """Coefficients (28,), um, on a pupil with vergence added to the relaxed eye.
+
+        ``added_defocus_dpt`` is object vergence minus accommodation plus chromatic
+        shift; C(2,0) changes by -added r²/(4 sqrt 3), everything else is the
+        measurement rescaled.
+        """
+        radius_mm = pupil_diameter_mm / 2.0
+        zernike_um = rescale_pupil(
+            self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
+        )
+        zernike_um[rx.C20] -= added_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
+        zernike_um[0] = 0.0  # rescaling makes piston, which no image shows
+        return zernike_um
+
+    # ----- what the PSF cache asks of any eye (also estimator/field/traced_eye.py)
+
+    def accommodation_nodes_dpt(
+        self, focus_range_dpt: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """Accommodations whose shape of the wavefront differs: here a single one."""
+        return np.zeros(1)
+
+    def total_defocus_dpt(
+        self,
+        *,
+        h_deg: ArrayLike = 0.0,
+        v_deg: ArrayLike = 0.0,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction, dpt, on the pupil itself; object at infinity.
+
+        All arguments broadcast, and the result has their shape.
+        """
+        _, _, pupil_mm, used_dpt, wavelength_nm = np.broadcast_arrays(
+            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
+        )
+        radius_mm = self._radius_mm(pupil_mm)
+        shift_dpt = chromatic_refraction_dpt(wavelength_nm) - chromatic_refraction_dpt(
+            self.wavelength_nm
+        )
+        relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
+        return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+
+    def defocus_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[..., NDArray[np.float64]]:
+        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+
+        Returns
+        -------
+        callable
+            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
+            arguments' broadcast shape.
+        """
+        shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
+        return partial(self._defocus_dpt, wavelength_nm, shape)
+
+    def _defocus_dpt(
+        self, wavelength_nm: ArrayLike, shape: tuple, **state: float
+    ) -> NDArray[np.float64]:
+        found_dpt = self.total_defocus_dpt(wavelength_nm=wavelength_nm, **state)
+        return np.broadcast_to(found_dpt, shape)
+
+    def chief_ray_shift_mrad(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Lateral colour (..., 2), mrad: none, a measurement at one colour has none."""
+        states = np.broadcast_shapes(
+            *map(np.shape, (h_deg, v_deg, accommodation_dpt, wavelength_nm))
+        )
+        return np.zeros((*states, 2))
+
+    def wavefronts(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+        total_defocus_dpt: ArrayLike,
+    ) -> FieldWavefronts:
+        """Wavefronts with the given total defocus; P in C order of the broadcast.
+
+        Raises
+        ------
+        ValueError
+            A pupil larger than the measured one.
+        """
+        _, _, pupil_mm, _, _, total_dpt = np.broadcast_arrays(
+            h_deg,
+            v_deg,
+            pupil_diameter_mm,
+            accommodation_dpt,
+            wavelength_nm,
+            total_defocus_dpt,
+        )
+        radius_mm = self._radius_mm(pupil_mm)
+        rim_mm = np.zeros((radius_mm.size, N_RIM))
+        rim_mm[:, 2] = rim_mm[:, 4] = radius_mm
+        return with_defocus(
+            self._on_circles(radius_mm), rim_mm, radius_mm, total_defocus_dpt=total_dpt
+        )
+
+    def _on_circles(self, radius_mm: NDArray) -> NDArray[np.float64]:
+        """Measured coefficients (P, 28) on circles (P,); piston zero."""
+        polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)
+        return zernike_from_polynomial(polynomial_um, radius_mm)
+
+    def _radius_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
+        """Half of pupils, flat; refuses those that are larger than the measured one."""
+        largest_mm = self.max_pupil_diameter_mm
+        if pupil_mm.size and not (
+            pupil_mm.min() > 0.0 and pupil_mm.max() <= largest_mm + 1e-6
+        ):
+            raise ValueError(
+                f"pupil_diameter_mm {pupil_mm.min():g} to {pupil_mm.max():g}: allowed "
+                f"is above 0 to {largest_mm:g}"
+            )
+        return pupil_mm.ravel() / 2.0
+
+    def state(
+        self,
+        *,
+        pupil_diameter_mm: float,
+        object_dpt: float,
+        focus_dpt: float,
+        wavelength_nm: float,
+    ) -> WavefrontState:
+        """Wavefront for one pupil, object distance, focus and wavelength.
+
+        Raises
+        ------
+        ValueError
+            A pupil that is not positive, or values that are not finite.
+        """
+        values = (pupil_diameter_mm, object_dpt, focus_dpt, wavelength_nm)
+        if not all(math.isfinite(v) for v in values) or pupil_diameter_mm <= 0:
+            raise ValueError(f"eye state {values}: needs a positive pupil, all finite")
+        usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
+        added_dpt = (
+            object_dpt
+            - self.accommodation_dpt(focus_dpt)
+            + self.chromatic_shift_dpt(wavelength_nm)
+        )
+        return WavefrontState(
+            zernike_um=self.zernike_with_defocus(
+                pupil_diameter_mm=usable_mm, added_defocus_dpt=added_dpt
+            ),
+            pupil_diameter_mm=usable_mm,
+            notes=self.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt),
+        )

@@ -1,0 +1,359 @@
+"""Eye profiles: what a user or an instrument knows about one eye.
+
+A profile arrives as a JSON object (file or wire), an ``.abp`` file of the paper's
+framework, or a CSV of coefficients, and leaves as an `EyeProfile` in the eye frame
+(x to the person's right, y up).  DESIGN 5.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.eye import checked_fields as fields
+from estimator.eye.checked_fields import ProfileError
+from estimator.eye.parameters import (
+    EyeParameters,
+    RetinaShape,
+    parse_parameters,
+    parse_retina,
+)
+from estimator.optics import prescription as rx
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import (
+    MAX_RADIAL_ORDER,
+    N_TERMS,
+    flip_horizontal,
+    index_from_nm,
+)
+
+__all__ = [
+    "EyeProfile",
+    "Measurement",
+    "ProfileError",
+    "parse_profile",
+    "preset_names",
+]
+
+COMMON_FIELDS = ("kind", "eye_side", "age_years", "correction", "name", "retina")
+PRESCRIPTION_FIELDS = (
+    "sphere_dpt",
+    "cylinder_dpt",
+    "axis_deg",
+    "vertex_mm",
+    "add_dpt",
+)
+ZERNIKE_FIELDS = ("frame", "pupil_diameter_mm", "wavelength_nm", "zernike_um")
+SET_FIELDS = ("frame", "measurements")
+MEASURED_FIELD_LIMIT_DEG = 50.0
+"""Instruments measure to 40 deg or so; beyond this a field is a slip."""
+
+MAX_MEASUREMENTS = 100
+KINDS = ("prescription", "zernike", "zernike_set", "eye", "preset")
+MAX_COEFFICIENT_UM = 200.0
+
+PRESCRIPTION_RADIUS_MM = 3.0
+"""Circle on which a prescription is written down; it is exact on every other."""
+
+
+EYE_PUPIL_MM = 6.0
+"""Entrance pupil at which the wavefront of a given eye is written down."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One wavefront in the eye frame, with the field it was taken at.
+
+    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm`` about the chief ray.
+    ``h_deg`` and ``v_deg`` point to the source as the person sees it, whatever frame
+    the coefficients came in.
+    """
+
+    zernike_um: NDArray[np.float64]
+    pupil_diameter_mm: float
+    wavelength_nm: float
+    h_deg: float = 0.0
+    v_deg: float = 0.0
+
+    @property
+    def is_on_axis(self) -> bool:
+        """Return whether the field is the eye's axis."""
+        return self.h_deg == 0.0 and self.v_deg == 0.0
+
+
+@dataclass(frozen=True)
+class EyeProfile:
+    """One eye's measured wavefront in the eye frame, and what limits it.
+
+    Attributes
+    ----------
+    max_pupil_diameter_mm : float
+        Largest pupil the data speak for (infinite for a prescription).
+    correction : Prescription or None
+        Spectacles or lens worn during the simulation.
+    add_dpt : float
+        Near addition; limits the amplitude of accommodation when above zero.
+    measurements : tuple of Measurement
+        All that was measured, the leading one first.  Empty for kind ``eye``.
+    eye : EyeParameters or None
+        The eye itself, for kind ``eye``.
+    retina : RetinaShape or None
+        Instead of the sphere of radius eye length / 2.
+    """
+
+    name: str
+    kind: str
+    eye_side: str
+    pupil_diameter_mm: float
+    wavelength_nm: float
+    max_pupil_diameter_mm: float
+    age_years: float | None = None
+    add_dpt: float = 0.0
+    correction: rx.Prescription | None = None
+    measurements: tuple[Measurement, ...] = ()
+    eye: EyeParameters | None = None
+    retina: RetinaShape | None = None
+
+    @cached_property
+    def zernike_um(self) -> NDArray[np.float64]:
+        """Return the leading wavefront (28,), um; a given eye is traced for it once.
+
+        On the circle of ``pupil_diameter_mm``, at ``wavelength_nm``; accommodation
+        relaxed; a worn correction is *not* yet taken off.
+
+        Raises
+        ------
+        ProfileError
+            Light does not pass the given eye.
+        """
+        if self.eye is None:
+            return self.measurements[0].zernike_um
+        return _traced_zernike_um(self.eye, self.retina)
+
+
+def parse_profile(data: object) -> EyeProfile:
+    """Read one profile object.
+
+    Raises
+    ------
+    ProfileError
+        Names the field, the bad value and what is allowed.
+    """
+    data = fields.mapping(data, "profile")
+    kind = fields.choice(data, "kind", KINDS)
+    if kind == "preset":
+        return _parse_preset(data)
+    if kind == "prescription":
+        return _parse_prescription_profile(data)
+    if kind == "zernike_set":
+        return _parse_zernike_set(data)
+    if kind == "eye":
+        return _parse_eye(data)
+    return _parse_zernike_profile(data)
+
+
+@cache
+def _presets() -> dict:
+    text = (Path(__file__).parent / "presets.json").read_text(encoding="utf-8")
+    return json.loads(text)["presets"]
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names accepted by ``{"kind": "preset", "name": ...}``."""
+    return tuple(_presets())
+
+
+def _parse_preset(data: Mapping) -> EyeProfile:
+    fields.only_known(data, COMMON_FIELDS)
+    name = fields.choice(data, "name", preset_names())
+    merged = {**_presets()[name], **{k: v for k, v in data.items() if k != "kind"}}
+    return _parse_zernike_profile(merged)
+
+
+def _common(data: Mapping) -> dict:
+    age_years = None
+    if "age_years" in data:
+        age_years = fields.number(data, "age_years", 3.0, 120.0)
+    correction = None
+    if data.get("correction") is not None:
+        body = fields.mapping(data["correction"], "correction")
+        fields.only_known(body, PRESCRIPTION_FIELDS[:4], path="correction.")
+        correction = _prescription(body, path="correction.")
+    return {
+        "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
+        "age_years": age_years,
+        "correction": correction,
+        "retina": parse_retina(data),
+    }
+
+
+def _prescription(data: Mapping, *, path: str = "") -> rx.Prescription:
+    if data.get("cylinder_dpt") and "axis_deg" not in data:
+        allowed = "a number from 0 to 180"
+        raise ProfileError(f"{path}axis_deg", "is missing beside a cylinder", allowed)
+    return rx.Prescription(
+        sphere_dpt=fields.number(data, "sphere_dpt", -30.0, 30.0, path=path),
+        cylinder_dpt=fields.number(
+            data, "cylinder_dpt", -15.0, 15.0, default=0.0, path=path
+        ),
+        axis_deg=fields.number(data, "axis_deg", 0.0, 180.0, default=0.0, path=path),
+        vertex_mm=fields.number(data, "vertex_mm", 0.0, 25.0, default=0.0, path=path),
+    )
+
+
+def _parse_prescription_profile(data: Mapping) -> EyeProfile:
+    fields.only_known(data, COMMON_FIELDS + PRESCRIPTION_FIELDS)
+    prescription = _prescription(data)
+    zernike_um = rx.zernike_from_power_vector(
+        *rx.power_vector(prescription), zernike_radius_mm=PRESCRIPTION_RADIUS_MM
+    )
+    return EyeProfile(
+        name=str(data.get("name", "prescription")),
+        kind="prescription",
+        **_primary(
+            Measurement(
+                zernike_um, 2.0 * PRESCRIPTION_RADIUS_MM, REFERENCE_WAVELENGTH_NM
+            )
+        ),
+        max_pupil_diameter_mm=math.inf,
+        add_dpt=fields.number(data, "add_dpt", 0.0, 4.0, default=0.0),
+        **_common(data),
+    )
+
+
+def _primary(first: Measurement, *others: Measurement) -> dict:
+    return {
+        "pupil_diameter_mm": first.pupil_diameter_mm,
+        "wavelength_nm": first.wavelength_nm,
+        "measurements": (first, *others),
+    }
+
+
+def _parse_zernike_profile(data: Mapping) -> EyeProfile:
+    fields.only_known(data, COMMON_FIELDS + ZERNIKE_FIELDS)
+    measurement = _measurement(data)
+    return EyeProfile(
+        name=str(data.get("name", "zernike")),
+        kind="zernike",
+        **_primary(measurement),
+        max_pupil_diameter_mm=measurement.pupil_diameter_mm,
+        **_common(data),
+    )
+
+
+def _measurement(data: Mapping, *, path: str = "") -> Measurement:
+    zernike_um = _coefficients(data, path=path)
+    frame = fields.choice(data, "frame", ("eye", "examiner"), default="eye", path=path)
+    if frame == "examiner":
+        zernike_um = flip_horizontal(zernike_um)
+    limit = MEASURED_FIELD_LIMIT_DEG
+    return Measurement(
+        zernike_um=zernike_um,
+        pupil_diameter_mm=fields.number(data, "pupil_diameter_mm", 1.0, 9.0, path=path),
+        wavelength_nm=fields.number(data, "wavelength_nm", 365.0, 1014.0, path=path),
+        h_deg=fields.number(data, "h_deg", -limit, limit, default=0.0, path=path),
+        v_deg=fields.number(data, "v_deg", -limit, limit, default=0.0, path=path),
+    )
+
+
+def _parse_zernike_set(data: Mapping) -> EyeProfile:
+    """Several measurements of one eye; the widest on-axis one leads."""
+    fields.only_known(data, COMMON_FIELDS + SET_FIELDS)
+    entries = data.get("measurements")
+    allowed = f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_MEASUREMENTS:
+        raise ProfileError("measurements", f"{entries!r:.60} is not one", allowed)
+    measurements = []
+    for number, entry in enumerate(entries):
+        path = f"measurements.{number}."
+        entry = fields.mapping(entry, path.rstrip("."))
+        fields.only_known(entry, ("kind", *ZERNIKE_FIELDS, "h_deg", "v_deg"), path=path)
+        fields.choice(entry, "kind", ("zernike",), default="zernike", path=path)
+        common = {"frame": data["frame"]} if "frame" in data else {}
+        measurements.append(_measurement({**common, **entry}, path=path))
+    on_axis = [m for m in measurements if m.is_on_axis]
+    if not on_axis:
+        raise ProfileError("measurements", "none is on the axis", allowed)
+    first = max(on_axis, key=lambda m: m.pupil_diameter_mm)
+    others = [m for m in measurements if m is not first]
+    return EyeProfile(
+        name=str(data.get("name", "zernike set")),
+        kind="zernike_set",
+        **_primary(first, *others),
+        max_pupil_diameter_mm=first.pupil_diameter_mm,
+        **_common(data),
+    )
+
+
+def _parse_eye(data: Mapping) -> EyeProfile:
+    fields.only_known(data, (*COMMON_FIELDS, "parameters"))
+    if "parameters" not in data:
+        raise ProfileError("parameters", "is missing", "an object of the 45 by name")
+    eye = parse_parameters(data["parameters"])
+    return EyeProfile(
+        name=str(data.get("name", "eye")),
+        kind="eye",
+        pupil_diameter_mm=EYE_PUPIL_MM,
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        max_pupil_diameter_mm=EYE_PUPIL_MM,
+        eye=eye,
+        **_common(data),
+    )
+
+
+def _traced_zernike_um(
+    eye: EyeParameters, retina: RetinaShape | None
+) -> NDArray[np.float64]:
+    from estimator.eye.tracing import (  # compiled: loads slowly
+        TraceFailed,
+        on_axis_zernike_um,
+    )
+
+    try:
+        return on_axis_zernike_um(
+            eye,
+            retina=retina,
+            pupil_diameter_mm=EYE_PUPIL_MM,
+            wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        )
+    except TraceFailed as error:
+        raise ProfileError(
+            "parameters",
+            str(error),
+            f"an eye that light crosses at a {EYE_PUPIL_MM:g} mm pupil",
+        ) from None
+
+
+def _coefficients(data: Mapping, *, path: str = "") -> NDArray[np.float64]:
+    allowed = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
+    if "zernike_um" not in data:
+        raise ProfileError(path + "zernike_um", "is missing", allowed)
+    entries = fields.mapping(data["zernike_um"], path + "zernike_um")
+    zernike_um = np.zeros(N_TERMS)
+    limit = MAX_COEFFICIENT_UM
+    for key in entries:
+        j = _term_index(key, allowed, path=path)
+        zernike_um[j] = fields.number(
+            entries, key, -limit, limit, path=path + "zernike_um."
+        )
+    return zernike_um
+
+
+def _term_index(key: str, allowed: str, *, path: str) -> int:
+    try:
+        n, m = (int(part) for part in key.split(","))
+    except ValueError:
+        problem = "is not of the form 'n,m'"
+        raise ProfileError(f"{path}zernike_um.{key}", problem, allowed) from None
+    try:
+        j = index_from_nm(n, m)
+    except ValueError as error:
+        raise ProfileError(f"{path}zernike_um.{key}", str(error), allowed) from None
+    if j >= N_TERMS:
+        raise ProfileError(f"{path}zernike_um.{key}", f"radial order {n}", allowed)
+    return j

@@ -1,0 +1,278 @@
+"""PSFs by the extended Nijboer-Zernike (ENZ) series, where it holds.
+
+The method of Csoba & Kunkli 2023 (section 4): the pupil function is expanded in Zernike
+functions with complex coefficients beta, and every Zernike function has a known image
+V.  Defocus is carried outside the expansion, with its sign; tilt shifts the image.  The
+series needs Zernike degrees up to about 2 pi times the waves (peak to valley) of all
+other aberrations, so it is for good eyes and small pupils: outside, it refuses.
+"""
+
+import math
+from concurrent.futures import Executor
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from estimator.optics.zernike import monomial_matrix, zernike_values
+from estimator.psf.enz_series import (
+    hankel_table,
+    radial_nodes,
+    radial_polynomial,
+    zernike_betas,
+)
+from estimator.psf.fourier import FourierAccuracy, pixel_filter, plan_grids
+from estimator.psf.kernel_types import KernelBuffer, finish_kernel
+from estimator.psf.survey import PupilSurvey
+from estimator.psf.tail import add_tail
+
+RELEASED_DEGREE = 30
+"""Zernike degree of the paper's released program: 4.5 waves of non-defocus PV."""
+
+MAX_DEGREE = 120
+MIN_CAPTURED_RATIO = 0.998
+"""Share of the pupil's energy that the expansion must hold: kernels then err by at most
+2 % (L2), at 99 % by up to 6 % (the six presets, fields to 40 deg)."""
+
+DEGREE_PER_WAVE = 2.0 * math.pi
+"""Degree that holds 99 % of the energy per wave of PV: measured 0.9 to 1.4 times it."""
+
+_RADIAL_STEPS = 32
+"""Samples of V per lambda / pupil radius; cubic interpolation errs by 4e-5."""
+
+
+class EnzOutsideDomain(ValueError):
+    """The aberrations need a higher Zernike degree than the series has.
+
+    Attributes
+    ----------
+    index : int
+        Which PSF of the call it is.
+    degree_count, needed_degree_count : int
+    """
+
+    def __init__(self, *, index: int, degree: int, needed: int, captured: float | None):
+        share = "" if captured is None else f" and hold {captured:.1%} of the pupil"
+        super().__init__(
+            f"PSF {index} is outside the domain of the ENZ series: its non-defocus "
+            f"aberrations need Zernike degree {needed}{share}; degree {degree} is in "
+            f"use (at least {MIN_CAPTURED_RATIO:.1%} must be held): use the fourier or "
+            "auto method"
+        )
+        self.index, self.degree_count = index, degree
+        self.needed_degree_count = needed
+
+
+@njit(cache=True, nogil=True)
+def _intensities(qx, qy, step_x, step_y, table, per_r, out):
+    """|U|² on a tensor grid of pixels' samples, by cubic interpolation of the table.
+
+    U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
+    """
+    top = table.shape[1] // 2
+    for j in range(step_y.size):
+        for i in range(step_x.size):
+            ax = qx[0] * step_x[i] + qy[0] * step_y[j]
+            ay = qx[1] * step_x[i] + qy[1] * step_y[j]
+            r = math.sqrt(ax * ax + ay * ay)
+            turn = complex(1.0, 0.0)
+            if r > 1e-12:
+                turn = complex(ax / r, ay / r)
+            place = r * per_r + 1.0
+            k = min(int(place), table.shape[0] - 3)
+            t = place - k
+            w0 = -t * (t - 1.0) * (t - 2.0) / 6.0
+            w1 = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
+            w2 = -(t + 1.0) * t * (t - 2.0) / 2.0
+            w3 = (t + 1.0) * t * (t - 1.0) / 6.0
+            total = complex(0.0, 0.0)
+            phase = complex(1.0, 0.0)
+            for m in range(top + 1):
+                c = top + m
+                plus = w0 * table[k - 1, c] + w1 * table[k, c]
+                plus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
+                total += plus * phase
+                if m > 0:
+                    c = top - m
+                    minus = w0 * table[k - 1, c] + w1 * table[k, c]
+                    minus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
+                    total += minus * phase.conjugate()
+                phase *= turn
+            out[j, i] = total.real * total.real + total.imag * total.imag
+
+
+class _Series:
+    """One PSF's series: expansion, check, and its image on the pixel grid."""
+
+    def __init__(self, survey: PupilSurvey, index: int, degree: int, is_checked: bool):
+        frames = survey.frames
+        self.survey, self.index, self.degree = survey, index, degree
+        self.wavelength_um = float(frames.wavelength_nm[index]) / 1000.0
+        self.half = frames.half_width_um_per_px[index]
+        self.shear = float(frames.shear_ratio[index])
+        zernike_um = np.linalg.solve(
+            monomial_matrix().T, frames.disc_polynomial_um[index]
+        )
+        # W = sqrt(3) C20 (2 rho² - 1) + ...; tilt 2 C rho cos and sin.
+        per_um = 2.0 * math.pi / self.wavelength_um
+        self.defocus_rad = per_um * 2.0 * math.sqrt(3.0) * zernike_um[4]
+        self.shift = 2.0 * zernike_um[[2, 1]] / self.wavelength_um
+        self.residual_um = zernike_um.copy()
+        self.residual_um[[0, 1, 2, 4]] = 0.0
+        self.betas = self._expand(frames, is_checked)
+
+    def _log_amplitude(self, log_amplitude):
+        if not log_amplitude.any():
+            return None
+        room = math.sqrt(1.0 - self.shear**2)
+
+        def at(x, y):
+            y = self.shear * x + room * y
+            powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+            return powers @ log_amplitude
+
+        return at
+
+    def _expand(self, frames, is_checked):
+        rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
+        x, y = rho * np.cos(angle), rho * np.sin(angle)
+        waves = zernike_values(x, y) @ self.residual_um / self.wavelength_um
+        self.needed = math.ceil(DEGREE_PER_WAVE * float(np.ptp(waves)))
+        far = {"index": self.index, "degree": self.degree, "needed": self.needed}
+        if is_checked and self.needed > 1.4 * self.degree:
+            raise EnzOutsideDomain(**far, captured=None)
+        betas = zernike_betas(
+            self.residual_um,
+            wavelength_um=self.wavelength_um,
+            degree=self.degree,
+            log_amplitude=self._log_amplitude(frames.log_amplitude[self.index]),
+        )
+        held = sum(float((np.abs(b) ** 2).sum()) for b in betas.values())
+        held /= float(self.survey.passed_ratio[self.index])
+        if is_checked and held < MIN_CAPTURED_RATIO:
+            far["needed"] = max(self.needed, self.degree + 1)
+            raise EnzOutsideDomain(**far, captured=held)
+        return betas
+
+    def _radial_table(self, reach: float):
+        """2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m on radii -1, 0, 1 ... steps."""
+        rho, weight = radial_nodes(self.degree, abs(self.defocus_rad), reach)
+        weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
+        weighted = np.empty((rho.size, 2 * self.degree + 1), np.complex128)
+        for m in range(-self.degree, self.degree + 1):
+            ring = np.zeros(rho.size, np.complex128)
+            for k, beta in enumerate(self.betas[m]):
+                n = abs(m) + 2 * k
+                ring += beta * math.sqrt(n + 1.0) * radial_polynomial(n, m, rho)
+            weighted[:, m + self.degree] = 2.0 * (-1j) ** abs(m) * weight * ring
+        r = np.arange(math.ceil(reach * _RADIAL_STEPS) + 4) / _RADIAL_STEPS
+        table = np.empty((r.size + 1, weighted.shape[1]), np.complex128)
+        hankel_table(r, rho, weighted, table[1:])
+        # J_m is even or odd in r as m is: the sample before 0 makes it cubic there.
+        signs = (-1.0) ** np.abs(np.arange(-self.degree, self.degree + 1))
+        table[0] = signs * table[2]
+        return table
+
+    def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
+        """(2R+1, 2R+1) shares of the light inside a window, edge light beyond."""
+        survey, p = self.survey, slice(self.index, self.index + 1)
+        plan = plan_grids(
+            extent_px=survey.extent_px[p], unit_px=survey.unit_px[p], accuracy=accuracy
+        )
+        k = np.maximum(
+            plan.samples_per_px_count[0], np.ceil(2.0 / survey.unit_px[self.index])
+        ).astype(int)
+        half_px = plan.length_count[0] / plan.samples_per_px_count[0] / 2.0
+        middle = (survey.slope_low_px + survey.slope_high_px)[self.index] / 2.0
+        low = np.maximum(np.ceil(middle - half_px + 0.5), -radius).astype(int)
+        high = np.minimum(np.floor(middle + half_px - 0.5), radius).astype(int)
+        kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float32)
+        window = np.array([low[0], high[0], low[1], high[1]])
+        if np.all(high >= low):
+            spans = zip((high - low + 1).tolist(), k.tolist(), strict=True)
+            filters = [_filter_matrix(n, c) for n, c in spans]
+            samples = [
+                a + (np.arange(f.shape[1]) - _reach(int(c))) / c
+                for a, f, c in zip(low, filters, k, strict=True)
+            ]
+            pixels = filters[1] @ self._intensity(*samples) @ filters[0].T
+            rows = slice(radius - high[1], radius - low[1] + 1)
+            kernel[rows, radius + low[0] : radius + high[0] + 1] = pixels[::-1]
+        half, shear = self.half, self.shear
+        edge = survey.edge_slope_px[self.index]
+        edge_um = float(survey.edge_light_um[self.index])
+        add_tail(kernel, window, 0.0, edge, half, shear, edge_um)
+        return kernel
+
+    def _intensity(self, x_px, y_px):
+        """Share of the light per sample-pixel area at a grid of image points."""
+        room = math.sqrt(1.0 - self.shear**2)
+        # q = T^T p / lambda, t = T w with T lower triangular.
+        qx = np.array([self.half[0], 0.0]) / self.wavelength_um
+        qy = np.array([self.shear, room]) * self.half[1] / self.wavelength_um
+        # Tilt moves the image: p - T^-T shift.
+        shift_y = self.shift[1] / qy[1]
+        shift_x = (self.shift[0] - qy[0] * shift_y) / qx[0]
+        x, y = x_px - shift_x, y_px - shift_y
+        far = np.abs(x).max() * np.hypot(*qx) + np.abs(y).max() * np.hypot(*qy)
+        out = np.empty((y.size, x.size))
+        _intensities(qx, qy, x, y, self._radial_table(float(far)), _RADIAL_STEPS, out)
+        area = math.pi * self.half[0] * self.half[1] * room
+        passed = float(self.survey.passed_ratio[self.index])
+        return out * area / self.wavelength_um**2 / passed
+
+
+_FILTER_REACH = 8
+
+
+def _reach(samples_per_px: int) -> int:
+    return (samples_per_px + 1) // 2 + _FILTER_REACH
+
+
+def _filter_matrix(n_px: int, samples_per_px: int) -> NDArray[np.float64]:
+    """(pixels, samples): pixel integrals of samples 1/k apart, in shares of a pixel."""
+    weights = pixel_filter(samples_per_px, _FILTER_REACH) / samples_per_px
+    matrix = np.zeros((n_px, (n_px - 1) * samples_per_px + weights.size))
+    for q in range(n_px):
+        start = q * samples_per_px
+        matrix[q, start : start + weights.size] = weights
+    return matrix
+
+
+def enz_kernels(
+    survey: PupilSurvey,
+    members: NDArray[np.int64],
+    *,
+    degree: int,
+    is_checked: bool,
+    accuracy: FourierAccuracy,
+    output: KernelBuffer,
+    pool: Executor,
+) -> None:
+    """Add pixel-integrated PSFs by the ENZ series to a buffer.
+
+    Parameters
+    ----------
+    survey : PupilSurvey
+    members : (M,)
+    degree : int
+        Largest Zernike degree of the expansion.
+    is_checked : bool
+        False leaves out the domain's check: for tables that show where it breaks.
+    accuracy, output, pool
+        As in `fourier.fourier_kernels`.
+
+    Raises
+    ------
+    EnzOutsideDomain
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"enz_degree {degree}: must be 0 to {MAX_DEGREE}")
+
+    def work(p: int) -> None:
+        radius, start = int(output.radius_px[p]), int(output.offset_count[p])
+        kernel = _Series(survey, p, degree, is_checked).kernel(radius, accuracy)
+        part = output.flat_kernels[start : start + kernel.size]
+        output.total_ratio[p] = finish_kernel(kernel, 1.0, part)
+
+    list(pool.map(work, members.tolist()))

@@ -1,0 +1,189 @@
+"""Mathematics of the extended Nijboer-Zernike (ENZ) series: its functions and fit.
+
+V_n^m is the image of a Zernike function through a defocused lens; beta_n^m are a pupil
+function's coefficients.  `enz.py` makes PSFs of them.
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import eval_jacobi
+
+from estimator.optics.zernike import zernike_values
+
+
+def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
+    """Zernike's R_n^|m|, by the recurrence of Jacobi polynomials: stable at any n."""
+    m, rho = abs(m), np.asarray(rho, np.float64)
+    return rho**m * eval_jacobi((n - m) // 2, 0, m, 2.0 * rho**2 - 1.0)
+
+
+_UPWARD_FROM = 50.0
+"""Arguments from which J_0 and J_1 come from Hankel's expansion, to 1e-15."""
+
+
+@njit(cache=True, nogil=True)
+def _hankel_asymptotic(order, x):
+    """J_order(x) for order 0 or 1 and large x."""
+    term, even, odd = 1.0, 1.0, 0.0
+    for k in range(1, 13):
+        term *= (4.0 * order * order - (2.0 * k - 1.0) ** 2) / (8.0 * k * x)
+        if k % 2 == 0:
+            even += -term if k % 4 == 2 else term
+        else:
+            odd += term if k % 4 == 1 else -term
+    phase = x - (0.5 * order + 0.25) * math.pi
+    return math.sqrt(2.0 / (math.pi * x)) * (
+        even * math.cos(phase) - odd * math.sin(phase)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _bessel_orders(x, count, out):
+    """J_0 .. J_(count-1) at x >= 0, by whichever recurrence is stable.
+
+    Upward below the argument; Miller's downward one elsewhere.
+    """
+    out[:count] = 0.0
+    if x > max(_UPWARD_FROM, count + 1.0):
+        below, here = _hankel_asymptotic(0, x), _hankel_asymptotic(1, x)
+        for order in range(count):
+            out[order] = below
+            below, here = here, 2.0 * (order + 1.0) / x * here - below
+        return
+    if x < 1e-12:
+        out[0] = 1.0
+        return
+    start = 2 * ((int(max(float(count), x)) + 30 + int(6.0 * x ** (1.0 / 3.0))) // 2)
+    above, here, norm = 0.0, 1e-300, 0.0
+    for order in range(start, 0, -1):
+        below = 2.0 * order / x * here - above
+        above, here = here, below
+        if order - 1 < count:
+            out[order - 1] = here
+        if (order - 1) % 2 == 0:
+            norm += here if order == 1 else 2.0 * here
+        if abs(here) > 1e200:
+            here, above, norm = here * 1e-200, above * 1e-200, norm * 1e-200
+            for k in range(order - 1, count):
+                out[k] *= 1e-200
+    for k in range(count):
+        out[k] /= norm
+
+
+@njit(cache=True, nogil=True)
+def hankel_table(r, rho, weighted, out):
+    """Sum over nodes: out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
+
+    ``weighted`` is (nodes, 2 M + 1) for m = -M .. M.
+    """
+    top = weighted.shape[1] // 2
+    bessel = np.empty(top + 1)
+    for q in range(r.size):
+        out[q] = 0.0
+        for g in range(rho.size):
+            _bessel_orders(2.0 * math.pi * r[q] * rho[g], top + 1, bessel)
+            for m in range(-top, top + 1):
+                out[q, m + top] += weighted[g, m + top] * bessel[abs(m)]
+
+
+def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
+    """V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.
+
+    Parameters
+    ----------
+    r : (k,)
+        Image radius in lambda / pupil radius (lambda / NA); 0 is no special case.
+    defocus_rad : float
+        f, signed; 0 is no special case: (-1)^((n-|m|)/2) J_(n+1)(2 pi r) / (2 pi r).
+
+    Returns
+    -------
+    V : (k,) complex128
+
+    Notes
+    -----
+    Gauss-Legendre quadrature.  The Bessel-Bessel series of Braat et al. 2008 is the
+    same integral with exp(i f rho²) expanded by Bauer's formula; it needs f/2 + 15
+    terms, a table of weights, and limits of its own at r = 0 and f = 0.
+    """
+    r = np.atleast_1d(np.asarray(r, np.float64))
+    rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
+    weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
+    weighted[:, -1] = (
+        weight * rho * np.exp(1j * defocus_rad * rho**2) * radial_polynomial(n, m, rho)
+    )
+    out = np.empty((r.size, weighted.shape[1]), np.complex128)
+    hankel_table(r, rho, weighted, out)
+    return out[:, -1]
+
+
+def radial_nodes(degree: int, defocus_rad: float, r: float):
+    """Gauss-Legendre nodes on 0..1 for degree, defocus and image radius together."""
+    swing = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
+    count = math.ceil(swing / 2.0 + 3.0 * swing ** (1.0 / 3.0)) + 8
+    # Rounded up: few sets of nodes then serve all PSFs.
+    node, weight = _legendre(32 * math.ceil(count / 32))
+    return (node + 1.0) / 2.0, weight / 2.0
+
+
+@lru_cache(maxsize=64)
+def _legendre(count: int):
+    return np.polynomial.legendre.leggauss(count)
+
+
+@lru_cache(maxsize=8)
+def _basis(degree: int, n_nodes: int):
+    """Nodes and every sqrt(n+1) R_n^m on them: {m: (n, nodes)} for m = 0 .. degree."""
+    node, weight = _legendre(n_nodes)
+    rho, weight = (node + 1.0) / 2.0, weight / 2.0
+    radial = {
+        m: np.array(
+            [
+                math.sqrt(n + 1.0) * radial_polynomial(n, m, rho)
+                for n in range(m, degree + 1, 2)
+            ]
+        )
+        for m in range(degree + 1)
+    }
+    return rho, weight, radial
+
+
+def zernike_betas(
+    zernike_um: NDArray[np.float64],
+    *,
+    wavelength_um: float,
+    degree: int,
+    log_amplitude=None,
+) -> dict[int, NDArray[np.complex128]]:
+    """Coefficients beta_n^m of the pupil function, {m: values for n = |m|, |m|+2 ...}.
+
+    Parameters
+    ----------
+    zernike_um : (28,)
+        On the unit disc; every term acts.
+    degree : int
+        Largest n.
+    log_amplitude : callable, optional
+        Logarithm of the apodisation at unit-disc points (x, y).
+
+    Notes
+    -----
+    Projection by Gauss-Legendre times trapezoid, converged for any wavefront that the
+    degree can hold.  The sum of |beta|² is the share of the energy that is held.
+    """
+    n_nodes, n_angles = 2 * degree + 40, 4 * degree + 64
+    rho, weight, radial = _basis(degree, n_nodes)
+    angle = 2.0 * math.pi * np.arange(n_angles) / n_angles
+    x, y = rho[:, None] * np.cos(angle), rho[:, None] * np.sin(angle)
+    field = np.exp(2j * math.pi / wavelength_um * (zernike_values(x, y) @ zernike_um))
+    if log_amplitude is not None:
+        field = field * np.exp(log_amplitude(x, y))
+    harmonics = np.fft.fft(field, axis=1) / n_angles
+    return {
+        m: 2.0 * (radial[abs(m)] * (weight * rho)) @ harmonics[:, m]
+        for m in range(-degree, degree + 1)
+    }

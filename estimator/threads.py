@@ -1,0 +1,60 @@
+"""How many threads this process should use."""
+
+from __future__ import annotations
+
+import math
+import os
+from functools import cache
+from pathlib import Path
+
+THREADS_VARIABLE = "OCUFILTER_THREADS"
+MAX_THREADS = 256
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+@cache
+def thread_count() -> int:
+    """Return the cores this process may run on, capped by a container's quota.
+
+    The environment variable ``OCUFILTER_THREADS`` says another number.
+
+    Raises
+    ------
+    ValueError
+        The variable holds no number from 1 to 256.
+    """
+    wanted = os.environ.get(THREADS_VARIABLE, "")
+    if wanted:
+        if not wanted.isdigit() or not 1 <= int(wanted) <= MAX_THREADS:
+            raise ValueError(
+                f"{THREADS_VARIABLE} is {wanted!r}; allowed: 1 to {MAX_THREADS}"
+            )
+        return int(wanted)
+    return max(1, min(_core_count(), _quota_cores(_CGROUP)))
+
+
+def _core_count() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _quota_cores(folder: Path) -> int:
+    """Return the cores that a control group pays for, rounded up; many without one.
+
+    Version 2 has ``cpu.max``: quota and period in microseconds, or ``max``; version 1
+    two files, and -1 for no quota.
+    """
+    try:
+        quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()[:2]
+    except (OSError, ValueError):
+        try:
+            old = folder / "cpu"
+            quota = (old / "cpu.cfs_quota_us").read_text(encoding="utf-8").strip()
+            period = (old / "cpu.cfs_period_us").read_text(encoding="utf-8").strip()
+        except OSError:
+            return MAX_THREADS
+    if not (quota.isdigit() and period.isdigit() and int(period) > 0):
+        return MAX_THREADS
+    return max(1, math.ceil(int(quota) / int(period)))

@@ -1,0 +1,404 @@
+"""Zernike aberrations of a traced eye: Algorithm 1 of Csoba & Kunkli 2023, exactly.
+
+Rays run from the retinal point of the chief ray out of the eye.  They are aimed at the
+stop by Broyden's method from a warm start, where the paper contracts a grid: the same
+rays at a few traces each.  W at a point of the plane through the cornea, normal to the
+chief ray, is the chief ray's optical path less that point's; its slope is the ray's.
+Pupil coordinates are true ones on the circle circumscribed about the chief ray; nothing
+is stretched, and the projected pupil's ellipse is given beside them.
+"""
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics.arrays import broadcast_copy
+from estimator.optics.paraxial import entrance_pupil_mm
+from estimator.optics.raytrace import STATUS_WORDS, RayStatus
+from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import N_TERMS
+from estimator.threads import thread_count
+from estimator.wavefront import bundle
+from estimator.wavefront.circle import circle_zernike
+from estimator.wavefront.fit import N_ELLIPSE
+from estimator.wavefront.kernels import magnification
+from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS, circle_nodes, stop_nodes
+
+FITS = ("opd", "slope")
+TRACED_FIELD_LIMIT_DEG = 75.0
+
+
+@dataclass(frozen=True)
+class PupilEllipse:
+    """Least-squares ellipse of the projected pupil's rim, chief ray at the origin.
+
+    ``major_axis_deg`` counts from +x towards +y, 0 to 180.
+    """
+
+    centre_x_mm: float
+    centre_y_mm: float
+    semi_major_mm: float
+    semi_minor_mm: float
+    major_axis_deg: float
+
+    @property
+    def axis_ratio(self) -> float:
+        """Minor over major semi-axis."""
+        return self.semi_minor_mm / self.semi_major_mm
+
+
+@dataclass(frozen=True)
+class FieldResults:
+    """Results of many evaluations, as arrays with common leading axes.
+
+    Attributes
+    ----------
+    zernike_um : (..., 28)
+        OSA coefficients, piston zero; nan where the chief ray fails.
+    zernike_radius_mm : (...)
+        Largest distance of the pupil's rim from the chief ray.
+    ellipse_mm : (..., 5)
+        Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad).
+    rms_residual_um : (...)
+        Of W against the fit.
+    open_ratio : (...)
+        Share of the stop's area that light passes; below 1 the pupil is vignetted.
+    chief_status_index, worst_status_index : (...) int
+        `RayStatus` of the chief ray, and the worst of all rays.
+    retinal_point_mm : (..., 3)
+        Where the chief ray meets the retina.
+    pupil_point_mm : (..., 3)
+        Where it meets the cornea: origin of the pupil plane.
+    """
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    ellipse_mm: NDArray[np.float64]
+    rms_residual_um: NDArray[np.float64]
+    open_ratio: NDArray[np.float64]
+    chief_status_index: NDArray[np.int64]
+    worst_status_index: NDArray[np.int64]
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    @classmethod
+    def from_rows(cls, rows: NDArray) -> "FieldResults":
+        """Take apart the rows (..., N_RESULT) that the compiled code wrote."""
+        ellipse, retina, plane = bundle.ELLIPSE, bundle.RETINA_POINT, bundle.PLANE_POINT
+        return cls(
+            zernike_um=rows[..., :N_TERMS],
+            zernike_radius_mm=rows[..., bundle.RADIUS],
+            ellipse_mm=rows[..., ellipse : ellipse + N_ELLIPSE],
+            rms_residual_um=rows[..., bundle.RMS],
+            open_ratio=rows[..., bundle.OPEN_SHARE],
+            chief_status_index=rows[..., bundle.CHIEF_STATUS].astype(np.int64),
+            worst_status_index=rows[..., bundle.WORST_STATUS].astype(np.int64),
+            retinal_point_mm=rows[..., retina : retina + 3],
+            pupil_point_mm=rows[..., plane : plane + 3],
+        )
+
+
+@dataclass(frozen=True)
+class Aberrations:
+    """Aberrations of one eye, field, wavelength and stop; arrays as in FieldResults."""
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: float
+    pupil_ellipse: PupilEllipse
+    rms_residual_um: float
+    stop_diameter_mm: float
+    open_ratio: float
+    chief_status: RayStatus
+    worst_status: RayStatus
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say in words what did not go through; empty for a whole pupil."""
+        if self.chief_status != RayStatus.TRACED:
+            return (f"no chief ray: {STATUS_WORDS[self.chief_status]}",)
+        if self.worst_status != RayStatus.TRACED:
+            reason = STATUS_WORDS[self.worst_status]
+            return (f"vignetted to {self.open_ratio:.1%} of the stop ({reason})",)
+        return ()
+
+
+def pupil_magnification(eye: EyeSurfaces) -> float:
+    """Entrance pupil over stop, at 555 nm, about the axial chief ray (parabasal).
+
+    Where the cornea is astigmatic it is the root of the product of both meridians'.
+    nan where no axial ray passes the middle of the stop.
+    """
+    return float(
+        magnification(pack_eye(eye), media_indices(eye, REFERENCE_WAVELENGTH_NM))
+    )
+
+
+def _stop_diameters_mm(
+    eye: EyeSurfaces, stop_mm: ArrayLike | None, pupil_mm: ArrayLike | None
+) -> NDArray[np.float64]:
+    if (stop_mm is None) == (pupil_mm is None):
+        raise ValueError("give either a stop diameter or an (entrance) pupil diameter")
+    given = np.atleast_1d(np.asarray(pupil_mm if stop_mm is None else stop_mm, float))
+    if not np.all((given > 0.0) & (given <= 12.0)):
+        raise ValueError(f"stop or pupil {given} mm: allowed is above 0 to 12 mm")
+    if stop_mm is not None:
+        return given
+    ratio = pupil_magnification(eye)
+    if not ratio > 0.0:
+        raise ValueError(
+            "no light along the axis reaches the middle of the stop, so the entrance "
+            "pupil is unknown: give a stop diameter"
+        )
+    return given / ratio
+
+
+def _check_view(fields_deg: NDArray, object_dpt: float, fit: str) -> None:
+    if fit not in FITS:
+        raise ValueError(f"fit '{fit}': allowed are {', '.join(FITS)}")
+    if not np.all(np.abs(fields_deg) <= TRACED_FIELD_LIMIT_DEG):
+        raise ValueError(
+            f"field {fields_deg.tolist()} deg: "
+            f"allowed is up to {TRACED_FIELD_LIMIT_DEG:g}"
+        )
+    if not abs(object_dpt) <= 50.0:
+        raise ValueError(f"object_dpt {object_dpt}: allowed is -50 to 50")
+
+
+def _in_threads(n: int, n_threads: int | None, work: Callable[[slice], None]) -> None:
+    """Share ``n`` items among threads; the compiled work releases the lock."""
+    n_threads = max(1, min(n_threads or thread_count(), n))
+    bounds = np.linspace(0, n, n_threads + 1).astype(int)
+    parts = [slice(a, b) for a, b in pairwise(bounds)]
+    if n_threads == 1:
+        work(parts[0])
+        return
+    with ThreadPoolExecutor(n_threads) as pool:
+        for done in [pool.submit(work, part) for part in parts]:
+            done.result()
+
+
+def wavefront_grid(
+    eye: EyeSurfaces,
+    *,
+    fields_deg: ArrayLike,
+    wavelengths_nm: ArrayLike,
+    stop_diameters_mm: ArrayLike | None = None,
+    pupil_diameters_mm: ArrayLike | None = None,
+    object_dpt: float = 0.0,
+    fit: str = "opd",
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
+    n_threads: int | None = None,
+) -> FieldResults:
+    """Aberrations over fields, wavelengths and pupils, each traced exactly.
+
+    Parameters
+    ----------
+    eye : EyeSurfaces
+    fields_deg : (n_fields, 2)
+        Azimuth h and elevation v of the source.
+    wavelengths_nm : (n_wavelengths,)
+    stop_diameters_mm or pupil_diameters_mm : (n_stops,)
+        The iris, or the entrance pupil at 555 nm; give one.
+    object_dpt : float
+        Vergence of the source, from the entrance pupil along the chief ray; the
+        wavefront is taken against its spherical wave on the pupil plane.
+    fit : {"opd", "slope"}
+        Least squares of W, or of its slopes (Algorithm 1).
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront.nodes`.
+    n_threads : int, optional
+        As many as the machine gives us where it is None.
+
+    Returns
+    -------
+    FieldResults
+        Leading axes (n_fields, n_wavelengths, n_stops).
+
+    Raises
+    ------
+    ValueError
+        Values out of range, an eye that cannot be traced, or an entrance pupil asked
+        of an eye that has none.
+    """
+    check_eye(eye)
+    fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
+    _check_view(fields_deg, object_dpt, fit)
+    stops_mm = _stop_diameters_mm(eye, stop_diameters_mm, pupil_diameters_mm)
+    packed, nodes = pack_eye(eye), stop_nodes(n_rings, n_azimuths)
+    indices = media_indices(eye, np.atleast_1d(wavelengths_nm))
+    pupil_z = entrance_pupil_mm(eye, wavelength_nm=REFERENCE_WAVELENGTH_NM)
+    shape = (len(fields_deg), len(indices), len(stops_mm), bundle.N_RESULT)
+    rows, fields_rad = np.empty(shape), np.radians(fields_deg)
+    viewed = (float(object_dpt), pupil_z, fit == "slope")
+
+    def work(part: slice) -> None:
+        bundle.analyse_fields(
+            packed,
+            indices,
+            fields_rad[part],
+            stops_mm / 2.0,
+            viewed,
+            nodes,
+            rows[part],
+        )
+
+    _in_threads(len(fields_deg), n_threads, work)
+    return FieldResults.from_rows(rows)
+
+
+def wavefront_aberrations(
+    eye: EyeSurfaces,
+    *,
+    wavelength_nm: float,
+    stop_diameter_mm: float | None = None,
+    pupil_diameter_mm: float | None = None,
+    h_deg: float = 0.0,
+    v_deg: float = 0.0,
+    object_dpt: float = 0.0,
+    fit: str = "opd",
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
+) -> Aberrations:
+    """Aberrations of one field, wavelength and pupil; see `wavefront_grid`."""
+    stops_mm = _stop_diameters_mm(eye, stop_diameter_mm, pupil_diameter_mm)
+    found = wavefront_grid(
+        eye,
+        fields_deg=[[h_deg, v_deg]],
+        wavelengths_nm=[wavelength_nm],
+        stop_diameters_mm=stops_mm,
+        object_dpt=object_dpt,
+        fit=fit,
+        n_rings=n_rings,
+        n_azimuths=n_azimuths,
+        n_threads=1,
+    )
+    one = (0, 0, 0)
+    *lengths_mm, axis_rad = (float(value) for value in found.ellipse_mm[one])
+    return Aberrations(
+        zernike_um=found.zernike_um[one],
+        zernike_radius_mm=float(found.zernike_radius_mm[one]),
+        pupil_ellipse=PupilEllipse(*lengths_mm, math.degrees(axis_rad)),
+        rms_residual_um=float(found.rms_residual_um[one]),
+        stop_diameter_mm=float(stops_mm[0]),
+        open_ratio=float(found.open_ratio[one]),
+        chief_status=RayStatus(int(found.chief_status_index[one])),
+        worst_status=RayStatus(int(found.worst_status_index[one])),
+        retinal_point_mm=found.retinal_point_mm[one],
+        pupil_point_mm=found.pupil_point_mm[one],
+    )
+
+
+def eyes_aberrations(
+    packed: NDArray[np.float64],
+    indices: NDArray[np.float64],
+    *,
+    stop_diameters_mm: ArrayLike,
+    h_deg: ArrayLike = 0.0,
+    v_deg: ArrayLike = 0.0,
+    fit: str = "opd",
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
+    n_threads: int | None = None,
+) -> FieldResults:
+    """Aberrations of many eyes, each at one field; leading axis (n_eyes,).
+
+    Parameters
+    ----------
+    packed : (n_eyes, n_surfaces + 1, 48)
+        Stacked `surfaces.pack_eye`.
+    indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
+        From `surfaces.media_indices`, at the wavelength of the wavefront.
+    stop_diameters_mm, h_deg, v_deg : scalar or (n_eyes,)
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront.nodes`.
+    """
+    packed = np.ascontiguousarray(packed, dtype=np.float64)
+    n_eyes, n_rows = packed.shape[:2]
+    indices = broadcast_copy(indices, (n_eyes, n_rows))
+    stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
+    fields_deg = np.empty((n_eyes, 2))
+    fields_deg[:, 0], fields_deg[:, 1] = h_deg, v_deg
+    _check_view(fields_deg, 0.0, fit)
+    rows, stop_radii = np.empty((n_eyes, bundle.N_RESULT)), stops_mm / 2.0
+    fields_rad = np.radians(fields_deg)
+    viewed, nodes = (0.0, 0.0, fit == "slope"), stop_nodes(n_rings, n_azimuths)
+
+    def work(part: slice) -> None:
+        bundle.analyse_eyes(
+            packed[part],
+            indices[part],
+            fields_rad[part],
+            stop_radii[part],
+            viewed,
+            nodes,
+            rows[part],
+        )
+
+    _in_threads(n_eyes, n_threads, work)
+    return FieldResults.from_rows(rows)
+
+
+def on_axis_zernike(
+    packed: NDArray[np.float64],
+    indices: NDArray[np.float64],
+    *,
+    zernike_radius_mm: ArrayLike,
+    h_deg: float = 0.0,
+    v_deg: float = 0.0,
+    n_threads: int | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Coefficients of many eyes on given circles outside the eye.
+
+    The circle is filled, whatever the stop; for measurements, whose circle is half
+    the pupil diameter they were taken at.
+
+    Parameters
+    ----------
+    packed : (n_eyes, n_surfaces + 1, 48)
+        Stacked `surfaces.pack_eye`.
+    indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
+        From `surfaces.media_indices`, at the wavelength of the measurement.
+    zernike_radius_mm : scalar or (n_eyes,)
+    h_deg, v_deg : float
+        Field; off axis a real pupil fills its circle only in part.
+    n_threads : int, optional
+        As many as the machine gives us where it is None.
+
+    Returns
+    -------
+    zernike_um : (n_eyes, 28)
+        Piston zero.  nan where the chief ray or most of the circle fails.
+    status_index : (n_eyes,) int
+        Worst `RayStatus`; rays that fail are left out of the fit.
+    """
+    packed = np.ascontiguousarray(packed, dtype=np.float64)
+    n_eyes, n_rows = packed.shape[:2]
+    indices = broadcast_copy(indices, (n_eyes, n_rows))
+    zernike_um, status = np.empty((n_eyes, N_TERMS)), np.empty(n_eyes, np.int64)
+    field_rad = (math.radians(h_deg), math.radians(v_deg))
+    radii_mm = np.empty(n_eyes)
+    radii_mm[:] = zernike_radius_mm
+    nodes = circle_nodes()
+
+    def work(part: slice) -> None:
+        circle_zernike(
+            packed[part],
+            indices[part],
+            field_rad,
+            radii_mm[part],
+            nodes,
+            zernike_um[part],
+            status[part],
+        )
+
+    _in_threads(n_eyes, n_threads, work)
+    return zernike_um, status

@@ -1,0 +1,303 @@
+"""Compiled: the bundle that fills the stop of one field, and everything read from it.
+
+Rays are aimed at the nodes of a quadrature over the stop: Gauss-Radau rings in the
+squared radius (the last one on the rim), equal azimuths.  It integrates polynomials of
+degree 4 n_rings - 4 (below n_azimuths) exactly, so the fit converges exponentially.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED
+from estimator.optics.zernike import N_TERMS
+from estimator.wavefront.fit import N_ELLIPSE, fit_ellipse, fit_zernike, rim_radius
+from estimator.wavefront.kernels import (
+    N_SAMPLE,
+    SLOPE_X,
+    SLOPE_Y,
+    UM_PER_MM,
+    W,
+    X,
+    Y,
+    across,
+    aim,
+    back_to_stop,
+    chief_ray,
+    leave_eye,
+    stop_response,
+)
+
+_AIM_TOLERANCE_MM = 1e-7  # only moves a sample
+_RIM_TOLERANCE_MM = 1e-9  # is the error of the radius
+_EDGE_HALVINGS = 40
+_EDGE_MARGIN = 1e-6  # times the stop: more than the aim's tolerance
+_FEWEST_SPOKES = 6
+
+# --- columns of one result ---
+ZERNIKE = 0
+RADIUS = N_TERMS
+ELLIPSE = RADIUS + 1
+RMS = ELLIPSE + N_ELLIPSE
+OPEN_SHARE = RMS + 1  # of the stop's area that light passes
+CHIEF_STATUS = OPEN_SHARE + 1
+WORST_STATUS = CHIEF_STATUS + 1
+RETINA_POINT = WORST_STATUS + 1
+PLANE_POINT = RETINA_POINT + 3
+N_RESULT = PLANE_POINT + 3
+
+
+# Several arguments that always go together travel as one tuple, ``light``:
+# (packed, indices, chief (2, 3): retinal point and plane's point, frame (2, 3) across
+# the chief ray in the eye and the ray itself, axes (3, 3) outside, chief path in mm).
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, sag):
+    """Chief ray of a field, in and out again; (status, its optical path in mm)."""
+    ray, start = np.empty(RAY_SIZE), np.empty(2)
+    status = chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag)
+    if status != TRACED:
+        return status, math.nan
+    chief[0] = ray[:3]
+    chief[1] = ray[:3]
+    frame[2] = -ray[3:6]
+    across(frame[2], frame)
+    status = back_to_stop(packed, indices, chief, frame, 0.0, 0.0, ray, sag)
+    if status != TRACED:
+        return status, math.nan
+    sample = np.empty(N_SAMPLE)
+    status = leave_eye(packed, indices, chief, axes, 0.0, ray, sample, sag)
+    if status != TRACED:
+        return status, math.nan
+    chief[1] = ray[:3]
+    path_mm = ray[6]
+    status = stop_response(packed, indices, chief, frame, ray, response, sag)
+    return status, path_mm
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def extrapolate(radii, solution, ring, out):
+    """Extrapolate the directions of inner rings (and the chief ray) to this one."""
+    first = max(0, ring - 3)
+    out[:] = 0.0
+    for i in range(first, ring):
+        share = 1.0
+        for k in range(first, ring):
+            if k != i:
+                share *= (radii[ring] - radii[k]) / (radii[i] - radii[k])
+        out[0] += share * solution[i, 0]
+        out[1] += share * solution[i, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shoot(light, x, y, tolerance, guess, inverse, ray, sample, sag):
+    """One ray through (x, y) of the stop and out; its status."""
+    packed, indices, chief, frame, axes, path = light
+    status = aim(
+        packed, indices, chief, frame, x, y, tolerance, guess, inverse, ray, sag
+    )
+    if status != TRACED:
+        return status
+    return leave_eye(packed, indices, chief, axes, path, ray, sample, sag)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
+    """Rings 1.. of one azimuth, outwards; (rings done, status of the next).
+
+    ``radii`` (n_rings + 1,) start at 0, the chief ray; ``out`` (n_rings, N_SAMPLE).
+    """
+    inverse, guess, ray = response.copy(), np.empty(2), np.empty(RAY_SIZE)
+    solution[0] = 0.0
+    for ring in range(1, radii.shape[0]):
+        x, y = radii[ring] * azimuth[0], radii[ring] * azimuth[1]
+        if ring == 1:
+            guess[0] = inverse[0, 0] * x + inverse[0, 1] * y
+            guess[1] = inverse[1, 0] * x + inverse[1, 1] * y
+        else:
+            extrapolate(radii, solution, ring, guess)
+        is_rim = ring == radii.shape[0] - 1
+        tolerance = _RIM_TOLERANCE_MM if is_rim else _AIM_TOLERANCE_MM
+        status = _shoot(light, x, y, tolerance, guess, inverse, ray, out[ring - 1], sag)
+        if status != TRACED:
+            return ring - 1, status
+        solution[ring] = guess
+    return radii.shape[0] - 1, TRACED
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _open_radius(light, low, high, azimuth, inner, response, sag):
+    """Bisect the largest stop radius on this azimuth that light still passes.
+
+    ``inner`` (2,) are the direction cosines of the ray through radius ``low``.
+    """
+    ray, sample, guess = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
+    inverse, known = np.empty((2, 2)), inner.copy()
+    for _ in range(_EDGE_HALVINGS):
+        radius = 0.5 * (low + high)
+        inverse[:] = response
+        guess[:] = known
+        if low > 0.0:
+            guess *= radius / low
+        x, y = radius * azimuth[0], radius * azimuth[1]
+        status = _shoot(
+            light, x, y, _AIM_TOLERANCE_MM, guess, inverse, ray, sample, sag
+        )
+        if status == TRACED:
+            low = radius
+            known[:] = guess
+        else:
+            high = radius
+    return low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, sag):
+    """Fill ``samples`` (n_azimuths, n_rings, N_SAMPLE) with one field's wavefront.
+
+    Where light does not pass the whole radius of an azimuth, its rings are drawn
+    together on the open part; ``edge`` (n_azimuths,) is the open share of the radius.
+    Returns the worst status.
+    """
+    n_rings, worst = rings.shape[0], TRACED
+    radii, solution = np.zeros(n_rings + 1), np.zeros((n_rings + 1, 2))
+    for k in range(azimuths.shape[0]):
+        edge[k] = 1.0
+        for attempt in range(2):
+            radii[1:] = stop_radius * edge[k] * rings
+            done, status = _walk_spoke(
+                light, radii, azimuths[k], response, solution, samples[k], sag
+            )
+            if status == TRACED:
+                break
+            worst = max(worst, status)
+            if attempt == 1:
+                edge[k] = 0.0
+                break
+            low = _open_radius(
+                light,
+                radii[done],
+                radii[done + 1],
+                azimuths[k],
+                solution[done],
+                response,
+                sag,
+            )
+            edge[k] = low / stop_radius * (1.0 - _EDGE_MARGIN)
+    return worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refer_to_object(samples, distance_mm):
+    """Take the spherical wave of a point ``distance_mm`` before the plane off W."""
+    for i in range(samples.shape[0]):
+        squared = samples[i, X] ** 2 + samples[i, Y] ** 2
+        root = math.sqrt(1.0 + squared / (distance_mm * distance_mm))
+        samples[i, W] -= UM_PER_MM * squared / (distance_mm * (1.0 + root))
+        slope = UM_PER_MM / (distance_mm * root)
+        samples[i, SLOPE_X] -= slope * samples[i, X]
+        samples[i, SLOPE_Y] -= slope * samples[i, Y]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
+    """Coefficients, radius, ellipse and residual of one filled stop."""
+    n_azimuths, n_rings = samples.shape[0], samples.shape[1]
+    weights = np.zeros((n_azimuths, n_rings))
+    rim = np.empty((2, n_azimuths))
+    n_rim, share = 0, 0.0
+    for k in range(n_azimuths):
+        area = edge[k] * edge[k] / n_azimuths
+        share += area
+        if edge[k] > 0.0:
+            weights[k] = area * ring_weights
+            rim[0, n_rim], rim[1, n_rim] = samples[k, -1, X], samples[k, -1, Y]
+            n_rim += 1
+        else:
+            samples[k] = 0.0
+    result[OPEN_SHARE] = share
+    if n_rim < _FEWEST_SPOKES:
+        return
+    rim = rim[:, :n_rim]
+    radius = rim_radius(rim[0], rim[1], edge.min() == 1.0)
+    result[RADIUS] = radius
+    fit_ellipse(rim[0], rim[1], radius, result[ELLIPSE : ELLIPSE + N_ELLIPSE])
+    flat = samples.reshape(n_azimuths * n_rings, N_SAMPLE)
+    if distance_mm < math.inf:
+        _refer_to_object(flat, distance_mm)
+    result[RMS] = fit_zernike(
+        flat, weights.ravel(), radius, use_slopes, result[ZERNIKE : ZERNIKE + N_TERMS]
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results):
+    """Everything asked of one field and wavelength: a row of results per stop.
+
+    Parameters
+    ----------
+    field_rad : (h, v)
+    stop_radii : (n_stops,) mm
+    viewed : (object_dpt, entrance pupil z in mm, use_slopes)
+    nodes : (rings (n_rings,), their weights, azimuths (n_azimuths, 2))
+    results : (n_stops, N_RESULT) out
+    """
+    object_dpt, pupil_z, use_slopes = viewed
+    rings, ring_weights, azimuths = nodes
+    chief, frame, axes = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
+    response, sag = np.empty((2, 2)), np.empty(3)
+    results[:] = math.nan
+    results[:, OPEN_SHARE] = 0.0
+    status, path = prepare_chief(
+        packed, indices, field_rad[0], field_rad[1], chief, frame, axes, response, sag
+    )
+    results[:, CHIEF_STATUS] = status
+    results[:, WORST_STATUS] = status
+    if status != TRACED:
+        return
+    distance_mm = math.inf
+    if object_dpt != 0.0:
+        along = 0.0
+        for i in range(3):
+            along += (chief[1, i] - (pupil_z if i == 2 else 0.0)) * axes[2, i]
+        distance_mm = UM_PER_MM / object_dpt - along
+    samples = np.empty((azimuths.shape[0], rings.shape[0], N_SAMPLE))
+    edge = np.empty(azimuths.shape[0])
+    light = (packed, indices, chief, frame, axes, path)
+    for s in range(stop_radii.shape[0]):
+        result = results[s]
+        result[WORST_STATUS] = sample_pupil(
+            light, response, stop_radii[s], rings, azimuths, samples, edge, sag
+        )
+        result[RETINA_POINT : RETINA_POINT + 3] = chief[0]
+        result[PLANE_POINT : PLANE_POINT + 3] = chief[1]
+        _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+    """`analyse_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
+
+    ``results`` is (F, L, n_stops, N_RESULT).
+    """
+    for f in range(fields_rad.shape[0]):
+        field_rad = (fields_rad[f, 0], fields_rad[f, 1])
+        for w in range(indices.shape[0]):
+            analyse_field(
+                packed, indices[w], field_rad, stop_radii, viewed, nodes, results[f, w]
+            )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def analyse_eyes(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+    """`analyse_field` over eyes, each with a field and a stop of its own.
+
+    ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
+    (E, 2), ``stop_radii`` (E,), ``results`` (E, N_RESULT).
+    """
+    for e in range(packed.shape[0]):
+        field_rad = (fields_rad[e, 0], fields_rad[e, 1])
+        stop, result = stop_radii[e : e + 1], results[e : e + 1]
+        analyse_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)

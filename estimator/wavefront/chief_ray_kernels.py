@@ -1,0 +1,70 @@
+"""Compiled: chief rays of several wavelengths, and where each is seen."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED
+from estimator.wavefront.kernels import (
+    N_SAMPLE,
+    SLOPE_X,
+    SLOPE_Y,
+    UM_PER_MM,
+    across,
+    aim,
+    chief_ray,
+    leave_eye,
+    stop_response,
+)
+
+_TOLERANCE_MM = 1e-10
+"""Of the aim at the middle of the stop: 1e-8 mrad of the shift."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
+    """Shifts (F, L, 2) as direction cosines.
+
+    ``indices`` (L, n_surfaces + 1) are those of the wavelengths, ``reference``
+    (n_surfaces + 1,) of the one that images are seen by.
+    """
+    chief, frame, axes = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
+    ray, sample, start = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
+    inverse, guess, sag = np.empty((2, 2)), np.empty(2), np.empty(3)
+    shifts[:] = math.nan
+    for f in range(fields_rad.shape[0]):
+        h_rad, v_rad = fields_rad[f, 0], fields_rad[f, 1]
+        for w in range(indices.shape[0]):
+            status = chief_ray(packed, indices[w], h_rad, v_rad, axes, start, ray, sag)
+            if status != TRACED:
+                continue
+            chief[0] = ray[:3]
+            chief[1] = 0.0  # any plane outside does: only the slope is read
+            frame[2] = -ray[3:6]
+            across(frame[2], frame)
+            status = stop_response(packed, reference, chief, frame, ray, inverse, sag)
+            if status != TRACED:
+                continue
+            guess[:] = 0.0
+            status = aim(
+                packed,
+                reference,
+                chief,
+                frame,
+                0.0,
+                0.0,
+                _TOLERANCE_MM,
+                guess,
+                inverse,
+                ray,
+                sag,
+            )
+            if status == TRACED:
+                status = leave_eye(
+                    packed, reference, chief, axes, 0.0, ray, sample, sag
+                )
+            if status == TRACED:
+                # A sample holds the slope of the wave, against the ray's way out.
+                shifts[f, w, 0] = -sample[SLOPE_X] / UM_PER_MM
+                shifts[f, w, 1] = -sample[SLOPE_Y] / UM_PER_MM

@@ -1,0 +1,174 @@
+"""Wavefronts over the visual field, in the form that the PSF engines take.
+
+Between their nodes wavefronts are polynomials in mm of the pupil plane: those do not
+depend on which circle they were fitted on.  A pupil's rim is a centre and a symmetric
+matrix, which turn smoothly where the axes of an ellipse jump.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics import prescription as rx
+from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.zernike import EXPONENTS, monomial_matrix, wavefront_polynomial
+
+DEGREE = EXPONENTS.sum(axis=1)
+"""(28,): degree of each monomial."""
+
+TILT_Y, TILT_X = 1, 2
+"""Index of C(1,-1) and C(1,1)."""
+
+N_RIM = 5
+"""Columns of a rim: centre x, y and the matrix' xx, xy, yy, mm."""
+
+_ANGLES = 2.0 * np.pi * np.arange(16) / 16
+_NEWTON_STEPS = 4
+
+
+@dataclass(frozen=True)
+class FieldWavefronts:
+    """P wavefronts with their pupils, as `psf.compute.compute_psf_batch` takes them.
+
+    Attributes
+    ----------
+    zernike_um : (P, 28), um
+        OSA coefficients on the circle, tilt kept, piston zero.
+    circle_diameter_mm : (P,)
+        Circle about the chief ray, circumscribed about the pupil.
+    pupil_ellipse : (P, 5)
+        Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad).
+    """
+
+    zernike_um: NDArray[np.float64]
+    circle_diameter_mm: NDArray[np.float64]
+    pupil_ellipse: NDArray[np.float64]
+
+
+def rim_from_ellipse(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Centre and symmetric matrix (..., 5) of ellipses (..., 5), mm."""
+    x, y, major, minor, angle = np.moveaxis(ellipse_mm, -1, 0)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    xx = major * cosine**2 + minor * sine**2
+    yy = major * sine**2 + minor * cosine**2
+    return np.stack([x, y, xx, (major - minor) * cosine * sine, yy], axis=-1)
+
+
+def ellipse_from_rim(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ellipses (..., 5): centre x, y, semi-major, semi-minor, angle in [0, pi)."""
+    x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)
+    mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) % np.pi
+    return np.stack([x, y, mean + half, mean - half, angle], axis=-1)
+
+
+def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radius (...) of the circle about the chief ray that a rim just fits into."""
+    x, y, xx, xy, yy = np.moveaxis(rim_mm[..., None], -2, 0)
+
+    def rim_point(cosine, sine):
+        return x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
+
+    def half_square(angle):
+        """Half the squared distance of a rim point."""
+        px, py = rim_point(np.cos(angle), np.sin(angle))
+        return 0.5 * (px * px + py * py)
+
+    def derivatives(angle):
+        """Return the first two of that."""
+        cosine, sine = np.cos(angle), np.sin(angle)
+        px, py = rim_point(cosine, sine)
+        tx, ty = xy * cosine - xx * sine, yy * cosine - xy * sine
+        second = tx * tx + ty * ty - px * (px - x) - py * (py - y)
+        return px * tx + py * ty, second
+
+    sampled = half_square(_ANGLES)
+    angle = _ANGLES[np.argmax(sampled, axis=-1)][..., None]
+    for _ in range(_NEWTON_STEPS):
+        first, second = derivatives(angle)
+        bends_down = second < 0.0
+        step = np.where(bends_down, -first / np.where(bends_down, second, 1.0), 0.0)
+        angle = angle + np.clip(step, -0.2, 0.2)
+    highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
+    return np.sqrt(2.0 * highest)
+
+
+def polynomial_in_mm(
+    zernike_um: NDArray[np.float64], radius_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Monomial coefficients (..., 28), um/mm^degree, of sets on circles (...)."""
+    radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
+    return wavefront_polynomial(zernike_um) / radius_mm**DEGREE
+
+
+def zernike_from_polynomial(
+    polynomial_um: NDArray[np.float64], radius_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """OSA coefficients (..., 28), um, on circles (...); piston zero."""
+    radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
+    zernike_um = (polynomial_um * radius_mm**DEGREE) @ np.linalg.inv(monomial_matrix())
+    zernike_um[..., 0] = 0.0
+    return zernike_um
+
+
+def correction_polynomial(correction: rx.Prescription | None) -> NDArray[np.float64]:
+    """Monomial coefficients (28,), um/mm^degree, that a worn correction takes off.
+
+    The same dioptres at every field, in the pupil plane of the field: a lens that is
+    turned to the source.  What a real lens adds off its axis depends on its shape.
+    """
+    if correction is None:
+        return np.zeros(DEGREE.size)
+    zernike_um = rx.zernike_from_power_vector(
+        *rx.power_vector(correction), zernike_radius_mm=1.0
+    )
+    return polynomial_in_mm(zernike_um, 1.0)
+
+
+def total_defocus_dpt(
+    zernike_um: NDArray[np.float64], radius_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Least-squares M = -4 sqrt(3) C(2,0) / r² (...) of sets on circles (...)."""
+    return -SPHERE_PER_C20 * zernike_um[..., rx.C20] / np.square(radius_mm)
+
+
+def with_defocus(
+    zernike_um: NDArray[np.float64],
+    rim_mm: NDArray[np.float64],
+    radius_mm: NDArray[np.float64],
+    *,
+    total_defocus_dpt: ArrayLike,
+) -> FieldWavefronts:
+    """Wavefronts (P, 28) on circles (P,) with their defocus replaced."""
+    zernike_um = zernike_um.copy()
+    zernike_um[:, rx.C20] = -np.ravel(total_defocus_dpt) * radius_mm**2 / SPHERE_PER_C20
+    return FieldWavefronts(
+        zernike_um=zernike_um,
+        circle_diameter_mm=2.0 * radius_mm,
+        pupil_ellipse=ellipse_from_rim(rim_mm),
+    )
+
+
+def with_tilt(
+    zernike_um: NDArray[np.float64], radius_mm: ArrayLike, shift_mrad: ArrayLike
+) -> NDArray[np.float64]:
+    """Wavefronts (P, 28) on circles (P,) whose PSFs lie aside by (P, 2), x and y.
+
+    A PSF lies at +grad W (mrad = um/mm), and Z(1,1) = 2 x / r.
+    """
+    zernike_um = zernike_um.copy()
+    tilt_um = 0.5 * np.asarray(radius_mm)[..., None] * shift_mrad
+    zernike_um[..., [TILT_X, TILT_Y]] += tilt_um
+    return zernike_um
+
+
+def distinct_rows(*columns: NDArray) -> tuple[NDArray, NDArray]:
+    """First index of each distinct row of columns (n,), and every row's number."""
+    number = np.zeros(columns[0].size, dtype=np.int64)
+    for column in columns:
+        if (column == column[:1]).all():
+            continue  # most calls vary one or two of them only
+        values, place = np.unique(column, return_inverse=True)
+        number = np.unique(number * values.size + place, return_inverse=True)[1]
+    return np.unique(number, return_index=True)[1], number

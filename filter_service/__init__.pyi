@@ -1,0 +1,15 @@
+from .camera import Camera as Camera
+from .camera import tangents_from_fov as tangents_from_fov
+from .errors import BadMessage as BadMessage
+from .errors import FilterError as FilterError
+from .filtering.eye_filter import EyeFilter as EyeFilter
+from .filtering.filtered import BuildingEye as BuildingEye
+from .filtering.filtered import EyeFailed as EyeFailed
+from .filtering.filtered import EyeReady as EyeReady
+from .filtering.filtered import Filtered as Filtered
+from .rgbd_view import ColorImage as ColorImage
+from .rgbd_view import RgbdView as RgbdView
+from .rgbd_view import as_views as as_views
+from .settings import Accumulation as Accumulation
+from .settings import FilterSettings as FilterSettings
+from .settings import Output as Output

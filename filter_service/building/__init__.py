@@ -1,0 +1,16 @@
+"""The worker process: from a profile to its PSF stores.
+
+jobs            what is asked for and what comes back
+read_profile    a profile's body, checked
+from_profile    the work itself
+preview         what to build first
+worker          the process
+worker_handle   the service's end of it
+shared_buffers  large arrays between the two
+head_start      work begun before it is asked for
+compile_builds  every loop compiled before the first build
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

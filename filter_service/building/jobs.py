@@ -1,0 +1,88 @@
+"""What the worker is asked to build, and what comes back; plain data."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from estimator.profiles.parse import EyeProfile
+from filter_service.camera import Camera
+from filter_service.settings import FilterSettings
+
+
+def default_cache_dir() -> str:
+    """Return where finished PSFs are kept if nothing else is said."""
+    own = os.environ.get("OCUFILTER_CACHE_DIR")
+    if own is not None:
+        return own
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return str(Path(base) / "ocufilter")
+
+
+@dataclass(frozen=True)
+class LookAt:
+    """The state of the eye that frames show."""
+
+    pupil_diameter_mm: float
+    focus_dpt: float
+
+
+@dataclass(frozen=True)
+class BuildLimits:
+    """What the service's configuration sets for every build.
+
+    ``store_cache_dir`` is empty where stores are not kept on disk.
+    """
+
+    max_blur_radius_px: int = 255
+    max_store_mb: int = 2000
+    psf_engine: str = "auto"
+    store_cache_dir: str = ""
+    store_cache_max_mb: int = 2000
+
+
+@dataclass(frozen=True)
+class BuildJob:
+    """One eye for one camera.
+
+    ``look_at`` is what the preview is for: the state of the last frame, if any.
+    """
+
+    profile: EyeProfile
+    settings: FilterSettings
+    camera: Camera
+    limits: BuildLimits = BuildLimits()
+    look_at: LookAt | None = None
+
+
+class Store(Protocol):
+    """PSFs of an eye for a camera, as an engine's ``load_steps`` takes them."""
+
+    @property
+    def psf_count(self) -> int:
+        """How many PSFs."""
+
+    @property
+    def memory_mb(self) -> float:
+        """What they take."""
+
+
+@dataclass(frozen=True)
+class BuiltStore:
+    """What came out of a job.
+
+    A store that is not complete is a preview; a complete one follows.
+    """
+
+    store: Store
+    build_ms: float
+    psf_count: int
+    memory_mb: float
+    notes: tuple[str, ...] = ()
+    is_complete: bool = True
+
+
+Build = Callable[..., Iterator[BuiltStore]]

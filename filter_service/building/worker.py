@@ -1,0 +1,175 @@
+"""The worker process: computes PSF stores and hands them to the service.
+
+A process, not a thread: OpenGL calls hold the interpreter lock of the render loop.
+
+Parent to worker: ``("build", ticket, job)``, ``("cancel", ticket)``.  Worker to parent:
+``("ready",)``, ``("progress", ticket, fraction, stage)``; for each store that a build
+yields ``("result", ticket, head, sizes)`` and then the descriptor of a file in memory
+with the arrays; at the end ``("finished", ticket)`` or ``("failed", ticket, code,
+message, field, allowed)``.  The render loop maps the file: over the pipe 100 MB would
+take it 0.2 s.  The pipe joins two processes of ours, so it may carry pickles; nothing
+from outside does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import send_handle
+from typing import Any
+
+from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
+from filter_service.building.head_start import HeadStart
+from filter_service.building.shared_buffers import write_shared
+from filter_service.errors import BuildCancelled, BuildFailed, FilterError
+
+PROGRESS_INTERVAL_S = 0.1
+IDLE_S = 3.0
+"""Without a job for so long, the worker prepares for those that will come."""
+
+log = logging.getLogger("ocufilter.worker")
+
+
+class ParentGone(Exception):
+    """The service has ended; so does the worker."""
+
+
+def main() -> None:
+    """Run as ``python -m``: DESCRIPTOR BUILD NICENESS WARM_UP; the entry point."""
+    descriptor, build_name, niceness, warm_up_name = sys.argv[1:]
+    serve_builds(Connection(int(descriptor)), build_name, int(niceness), warm_up_name)
+
+
+def serve_builds(
+    pipe: Connection, build_name: str, niceness: int, warm_up_name: str = ""
+) -> None:
+    """Build what is asked for until the pipe closes."""
+    # Ctrl-C goes to the whole group; the service ends the worker in its own time.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.basicConfig(level=logging.INFO, format="ocufilter worker: %(message)s")
+    try:
+        build, head_start = _named(build_name), None
+        pipe.send(("ready",))
+        # A client that knows a restarted service comes at once, and maybe for a store
+        # from the disk: it shall not share the processor with what it does not need.
+        if warm_up_name and not pipe.poll(IDLE_S):
+            head_start = HeadStart(_named(warm_up_name))
+        while True:
+            message = pipe.recv()
+            if message[0] == "build":
+                ticket, job = message[1:]
+                _build_one(pipe, build, niceness, head_start, ticket=ticket, job=job)
+    except (EOFError, OSError, ParentGone):
+        return
+
+
+def _named(name: str) -> Callable:
+    module, _, function = name.partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def _build_one(
+    pipe: Connection,
+    build: Callable[..., Iterator[Any]],
+    niceness: int,
+    head_start: HeadStart | None,
+    *,
+    ticket: int,
+    job: object,
+) -> None:
+    progress = _throttled_progress(pipe, ticket)
+
+    def cancelled() -> bool:
+        return _is_cancelled(pipe, ticket)
+
+    if head_start is not None:
+        progress = head_start.before(progress, cancelled)
+    try:
+        stores = build(job, progress=progress, cancelled=cancelled)
+        # Somebody waits for the first; what follows makes room for the frames.
+        _send_result(pipe, ticket, next(stores))
+        _run_nicely(niceness, lambda: _send_all(pipe, ticket, stores))
+    except ParentGone:
+        raise
+    except Exception as error:
+        _send_failure(pipe, ticket, error)
+        return
+    pipe.send(("finished", ticket))
+
+
+def _run_nicely(niceness: int, work: Callable[[], None]) -> None:
+    """Run something in a thread with a niceness of its own, as Linux has it.
+
+    Threads that it starts have it too.  For the process it could not be taken back.
+    """
+
+    def yield_to_others() -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+
+    with ThreadPoolExecutor(1, initializer=yield_to_others) as pool:
+        pool.submit(work).result()
+
+
+def _send_all(pipe: Connection, ticket: int, stores: Iterator[Any]) -> None:
+    for built in stores:
+        _send_result(pipe, ticket, built)
+
+
+def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
+    next_s, last_stage = 0.0, None
+
+    def progress(fraction: float, stage: str) -> None:
+        nonlocal next_s, last_stage
+        now_s = time.monotonic()
+        # The first word of a stage is never held back: a short one has no second.
+        if now_s >= next_s or stage != last_stage:
+            next_s, last_stage = now_s + PROGRESS_INTERVAL_S, stage
+            pipe.send(("progress", ticket, min(max(float(fraction), 0.0), 1.0), stage))
+
+    return progress
+
+
+def _is_cancelled(pipe: Connection, ticket: int) -> bool:
+    """Return whether the parent cancelled this ticket (2 us when it did not)."""
+    while pipe.poll(0):
+        try:
+            message = pipe.recv()
+        except (EOFError, OSError):
+            raise ParentGone from None
+        if message == ("cancel", ticket):
+            return True
+    return False
+
+
+def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:
+    if not isinstance(error, FilterError):
+        log.exception("a build failed in a way that is not foreseen")
+        error = BuildFailed(f"{type(error).__name__}: {error}")
+    if not isinstance(error, BuildCancelled):
+        log.info("build %d failed: %s", ticket, error)
+    pipe.send(("failed", ticket, error.code, error.message, error.field, error.allowed))
+
+
+def _send_result(pipe: Connection, ticket: int, built: object) -> None:
+    buffers: list[pickle.PickleBuffer] = []
+    head = pickle.dumps(built, protocol=5, buffer_callback=buffers.append)
+    arrays = [buffer.raw() for buffer in buffers]
+    descriptor = write_shared(arrays)
+    try:
+        pipe.send(("result", ticket, head, [array.nbytes for array in arrays]))
+        send_handle(pipe, descriptor, os.getppid())
+    finally:
+        os.close(descriptor)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,282 @@
+"""The service's end of the worker: a queue of builds, one running, crashes repaired."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle
+from typing import Any
+
+from filter_service.building.shared_buffers import map_shared
+from filter_service.errors import (
+    BuildCancelled,
+    FilterError,
+    WorkerCrashed,
+    error_from_code,
+)
+
+RECEIVE_BUDGET_S = 0.004  # the render loop's time for one call of poll
+RESTART_DELAY_S = 1.0  # after a worker that never got ready
+STOP_GRACE_S = 1.0
+
+BUILD = "filter_service.building.from_profile:build"
+WARM_UP = "filter_service.building.compile_builds:build_a_few"
+
+log = logging.getLogger("ocufilter.worker")
+
+
+@dataclass(frozen=True)
+class BuildProgress:
+    """How far a build is."""
+
+    ticket: int
+    fraction: float
+    stage: str
+
+
+@dataclass(frozen=True)
+class BuildDone:
+    """What a build made; more may follow, as ``built`` says."""
+
+    ticket: int
+    built: Any
+
+
+@dataclass(frozen=True)
+class BuildError:
+    """Why a build made nothing."""
+
+    ticket: int
+    error: FilterError
+
+
+BuildEvent = BuildProgress | BuildDone | BuildError
+
+
+@dataclass(frozen=True)
+class _Incoming:
+    """A result of which the arrays are still to come."""
+
+    ticket: int
+    head: bytes
+    sizes: list[int]
+
+    def received(self, pipe: Connection) -> BuildDone:
+        """Take the descriptor of the arrays' file, which waits in the pipe."""
+        try:
+            descriptor = recv_handle(pipe)
+        except RuntimeError as error:  # what it says of a pipe that ends
+            raise EOFError from error
+        try:
+            buffers = map_shared(descriptor, self.sizes)
+        finally:
+            os.close(descriptor)
+        return BuildDone(self.ticket, pickle.loads(self.head, buffers=buffers))
+
+
+@dataclass
+class WorkerHandle:
+    """Runs builds in a process of its own, one at a time, in the order asked for.
+
+    Parameters
+    ----------
+    build : str
+        ``module:function`` of ``build(job, *, progress, cancelled)``, which yields what
+        it has built, a preview maybe before the whole.  A name, because to import the
+        function here would keep the new process waiting.
+    niceness : int
+        Of what a build does after the first store that it yields.
+    cancel_grace_s : float
+        A cancelled build that goes on longer is ended with its process.
+    warm_up : str
+        ``module:function`` of what the process does until the first job comes.
+    """
+
+    build: str = BUILD
+    niceness: int = 5
+    cancel_grace_s: float = 3.0
+    warm_up: str = WARM_UP
+    n_restarts: int = 0
+    _queue: deque[tuple[int, Any]] = field(default_factory=deque)
+    _next_ticket: int = 1
+    _running: int | None = None
+    _kill_at_s: float | None = None
+    _start_at_s: float = 0.0
+    _is_ready: bool = False
+    _process: subprocess.Popen[bytes] | None = None
+    _pipe: Connection | None = None
+    _incoming: _Incoming | None = None
+
+    def start(self) -> None:
+        """Start the process, if there is none; it gets ready on its own time."""
+        if self._process is not None:
+            return
+        ours, theirs = socket.socketpair()
+        # A plain process: one that multiprocessing spawns would run the main module
+        # again, which a script without a guard does not survive.
+        self._process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "filter_service.building.worker"),
+                *(str(theirs.fileno()), self.build, str(self.niceness), self.warm_up),
+            ],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(_import_path())},
+        )
+        theirs.close()
+        self._pipe = Connection(ours.detach())
+
+    def close(self) -> None:
+        """End the process, with patience first."""
+        if self._process is None:
+            return
+        self._pipe.close()
+        self._process.terminate()
+        _end(self._process)
+        self._process = None
+
+    @property
+    def file_descriptor(self) -> int | None:
+        """Return what to poll for reading; it changes when the worker restarts."""
+        return None if self._process is None else self._pipe.fileno()
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether a build runs or waits."""
+        return self._running is not None or bool(self._queue)
+
+    @property
+    def needs_attention_soon(self) -> bool:
+        """Return whether poll has something to do although the pipe is silent."""
+        return self._process is None or self._kill_at_s is not None
+
+    def submit(self, job: object) -> int:
+        """Put a job at the end of the queue; return its ticket."""
+        ticket = self._next_ticket
+        self._next_ticket += 1
+        self._queue.append((ticket, job))
+        self._start_next()
+        return ticket
+
+    def cancel(self, ticket: int) -> None:
+        """Stop a build; no event follows for a ticket that only waited."""
+        self._queue = deque(item for item in self._queue if item[0] != ticket)
+        if ticket == self._running and self._kill_at_s is None:
+            self._kill_at_s = time.monotonic() + self.cancel_grace_s
+            self._tell(("cancel", ticket))
+
+    def poll(self) -> list[BuildEvent]:
+        """Return what happened, in at most a few milliseconds."""
+        events: list[BuildEvent] = []
+        now_s = time.monotonic()
+        if self._process is None:
+            if now_s >= self._start_at_s:
+                self.start()
+            return events
+        if self._kill_at_s is not None and now_s > self._kill_at_s:
+            log.warning("a cancelled build did not stop; its process is ended")
+            self._process.kill()
+        try:
+            while self._pipe.poll(0):
+                self._receive(events)
+                if time.monotonic() - now_s > RECEIVE_BUDGET_S:
+                    break
+        except (EOFError, OSError, pickle.UnpicklingError):
+            events += self._after_crash()
+        self._start_next()
+        return events
+
+    def _receive(self, events: list[BuildEvent]) -> None:
+        if self._incoming is not None:
+            incoming, self._incoming = self._incoming, None
+            events.append(incoming.received(self._pipe))
+            return
+        message = self._pipe.recv()
+        kind = message[0]
+        if kind == "ready":
+            self._is_ready = True
+        elif kind == "progress":
+            events.append(BuildProgress(*message[1:]))
+        elif kind == "failed":
+            ticket, code, text, at_field, allowed = message[1:]
+            error = error_from_code(code, text, field=at_field, allowed=allowed)
+            self._end_running()
+            events.append(BuildError(ticket, error))
+        elif kind == "result":
+            self._incoming = _Incoming(*message[1:])
+        elif kind == "finished":
+            self._end_running()
+
+    def _end_running(self) -> None:
+        self._running = None
+        self._kill_at_s = None
+
+    def _start_next(self) -> None:
+        """Hand the next job over; a worker that starts up would not read it yet."""
+        if self._running is None and self._is_ready and self._queue:
+            ticket, job = self._queue.popleft()
+            self._running = ticket
+            self._tell(("build", ticket, job))
+
+    def _tell(self, message: tuple[Any, ...]) -> None:
+        try:
+            self._pipe.send(message)
+        except OSError:
+            log.debug("the worker is gone; poll will find out")
+
+    def _after_crash(self) -> list[BuildEvent]:
+        """Start a new process; the build that ran is lost, those that wait are not."""
+        how = _how_it_ended(_end(self._process))
+        was_cancelled = self._kill_at_s is not None
+        was_ready = self._is_ready
+        tickets = [] if self._running is None else [self._running]
+        self._pipe.close()
+        self._process = self._incoming = None
+        self._is_ready = False
+        self._end_running()
+        self.n_restarts += 1
+        if was_cancelled:
+            error: FilterError = BuildCancelled("the build was stopped by force")
+        else:
+            error = WorkerCrashed(f"the process that computes PSFs {how}")
+            log.error("%s; a new one is started", error.message)
+        if not was_ready:
+            # No job was the reason, so those that wait would wait for ever.
+            tickets += [ticket for ticket, _ in self._queue]
+            self._queue.clear()
+            self._start_at_s = time.monotonic() + RESTART_DELAY_S
+        else:
+            self.start()
+        return [BuildError(ticket, error) for ticket in tickets]
+
+
+def _how_it_ended(exit_code: int | None) -> str:
+    if exit_code is not None and exit_code < 0:
+        try:
+            return f"was killed by {signal.Signals(-exit_code).name}"
+        except ValueError:
+            return f"was killed by signal {-exit_code}"
+    return f"ended with code {exit_code}"
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """Wait for a process that is to end, then end it by force; return its code."""
+    try:
+        return process.wait(STOP_GRACE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _import_path() -> list[str]:
+    """Return where this process imports from; the worker starts in the same folder."""
+    return [entry or os.getcwd() for entry in sys.path]

@@ -1,0 +1,131 @@
+"""A pinhole camera, and which cameras one PSF store serves.
+
+An on-axis store knows nothing of a camera but the size of its pixels.  A store that
+follows the visual field holds kernels for directions in one image, mapped by its local
+scale, so it serves that image only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
+
+from filter_service.checked import Record, checked, show
+from filter_service.errors import BadMessage
+
+MAX_SIDE_PX = 16384
+MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
+MIN_EXTENT = 1e-6
+
+SAME_RATIO = 1e-3
+"""Of a pixel pitch, and of an image's extent: a kernel of 255 px is then right to a
+quarter of a pixel, and a direction to about one."""
+
+SidePx = Annotated[int, Meta(ge=1, le=MAX_SIDE_PX)]
+Tangent = Annotated[float, Meta(ge=-MAX_TANGENT, le=MAX_TANGENT)]
+Tangents = tuple[Tangent, Tangent, Tangent, Tangent]
+
+
+def tangents_from_fov(
+    vertical_fov_deg: float, width_px: int, height_px: int
+) -> tuple[float, float, float, float]:
+    """Return (left, right, up, down) of a symmetric camera with square pixels."""
+    if not 0 < vertical_fov_deg < 174:
+        raise ValueError(f"vertical_fov_deg is {vertical_fov_deg}; allowed: 0 to 174")
+    up = math.tan(math.radians(vertical_fov_deg) / 2)
+    right = up * width_px / height_px
+    return (-right, right, up, -up)
+
+
+@dataclass(frozen=True)
+class Camera(Record):
+    """A pinhole: image size, tangents to the left, right, upper and lower edge.
+
+    Raises
+    ------
+    BadMessage
+        A size or tangent out of range, or edges on the wrong sides.
+    """
+
+    width_px: SidePx
+    height_px: SidePx
+    tangents: Tangents
+
+    def __post_init__(self) -> None:
+        """Refuse what no pinhole has; a list of tangents becomes a tuple."""
+        checked(self.width_px, SidePx, "width_px")
+        checked(self.height_px, SidePx, "height_px")
+        tangents = checked(self.tangents, Tangents, "tangents")
+        left, right, up, down = tangents
+        if right - left < MIN_EXTENT or up - down < MIN_EXTENT:
+            raise BadMessage(
+                f"they are {show(list(tangents))}",
+                field="tangents",
+                allowed="(left, right, up, down) with left < right and down < up",
+            )
+        object.__setattr__(self, "tangents", tangents)
+
+    @classmethod
+    def from_fov(
+        cls, vertical_fov_deg: float, *, width_px: int, height_px: int
+    ) -> Camera:
+        """Return a symmetric camera with square pixels."""
+        tangents = tangents_from_fov(vertical_fov_deg, width_px, height_px)
+        return cls(width_px, height_px, tangents)
+
+    @property
+    def pixel_pitch_mrad(self) -> tuple[float, float]:
+        """Return the angle of one pixel on the axis, (x, y), in mrad."""
+        left, right, up, down = self.tangents
+        return (
+            1000.0 * (right - left) / self.width_px,
+            1000.0 * (up - down) / self.height_px,
+        )
+
+    @property
+    def pixel_count(self) -> int:
+        """Return width times height."""
+        return self.width_px * self.height_px
+
+
+def is_same_camera(first: Camera, second: Camera, *, follows_field: bool) -> bool:
+    """Return whether one PSF store serves both cameras.
+
+    Parameters
+    ----------
+    follows_field : bool
+        The store's kernels differ over the visual field.
+    """
+    pitches = zip(first.pixel_pitch_mrad, second.pixel_pitch_mrad, strict=True)
+    if any(abs(a / b - 1.0) > SAME_RATIO for a, b in pitches):
+        return False
+    return not follows_field or _shows_the_same(first, second)
+
+
+def _shows_the_same(first: Camera, second: Camera) -> bool:
+    if (first.width_px, first.height_px) != (second.width_px, second.height_px):
+        return False
+    left, right, up, down = second.tangents
+    extents = (right - left, right - left, up - down, up - down)
+    return all(
+        abs(a - b) <= SAME_RATIO * extent
+        for a, b, extent in zip(first.tangents, second.tangents, extents, strict=True)
+    )
+
+
+def distinct_cameras(
+    cameras: Sequence[Camera], *, follows_field: bool
+) -> tuple[Camera, ...]:
+    """Return the cameras that need a store each, in order."""
+    distinct: list[Camera] = []
+    for camera in cameras:
+        if not any(
+            is_same_camera(known, camera, follows_field=follows_field)
+            for known in distinct
+        ):
+            distinct.append(camera)
+    return tuple(distinct)

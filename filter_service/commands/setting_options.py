@@ -1,0 +1,127 @@
+"""Command-line options made from `FilterSettings`: a new setting is an option at once.
+
+Choices become ``--mode``, angles ``--gaze-h-deg`` and ``--gaze-v-deg``, switches that
+are on ``--no-chromatic`` and those that are off ``--lateral-color``.  Ranges have no
+option: a command takes them from its image.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, get_args
+
+import typer
+
+from filter_service.checked import checked
+from filter_service.errors import BadMessage
+from filter_service.settings import DEFAULTS, setting_help, setting_types
+
+HELP_OF_SIDE = {"h": "to the right", "v": "upwards"}
+
+
+def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
+    """Give a command an option for each setting; it gets them as ``settings``.
+
+    Parameters
+    ----------
+    **defaults
+        Settings whose default is another here than in a service.
+    """
+
+    def decorated(command: Callable) -> Callable:
+        own = inspect.signature(command).parameters
+        options = [
+            option
+            for name in setting_types()
+            if "_range_" not in name
+            for option in _options(name, defaults.get(name, getattr(DEFAULTS, name)))
+        ]
+
+        @functools.wraps(command)
+        def run(**values: Any) -> Any:
+            given = {o.name: values.pop(o.name) for o in options}
+            return command(**values, settings=_settings(given))
+
+        kept = [p for name, p in own.items() if name != "settings"]
+        everything = [
+            p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*kept, *options)
+        ]
+        run.__signature__ = inspect.Signature(everything)
+        run.__annotations__ = {p.name: p.annotation for p in everything}
+        return run
+
+    return decorated
+
+
+def _options(name: str, default: Any) -> list[inspect.Parameter]:
+    """Parameters, as typer reads them, for one setting."""
+    kind = get_args(setting_types()[name])[0]
+    words = setting_help(name)
+    if isinstance(default, bool):
+        flag = f"--{'no-' if default else ''}{name.replace('_', '-')}"
+        return [_option(name, bool, default=False, words=words, flags=(flag,))]
+    if isinstance(default, tuple):
+        stem, _, unit = name.rpartition("_")
+        return [
+            _option(
+                f"{stem}_{side}_{unit}",
+                float,
+                default=value,
+                words=f"{words}  Here: {HELP_OF_SIDE[side]}.",
+            )
+            for side, value in zip(HELP_OF_SIDE, default, strict=True)
+        ]
+    return [_option(name, _plain_type(kind), default=default, words=words)]
+
+
+def _option(
+    name: str, kind: Any, *, default: Any, words: str, flags: tuple[str, ...] = ()
+) -> inspect.Parameter:
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[kind, typer.Option(*flags, help=words)],
+    )
+
+
+def _plain_type(kind: Any) -> Any:
+    """Return the type without its limits, which `FilterSettings` checks."""
+    if hasattr(kind, "__metadata__"):
+        return kind.__origin__
+    parts = get_args(kind)
+    if type(None) in parts:
+        return _plain_type(parts[0]) | None
+    return kind
+
+
+def _settings(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of settings from those of their options.
+
+    Raises
+    ------
+    ValueError
+        Names the option, the value and what is allowed.
+    """
+    found = {}
+    for name, kind in setting_types().items():
+        stem, _, unit = name.rpartition("_")
+        sides = [f"{stem}_{side}_{unit}" for side in HELP_OF_SIDE]
+        if name in given:
+            value = given[name]
+            if isinstance(getattr(DEFAULTS, name), bool) and getattr(DEFAULTS, name):
+                value = not value
+            names = [name]
+        elif all(side in given for side in sides):
+            value, names = tuple(given[side] for side in sides), sides
+        else:
+            continue
+        try:
+            found[name] = checked(value, kind, name)
+        except BadMessage as error:
+            at = names[1 if str(error.field).endswith("[1]") else 0]
+            option = f"--{at.replace('_', '-')}"
+            raise ValueError(
+                f"{option}: {error.message}; allowed: {error.allowed}"
+            ) from None
+    return found

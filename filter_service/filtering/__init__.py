@@ -1,0 +1,15 @@
+"""Streams of frames through eyes that may change on the way.
+
+eye_filter        `EyeFilter`: one stream; the public face
+filtered          a filtered frame, and events on the way
+accepted_profile  one profile and the stores of it
+stream_eyes       which eye serves, and what is to be built
+workshop          one worker and one engine for all streams
+shared_workshop   the one that a process shares
+upload            a store on its way to the engine
+one_image         a single picture, planned for itself
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

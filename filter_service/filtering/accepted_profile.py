@@ -1,0 +1,72 @@
+"""One accepted profile with the stores that exist of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from estimator.profiles.parse import EyeProfile
+from filter_service.camera import Camera, distinct_cameras, is_same_camera
+from filter_service.errors import FilterError
+from filter_service.rendering.engine import LoadedStore
+from filter_service.settings import FilterSettings
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedStore:
+    """A loaded store and the camera it was built for.
+
+    ``is_complete`` is false for a preview, which a complete store will replace.
+    """
+
+    camera: Camera
+    store: LoadedStore
+    is_complete: bool = True
+
+
+@dataclass(eq=False)
+class AcceptedProfile:
+    """One accepted profile with the stores that exist of it.
+
+    ``generation`` counts the accepted profiles of a session; every result names it.
+    Stores are in order of last use, at most one for each camera.
+    """
+
+    generation: int
+    profile_id: int
+    profile: EyeProfile
+    settings: FilterSettings
+    wanted: tuple[Camera, ...] = ()
+    stores: list[PreparedStore] = field(default_factory=list)
+    failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
+
+    def is_same(self, first: Camera, second: Camera) -> bool:
+        """Return whether one store of this eye serves both cameras."""
+        return is_same_camera(first, second, follows_field=self.settings.follows_field)
+
+    def store_for(self, camera: Camera) -> PreparedStore | None:
+        """Return the store that serves a camera."""
+        return next((s for s in self.stores if self.is_same(s.camera, camera)), None)
+
+    def note_use(self, camera: Camera) -> None:
+        """Move a camera's store to the end."""
+        self.stores.sort(key=lambda prepared: self.is_same(prepared.camera, camera))
+
+    def failure_for(self, camera: Camera) -> FilterError | None:
+        """Return why the build for a camera failed."""
+        return next((e for c, e in self.failures if self.is_same(c, camera)), None)
+
+    def want(self, cameras: Iterable[Camera]) -> None:
+        """Ask for stores for cameras that have none; one that failed stays failed."""
+        new = [
+            camera
+            for camera in cameras
+            if self.store_for(camera) is None and self.failure_for(camera) is None
+        ]
+        self.wanted = distinct_cameras(
+            [*self.wanted, *new], follows_field=self.settings.follows_field
+        )
+
+    def want_no_more(self, camera: Camera) -> None:
+        """Forget the wish for a camera."""
+        self.wanted = tuple(c for c in self.wanted if not self.is_same(c, camera))

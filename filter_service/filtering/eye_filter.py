@@ -1,0 +1,335 @@
+"""`EyeFilter`: pictures through a person's eye, in this process, without a socket.
+
+    camera = Camera.from_fov(50, width_px=480, height_px=270)
+    with EyeFilter("keratoconus", camera) as eye_filter:
+        seen = eye_filter.filter(color, depth_m, pupil_diameter_mm=4, focus_dpt=0)
+
+The service holds one of these for each client.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from numpy.typing import NDArray
+
+from estimator.profiles.files import load_profile
+from estimator.profiles.parse import EyeProfile, parse_profile
+from filter_service.building.jobs import LookAt
+from filter_service.camera import Camera
+from filter_service.checked import checked
+from filter_service.errors import BadMessage, ServiceTimeout
+from filter_service.filtering.accepted_profile import AcceptedProfile
+from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
+from filter_service.filtering.shared_workshop import SHARED
+from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.workshop import Workshop
+from filter_service.rendering.engine import Rendered
+from filter_service.rgbd_view import ColorImage, RgbdView, as_views
+from filter_service.settings import (
+    DEFAULTS,
+    Accumulation,
+    FilterSettings,
+    GazeDeg,
+    Output,
+    PupilMm,
+    VergenceDpt,
+)
+
+WAIT_SLICE_S = 0.02
+
+Profile = EyeProfile | Mapping[str, Any] | str | Path
+
+
+def as_profile(profile: Profile) -> EyeProfile:
+    """Return a profile of any form: parsed, a map, a preset's name or a file.
+
+    Raises
+    ------
+    ValueError
+        Names the field, the bad value and what is allowed.
+    """
+    if isinstance(profile, Mapping):
+        return parse_profile(profile)
+    if isinstance(profile, str | Path):
+        return load_profile(str(profile))
+    return profile
+
+
+class EyeFilter:
+    """One stream of frames through one person's eye, which may change on the way.
+
+    A change of profile never stops the stream: frames go through the old eye until the
+    new one is ready, first through a small preview of it, then through the whole.  One
+    thread at a time may use it.
+
+    Parameters
+    ----------
+    profile : EyeProfile, mapping, str or Path, optional
+        A parsed profile, its JSON object, a preset's name, or a file.
+    camera : Camera, or several, optional
+        What to prepare for; other cameras are prepared for when their frames come.
+        Frames given as bare arrays are taken with the first.
+    settings : FilterSettings, optional
+    on_event : callable, optional
+        Told of every `BuildingEye`, `EyeReady` and `EyeFailed`.
+    workshop : Workshop, optional
+        Where eyes are made; all filters of a process share one unless told otherwise.
+    max_cameras : int
+        Cameras that are kept prepared.
+
+    Raises
+    ------
+    ValueError
+        A profile that is wrong; names the field.
+    RenderError
+        No engine works on this machine; names what to install.
+    """
+
+    def __init__(
+        self,
+        profile: Profile | None = None,
+        camera: Camera | Sequence[Camera] = (),
+        settings: FilterSettings = DEFAULTS,
+        *,
+        on_event: Callable[[EyeEvent], None] | None = None,
+        workshop: Workshop | None = None,
+        max_cameras: int = 4,
+    ) -> None:
+        first = None if profile is None else as_profile(profile)
+        self.cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+        self._on_event = on_event
+        self._is_shared = workshop is None
+        self._workshop: Workshop | None = workshop or SHARED.take()
+        self._eyes = StreamEyes(self._take_event, max_cameras)
+        self._workshop.streams.append(self._eyes)
+        self._failure: EyeFailed | None = None
+        self.ready: EyeReady | None = None
+        if first is not None:
+            self.set_profile(first, settings=settings, cameras=self.cameras)
+
+    def __enter__(self) -> Self:
+        """Return the filter."""
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Give up what the filter holds."""
+        self.close()
+
+    def close(self) -> None:
+        """Give up what the filter holds; closing twice is allowed."""
+        if self._workshop is None:
+            return
+        self._workshop.end(self._eyes)
+        if self._is_shared:
+            SHARED.give_back()
+        self._workshop = None
+
+    @property
+    def workshop(self) -> Workshop:
+        """Return where the filter's eyes are made.
+
+        Raises
+        ------
+        ValueError
+            The filter is closed.
+        """
+        if self._workshop is None:
+            raise ValueError("this EyeFilter is closed")
+        return self._workshop
+
+    # The eye
+
+    def set_profile(
+        self,
+        profile: Profile,
+        *,
+        settings: FilterSettings = DEFAULTS,
+        cameras: Sequence[Camera] = (),
+        profile_id: int = 0,
+    ) -> AcceptedProfile:
+        """Change the eye; frames go through the old one until it is ready.
+
+        Parameters
+        ----------
+        cameras : sequence of Camera, optional
+            What to prepare for; else the cameras of the last frame, else those of the
+            eye in use.
+        profile_id : int
+            The caller's own number; comes back with results.
+
+        Raises
+        ------
+        ValueError
+            The profile is wrong, and the eye stays as it was.
+        """
+        return self.workshop.accept(
+            self._eyes,
+            as_profile(profile),
+            settings,
+            cameras or (() if self._eyes.eyes else self.cameras),
+            profile_id=profile_id,
+        )
+
+    def advance(self) -> None:
+        """Let builds go on where no frames do; `filter` does it by itself."""
+        self.workshop.advance()
+
+    def wait(self, timeout_s: float = 120.0) -> EyeReady:
+        """Return when the newest eye is complete for all cameras it was asked for.
+
+        Raises
+        ------
+        FilterError
+            What the build of the eye ended with, or `ServiceTimeout`.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            self.workshop.advance()
+            newest = self._eyes.eyes[0] if self._eyes.eyes else None
+            failure = self._failure
+            if failure is not None:
+                self._failure = None
+                raise failure.error
+            if newest is None:
+                raise BadMessage("there is no profile", field="profile")
+            if not newest.wanted and self.ready is not None:
+                return self.ready
+            self._wait_for_worker(deadline_s, "the eye to be ready")
+
+    def _take_event(self, event: EyeEvent) -> None:
+        if isinstance(event, EyeFailed):
+            self._failure = event
+        elif isinstance(event, EyeReady):
+            self._failure = None
+            self.ready = event
+        if self._on_event is not None:
+            self._on_event(event)
+
+    def _wait_for_worker(self, deadline_s: float, what: str) -> None:
+        remaining_s = deadline_s - time.monotonic()
+        if remaining_s <= 0.0:
+            raise ServiceTimeout(f"waited in vain for {what}")
+        descriptor = self.workshop.worker.file_descriptor
+        watched = [] if descriptor is None else [descriptor]
+        if not self.workshop.is_loading:
+            select.select(watched, [], [], min(remaining_s, WAIT_SLICE_S))
+
+    # Frames
+
+    def filter(
+        self,
+        color: ColorImage | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[Any] | None = None,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
+        merge: bool = True,
+        timeout_s: float = 120.0,
+    ) -> Filtered:
+        """Filter one frame; waits where its eye is not ready for its camera yet.
+
+        Parameters
+        ----------
+        color : (height, width, 3) array, RgbdView, or several views
+            uint8 sRGB, or float32 or float16 linear light.
+        depth_m : (height, width) float32
+            View-space z in metres, beside an array of colour; else part of the view.
+        pupil_diameter_mm : float, 0.5 to 9
+            Entrance pupil.
+        focus_dpt : float, 0 to 20
+            Where the person wants to focus; 0 is infinity.
+        gaze_deg : (h, v), optional
+            Where the eye looks in the image; as in the settings where it is None.
+        output : "srgb8", "linear" or "linear16"
+
+        Raises
+        ------
+        BadMessage
+            An argument out of range (a ValueError, too).
+        SessionError, RenderError, ServiceTimeout
+        """
+        views = as_views(color, depth_m, next(iter(self.cameras), None))
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            self.workshop.advance()
+            seen = self.try_filter(
+                views,
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                gaze_deg=gaze_deg,
+                output=output,
+                accumulation=accumulation,
+                merge=merge,
+            )
+            if seen is not None:
+                return seen
+            self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
+
+    def try_filter(
+        self,
+        views: Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
+        merge: bool = True,
+    ) -> Filtered | None:
+        """Filter one frame like `filter`; None while its eye is being prepared."""
+        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
+        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
+        if gaze_deg is not None:
+            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
+        look_at = LookAt(pupil_diameter_mm, focus_dpt)
+        plan = self._eyes.plan([view.camera for view in views], look_at)
+        self.workshop.free_retired(self._eyes)
+        if plan is None:
+            return None
+        started_s = time.monotonic()
+        rendered = [
+            self.workshop.engine.render(
+                view,
+                store,
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                accumulation=accumulation,
+                merge=merge,
+                output=output,
+                gaze_deg=gaze_deg,
+            )
+            for view, store in zip(views, plan.stores, strict=True)
+        ]
+        self.workshop.frame_s = time.monotonic() - started_s
+        return _filtered(plan, rendered)
+
+
+def _filtered(plan: RenderPlan, rendered: list[Rendered]) -> Filtered:
+    first = rendered[0]
+    stages_ms: dict[str, float] = {}
+    for view in rendered:
+        for name, value_ms in view.stage_times_ms.items():
+            stages_ms[name] = stages_ms.get(name, 0.0) + float(value_ms)
+    h_deg, v_deg = first.gaze_deg
+    return Filtered(
+        colors=tuple(view.color for view in rendered),
+        profile_id=plan.eye.profile_id,
+        generation=plan.eye.generation,
+        is_complete=plan.is_complete,
+        pupil_diameter_mm=float(first.pupil_diameter_mm),
+        focus_dpt=float(first.focus_dpt),
+        gaze_deg=(float(h_deg), float(v_deg)),
+        missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
+        clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
+        overflow_count=sum(int(v.overflow_count) for v in rendered),
+        notes=tuple(dict.fromkeys(note for view in rendered for note in view.notes)),
+        stage_times_ms=stages_ms,
+    )

@@ -1,0 +1,86 @@
+"""A filtered frame, and events on the way to the eye that it is seen through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from filter_service.camera import Camera
+from filter_service.errors import FilterError
+from filter_service.filtering.accepted_profile import AcceptedProfile
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """A filtered frame with everything that decided how it looks.
+
+    Attributes
+    ----------
+    colors : tuple of (height, width, 3)
+        One picture for each view.
+    generation : int
+        Counts the profiles that the filter was given.
+    is_complete : bool
+        False where it was seen through a preview, which the whole will replace.
+    pupil_diameter_mm, focus_dpt, gaze_deg
+        As used: a profile may cap the pupil, and an eye can only add power.
+    missing_depth_count, clamped_depth_count, overflow_count : int
+        Pixels whose depth was filled in or lay outside of the prepared distances;
+        shares of light that found no room.
+    notes : tuple of str
+        What the user should know, in sentences.
+    stage_times_ms : dict
+    """
+
+    colors: tuple[NDArray[Any], ...]
+    profile_id: int
+    generation: int
+    is_complete: bool
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float]
+    missing_depth_count: int
+    clamped_depth_count: int
+    overflow_count: int
+    notes: tuple[str, ...]
+    stage_times_ms: dict[str, float]
+
+    @property
+    def color(self) -> NDArray[Any]:
+        """Return the first view's picture, (height, width, 3)."""
+        return self.colors[0]
+
+
+@dataclass(frozen=True)
+class BuildingEye:
+    """How far the PSFs of a profile are."""
+
+    eye: AcceptedProfile
+    fraction: float
+    stage: str
+
+
+@dataclass(frozen=True)
+class EyeReady:
+    """The PSFs of a profile are in place for a camera, or a preview of them."""
+
+    eye: AcceptedProfile
+    camera: Camera
+    build_ms: float
+    psf_count: int
+    memory_mb: float
+    notes: tuple[str, ...]
+    is_complete: bool
+
+
+@dataclass(frozen=True)
+class EyeFailed:
+    """A profile, or its PSFs for a camera, came to nothing."""
+
+    eye: AcceptedProfile
+    error: FilterError
+
+
+EyeEvent = BuildingEye | EyeReady | EyeFailed

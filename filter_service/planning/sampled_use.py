@@ -1,0 +1,224 @@
+"""What frames will ask of a cache, sampled, and how far blended PSFs miss it there."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.eye_optics import EyeOptics
+from filter_service.planning.error_law import AXIS_FACTOR, blend_error
+from filter_service.planning.field_directions import MAX_FIELD_DEG, field_deg
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import (
+    CachePlan,
+    bracket_axis,
+)
+from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+
+AXES = ("h", "v", "pupil", "accommodation", "defocus")
+FIELD_OF_AXIS = {
+    "h": "h_deg",
+    "v": "v_deg",
+    "pupil": "pupil_diameter_mm",
+    "accommodation": "accommodation_dpt",
+}
+
+_PLASTIC = 1.1127756842787055
+"""Root of x^7 = x + 1: its powers fill six dimensions evenly (R-sequence)."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """Sampled states of frames, with their exact PSFs.
+
+    Attributes
+    ----------
+    states : PupilStates
+    object_dpt : (P,)
+    pixel_from_mrad : (P, 2, 2) or None
+        Scale of the image there, where frames map stored kernels to it.  None without
+        a range of gaze: between the nodes around a pixel the scale changes so little
+        that to map a kernel costs as much as it gains.
+    exact_px : (P, n, 2)
+        Slopes, px.
+    """
+
+    eye: EyeOptics
+    spec: GridSpec
+    states: PupilStates
+    object_dpt: NDArray[np.float64]
+    pixel_from_mrad: NDArray[np.float64] | None
+    exact_px: NDArray[np.float64]
+
+    @property
+    def unit_px(self) -> NDArray[np.float64]:
+        """Lambda over pupil diameter (P,), px."""
+        return unit_px(self.spec, self.states)
+
+    def taken(self, index: NDArray[np.int64]) -> "Use":
+        """Return some of the states, in any order."""
+        return replace(
+            self,
+            states=self.states.taken(index),
+            object_dpt=self.object_dpt[index],
+            pixel_from_mrad=(
+                None if self.pixel_from_mrad is None else self.pixel_from_mrad[index]
+            ),
+            exact_px=self.exact_px[index],
+        )
+
+
+def unit_px(spec: GridSpec, states: PupilStates) -> NDArray[np.float64]:
+    """Lambda over pupil diameter (P,) in pixels of the camera's axis."""
+    unit_mrad = states.wavelength_nm / 1e3 / states.pupil_diameter_mm  # um/mm
+    return unit_mrad / min(spec.pixel_pitch_mrad)
+
+
+def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
+    """Sample states evenly: image positions, pupils, foci, distances and channels.
+
+    Half of the objects are where the eye focuses, where interpolation shows most; the
+    others anywhere in the range.
+    """
+    steps = 1.0 / _PLASTIC ** np.arange(1, 7)
+    unit = (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+    x, y, pupil, focus, distance, channel = unit.T
+    h_deg, v_deg, scale = _seen_directions(spec, x, y)
+    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
+    foci_dpt = (
+        spec.settings.focus_range_dpt[0] + np.ptp(spec.settings.focus_range_dpt) * focus
+    )
+    used_dpt = np.array([eye.accommodation_dpt(f) for f in foci_dpt])
+    focused_dpt = np.array([eye.reachable_focus_dpt(f) for f in foci_dpt])
+    low_dpt, high_dpt = spec.settings.object_range_dpt
+    object_dpt = np.where(
+        distance < 0.5,
+        np.clip(focused_dpt, low_dpt, high_dpt),
+        low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
+    )
+    wavelengths_nm = spec.channel_wavelengths_nm
+    known = {
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "pupil_diameter_mm": low_mm + (high_mm - low_mm) * pupil,
+        "accommodation_dpt": used_dpt,
+        "wavelength_nm": wavelengths_nm[(channel * len(wavelengths_nm)).astype(int)],
+    }
+    states = PupilStates(
+        **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + object_dpt
+    )
+    if not any(spec.settings.gaze_range_deg):
+        scale = None
+    exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
+    return Use(eye, spec, states, object_dpt, scale, exact_px)
+
+
+def _seen_directions(
+    spec: GridSpec, x: NDArray, y: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Field directions (P,) at image positions in 0..1, and the image's scale there.
+
+    One after the other they take the directions of gaze that frames may have.
+    """
+    if not spec.follows_field:
+        zeros = np.zeros(x.size)
+        return zeros, zeros, spec.pixel_from_mrad(zeros, zeros)
+    camera, gazes = spec.camera, spec.gaze_samples_deg()
+    h_deg, v_deg = np.empty(x.size), np.empty(x.size)
+    scale = np.empty((x.size, 2, 2))
+    for k, gaze_deg in enumerate(gazes):
+        own = slice(k, None, len(gazes))
+        h_deg[own], v_deg[own] = (
+            np.clip(angle, -MAX_FIELD_DEG, MAX_FIELD_DEG)
+            for angle in field_deg(
+                camera,
+                x[own] * camera.width_px,
+                y[own] * camera.height_px,
+                gaze_deg=gaze_deg,
+            )
+        )
+        scale[own] = spec.pixel_from_mrad(h_deg[own], v_deg[own], gaze_deg=gaze_deg)
+    return h_deg, v_deg, scale
+
+
+def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
+    """Neighbouring states (P,) at which a frame's states are read along an axis.
+
+    Along the field and accommodation the total defocus stays, along the pupil the
+    geometric blur.  The paper's grids are read at the distance of the object.
+    """
+    columns = vars(use.states) | {FIELD_OF_AXIS[axis]: to}
+    total_dpt = columns.pop("total_defocus_dpt")
+    if axis == "pupil":
+        total_dpt = total_dpt * use.states.pupil_diameter_mm / to
+    elif axis in ("h", "v") and not use.spec.blends_at_equal_blur:
+        total_dpt = use.eye.total_defocus_dpt(**columns) + use.object_dpt
+    return PupilStates(**columns, total_defocus_dpt=total_dpt)
+
+
+def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
+    """Mean square error of the states when one axis is interpolated between nodes."""
+    lower, upper, share = bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]])
+    twice = use.taken(np.tile(np.arange(share.size), 2))
+    neighbours = moved(twice, axis, nodes[np.append(lower, upper)])
+    return AXIS_FACTOR[axis] * _error(use, neighbours, share)
+
+
+def defocus_error(use: Use, plan: CachePlan) -> float:
+    """Mean square error of the states when defocus is interpolated within its groups.
+
+    Each state reads the group of its nearest field, pupil and accommodation.
+    """
+    states = use.states
+    corner = [
+        np.abs(nodes - values[:, None]).argmin(axis=1)
+        for nodes, values in (
+            (plan.v_deg, states.v_deg),
+            (plan.h_deg, states.h_deg),
+            (plan.pupils_mm, states.pupil_diameter_mm),
+            (plan.accommodations_dpt, states.accommodation_dpt),
+        )
+    ]
+    groups = np.ravel_multi_index(corner, plan.group_shape)
+    own_dpt = np.zeros(states.h_deg.size)
+    if not use.spec.blends_at_equal_blur:  # a group holds the range of its own field
+        node = PupilStates(
+            **vars(states)
+            | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
+        )
+        own_dpt += use.object_dpt - states.total_defocus_dpt
+        own_dpt += _at_infinity_dpt(use, node)
+    channel = np.argmin(
+        np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
+    )
+    shift_dpt = plan.channel_shift_dpt[groups, channel]
+    scale = states.pupil_diameter_mm / plan.pupils_mm[corner[2]]
+    read_dpt = (states.total_defocus_dpt + own_dpt) * scale - shift_dpt
+    lower, upper, share = plan.defocus.bracket(groups, read_dpt)
+    columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
+    columns["total_defocus_dpt"] = np.concatenate(
+        [
+            (plan.defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
+            for index in (lower, upper)
+        ]
+    )
+    return AXIS_FACTOR["defocus"] * _error(use, PupilStates(**columns), share)
+
+
+def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
+    columns = dict(vars(states))
+    del columns["total_defocus_dpt"]
+    return use.eye.total_defocus_dpt(**columns)
+
+
+def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
+    """Mean square error with all lower neighbours and then all upper ones."""
+    scale = use.pixel_from_mrad
+    if scale is not None:
+        scale = np.tile(scale, (2, 1, 1))
+    frames = state_frames(use.eye, use.spec, neighbours, pixel_from_mrad=scale)
+    lower_px, upper_px = np.split(slopes_px(frames), 2)
+    errors = blend_error(
+        lower_px, upper_px, use.exact_px, share_ratio=share, unit_px=use.unit_px
+    )
+    return float(errors.mean())

@@ -1,0 +1,60 @@
+"""The eye of a profile, over the pupils, foci and directions that a cache is for."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from estimator.field.eye_optics import EyeOptics
+from estimator.field.prepare import prepare_eye
+from estimator.field.traced_eye import MAX_PUPIL_MM
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import EyeProfile
+from filter_service.errors import BuildCancelled
+from filter_service.planning.grid import GridSpec, pupil_nodes_mm
+
+NO_LATERAL_COLOR = "a measured wavefront holds no lateral colour: it needs a traced eye"
+
+
+def eye_for_spec(
+    profile: EyeProfile,
+    spec: GridSpec,
+    *,
+    progress: Callable[[float, str], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> tuple[EyeOptics, tuple[str, ...]]:
+    """Return the eye and what to say about it, see `estimator.prepare_eye`.
+
+    Parameters
+    ----------
+    cancelled : callable, optional
+        Asked at every step.
+
+    Raises
+    ------
+    ValueError
+        An eye that light does not pass.
+    BuildCancelled
+    """
+
+    def report(fraction: float, stage: str) -> None:
+        if cancelled is not None and cancelled():
+            raise BuildCancelled("a newer profile took over")
+        if progress is not None:
+            progress(fraction, stage)
+
+    settings = spec.settings
+    if settings.age_years is not None:
+        profile = replace(profile, age_years=settings.age_years)
+    low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
+    eye, notes = prepare_eye(
+        profile,
+        pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
+        focus_range_dpt=settings.focus_range_dpt,
+        wavelengths_nm=spec.channel_wavelengths_nm,
+        field_range_deg=spec.field_range_deg,
+        eye_model=settings.eye_model,
+        accuracy=settings.accuracy,
+        progress=report,
+    )
+    if settings.lateral_color and isinstance(eye, MeasuredWavefront):
+        notes = (*notes, NO_LATERAL_COLOR)
+    return eye, notes

@@ -1,0 +1,75 @@
+"""Who computes the PSFs of a cache: the GPU where there is one, else all CPU cores."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+
+from estimator.psf.compute import PsfBatch, compute_psf_batch
+from filter_service.constants import PSF_ENGINES
+from filter_service.errors import RenderFailed
+from filter_service.gl.gpu import Gpu
+from filter_service.psfs.gpu_build import gpu_psf_batch
+
+CPU_BATCH = 768
+GPU_BATCH = 8192
+"""PSFs computed between two looks at progress and cancellation: about 0.05 s of two
+cores; the GPU's number is a guess, for none was at hand."""
+
+
+@dataclass(frozen=True)
+class PsfEngine:
+    """A way to compute PSFs.
+
+    Attributes
+    ----------
+    name : "cpu" or "gpu"
+    compute : callable
+        As `estimator.psf.compute.compute_psf_batch`.
+    batch_count : int
+        PSFs to ask for at a time.
+    """
+
+    name: str
+    compute: Callable[..., PsfBatch]
+    batch_count: int
+
+
+CPU = PsfEngine("cpu", compute_psf_batch, CPU_BATCH)
+
+
+@cache
+def psf_engine(choice: str = "auto") -> PsfEngine:
+    """Return the engine of a choice; the process keeps it and its GPU context.
+
+    Parameters
+    ----------
+    choice : "auto", "cpu" or "gpu"
+        "auto" takes the GPU where it is none that a processor imitates: there the
+        compiled loops of the CPU are two to four times as fast.
+
+    Raises
+    ------
+    ValueError
+        Another choice.
+    filter_service.errors.RenderFailed
+        "gpu" without OpenGL 4.3.
+    """
+    if choice not in PSF_ENGINES:
+        raise ValueError(f"psf_engine {choice!r}: allowed are {', '.join(PSF_ENGINES)}")
+    if choice == "cpu":
+        return CPU
+    try:
+        gpu = Gpu()
+    except RenderFailed:
+        if choice == "gpu":
+            raise
+        return CPU
+    if choice == "auto" and gpu.is_software:
+        gpu.close()
+        return CPU
+    return PsfEngine("gpu", partial(_computed_on, gpu), GPU_BATCH)
+
+
+def _computed_on(gpu: Gpu, *arguments, diffraction: bool = True, **options) -> PsfBatch:
+    with gpu.context:
+        return gpu_psf_batch(gpu, *arguments, diffraction=diffraction, **options)

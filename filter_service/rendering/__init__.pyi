@@ -1,0 +1,3 @@
+from .engine import FrameEngine as FrameEngine
+from .engine import LoadedStore as LoadedStore
+from .engine import Rendered as Rendered

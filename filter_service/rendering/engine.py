@@ -1,0 +1,85 @@
+"""What every frame engine offers, so that a second fits beside the first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import Accumulation, Output
+
+
+class LoadedStore(Protocol):
+    """A PSF store that an engine can filter frames with."""
+
+    def release(self) -> None:
+        """Free what the engine holds of it; once."""
+
+
+class Rendered(Protocol):
+    """What an engine says of one filtered view.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        float32 or float16 linear light, or uint8 sRGB.
+    stage_times_ms : dict
+        By stage; their sum is the time spent in the engine.
+    pupil_diameter_mm, focus_dpt, gaze_deg : as used
+    """
+
+    @property
+    def color(self) -> NDArray[Any]: ...  # noqa: D102
+    @property
+    def stage_times_ms(self) -> dict[str, float]: ...  # noqa: D102
+    @property
+    def missing_depth_count(self) -> int: ...  # noqa: D102
+    @property
+    def clamped_depth_count(self) -> int: ...  # noqa: D102
+    @property
+    def overflow_count(self) -> int: ...  # noqa: D102
+    @property
+    def pupil_diameter_mm(self) -> float: ...  # noqa: D102
+    @property
+    def focus_dpt(self) -> float: ...  # noqa: D102
+    @property
+    def gaze_deg(self) -> tuple[float, float]: ...  # noqa: D102
+    @property
+    def notes(self) -> list[str]: ...  # noqa: D102
+
+
+class FrameEngine(Protocol):
+    """Filters views through loaded stores, one at a time; not thread-safe."""
+
+    @property
+    def name(self) -> str:
+        """What does the work, as replies and `ocufilter doctor` name it."""
+
+    def load_steps(self, store: Any) -> Iterator[LoadedStore | None]:
+        """Take a store in slices, so that frames go on between.
+
+        Yields None after each slice and in the end the loaded store; closing the
+        iterator before gives the load up.
+        """
+
+    def render(
+        self,
+        view: RgbdView,
+        handle: Any,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        accumulation: Accumulation = "coverage",
+        merge: bool = True,
+        output: Output = "linear",
+        gaze_deg: tuple[float, float] | None = None,
+    ) -> Rendered:
+        """Filter one view through the eye of a loaded store.
+
+        Raises
+        ------
+        FilterError
+            `BadMessage`, `CameraMismatch` or another `RenderError`.
+        """

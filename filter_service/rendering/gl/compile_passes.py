@@ -1,0 +1,85 @@
+"""Compiles every pass before the first client comes, by filtering a few pixels.
+
+A software renderer translates a shader at its first dispatch; without this, the first
+frames through a new service stall by half a second.  The loops that plan a frame are
+compiled too, in 8 s on two busy cores, but only once: they are kept on disk.
+"""
+
+import numpy as np
+
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
+from filter_service.camera import Camera
+from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
+from filter_service.psfs.store import PsfStore
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import FilterSettings
+
+SIDE_PX = 16
+PUPIL_MM = 3.0
+TANGENTS = (-0.01, 0.01, 0.01, -0.01)
+
+
+def compile_passes(renderer: FilterRenderer) -> None:
+    """Render a tiny frame in every variant that clients may ask for."""
+    handle = renderer.load(_one_pixel_store())
+    depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
+    for dtype, output, accumulations in (
+        (np.uint8, "srgb8", ("coverage", "paper")),
+        (np.float32, "linear", ("coverage",)),
+        (np.float16, "linear16", ("coverage",)),
+    ):
+        view = RgbdView(np.ones((SIDE_PX, SIDE_PX, RGB), dtype), depth_m, TANGENTS)
+        for accumulation in accumulations:
+            renderer.render(
+                view,
+                handle,
+                pupil_diameter_mm=PUPIL_MM,
+                focus_dpt=0.0,
+                accumulation=accumulation,
+                output=output,
+            )
+    handle.release()
+
+
+def _one_pixel_store() -> PsfStore:
+    """Store of a perfect eye, wide enough on paper for every merging pass to run."""
+    spec = GridSpec(
+        Camera(SIDE_PX, SIDE_PX, TANGENTS),
+        FilterSettings(
+            mode="on-axis",
+            pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+            focus_range_dpt=(0.0, 0.0),
+            object_range_dpt=(0.0, 2.0),
+        ),
+    )
+    eye = MeasuredWavefront.from_profile(
+        parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
+    )
+    one = np.ones(RGB)
+    return PsfStore(
+        spec=spec,
+        eye=eye,
+        plan=CachePlan(
+            h_deg=np.zeros(1),
+            v_deg=np.zeros(1),
+            pupils_mm=np.array([PUPIL_MM]),
+            accommodations_dpt=eye.accommodation_nodes_dpt(
+                spec.settings.focus_range_dpt
+            ),
+            defocus=RaggedNodes.of([np.zeros(1)]),
+            channel_shift_dpt=np.zeros((1, RGB)),
+            prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
+            is_limited=np.zeros(1, bool),
+        ),
+        kernels=np.full(RGB, WEIGHT_MAX, np.uint16),
+        offsets=np.arange(RGB),
+        reach_px=np.zeros((RGB, 4), np.int64),
+        radius_px=np.zeros(RGB, np.int64),
+        blur_px=0.0 * one,
+        spread_px=16.0 * one,
+        peak_ratio=one,
+    )

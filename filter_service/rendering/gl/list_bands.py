@@ -1,0 +1,73 @@
+"""Cuts a frame's lists into bands of bins whose entries fit their buffer; CPU only."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    TOTAL_ENTRIES,
+    TOTAL_ENTRIES_FLOAT,
+    TOTAL_LONGEST,
+    TOTAL_LOST,
+    TOTAL_WORDS,
+)
+from filter_service.rendering.gl.kernel_passes import MAX_GROUPS
+
+ENTRY_BYTES = 4
+MAX_BAND_ENTRIES = 16 * 2**20
+"""List entries in flight; more go through in bands.  Keeps each list buffer at 64 MB,
+half of the smallest storage block that the service runs on.  Also the most that one
+bin's list may hold: a bin has fewer than 2**19 pixels within the reach of a kernel, so
+that only many surfaces, or a smaller limit, leave some out; they are counted."""
+
+
+@dataclass(frozen=True)
+class ListTotals:
+    """What the scan found.
+
+    Attributes
+    ----------
+    entry_count : int
+        Of all lists; exact below 2**32, to seven digits beyond.
+    overflow_count : int
+        Entries that did not fit a bin's list.
+    longest : int
+        Entries of the longest list.
+    """
+
+    entry_count: int = 0
+    overflow_count: int = 0
+    longest: int = 0
+
+
+def read_totals(words: bytes) -> ListTotals:
+    """Totals from the words behind the bins' offsets."""
+    whole = np.frombuffer(words, np.uint32, TOTAL_WORDS)
+    as_float = whole[TOTAL_ENTRIES_FLOAT : TOTAL_ENTRIES_FLOAT + 1].view(np.float32)
+    rounded = round(float(as_float[0]))
+    return ListTotals(
+        entry_count=rounded if rounded > 2**31 else int(whole[TOTAL_ENTRIES]),
+        overflow_count=int(whole[TOTAL_LOST]),
+        longest=int(whole[TOTAL_LONGEST]),
+    )
+
+
+def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list]:
+    """Cut lists into bands of at most ``limit`` entries and MAX_GROUPS bins.
+
+    Returns
+    -------
+    offsets : (n_bins,)
+        Starts of the lists, relative to their band.
+    bands : list of (first bin, bin count, entries)
+    """
+    bands, offsets = [], np.zeros(len(counts), dtype=np.int64)
+    first = 0
+    while first < len(counts):
+        sums = np.cumsum(counts[first : first + MAX_GROUPS])
+        bins = max(int(np.searchsorted(sums, limit, side="right")), 1)
+        offsets[first : first + bins] = sums[:bins] - counts[first : first + bins]
+        bands.append((first, bins, int(sums[bins - 1])))
+        first += bins
+    return offsets, bands

@@ -1,0 +1,162 @@
+"""One view of a scene: colour, depth and camera, for clients and engines alike.
+
+A view may have a second, hidden layer: what the camera would see if what it sees were
+away.  Blurred edges let light of it pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.camera import Camera, Tangents
+from filter_service.errors import BadMessage
+from filter_service.settings import DEPTH_KINDS, DepthKind
+
+ColorImage = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
+"""(height, width, 3): 8-bit sRGB, or linear light."""
+
+COLOR_DTYPES = (np.uint8, np.float32, np.float16)
+
+
+@dataclass(frozen=True)
+class RgbdView:
+    """Colour, depth and camera of one view.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        uint8 sRGB; or float32 or float16 linear light, above 1 and below 0 too.
+    depth_m : (height, width), float32
+        +inf is infinity; 0, negative and NaN are missing.
+    tangents : (left, right, up, down)
+        Of the angles to the image edges, left < right and down < up.
+    depth_kind : "planar" or "radial"
+        View-space z, or distance from the eye.
+    hidden_color, hidden_depth_m : like color and depth_m, optional
+        What is behind: both or neither.  Depth of 0, negative or NaN: nothing is hidden
+        here, and nothing is filled in.
+
+    Raises
+    ------
+    BadMessage
+        Arrays that are no RGB-D image; a ValueError, too.
+    """
+
+    color: ColorImage
+    depth_m: NDArray[np.float32]
+    tangents: Tangents
+    depth_kind: DepthKind = "planar"
+    hidden_color: ColorImage | None = None
+    hidden_depth_m: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that are no RGB-D image."""
+        color, depth_m = self.color, self.depth_m
+        if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+            raise BadMessage(
+                f"it has shape {color.shape}",
+                field="color",
+                allowed="(height, width, 3)",
+            )
+        if color.dtype not in COLOR_DTYPES:
+            raise BadMessage(
+                f"it is {color.dtype}",
+                field="color",
+                allowed="uint8 sRGB, float32 or float16 linear",
+            )
+        if depth_m.shape != color.shape[:2] or depth_m.dtype != np.float32:
+            raise BadMessage(
+                f"it is {depth_m.dtype} of shape {depth_m.shape}",
+                field="depth",
+                allowed=f"float32 of shape {color.shape[:2]}",
+            )
+        if self.depth_kind not in DEPTH_KINDS:
+            raise BadMessage(
+                f"it is {self.depth_kind!r}",
+                field="depth.kind",
+                allowed=", ".join(DEPTH_KINDS),
+            )
+        if self.hidden_color is not None or self.hidden_depth_m is not None:
+            self._check_hidden()
+        object.__setattr__(self, "tangents", self.camera.tangents)
+
+    def _check_hidden(self) -> None:
+        """Refuse a hidden layer that is not of the kind of what is seen."""
+        for field, image, seen in (
+            ("hidden_color", self.hidden_color, self.color),
+            ("hidden_depth", self.hidden_depth_m, self.depth_m),
+        ):
+            wanted = f"{seen.dtype} of shape {seen.shape}"
+            found = "missing"
+            if image is not None:
+                found = f"{image.dtype} of shape {image.shape}"
+            if found != wanted:
+                raise BadMessage(f"it is {found}", field=field, allowed=wanted)
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera of this view."""
+        return Camera(self.width_px, self.height_px, self.tangents)
+
+    @property
+    def width_px(self) -> int:
+        """Return the number of columns."""
+        return int(self.color.shape[1])
+
+    @property
+    def height_px(self) -> int:
+        """Return the number of rows."""
+        return int(self.color.shape[0])
+
+    @property
+    def surface_count(self) -> int:
+        """Return 1, or 2 with a hidden layer."""
+        return 1 if self.hidden_depth_m is None else 2
+
+    @property
+    def surface_colors(self) -> tuple[Any, ...]:
+        """Return the colour of each surface."""
+        return (self.color, self.hidden_color)[: self.surface_count]
+
+    @property
+    def surface_depths_m(self) -> tuple[Any, ...]:
+        """Return the depth of each surface."""
+        return (self.depth_m, self.hidden_depth_m)[: self.surface_count]
+
+    @property
+    def images(self) -> tuple[NDArray[Any], ...]:
+        """Return colour and depth, and those of the hidden layer if there is one."""
+        surfaces = zip(self.surface_colors, self.surface_depths_m, strict=True)
+        return tuple(image for surface in surfaces for image in surface)
+
+
+def as_views(
+    color: ColorImage | RgbdView | Sequence[RgbdView],
+    depth_m: NDArray[np.float32] | None,
+    camera: Camera | None,
+) -> tuple[RgbdView, ...]:
+    """Return the views of a frame: given as such, or as arrays seen by a camera.
+
+    Raises
+    ------
+    BadMessage
+        Arrays without depth or without a camera, or views with depth beside them.
+    """
+    if isinstance(color, np.ndarray):
+        if depth_m is None:
+            raise BadMessage("it is missing", field="depth", allowed="depth in metres")
+        if camera is None:
+            raise BadMessage(
+                "it is not known", field="camera", allowed="a camera, or an RgbdView"
+            )
+        return (RgbdView(color, depth_m, camera.tangents),)
+    if depth_m is not None:
+        raise BadMessage(
+            "it is given twice", field="depth", allowed="arrays, or an RgbdView"
+        )
+    return (color,) if isinstance(color, RgbdView) else tuple(color)

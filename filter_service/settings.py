@@ -1,0 +1,147 @@
+"""The settings of a filter: each stands here once, with range, default and meaning.
+
+Commands, wire, planner and store read the same object.  A new setting is a line here
+and a line in PROTOCOL.md, beside what reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+from msgspec import Meta
+
+from filter_service.checked import RISING, Record, check_rising, checked
+
+MIN_PUPIL_MM = 0.5
+MAX_PUPIL_MM = 9.0
+MAX_VERGENCE_DPT = 20.0
+MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
+
+PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]
+VergenceDpt = Annotated[float, Meta(ge=0.0, le=MAX_VERGENCE_DPT)]
+GazeDeg = Annotated[float, Meta(ge=-MAX_GAZE_DEG, le=MAX_GAZE_DEG)]
+TurnDeg = Annotated[float, Meta(ge=0.0, le=MAX_GAZE_DEG)]
+Years = Annotated[float, Meta(ge=3.0, le=120.0)]
+
+Mode = Literal["on-axis", "quality", "dynamic"]
+Grid = Literal["planned", "paper"]
+Tolerance = Literal["loose", "normal", "fine"]
+EyeModel = Literal["traced", "wavefront"]
+Accuracy = Literal["fast", "balanced", "exact"]
+Accumulation = Literal["coverage", "paper"]
+DepthKind = Literal["planar", "radial"]
+Output = Literal["srgb8", "linear", "linear16"]
+
+TOLERANCES: tuple[str, ...] = get_args(Tolerance)
+"""From the loosest to the finest."""
+
+ACCUMULATIONS: tuple[str, ...] = get_args(Accumulation)
+DEPTH_KINDS: tuple[str, ...] = get_args(DepthKind)
+OUTPUTS: tuple[str, ...] = get_args(Output)
+
+
+def _doc(text: str, **more: Any) -> Meta:
+    return Meta(description=text, **more)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterSettings(Record):
+    """How the PSFs of an eye are computed, and what frames may ask of them.
+
+    Raises
+    ------
+    BadMessage
+        A value out of its range; names the setting.
+    """
+
+    mode: Annotated[
+        Mode,
+        _doc(
+            "on-axis: one direction for the whole image; quality and dynamic: PSFs "
+            "that follow the visual field, over a finer and a coarser grid."
+        ),
+    ] = "dynamic"
+    grid: Annotated[
+        Grid, _doc("planned: PSFs where this eye needs them; paper: its grid.")
+    ] = "planned"
+    tolerance: Annotated[
+        Tolerance, _doc("Interpolation of a planned grid at about 43, 49 or 55 dB.")
+    ] = "normal"
+    pupil_range_mm: Annotated[
+        tuple[PupilMm, PupilMm],
+        _doc("Entrance pupils that frames may ask for, mm.", extra=RISING),
+    ] = (2.0, 7.0)
+    focus_range_dpt: Annotated[
+        tuple[VergenceDpt, VergenceDpt],
+        _doc("Focus that frames may ask for, dpt.", extra=RISING),
+    ] = (0.0, 6.0)
+    object_range_dpt: Annotated[
+        tuple[VergenceDpt, VergenceDpt],
+        _doc("Object distances in the scene, dpt; 0 is infinity.", extra=RISING),
+    ] = (0.0, 10.0)
+    gaze_deg: Annotated[
+        tuple[GazeDeg, GazeDeg],
+        _doc("Gaze from the image's axis to the right and upwards, deg."),
+    ] = (0.0, 0.0)
+    gaze_range_deg: Annotated[
+        tuple[TurnDeg, TurnDeg],
+        _doc("How far frames may turn the gaze from there, to either side, deg."),
+    ] = (0.0, 0.0)
+    diffraction: Annotated[bool, _doc("Off: geometrical optics only.")] = True
+    chromatic: Annotated[bool, _doc("Off: all colours are focused alike.")] = True
+    lateral_color: Annotated[
+        bool,
+        _doc("Displace red and blue against green off the axis; a traced eye only."),
+    ] = False
+    eye_model: Annotated[
+        EyeModel,
+        _doc(
+            "wavefront: the measurement by formula, up to its own pupil; traced: an "
+            "estimated eye, ray-traced at any pupil and focus."
+        ),
+    ] = "traced"
+    accuracy: Annotated[
+        Accuracy,
+        _doc(
+            "Of a traced eye.  exact: everything ray-traced; fast: networks, 35 to 170 "
+            "ms less for a new eye, 0.03 to 0.4 um off over the field; balanced: a "
+            "refined eye and networks where they save 0.1 s, which few eyes do."
+        ),
+    ] = "exact"
+    age_years: Annotated[
+        Years | None, _doc("Instead of the profile's; limits accommodation.")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is out of range; lists become tuples, integers floats."""
+        for name, kind in setting_types().items():
+            value = checked(getattr(self, name), kind, name)
+            check_rising(value, kind, name)
+            object.__setattr__(self, name, value)
+
+    @property
+    def follows_field(self) -> bool:
+        """Return whether PSFs differ over the visual field."""
+        return self.mode != "on-axis"
+
+    def changed(self, **changes: Any) -> FilterSettings:
+        """Return settings of which some are others."""
+        return replace(self, **changes)
+
+
+@cache
+def setting_types() -> dict[str, Any]:
+    """Return the annotated type of each setting."""
+    hints = get_type_hints(FilterSettings, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(FilterSettings)}
+
+
+def setting_help(name: str) -> str:
+    """Return what a setting means, in a sentence."""
+    metas = [m for m in setting_types()[name].__metadata__ if isinstance(m, Meta)]
+    return str(metas[0].description)
+
+
+DEFAULTS = FilterSettings()

@@ -1,0 +1,120 @@
+"""What every message has in common: header fields from annotated types, and parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Self
+
+from msgspec import Meta
+
+from filter_service.checked import Record, checked
+from filter_service.errors import BadMessage
+
+Part = bytes | bytearray | memoryview
+
+MAX_ID = 2**53 - 1  # ids survive a trip through a double, as in JSON or JavaScript
+MAX_NOTES = 8
+MAX_NOTE_BYTES = 200
+
+Id = Annotated[int, Meta(ge=0, le=MAX_ID)]
+Count = Id
+Word = Annotated[str, Meta(max_length=100)]
+Text = Annotated[str, Meta(max_length=2048)]
+Notes = Annotated[tuple[Text, ...], Meta(max_length=MAX_NOTES)]
+Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
+Moment = Annotated[float, Meta(ge=-1e18, le=1e18)]
+Megabytes = Annotated[float, Meta(ge=0.0, le=1e9)]
+Size = Annotated[int, Meta(ge=1, le=2**40)]
+
+
+@dataclass(frozen=True)
+class Limits(Record):
+    """What one service accepts; it is published in ``welcome``."""
+
+    max_width_px: Size = 4096
+    max_height_px: Size = 4096
+    max_views: Size = 2
+    max_part_bytes: Size = 100_000_000  # 3840 x 2160 linear float32 colour fits
+    max_profile_bytes: Size = 2**20
+
+    def narrowed(self, error: BadMessage) -> BadMessage:
+        """Return a refusal that states this service's limit, not the protocol's."""
+        name = (error.field or "").rpartition(".")[2]
+        allowed = {
+            "width_px": f"an integer 1 to {self.max_width_px}",
+            "height_px": f"an integer 1 to {self.max_height_px}",
+            "views": f"a list of at most {self.max_views} items",
+        }.get(name, error.allowed)
+        return BadMessage(error.message, field=error.field, allowed=allowed)
+
+
+class Message(Record):
+    """Base of all messages: frozen dataclasses whose fields are the header's.
+
+    Attributes
+    ----------
+    payload : str
+        Name of the field that travels in parts of its own; empty for most.
+    """
+
+    type_name: ClassVar[str]
+    payload: ClassVar[str] = ""
+
+    def fields(self) -> dict[str, Any]:
+        """Return the header fields; what is None does not travel."""
+        fields = super().fields()
+        fields.pop(self.payload, None)
+        return fields
+
+    def parts(self) -> list[Any]:
+        """Return what follows the header."""
+        return []
+
+    @classmethod
+    def parse(
+        cls, header: Mapping[str, Any], parts: Sequence[Part], limits: Limits
+    ) -> Self:
+        """Return the checked message with what follows its header.
+
+        Raises
+        ------
+        BadMessage
+            Names the field, the bad value and what is allowed.
+        """
+        given = {name: value for name, value in header.items() if name != cls.payload}
+        try:
+            return checked(given, cls).with_parts(parts, limits)
+        except BadMessage as error:
+            raise limits.narrowed(error) from None
+
+    def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
+        """Return the message with its parts; most have none."""
+        expect_parts(parts, 0)
+        return self
+
+    def _with_payload(self, value: object) -> Self:
+        return replace(self, **{self.payload: value})  # type: ignore[type-var]
+
+
+def expect_parts(parts: Sequence[Part], count: int) -> None:
+    """Raise unless exactly ``count`` parts follow the header."""
+    if len(parts) != count:
+        raise BadMessage(
+            f"{len(parts)} parts follow the header",
+            field="parts",
+            allowed=f"{count} parts",
+        )
+
+
+def clip(text: str, max_bytes: int) -> str:
+    """Return the text, shortened with dots where its UTF-8 form is too long."""
+    encoded = text.encode("utf-8", "replace")
+    if len(encoded) <= max_bytes:
+        return encoded.decode("utf-8")
+    return encoded[: max_bytes - 3].decode("utf-8", "ignore") + "..."
+
+
+def clip_notes(notes: Sequence[str]) -> tuple[str, ...]:
+    """Return the notes that fit into a header."""
+    return tuple(clip(note, MAX_NOTE_BYTES) for note in notes[:MAX_NOTES])

@@ -1,0 +1,54 @@
+"""The headers of all messages as JSON Schema, for clients in other languages.
+
+    python -m filter_service.wire.schema
+
+writes ``filter_service/protocol.schema.json``.  What a schema cannot say (an edge on
+the wrong side, the size of a part) is in PROTOCOL.md.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from filter_service.messages import PROTOCOL_VERSION, REPLIES, REQUESTS
+
+SCHEMA_FILE = Path(__file__).resolve().parents[1] / "protocol.schema.json"
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def protocol_schema() -> dict[str, Any]:
+    """Return one schema: a header is one of the messages, told apart by ``type``."""
+    kinds = [*REQUESTS.values(), *REPLIES.values()]
+    _, parts = msgspec.json.schema_components(kinds, ref_template="#/$defs/{name}")
+    for kind in kinds:
+        schema = parts[kind.__name__]
+        schema["properties"].pop(kind.payload, None)
+        schema["properties"] = {
+            "type": {"const": kind.type_name},
+            "version": {"const": PROTOCOL_VERSION},
+            **schema["properties"],
+        }
+        schema["required"] = ["type", "version", *schema["required"]]
+    for schema in parts.values():
+        if "description" in schema:
+            schema["description"] = inspect.cleandoc(schema["description"])
+    return {
+        "$schema": DRAFT,
+        "title": f"Headers of the filter service's protocol {PROTOCOL_VERSION}",
+        "oneOf": [{"$ref": f"#/$defs/{kind.__name__}"} for kind in kinds],
+        "$defs": dict(sorted(parts.items())),
+    }
+
+
+def schema_text() -> str:
+    """Return the schema as it is kept."""
+    return json.dumps(protocol_schema(), indent=1, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    SCHEMA_FILE.write_text(schema_text(), encoding="utf-8")
