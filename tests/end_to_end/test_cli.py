@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -77,7 +78,7 @@ def test_doctor_reports_a_machine_that_can_serve():
     assert report["gl"]["renderer"]
     assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
     checks = {check["name"]: check["ok"] for check in report["checks"]}
-    assert checks["compute"] and checks["networks"]
+    assert checks["compute"] and checks["shaders"] and checks["networks"]
     assert set(report["networks"]) == set(NETWORK_NAMES)
     assert all(card["n_parameters"] > 0 for card in report["networks"].values())
 
@@ -342,11 +343,11 @@ def test_other_commands_refuse_bad_input_with_one_line(arguments, named):
 @pytest.mark.parametrize("arguments", [("demo",), ("bench", "psf")])
 def test_checkout_commands_say_so_elsewhere(tmp_path, arguments):
     (tmp_path / "estimator").symlink_to(ROOT / "estimator")
-    (tmp_path / "filter_service").mkdir()
-    for path in (ROOT / "filter_service").rglob("*.py"):
-        copy = tmp_path / path.relative_to(ROOT)
-        copy.parent.mkdir(exist_ok=True)
-        copy.write_bytes(path.read_bytes())
+    shutil.copytree(
+        ROOT / "filter_service",
+        tmp_path / "filter_service",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
     finished = subprocess.run(
         [sys.executable, "-m", "filter_service", *arguments],
         cwd=tmp_path,
