@@ -22,10 +22,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from clients.demo_eyes import EYES
+from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.pyrender_stream import parse_size, path_settings
-from clients.scene_renderer import SceneFrame, scene_frames
-from clients.scenes.catalogue import build_scene
 from clients.service_process import ServiceProcess
 from clients.sheet import (
     Cell,
@@ -37,9 +35,18 @@ from clients.sheet import (
     state_panel,
     video_frame,
 )
-from clients.streaming import FrameLog, change_eye, filter_in_order
-from clients.video import write_video
 from filter_service.errors import FilterError, RenderFailed
+
+try:
+    from clients.pyrender_stream import parse_size, path_settings
+    from clients.scene_renderer import SceneFrame, scene_frames
+    from clients.scenes.catalogue import build_scene
+    from clients.streaming import FrameLog, change_eye, filter_in_order
+    from clients.video import write_video
+except ModuleNotFoundError as error:
+    if __name__ != "__main__":
+        raise
+    sys.exit(f"demo: {what_to_install(error)}")
 
 FRAMES_PER_SECOND = 12
 # Upper left corner, as parts of width and height, of what the sheet magnifies.

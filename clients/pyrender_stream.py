@@ -21,20 +21,27 @@ from typing import Any
 
 import numpy as np
 
+from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.scene_renderer import (
-    SceneFrame,
-    SceneRenderer,
-    frame_at,
-    scene_frames,
-)
-from clients.scenes.catalogue import SCENE_BUILDERS, build_scene
-from clients.scenes.paths import PATHS, path_moments
-from clients.scenes.scene import Scene
-from clients.streaming import FrameLog, view_of
-from clients.window import LiveWindow, NoDisplay
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import DEFAULT_ENDPOINT, Dropped, ErrorReply
+
+try:
+    from clients.scene_renderer import (
+        SceneFrame,
+        SceneRenderer,
+        frame_at,
+        scene_frames,
+    )
+    from clients.scenes.catalogue import SCENE_BUILDERS, build_scene
+    from clients.scenes.paths import PATHS, path_moments
+    from clients.scenes.scene import Scene
+    from clients.streaming import FrameLog, view_of
+    from clients.window import LiveWindow, NoDisplay
+except ModuleNotFoundError as error:
+    if __name__ != "__main__":
+        raise
+    sys.exit(f"pyrender_stream: {what_to_install(error)}")
 
 FRAMES_PER_ROUND = 60
 MAX_LOOK_AROUND_DEG = 30.0
