@@ -15,6 +15,8 @@ import typer
 
 from filter_service.commands.console import CommandFailed, Json, say
 
+CHECKOUT = Path(__file__).resolve().parents[2]
+
 
 class Bench(StrEnum):
     """Benchmarks by what they time."""
@@ -103,13 +105,13 @@ def _checked_size(size: str) -> str:
 
 
 def _run_program(module: str, arguments: list[str], *, json_output: bool) -> None:
-    _check_is_there(module)
+    folder = _folder_to_start_in(module)
     command = [sys.executable, "-m", module, *arguments]
     if not json_output:
-        finished = subprocess.run(command, check=False)
+        finished = subprocess.run(command, cwd=folder, check=False)
     else:
         finished = subprocess.run(
-            [*command, "--json"], stdout=subprocess.PIPE, check=False
+            [*command, "--json"], cwd=folder, stdout=subprocess.PIPE, check=False
         )
     if finished.returncode in (1, 2):  # it has said why, on the stderr we share
         raise typer.Exit(finished.returncode)
@@ -126,21 +128,26 @@ def _one_json_object(output: bytes, module: str) -> dict:
         raise CommandFailed(f"{module} printed no JSON object: {error}") from None
 
 
-def _check_is_there(module: str) -> None:
-    """Refuse a program that did not come along.
+def _folder_to_start_in(module: str) -> Path | None:
+    """Return where ``python -m`` finds a program; None where it is found anyway.
+
+    The `ocufilter` of an editable install sees the installed packages, which the
+    tests' are not: they are found from the checkout's own folder.
 
     Raises
     ------
     CommandFailed
-        Says that it needs a checkout.
+        The program did not come along: says that it needs a checkout.
     """
-    package = module.partition(".")[0]
     try:
-        found = importlib.util.find_spec(module)
+        if importlib.util.find_spec(module) is not None:
+            return None
     except ModuleNotFoundError:
-        found = None
-    if found is None:
-        raise CommandFailed(
-            f"this command runs a program in {package}/, which an installed package "
-            "does not hold: run it in a checkout"
-        )
+        pass
+    if CHECKOUT.joinpath(*module.split(".")).with_suffix(".py").is_file():
+        return CHECKOUT
+    package = module.partition(".")[0]
+    raise CommandFailed(
+        f"this command runs a program in {package}/, which an installed package "
+        "does not hold: run it in a checkout"
+    )
