@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from estimator.threads import thread_count
 from filter_service.threads import UNSAFE_THREADING_LAYER
@@ -21,6 +22,8 @@ SERVICE_PACKAGES = (
     "glcontext",
     "pyzmq",
     "msgpack",
+    "msgspec",
+    "lazy-loader",
     "pillow",
     "OpenEXR",
     "onnxruntime",
@@ -33,14 +36,26 @@ SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
 """Library that must be found by name, and the Debian package that holds it."""
 
 PROBE_TIMEOUT_S = 60.0
+SHADERS_TIMEOUT_S = 180.0
+"""At its first use, loops are compiled for half a minute of two idle cores."""
 
-FIX_PACKAGES = "make demo, or: sh setup.sh"
+FRAME_ERROR_MAX = 2e-3
+"""Change of a pixel of a perfect eye's picture; a half float's step is 1e-3."""
+PSF_ERROR_MAX = 0.1
+"""Light that wave and ray optics may place differently, of all; 0.04 is usual."""
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+IN_CHECKOUT = (CHECKOUT / "setup.sh").is_file()
+
+FIX_SETUP = "make demo, or: sh setup.sh"
+FIX_PYRENDER = "pip install --no-deps pyrender==0.1.45"
+"""Apart and without its dependencies: it pins a PyOpenGL that is too old."""
+FIX_WHEEL = "pip install --force-reinstall --no-deps ocufilter-*.whl"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
-FIX_WEIGHTS = "git checkout -- estimator/networks/weights"
+FIX_DRIVER = "update the graphics driver"
+FIX_WEIGHTS = "git checkout -- estimator/networks/weights" if IN_CHECKOUT else FIX_WHEEL
+FIX_SHADERS = "git checkout -- shaders" if IN_CHECKOUT else FIX_WHEEL
 FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
-
-
-"""Numba's fallback: two threads in parallel kernels at once end the process."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +79,7 @@ def examine() -> dict:
         ``networks`` (each with its weights' size and expected error), ``packages``.
     """
     gl = run_probe("gl")
+    shaders = {} if "error" in gl else run_probe("shaders", SHADERS_TIMEOUT_S)
     threads = run_probe("threads")
     networks = run_probe("networks")
     packages = package_versions()
@@ -73,6 +89,7 @@ def examine() -> dict:
         *check_libraries(),
         check_gl(gl),
         check_compute(gl),
+        check_shaders(gl, shaders),
         check_threads(threads),
         check_networks(networks),
         check_packages("client packages", CLIENT_PACKAGES, packages),
@@ -93,7 +110,7 @@ def examine() -> dict:
     }
 
 
-def run_probe(name: str) -> dict:
+def run_probe(name: str, timeout_s: float = PROBE_TIMEOUT_S) -> dict:
     """Run one probe in its own process; ``error`` says why it gave no answer."""
     command = [sys.executable, "-m", "filter_service.commands.doctor_probes", name]
     try:
@@ -101,11 +118,11 @@ def run_probe(name: str) -> dict:
             command,
             capture_output=True,
             text=True,
-            timeout=PROBE_TIMEOUT_S,
+            timeout=timeout_s,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return {"error": f"no answer within {PROBE_TIMEOUT_S:g} s"}
+        return {"error": f"no answer within {timeout_s:g} s"}
     if finished.returncode == 0:
         return json.loads(finished.stdout.splitlines()[-1])
     if finished.returncode < 0:
@@ -163,8 +180,21 @@ def check_packages(
     """Check that every package of one purpose is installed."""
     missing = [package for package in wanted if versions[package] is None]
     if missing:
-        return Check(name, False, "missing: " + ", ".join(missing), FIX_PACKAGES)
+        return Check(
+            name, False, "missing: " + ", ".join(missing), install_command(missing)
+        )
     return Check(name, True, ", ".join(f"{p} {versions[p]}" for p in wanted))
+
+
+def install_command(missing: list[str]) -> str:
+    """Return what installs packages: in a checkout, what installs all at once."""
+    if IN_CHECKOUT:
+        return FIX_SETUP
+    others = " ".join(package for package in missing if package != "pyrender")
+    commands = [f"pip install {others}"] if others else []
+    if "pyrender" in missing:
+        commands.append(FIX_PYRENDER)
+    return " && ".join(commands)
 
 
 def check_libraries() -> list[Check]:
@@ -191,13 +221,31 @@ def check_compute(gl: dict) -> Check:
         return Check("compute", False, "not tried: no OpenGL context")
     ok = gl["compute_correct"] and gl["gl_error"] == "GL_NO_ERROR"
     detail = "ran and read back" if ok else f"wrong result ({gl['gl_error']})"
-    return Check("compute", ok, detail, "" if ok else "update the graphics driver")
+    return Check("compute", ok, detail, "" if ok else FIX_DRIVER)
+
+
+def check_shaders(gl: dict, shaders: dict) -> Check:
+    """Report whether the real passes compile, run and give what they should."""
+    if "error" in gl:
+        return Check("shaders", False, "not tried: no OpenGL context")
+    if "error" in shaders:
+        is_missing = "does not exist" in shaders["error"]
+        fix = FIX_SHADERS if is_missing else FIX_DRIVER
+        return Check("shaders", False, shaders["error"], fix)
+    frame_error, psf_error = shaders["frame_error"], shaders["psf_error"]
+    detail = (
+        f"{shaders['program_count']} programs compiled and run; "
+        f"a perfect eye changes a picture by {frame_error:.1g}, "
+        f"wave and ray optics differ by {psf_error:.1g} of the light"
+    )
+    ok = frame_error <= FRAME_ERROR_MAX and psf_error <= PSF_ERROR_MAX
+    return Check("shaders", ok, detail, "" if ok else FIX_DRIVER)
 
 
 def check_threads(threads: dict) -> Check:
     """Check that two threads may call Numba at once."""
     if "error" in threads:
-        return Check("threads", False, threads["error"], FIX_PACKAGES)
+        return Check("threads", False, threads["error"], install_command(["numba"]))
     layer = threads["layer"]
     if layer == UNSAFE_THREADING_LAYER:
         fix = f"{APT_INSTALL} libgomp1"
@@ -208,7 +256,8 @@ def check_threads(threads: dict) -> Check:
 def check_networks(networks: dict) -> Check:
     """Report the trained networks; without them everything is ray-traced."""
     if "error" in networks:
-        return Check("networks", False, networks["error"], FIX_PACKAGES)
+        fix = install_command(["onnxruntime"])
+        return Check("networks", False, networks["error"], fix)
     if networks["missing"]:
         detail = "; ".join(networks["missing"].values())
         return Check("networks", False, detail, FIX_WEIGHTS)
@@ -230,7 +279,7 @@ def check_display() -> Check:
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
     """Purposes of the program, from the checks each one needs."""
     psf = ok["python"] and ok["service packages"]
-    gpu = psf and ok["gl"] and ok["compute"]
+    gpu = psf and ok["gl"] and ok["compute"] and ok["shaders"]
     serve = gpu and ok["threads"]
     demo = serve and ok["client packages"]
     return {

@@ -2,7 +2,7 @@
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
-    python -m filter_service.commands.doctor_probes gl|threads|networks
+    python -m filter_service.commands.doctor_probes gl|shaders|threads|networks
 """
 
 import json
@@ -11,7 +11,12 @@ import sys
 import numpy as np
 from numba import njit, prange, threading_layer
 
+from filter_service.errors import FilterError
+
 PROBE_COUNT = 1000
+
+PROBE_DEFOCUS_UM, PROBE_COMA_UM = 1.0, 0.2
+"""A blur wide enough for wave and ray optics to agree within 5 % of the light."""
 
 LIMITS = (
     "GL_MAX_SHADER_STORAGE_BLOCK_SIZE",
@@ -54,6 +59,45 @@ def probe_gl() -> dict:
     }
 
 
+def probe_shaders() -> dict:
+    """Compile and run the passes that filter frames and those that build PSFs.
+
+    A perfect eye must leave a frame as it is, and the PSFs of wave optics must agree
+    with those of ray optics, which come from other passes.
+    """
+    from filter_service.gl.gpu import Gpu
+    from filter_service.psfs.gpu_build import gpu_psf_batch
+    from filter_service.rendering.gl.compile_passes import compile_passes
+    from filter_service.rendering.gl.renderer import FilterRenderer
+
+    gpu = Gpu()
+    zernike_um = np.zeros((1, 28))
+    zernike_um[0, [4, 7]] = PROBE_DEFOCUS_UM, PROBE_COMA_UM
+    try:
+        change = compile_passes(FilterRenderer(gpu))
+        wave, rays = (
+            gpu_psf_batch(
+                gpu,
+                zernike_um,
+                pupil_diameter_mm=3.0,
+                wavelength_nm=549.0,
+                pixel_pitch_mrad=1.0,
+                method=method,
+            ).flat_kernels
+            for method in ("fourier", "geometric")
+        )
+    except FilterError as error:  # a compiler's text has many lines
+        return {"error": " ".join(str(error).split())}
+    else:
+        return {
+            "program_count": gpu.program_count,
+            "frame_error": change,
+            "psf_error": float(np.abs(wave - rays).sum()),
+        }
+    finally:
+        gpu.close()
+
+
 @njit(parallel=True)
 def _sum_of_squares(count: int) -> float:
     total = 0.0
@@ -94,7 +138,12 @@ def probe_networks() -> dict:
     return {"cards": cards, "missing": missing}
 
 
-PROBES = {"gl": probe_gl, "threads": probe_threads, "networks": probe_networks}
+PROBES = {
+    "gl": probe_gl,
+    "shaders": probe_shaders,
+    "threads": probe_threads,
+    "networks": probe_networks,
+}
 
 if __name__ == "__main__":
     sys.stdout.write(json.dumps(PROBES[sys.argv[1]](), default=str) + "\n")

@@ -5,6 +5,8 @@ import tomllib
 
 import pytest
 
+from clients.extra import INSTALL
+from filter_service.commands.doctor_checks import FIX_PYRENDER
 from filter_service.commands.programs import BENCH_MODULES
 from tests.source_tree import ROOT
 
@@ -34,7 +36,8 @@ def test_every_requirement_has_a_pin():
 
 def test_pyrender_is_installed_in_the_pinned_version():
     setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
-    assert f"--no-deps pyrender=={PINS['pyrender']}" in setup
+    for text in (setup, INSTALL, FIX_PYRENDER):
+        assert f"--no-deps pyrender=={PINS['pyrender']}" in text
 
 
 @pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])
