@@ -13,6 +13,8 @@ from typing import Any
 
 SERVE_COMMAND = (sys.executable, "-m", "filter_service", "serve")
 CHECKOUT = Path(__file__).resolve().parents[1]
+# There `-m` finds our packages whatever the folder; installed ones are found anyway.
+SERVICE_FOLDER = CHECKOUT if (CHECKOUT / "pyproject.toml").is_file() else None
 POLL_S = 0.02
 LOG_TAIL_CHARACTERS = 2000
 
@@ -57,7 +59,7 @@ class ServiceProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                cwd=CHECKOUT,
+                cwd=SERVICE_FOLDER,
             )
         try:
             self._await_ready(start_timeout_s)

@@ -1,0 +1,301 @@
+"""The wheel, installed where no checkout is near, does what the checkout does."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.source_tree import ROOT
+
+TIMEOUT_S = 300  # where no kernel of numba's has been compiled yet
+WIDTH_PX, HEIGHT_PX = 24, 16
+PACKAGES = ("clients", "estimator", "filter_service")
+
+HELD = (
+    *(f"{package}/**/{name}" for package in PACKAGES for name in ("*.py", "*.pyi")),
+    *(f"{package}/py.typed" for package in PACKAGES),
+    "shaders/**/*.glsl",
+    "shaders/README.md",
+    "estimator/networks/weights/*.onnx",
+    "estimator/networks/weights/*.json",
+    "estimator/profiles/presets.json",
+    "estimator/estimate/eye_table.json",
+    "filter_service/PROTOCOL.md",
+    "filter_service/protocol.schema.json",
+    "clients/assets/*",
+)
+"""Files of the checkout that a wheel holds, and no others."""
+
+CLIENT = """
+import json, sys
+import numpy as np
+from clients import FilterClient, ServiceProcess
+from filter_service import Camera
+
+color = np.full((36, 64, 3), 128, np.uint8)
+color[:, 32:] = 255
+depth_m = np.full((36, 64), 2.0, np.float32)
+camera = Camera.from_fov(10.0, width_px=64, height_px=36)
+settings = {"mode": "on-axis", "eye_model": "wavefront"}
+with ServiceProcess(command=sys.argv[1:]) as service:
+    with FilterClient(service.endpoint) as client:
+        client.set_profile("myopia", settings=settings, views=[camera])
+        seen = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
+    code = service.stop()
+row = seen.color[18, :, 1].tolist()
+print(json.dumps({"shape": seen.color.shape, "row": row, "code": code}))
+"""
+
+
+def copy_checkout(folder):
+    """Copy what git would: a build leaves files behind in the folder it is made of."""
+    for name in files_of_git() or files_without_git():
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def files_of_git():
+    if shutil.which("git") is None:
+        return []
+    listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    finished = subprocess.run(listing, cwd=ROOT, capture_output=True, text=True)
+    return finished.stdout.split("\0")[:-1]
+
+
+def files_without_git():
+    found = [
+        path.relative_to(ROOT)
+        for name in (*PACKAGES, "shaders")
+        for path in (ROOT / name).rglob("*")
+        if "__pycache__" not in path.parts
+    ]
+    return [*found, "pyproject.toml", "README.md"]
+
+
+def pip(*arguments):
+    finished = subprocess.run(
+        [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    assert finished.returncode == 0, finished.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel of the checkout as it is."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    copy_checkout(source)
+    build = ("wheel", "-q", "--no-deps", "--no-build-isolation", "-w", folder, source)
+    pip(*map(str, build))
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def wheel_names(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """An environment that has the wheel, and of this one's packages all others."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv = [sys.executable, "-m", "venv", "--without-pip", folder / "venv"]
+    subprocess.run(venv, check=True, timeout=TIMEOUT_S)
+    python = folder / "venv" / "bin" / "python"
+    install = ("install", "-q", "--no-deps", "--no-index", "--no-compile", wheel)
+    pip("--python", str(python), *map(str, install))
+    site = next((folder / "venv").glob("lib/python*/site-packages"))
+    # A .pth file names a folder but reads no .pth file in it, such as that of the
+    # checkout's editable install.
+    others = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (site / "others.pth").write_text("\n".join(others) + "\n", encoding="utf-8")
+    bring_compiled_kernels(site)
+    empty = folder / "empty"
+    empty.mkdir()
+    return SimpleNamespace(
+        python=python, ocufilter=python.parent / "ocufilter", site=site, cwd=empty
+    )
+
+
+def bring_compiled_kernels(site):
+    """Copy numba's files from the checkout: compiling anew takes two minutes.
+
+    They belong to a source of the same time, so that comes along too.
+    """
+    for package in PACKAGES:
+        for compiled in (ROOT / package).rglob("__pycache__/*.nb[ci]"):
+            name = compiled.relative_to(ROOT)
+            (site / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(compiled, site / name)
+        for path in (site / package).rglob("*.py"):
+            source = ROOT / path.relative_to(site)
+            os.utime(path, ns=(source.stat().st_mtime_ns,) * 2)
+
+
+def start(installed, *command):
+    """Run in an empty folder, with nothing that leads to the checkout."""
+    leads = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
+    environment = {k: v for k, v in os.environ.items() if k not in leads}
+    return subprocess.run(
+        [str(word) for word in command],
+        cwd=installed.cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+
+
+@pytest.fixture
+def run(installed):
+    def run(*arguments):
+        return start(installed, installed.ocufilter, *arguments)
+
+    return run
+
+
+@pytest.fixture
+def run_json(run):
+    def run_json(*arguments):
+        finished = run(*arguments, "--json")
+        assert finished.returncode == 0, finished.stderr
+        return json.loads(finished.stdout)
+
+    return run_json
+
+
+def one_line(finished, code):
+    assert finished.returncode == code, finished.stderr
+    assert finished.stdout == ""
+    assert finished.stderr.count("\n") == 1, finished.stderr
+    return finished.stderr
+
+
+def test_the_wheel_holds_everything_of_its_packages_and_nothing_else(wheel_names):
+    expected = set()
+    for pattern in HELD:
+        found = {path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern)}
+        assert found, pattern
+        expected |= found
+    expected = {re.sub("^shaders/", "filter_service/shaders/", n) for n in expected}
+    held = {name for name in wheel_names if ".dist-info/" not in name}
+    assert sorted(expected - held) == []
+    assert sorted(held - expected) == []
+    assert {name.split("/")[0] for name in held} == set(PACKAGES)
+
+
+def test_every_package_folder_is_listed():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    listed = set(tomllib.loads(text)["tool"]["setuptools"]["packages"])
+    folders = {
+        ".".join(path.parent.relative_to(ROOT).parts)
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("__init__.py")
+    }
+    shaders = {"", ".common", ".passes"}
+    assert listed == folders | {f"filter_service.shaders{name}" for name in shaders}
+
+
+def test_what_is_imported_is_the_wheel_s(installed):
+    script = (
+        "import clients, estimator, filter_service as f, numpy\n"
+        "from filter_service.gl.shader_source import SHADER_ROOT\n"
+        "print(*(m.__file__ for m in (clients, estimator, f)), SHADER_ROOT, sep='\\n')"
+    )
+    finished = start(installed, installed.python, "-c", script)
+    assert finished.returncode == 0, finished.stderr
+    files = [Path(line) for line in finished.stdout.splitlines()]
+    assert len(files) == 4
+    assert all(path.is_relative_to(installed.site) for path in files)
+
+
+def test_doctor_finds_a_machine_that_can_serve(run_json):
+    report = run_json("doctor")
+    assert report["ok"] and report["works"]["serve"]
+    checks = {check["name"]: check["ok"] for check in report["checks"]}
+    assert checks["shaders"] and checks["networks"]
+    fixes = " ".join(report["install"])
+    assert "setup.sh" not in fixes and "git" not in fixes
+
+
+@pytest.fixture
+def image(installed):
+    """Files of a bright half beside a dark one, 2 m away."""
+    color = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.float32)
+    color[:, WIDTH_PX // 2 :] = 1.0
+    np.save(installed.cwd / "color.npy", color)
+    depth_m = np.full((HEIGHT_PX, WIDTH_PX), 2.0, np.float32)
+    np.save(installed.cwd / "depth.npy", depth_m)
+    return (
+        *("filter", "--color", "color.npy", "--depth", "depth.npy"),
+        *("--fov-deg", "5", "--profile", "myopia", "-o", "out.npy"),
+    )
+
+
+def test_filter_blurs_a_picture(run_json, installed, image):
+    run_json(*image)
+    filtered = np.load(installed.cwd / "out.npy")
+    assert filtered.shape == (HEIGHT_PX, WIDTH_PX, 3)
+    assert np.isfinite(filtered).all()
+    middle = filtered[HEIGHT_PX // 2, WIDTH_PX // 2, 1]
+    assert 0.2 < middle < 0.8
+
+
+def test_filter_refuses_a_bad_option_in_one_line(run, image):
+    assert "--pupil-mm" in one_line(run(*image, "--pupil-mm", "30"), 2)
+
+
+def test_serve_answers_a_client(installed):
+    serve = (installed.ocufilter, "serve")
+    finished = start(installed, installed.python, "-c", CLIENT, *serve)
+    assert finished.returncode == 0, finished.stderr
+    seen = json.loads(finished.stdout)
+    assert seen["shape"] == [36, 64, 3] and seen["code"] == 0
+    assert 128 < seen["row"][32] < 255  # the edge is blurred
+
+
+def test_estimate_finds_an_eye(run_json):
+    found = run_json("estimate", "emmetropia")
+    assert found["mean_abs_error_um"] <= 5e-4
+
+
+def test_wavefront_is_traced(run_json):
+    options = ("--pupil-mm", "3", "--wavelength-nm", "555")
+    found = run_json("wavefront", "emmetropia", *options)
+    assert len(found["zernike_um"]) == 28
+
+
+def test_psf_is_written(run_json, installed):
+    options = ("--pupil-mm", "3", "--wavelength-nm", "549", "--pixel-arcmin", "1")
+    run_json("psf", "emmetropia", *options, "-o", "psf.npy")
+    kernel = np.load(installed.cwd / "psf.npy")
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
+    module = (installed.python, "-m", "filter_service")
+    assert "checkout" in one_line(start(installed, *module, "bench", "psf"), 1)
+
+
+def test_demo_and_the_round_trip_are_there(run, installed):
+    finished = run("demo", "--help")
+    assert finished.returncode == 0 and "--frames" in finished.stdout
+    finished = start(installed, installed.python, "-m", "clients.latency", "--help")
+    assert finished.returncode == 0 and "--rate-hz" in finished.stdout
