@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,11 @@ __all__ = [
 DEFAULT_SETTINGS = FilterSettings()
 
 
+def _floats(pair: tuple[float, float]) -> tuple[float, float]:
+    """Return numpy's numbers as Python's; the service refuses what is no pair."""
+    return cast("tuple[float, float]", tuple(map(float, pair)))
+
+
 class FilterClient:
     """A session with the filter service.  One thread at a time may use it.
 
@@ -90,7 +95,9 @@ class FilterClient:
         if max_in_flight < 1:
             raise ValueError(f"max_in_flight is {max_in_flight}; allowed: 1 or more")
         self.timeout_s = timeout_s
-        self._link = ServiceLink(endpoint, max_in_flight, client_name)
+        self._open_link: ServiceLink | None = ServiceLink(
+            endpoint, max_in_flight, client_name
+        )
         self._pool = SendBufferPool(timeout_s)
         self._camera: Camera | None = None
         self._next_frame_id = 0
@@ -117,10 +124,9 @@ class FilterClient:
         ServiceTimeout, TooManySessions, VersionMismatch
         """
         limit_s = self.timeout_s if timeout_s is None else timeout_s
-        self._link.wait_until(
-            lambda: self._link.welcome is not None, limit_s, "an answer to hello"
+        return self._link.wait_until(
+            lambda: self._link.welcome, limit_s, "an answer to hello"
         )
-        return self._link.welcome
 
     @property
     def welcome(self) -> Welcome | None:
@@ -129,9 +135,15 @@ class FilterClient:
 
     def close(self) -> None:
         """End the session; closing twice is allowed."""
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+        if self._open_link is not None:
+            self._open_link.close()
+            self._open_link = None
+
+    @property
+    def _link(self) -> ServiceLink:
+        if self._open_link is None:
+            raise ValueError("this FilterClient is closed")
+        return self._open_link
 
     # Profiles
 
@@ -275,7 +287,7 @@ class FilterClient:
             answer = self._link.take_event(
                 lambda e: getattr(e, "frame_id", None) == frame_id
             )
-            if answer is not None:
+            if isinstance(answer, FilteredFrame | Dropped | ErrorReply):
                 return answer
             self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
 
@@ -340,7 +352,7 @@ class FilterClient:
             views=tuple(ViewHeader.describing(item) for item in items),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
-            gaze_deg=None if gaze_deg is None else tuple(map(float, gaze_deg)),
+            gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
             options=FrameOptions(accumulation, merge),
             images=tuple(images),

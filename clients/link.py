@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
@@ -34,6 +34,8 @@ from filter_service.messages import (
 
 MAX_KEPT_PROGRESS = 1000
 RETRY_SEND_S = 0.002  # a new connection takes messages a moment after it is reported
+
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True)
@@ -138,13 +140,14 @@ class ServiceLink:
         return bool(self._events)
 
     def wait_until(
-        self, is_done: Callable[[], bool], timeout_s: float, what: str
-    ) -> None:
-        """Pump until something is so; ServiceTimeout says what was awaited."""
+        self, find: Callable[[], _Found | None], timeout_s: float, what: str
+    ) -> _Found:
+        """Pump until something is found; ServiceTimeout says what was awaited."""
         deadline_s = time.monotonic() + timeout_s
         self.pump(0.0)
-        while not is_done():
+        while not (found := find()):
             self.pump_before(deadline_s, what)
+        return found
 
     def pump_before(self, deadline_s: float, what: str) -> None:
         """Pump once, or raise where the time is over or the service refused hello."""
@@ -261,7 +264,9 @@ class ServiceLink:
 
     def _restart_session(self, reply: ErrorReply) -> None:
         """Say hello again: the service ended this session on a live connection."""
-        if reply.frame_id is not None and self.in_flight.pop(reply.frame_id, None):
-            self._events.append(Dropped(reply.frame_id, "connection_lost"))
+        frame_id = reply.frame_id
+        if frame_id is not None and frame_id in self.in_flight:
+            del self.in_flight[frame_id]
+            self._events.append(Dropped(frame_id, "connection_lost"))
         if self.welcome is not None:
             self.greet()

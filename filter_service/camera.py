@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, cast
 
 from msgspec import Meta
 
@@ -59,7 +59,9 @@ class Camera(Record):
         """Refuse what no pinhole has; a list of tangents becomes a tuple."""
         checked(self.width_px, SidePx, "width_px")
         checked(self.height_px, SidePx, "height_px")
-        tangents = checked(self.tangents, Tangents, "tangents")
+        # An alias of a tuple is no type to mypy.
+        kind = cast("type[Tangents]", Tangents)
+        tangents = checked(self.tangents, kind, "tangents")
         left, right, up, down = tangents
         if right - left < MIN_EXTENT or up - down < MIN_EXTENT:
             raise BadMessage(

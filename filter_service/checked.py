@@ -179,11 +179,11 @@ def _is_rising(kind: Any) -> bool:
     return any(extra == RISING for extra in _extras(kinds.type_info(kind)))
 
 
-def check_rising(value: object, kind: Any, path: str) -> None:
+def check_rising(value: Any, kind: Any, path: str) -> None:
     """Refuse a pair that falls, where its type is marked as `RISING`."""
     if not _is_rising(kind):
         return
-    first, last = value  # type: ignore[misc]
+    first, last = value
     if first > last:
         allowed = _allowed(kinds.type_info(kind))
         raise BadMessage(f"it is {show(value)}", field=path, allowed=allowed)

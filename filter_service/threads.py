@@ -13,7 +13,7 @@ UNSAFE_THREADING_LAYER = "workqueue"
 
 
 @njit(parallel=True, cache=True)
-def _count(n):
+def _count(n: int) -> int:
     total = 0
     for _ in prange(n):
         total += 1
@@ -36,4 +36,4 @@ def require_safe_threading_layer() -> str:
             "numba has no thread layer that two threads may share; "
             "install libgomp1 (apt-get install libgomp1) or tbb (pip install tbb)"
         ) from error
-    return threading_layer()
+    return str(threading_layer())

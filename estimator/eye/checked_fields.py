@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 
 class ProfileError(ValueError):
@@ -22,7 +23,13 @@ class ProfileError(ValueError):
 
 
 def number(
-    data: Mapping, field: str, low: float, high: float, *, default=None, path: str = ""
+    data: Mapping[str, Any],
+    field: str,
+    low: float,
+    high: float,
+    *,
+    default: float | None = None,
+    path: str = "",
 ) -> float:
     """Finite number in [low, high]; ``default`` where the field is absent."""
     name, allowed = path + field, f"a number from {low:g} to {high:g}"
@@ -37,7 +44,12 @@ def number(
 
 
 def choice(
-    data: Mapping, field: str, options: Sequence[str], *, default=None, path: str = ""
+    data: Mapping[str, Any],
+    field: str,
+    options: Sequence[str],
+    *,
+    default: str | None = None,
+    path: str = "",
 ) -> str:
     """One of ``options``; ``default`` where the field is absent."""
     name, allowed = path + field, "one of " + ", ".join(options)
@@ -49,14 +61,16 @@ def choice(
     return value
 
 
-def mapping(data: object, name: str) -> Mapping:
+def mapping(data: object, name: str) -> Mapping[str, Any]:
     """Return ``data`` if it is a mapping with string keys."""
     if not isinstance(data, Mapping) or not all(isinstance(k, str) for k in data):
         raise ProfileError(name, f"{data!r:.60} is not an object", "a JSON object")
     return data
 
 
-def only_known(data: Mapping, known: Sequence[str], *, path: str = "") -> None:
+def only_known(
+    data: Mapping[str, Any], known: Sequence[str], *, path: str = ""
+) -> None:
     """Refuse a field that nobody reads: a typing slip must not pass silently."""
     for field in data:
         if field not in known:

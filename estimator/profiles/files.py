@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 from estimator.profiles.parse import (
     EyeProfile,
@@ -48,7 +49,7 @@ def profile_body(
     *,
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """Return the profile as the plain object that also travels over the wire."""
     if str(source) in preset_names():
         return {"kind": "preset", "name": str(source)}
@@ -71,21 +72,22 @@ def profile_body(
     return body
 
 
-def _read_json(text: str, name: str) -> dict:
+def _read_json(text: str, name: str) -> dict[str, Any]:
     try:
-        return json.loads(text, object_pairs_hook=_without_repeats)
+        body: dict[str, Any] = json.loads(text, object_pairs_hook=_without_repeats)
     except json.JSONDecodeError as error:
         raise ProfileError(name, f"not JSON ({error})", "one JSON object") from None
+    return body
 
 
-def _without_repeats(pairs: list[tuple[str, object]]) -> dict:
-    body: dict = {}
+def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, Any]:
+    body: dict[str, Any] = {}
     for key, value in pairs:
         _set_once(body, key, value, where=key)
     return body
 
 
-def _set_once(body: dict, key: str, value: object, *, where: str) -> None:
+def _set_once(body: dict[str, Any], key: str, value: object, *, where: str) -> None:
     """Set a field that must not be there yet: of two values neither can be trusted."""
     if key in body:
         raise ProfileError(where, f"'{key}' is given twice", "each field once")
@@ -99,13 +101,18 @@ def _value(text: str, where: str) -> float:
         raise ProfileError(where, f"'{text}' is not a number", "a number") from None
 
 
-def _read_abp(text: str, name: str) -> dict:
+def _read_abp(text: str, name: str) -> dict[str, Any]:
     """Lines ``Ap = 5.0`` (mm), ``Wa = 587.56`` (nm), ``Z[n, m] = um``, ``#`` comments.
 
     Missing terms are zero; a missing Ap or Wa is an error here (the framework falls
     back to defaults in silence).
     """
-    body: dict = {"kind": "zernike", "name": name, "frame": "eye", "zernike_um": {}}
+    body: dict[str, Any] = {
+        "kind": "zernike",
+        "name": name,
+        "frame": "eye",
+        "zernike_um": {},
+    }
     keys = {"Ap": "pupil_diameter_mm", "Wa": "wavelength_nm"}
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0].strip()
@@ -121,8 +128,13 @@ def _read_abp(text: str, name: str) -> dict:
     return body
 
 
-def _read_csv(text: str, name: str) -> dict:
-    body: dict = {"kind": "zernike", "name": name, "frame": "eye", "zernike_um": {}}
+def _read_csv(text: str, name: str) -> dict[str, Any]:
+    body: dict[str, Any] = {
+        "kind": "zernike",
+        "name": name,
+        "frame": "eye",
+        "zernike_um": {},
+    }
     for number, line in enumerate(text.splitlines(), start=1):
         content, where = line.strip(), f"{name}, line {number}"
         if setting := _CSV_SETTING.fullmatch(content):

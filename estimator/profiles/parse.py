@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,9 +159,10 @@ def parse_profile(data: object) -> EyeProfile:
 
 
 @cache
-def _presets() -> dict:
+def _presets() -> dict[str, dict[str, Any]]:
     text = (Path(__file__).parent / "presets.json").read_text(encoding="utf-8")
-    return json.loads(text)["presets"]
+    presets: dict[str, dict[str, Any]] = json.loads(text)["presets"]
+    return presets
 
 
 def preset_names() -> tuple[str, ...]:
@@ -168,14 +170,14 @@ def preset_names() -> tuple[str, ...]:
     return tuple(_presets())
 
 
-def _parse_preset(data: Mapping) -> EyeProfile:
+def _parse_preset(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, COMMON_FIELDS)
     name = fields.choice(data, "name", preset_names())
     merged = {**_presets()[name], **{k: v for k, v in data.items() if k != "kind"}}
     return _parse_zernike_profile(merged)
 
 
-def _common(data: Mapping) -> dict:
+def _common(data: Mapping[str, Any]) -> dict[str, Any]:
     age_years = None
     if "age_years" in data:
         age_years = fields.number(data, "age_years", 3.0, 120.0)
@@ -192,7 +194,7 @@ def _common(data: Mapping) -> dict:
     }
 
 
-def _prescription(data: Mapping, *, path: str = "") -> rx.Prescription:
+def _prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:
     if data.get("cylinder_dpt") and "axis_deg" not in data:
         allowed = "a number from 0 to 180"
         raise ProfileError(f"{path}axis_deg", "is missing beside a cylinder", allowed)
@@ -206,7 +208,7 @@ def _prescription(data: Mapping, *, path: str = "") -> rx.Prescription:
     )
 
 
-def _parse_prescription_profile(data: Mapping) -> EyeProfile:
+def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, COMMON_FIELDS + PRESCRIPTION_FIELDS)
     prescription = _prescription(data)
     zernike_um = rx.zernike_from_power_vector(
@@ -226,7 +228,7 @@ def _parse_prescription_profile(data: Mapping) -> EyeProfile:
     )
 
 
-def _primary(first: Measurement, *others: Measurement) -> dict:
+def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
     return {
         "pupil_diameter_mm": first.pupil_diameter_mm,
         "wavelength_nm": first.wavelength_nm,
@@ -234,7 +236,7 @@ def _primary(first: Measurement, *others: Measurement) -> dict:
     }
 
 
-def _parse_zernike_profile(data: Mapping) -> EyeProfile:
+def _parse_zernike_profile(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, COMMON_FIELDS + ZERNIKE_FIELDS)
     measurement = _measurement(data)
     return EyeProfile(
@@ -246,7 +248,7 @@ def _parse_zernike_profile(data: Mapping) -> EyeProfile:
     )
 
 
-def _measurement(data: Mapping, *, path: str = "") -> Measurement:
+def _measurement(data: Mapping[str, Any], *, path: str = "") -> Measurement:
     zernike_um = _coefficients(data, path=path)
     frame = fields.choice(data, "frame", ("eye", "examiner"), default="eye", path=path)
     if frame == "examiner":
@@ -261,7 +263,7 @@ def _measurement(data: Mapping, *, path: str = "") -> Measurement:
     )
 
 
-def _parse_zernike_set(data: Mapping) -> EyeProfile:
+def _parse_zernike_set(data: Mapping[str, Any]) -> EyeProfile:
     """Several measurements of one eye; the widest on-axis one leads."""
     fields.only_known(data, COMMON_FIELDS + SET_FIELDS)
     entries = data.get("measurements")
@@ -290,7 +292,7 @@ def _parse_zernike_set(data: Mapping) -> EyeProfile:
     )
 
 
-def _parse_eye(data: Mapping) -> EyeProfile:
+def _parse_eye(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, (*COMMON_FIELDS, "parameters"))
     if "parameters" not in data:
         raise ProfileError("parameters", "is missing", "an object of the 45 by name")
@@ -329,7 +331,7 @@ def _traced_zernike_um(
         ) from None
 
 
-def _coefficients(data: Mapping, *, path: str = "") -> NDArray[np.float64]:
+def _coefficients(data: Mapping[str, Any], *, path: str = "") -> NDArray[np.float64]:
     allowed = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
     if "zernike_um" not in data:
         raise ProfileError(path + "zernike_um", "is missing", allowed)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.psf.compute import PsfTooLarge
-from filter_service.building.jobs import BuildJob, BuiltStore
+from filter_service.building.jobs import BuildJob, BuiltStore, Store
 from filter_service.building.preview import is_worthwhile, preview_spec
 from filter_service.building.read_profile import unknown_profile
 from filter_service.errors import (
@@ -79,7 +78,9 @@ def _built(
         if cancelled():
             raise BuildCancelled("a newer profile took over")
 
-    def result(store: Any, notes: tuple[str, ...], *, is_complete: bool) -> BuiltStore:
+    def result(
+        store: Store, notes: tuple[str, ...], *, is_complete: bool
+    ) -> BuiltStore:
         return BuiltStore(
             store=store,
             build_ms=1e3 * (time.perf_counter() - started_s),

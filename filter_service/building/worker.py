@@ -72,9 +72,10 @@ def serve_builds(
         return
 
 
-def _named(name: str) -> Callable:
+def _named(name: str) -> Callable[..., Any]:
     module, _, function = name.partition(":")
-    return getattr(importlib.import_module(module), function)
+    named: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return named
 
 
 def _build_one(

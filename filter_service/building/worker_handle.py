@@ -83,6 +83,14 @@ class _Incoming:
         return BuildDone(self.ticket, pickle.loads(self.head, buffers=buffers))
 
 
+@dataclass(frozen=True)
+class _Worker:
+    """A process and the pipe to it: there are both or neither."""
+
+    process: subprocess.Popen[bytes]
+    pipe: Connection
+
+
 @dataclass
 class WorkerHandle:
     """Runs builds in a process of its own, one at a time, in the order asked for.
@@ -112,18 +120,17 @@ class WorkerHandle:
     _kill_at_s: float | None = None
     _start_at_s: float = 0.0
     _is_ready: bool = False
-    _process: subprocess.Popen[bytes] | None = None
-    _pipe: Connection | None = None
+    _worker: _Worker | None = None
     _incoming: _Incoming | None = None
 
     def start(self) -> None:
         """Start the process, if there is none; it gets ready on its own time."""
-        if self._process is not None:
+        if self._worker is not None:
             return
         ours, theirs = socket.socketpair()
         # A plain process: one that multiprocessing spawns would run the main module
         # again, which a script without a guard does not survive.
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "filter_service.building.worker"),
                 *(str(theirs.fileno()), self.build, str(self.niceness), self.warm_up),
@@ -133,21 +140,21 @@ class WorkerHandle:
             env=os.environ | {"PYTHONPATH": os.pathsep.join(_import_path())},
         )
         theirs.close()
-        self._pipe = Connection(ours.detach())
+        self._worker = _Worker(process, Connection(ours.detach()))
 
     def close(self) -> None:
         """End the process, with patience first."""
-        if self._process is None:
+        if self._worker is None:
             return
-        self._pipe.close()
-        self._process.terminate()
-        _end(self._process)
-        self._process = None
+        self._worker.pipe.close()
+        self._worker.process.terminate()
+        _end(self._worker.process)
+        self._worker = None
 
     @property
     def file_descriptor(self) -> int | None:
         """Return what to poll for reading; it changes when the worker restarts."""
-        return None if self._process is None else self._pipe.fileno()
+        return None if self._worker is None else self._worker.pipe.fileno()
 
     @property
     def is_busy(self) -> bool:
@@ -157,7 +164,7 @@ class WorkerHandle:
     @property
     def needs_attention_soon(self) -> bool:
         """Return whether poll has something to do although the pipe is silent."""
-        return self._process is None or self._kill_at_s is not None
+        return self._worker is None or self._kill_at_s is not None
 
     def submit(self, job: object) -> int:
         """Put a job at the end of the queue; return its ticket."""
@@ -178,29 +185,30 @@ class WorkerHandle:
         """Return what happened, in at most a few milliseconds."""
         events: list[BuildEvent] = []
         now_s = time.monotonic()
-        if self._process is None:
+        worker = self._worker
+        if worker is None:
             if now_s >= self._start_at_s:
                 self.start()
             return events
         if self._kill_at_s is not None and now_s > self._kill_at_s:
             log.warning("a cancelled build did not stop; its process is ended")
-            self._process.kill()
+            worker.process.kill()
         try:
-            while self._pipe.poll(0):
-                self._receive(events)
+            while worker.pipe.poll(0):
+                self._receive(worker.pipe, events)
                 if time.monotonic() - now_s > RECEIVE_BUDGET_S:
                     break
         except (EOFError, OSError, pickle.UnpicklingError):
-            events += self._after_crash()
+            events += self._after_crash(worker)
         self._start_next()
         return events
 
-    def _receive(self, events: list[BuildEvent]) -> None:
+    def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
         if self._incoming is not None:
             incoming, self._incoming = self._incoming, None
-            events.append(incoming.received(self._pipe))
+            events.append(incoming.received(pipe))
             return
-        message = self._pipe.recv()
+        message = pipe.recv()
         kind = message[0]
         if kind == "ready":
             self._is_ready = True
@@ -228,19 +236,21 @@ class WorkerHandle:
             self._tell(("build", ticket, job))
 
     def _tell(self, message: tuple[Any, ...]) -> None:
+        if self._worker is None:
+            return  # closed: nobody will read it
         try:
-            self._pipe.send(message)
+            self._worker.pipe.send(message)
         except OSError:
             log.debug("the worker is gone; poll will find out")
 
-    def _after_crash(self) -> list[BuildEvent]:
+    def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
         """Start a new process; the build that ran is lost, those that wait are not."""
-        how = _how_it_ended(_end(self._process))
+        how = _how_it_ended(_end(worker.process))
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]
-        self._pipe.close()
-        self._process = self._incoming = None
+        worker.pipe.close()
+        self._worker = self._incoming = None
         self._is_ready = False
         self._end_running()
         self.n_restarts += 1

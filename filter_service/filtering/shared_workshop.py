@@ -33,6 +33,7 @@ def open_workshop(
     closing.callback(gpu.close)
     engine = FilterRenderer(gpu)
     compile_passes(engine)
+    # Here mypy sees that the renderer is a `FrameEngine`.
     workshop = Workshop(worker, engine, limits)
     closing.callback(workshop.close)
     return workshop

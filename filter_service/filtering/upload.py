@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Generator
+
+from filter_service.rendering.engine import LoadedStore
 
 
 class Upload:
@@ -12,17 +13,19 @@ class Upload:
 
     Parameters
     ----------
-    steps : iterator
+    steps : generator
         Of the renderer's ``load_steps``: None after each slice, in the end the loaded
         store.
     """
 
-    def __init__(self, steps: Iterator[Any]) -> None:
+    def __init__(self, steps: Generator[LoadedStore | None]) -> None:
         self._steps = steps
-        self.loaded: Any | None = None
+        self.loaded: LoadedStore | None = None
 
-    def advance(self, deadline_s: float) -> bool:
-        """Copy slices until the time is over, one at least; return whether it is done.
+    def advance(self, deadline_s: float) -> LoadedStore | None:
+        """Copy slices until the time is over, one at least; return the loaded store.
+
+        None where there is more to copy.
 
         Parameters
         ----------
@@ -33,7 +36,7 @@ class Upload:
             self.loaded = next(self._steps)
             if time.monotonic() >= deadline_s:
                 break
-        return self.loaded is not None
+        return self.loaded
 
     def give_up(self) -> None:
         """Free what has been copied."""

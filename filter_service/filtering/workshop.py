@@ -28,7 +28,7 @@ from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedS
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
 from filter_service.filtering.stream_eyes import StreamEyes
 from filter_service.filtering.upload import Upload
-from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.engine import FrameEngine, LoadedStore
 from filter_service.settings import FilterSettings
 
 LOAD_RANGE_S = (0.004, 0.03)  # for copying a new store to the engine between two frames
@@ -201,7 +201,8 @@ class Workshop:
             loading = self._loads[0]
             stream, eye, camera = loading.stream, loading.eye, loading.camera
             try:
-                if not loading.upload.advance(deadline_s):
+                loaded = loading.upload.advance(deadline_s)
+                if loaded is None:
                     return
             except Exception as error:
                 if not isinstance(error, FilterError):
@@ -213,14 +214,14 @@ class Workshop:
             else:
                 self._loads.pop(0)
                 self._released.append(loading.built)
-                self._put_in_place(loading)
+                self._put_in_place(loading, loaded)
 
-    def _put_in_place(self, loading: _Loading) -> None:
+    def _put_in_place(self, loading: _Loading, loaded: LoadedStore) -> None:
         stream, eye, built = loading.stream, loading.eye, loading.built
         if built.is_complete:
             stream.building = None
         stream.put_in_place(
-            eye, PreparedStore(loading.camera, loading.upload.loaded, built.is_complete)
+            eye, PreparedStore(loading.camera, loaded, built.is_complete)
         )
         self.free_retired(stream)
         stream.on_event(

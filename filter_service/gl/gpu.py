@@ -34,7 +34,7 @@ class Gpu:
         Whether a CPU does the work.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         try:
             self.context = moderngl.create_context(
                 standalone=True, require=430, backend="egl"

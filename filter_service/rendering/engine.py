@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -57,11 +57,11 @@ class FrameEngine(Protocol):
     def name(self) -> str:
         """What does the work, as replies and `ocufilter doctor` name it."""
 
-    def load_steps(self, store: Any) -> Iterator[LoadedStore | None]:
+    def load_steps(self, store: Any) -> Generator[LoadedStore | None]:
         """Take a store in slices, so that frames go on between.
 
         Yields None after each slice and in the end the loaded store; closing the
-        iterator before gives the load up.
+        generator before gives the load up.
         """
 
     def render(

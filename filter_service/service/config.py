@@ -190,7 +190,7 @@ def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(
             f"unknown setting {unknown[0]!r}; allowed: {', '.join(defaults)}"
         )
-    typed = {}
+    typed: dict[str, Any] = {}
     for name, value in settings.items():
         if name == "ready_file":
             if not isinstance(value, str | Path):

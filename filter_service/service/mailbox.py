@@ -81,7 +81,7 @@ class Mailbox:
         except (zmq.ZMQError, OSError) as error:
             self.close()
             raise OSError(f"cannot listen on {bind}: {error}") from None
-        self.endpoint = socket.last_endpoint.decode()
+        self.endpoint = socket.get_string(zmq.LAST_ENDPOINT)
         if self.endpoint.startswith("ipc://"):
             Path(self.endpoint.removeprefix("ipc://")).chmod(0o600)
         self._poller = zmq.Poller()

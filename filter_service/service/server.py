@@ -327,7 +327,7 @@ class FilterServer:
     def _filter_one_frame(self) -> None:
         """Filter the frame of the client that has been served least recently."""
         session = next((s for s in self._sessions.values() if s.waiting), None)
-        if session is None:
+        if session is None or session.waiting is None:
             return
         self._sessions[session.identity] = self._sessions.pop(session.identity)
         waiting, session.waiting = session.waiting, None

@@ -58,7 +58,9 @@ FORMATS: dict[Output, ImageFormat] = {
 }
 """Formats by the names that settings and renderers give them."""
 
-FORMAT_OF_DTYPE = {color.dtype: color for color in FORMATS.values()}
+FORMAT_OF_DTYPE: dict[str, ImageFormat] = {
+    color.dtype: color for color in FORMATS.values()
+}
 
 OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
     color: name for name, color in FORMATS.items()

@@ -49,6 +49,7 @@ class Limits(Record):
         return BadMessage(error.message, field=error.field, allowed=allowed)
 
 
+@dataclass(frozen=True)
 class Message(Record):
     """Base of all messages: frozen dataclasses whose fields are the header's.
 
@@ -94,7 +95,7 @@ class Message(Record):
         return self
 
     def _with_payload(self, value: object) -> Self:
-        return replace(self, **{self.payload: value})  # type: ignore[type-var]
+        return replace(self, **{self.payload: value})
 
 
 def expect_parts(parts: Sequence[Part], count: int) -> None:

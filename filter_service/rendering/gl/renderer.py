@@ -1,7 +1,7 @@
 """Filters one view: checks, layers, strips that fit the buffers, and the answer."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from math import ceil
 
@@ -110,14 +110,14 @@ class FilterRenderer:
 
     def load_steps(
         self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
-    ) -> Iterator[LoadedStore | None]:
+    ) -> Generator[LoadedStore | None]:
         """Copy a store's kernels in steps of a few MB, so that frames go on between.
 
         Yields
         ------
         LoadedStore or None
             None after each step, and in the end the loaded store.  The copy is given up
-            when the iterator is closed before.
+            when the generator is closed before.
         """
         n_lines = -(-store.kernels.size // STORE_SIDE)
         with self._gpu.context:
