@@ -28,12 +28,13 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	done
 	$(PYTHON) -m tests.benchmarks.bench_wavefront
 
-check: setup  ## lint and formatting
+check: setup  ## lint, formatting and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	$(PYTHON) -m mypy
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list
