@@ -1,0 +1,190 @@
+"""`EyeFilter`: the service's own object in this process, with doubles and for real."""
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from clients.filter_client import FilterClient
+from clients.service_process import ServiceProcess
+from filter_service import (
+    BuildingEye,
+    Camera,
+    EyeFailed,
+    EyeFilter,
+    EyeReady,
+    FilterSettings,
+    RgbdView,
+)
+from filter_service.building.jobs import BuildLimits
+from filter_service.building.worker_handle import WorkerHandle
+from filter_service.errors import (
+    BadMessage,
+    BuildCancelled,
+    BuildFailed,
+    NoProfile,
+    ServiceTimeout,
+)
+from filter_service.filtering.workshop import Workshop
+from tests.end_to_end.doubles import EngineDouble, ProfileDouble
+from tests.source_tree import ROOT
+
+CAMERA = Camera.from_fov(60.0, width_px=16, height_px=8)
+SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
+COLOR = np.full((8, 16, 3), 10, np.uint8)
+DEPTH_M = np.full((8, 16), 2.0, np.float32)
+
+
+@pytest.fixture(scope="module")
+def workshop():
+    worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+    workshop = Workshop(worker, EngineDouble(0.0), BuildLimits())
+    yield workshop
+    workshop.close()
+
+
+@pytest.fixture
+def events():
+    return []
+
+
+@pytest.fixture
+def eye_filter(workshop, events):
+    with EyeFilter(None, CAMERA, workshop=workshop, on_event=events.append) as made:
+        yield made
+
+
+def eye(mark, **more):
+    return ProfileDouble({"kind": "double", "mark": mark, **more})
+
+
+def mark_of(seen):
+    return int(seen.color[0, 0, 0])
+
+
+def test_a_picture_comes_through_the_eye_of_the_profile(eye_filter, events):
+    eye_filter.set_profile(eye(7))
+    seen = eye_filter.filter(COLOR, DEPTH_M, **SEE)
+    assert mark_of(seen) == 7
+    assert (seen.generation, seen.is_complete) == (1, True)
+    assert (seen.color[1:] == 245).all()
+    assert [type(event) for event in events][-1] is EyeReady
+
+
+def test_frames_go_through_the_old_eye_while_the_new_one_is_built(eye_filter, events):
+    eye_filter.set_profile(eye(1))
+    eye_filter.filter(COLOR, DEPTH_M, **SEE)
+    eye_filter.set_profile(eye(3, preview_mark=2, preview_s=0.05, build_s=0.1))
+    marks = []
+    deadline_s = time.monotonic() + 10.0
+    while marks[-1:] != [3] and time.monotonic() < deadline_s:
+        marks.append(mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)))
+    assert list(dict.fromkeys(marks)) == [1, 2, 3]
+    assert len(marks) > 20, "frames waited for the build"
+    assert any(isinstance(event, BuildingEye) for event in events)
+
+
+def test_a_profile_that_fails_leaves_the_old_eye_in_use(eye_filter, events):
+    eye_filter.set_profile(eye(1))
+    eye_filter.wait(10.0)
+    eye_filter.set_profile(eye(2, fail=True))
+    with pytest.raises(BuildFailed, match="told to fail"):
+        eye_filter.wait(10.0)
+    assert mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)) == 1
+    assert isinstance(events[-1], EyeFailed)
+
+
+def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, events):
+    eye_filter.set_profile(eye(1, build_s=30.0))
+    eye_filter.advance()
+    eye_filter.set_profile(eye(2))
+    assert mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)) == 2
+    (failed,) = [event for event in events if isinstance(event, EyeFailed)]
+    assert isinstance(failed.error, BuildCancelled)
+    assert failed.eye.generation == 1
+
+
+def test_streams_share_a_workshop_and_keep_their_eyes(workshop):
+    with (
+        EyeFilter(eye(1), CAMERA, workshop=workshop) as left,
+        EyeFilter(eye(2), CAMERA, workshop=workshop) as right,
+    ):
+        assert mark_of(left.filter(COLOR, DEPTH_M, **SEE)) == 1
+        assert mark_of(right.filter(COLOR, DEPTH_M, **SEE)) == 2
+    assert workshop.streams == []
+
+
+def test_two_views_make_two_pictures_and_a_new_camera_is_waited_for(eye_filter):
+    eye_filter.set_profile(eye(9))
+    wide = RgbdView(COLOR, DEPTH_M, (-0.9, 0.9, 0.4, -0.4))
+    near = RgbdView(COLOR, DEPTH_M, CAMERA.tangents)
+    seen = eye_filter.filter([wide, near], **SEE)
+    assert len(seen.colors) == 2
+
+
+def test_what_is_missing_or_wrong_is_named(eye_filter, workshop):
+    with pytest.raises(NoProfile):
+        eye_filter.filter(COLOR, DEPTH_M, **SEE)
+    with pytest.raises(BadMessage, match="depth: it is missing"):
+        eye_filter.filter(COLOR, **SEE)
+    with pytest.raises(ValueError, match=r"pupil_diameter_mm: it is 30\.0"):
+        eye_filter.filter(COLOR, DEPTH_M, pupil_diameter_mm=30.0, focus_dpt=0.0)
+    with pytest.raises(ValueError, match="is out of range"):
+        eye_filter.set_profile({"kind": "prescription", "sphere_dpt": -100})
+    with EyeFilter(eye(1), workshop=workshop) as blind:
+        with pytest.raises(BadMessage, match="camera: it is not known"):
+            blind.filter(COLOR, DEPTH_M, **SEE)
+    with pytest.raises(ValueError, match="is closed"):
+        blind.set_profile(eye(1))
+    eye_filter.set_profile(eye(1, build_s=5.0))
+    with pytest.raises(ServiceTimeout, match="the eye to be ready"):
+        eye_filter.wait(0.05)
+
+
+SCRIPT = """
+import numpy as np
+from filter_service import Camera, EyeFilter, FilterSettings
+
+camera = Camera.from_fov(6.0, width_px=64, height_px=36)
+settings = FilterSettings(mode="on-axis", eye_model="wavefront")
+rows, columns = np.indices((36, 64))
+color = np.repeat((255 * (columns // 8 % 2))[..., None], 3, axis=2).astype(np.uint8)
+depth_m = np.full((36, 64), 0.5, np.float32)
+with EyeFilter("myopia", camera, settings) as eye_filter:
+    eye_filter.wait()
+    seen = eye_filter.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=2.0)
+np.save("seen.npy", seen.color)
+"""
+
+
+def test_a_plain_script_gets_the_picture_that_the_service_gives(tmp_path):
+    """No guard for the main module, and the same bytes as over the wire."""
+    finished = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert finished.returncode == 0, finished.stderr
+    mine = np.load(tmp_path / "seen.npy")
+
+    camera = Camera.from_fov(6.0, width_px=64, height_px=36)
+    columns = np.indices((36, 64))[1]
+    color = np.repeat((255 * (columns // 8 % 2))[..., None], 3, axis=2)
+    depth_m = np.full((36, 64), 0.5, np.float32)
+    with ServiceProcess() as service, FilterClient(service.endpoint) as client:
+        client.set_profile(
+            "myopia",
+            settings=FilterSettings(mode="on-axis", eye_model="wavefront"),
+            views=[camera],
+        )
+        theirs = client.filter(
+            color.astype(np.uint8), depth_m, pupil_diameter_mm=4.0, focus_dpt=2.0
+        )
+    np.testing.assert_array_equal(mine, theirs.color)
+    assert np.ptp(mine[18, :, 1].astype(int)) < 255, "nothing was blurred"
