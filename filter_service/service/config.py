@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from estimator.threads import MAX_THREADS
 from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.constants import PSF_ENGINES
 from filter_service.messages import DEFAULT_ENDPOINT, Limits
@@ -47,6 +48,9 @@ class ServiceConfig:
         ``$OCUFILTER_CACHE_DIR``, or ``ocufilter`` in ``$XDG_CACHE_HOME`` or ~/.cache.
     store_cache_max_mb : int
         What that folder may hold; those unused for longest go.
+    threads : int
+        Of everything that is computed on the processor; 0 takes the cores that this
+        process may use, capped by a container's quota.
     build_niceness : int
         Of what is computed after a profile's first PSFs, so that the render loop wins
         where cores are few.
@@ -73,6 +77,7 @@ class ServiceConfig:
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
     store_cache_max_mb: int = 2000
+    threads: int = 0
     build_niceness: int = 5
     cancel_grace_s: float = 3.0
     alive_interval_s: float = 5.0
@@ -131,6 +136,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_store_mb": (1, 1_000_000),
     "max_cameras": (1, 16),
     "store_cache_max_mb": (1, 1_000_000),
+    "threads": (0, MAX_THREADS),
     "build_niceness": (0, 19),
     "cancel_grace_s": (0.05, 600.0),
     "alive_interval_s": (0.05, 600.0),

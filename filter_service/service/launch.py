@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
+from estimator.threads import THREADS_VARIABLE
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.service.config import ServiceConfig
 
@@ -56,6 +58,8 @@ def _announce(config: ServiceConfig, endpoint: str) -> None:
 def run(config: ServiceConfig) -> None:
     """Serve with the real engine and the real PSFs."""
     logging.basicConfig(level=logging.INFO, format="ocufilter: %(message)s")
+    if config.threads:
+        os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
     worker = WorkerHandle(
         niceness=config.build_niceness, cancel_grace_s=config.cancel_grace_s
     )

@@ -187,4 +187,4 @@ def test_a_plain_script_gets_the_picture_that_the_service_gives(tmp_path):
             color.astype(np.uint8), depth_m, pupil_diameter_mm=4.0, focus_dpt=2.0
         )
     np.testing.assert_array_equal(mine, theirs.color)
-    assert np.ptp(mine[18, :, 1].astype(int)) < 255, "nothing was blurred"
+    assert len(np.unique(mine[18, :, 1])) > 4, "nothing was blurred"

@@ -5,8 +5,9 @@ import pytest
 
 from filter_service import constants
 from filter_service.gl.gpu import StageTimer
-from filter_service.rendering.gl import frame_passes, list_bands
-from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.gl import list_bands, list_passes
+from filter_service.rendering.gl.list_passes import ListPasses
+from filter_service.rendering.gl.strip import Strip
 from tests.numerical import tile_lists
 from tests.numerical.synthetic import Bench, texture
 
@@ -39,20 +40,18 @@ def view(bench, rng):
     return bench.view(texture(rng, HEIGHT, WIDTH), depth_scene())
 
 
-def list_passes(bench, *, paper_rule=False, surface_count=1):
+def new_passes(bench, *, paper_rule=False, surface_count=1):
     """Passes of a view, about to make its lists."""
     view = bench.view(np.zeros((HEIGHT, WIDTH, 3), np.float32), 1.0)
-    return frame_passes.FramePasses(
+    strip = Strip(
         bench.gpu,
         view,
         StageTimer(bench.gpu),
         layers=bench.layers(),
-        image=image_cells(bench.spec, bench.store.plan),
-        corner_change_dpt=np.zeros((2, 2), np.float32),
         paper_rule=paper_rule,
-        merge=True,
         surface_count=surface_count,
     )
+    return ListPasses(strip, search_blocks=0)
 
 
 def random_buffers(rng, tile_count, columns, surface_count, *, reach_px):
@@ -87,24 +86,24 @@ def random_buffers(rng, tile_count, columns, surface_count, *, reach_px):
 
 def made_lists(passes, blocks, place, color, *, reach_px):
     """Run the list passes on buffers; counts, offsets and entries that they made."""
-    gpu = passes.gpu
+    gpu = passes.strip.gpu
     with gpu.context:
         for name, words in (
             ("BLOCKS", blocks),
             ("FRAGMENT_PLACE", place),
             ("FRAGMENT_COLOR", color),
         ):
-            passes.buffers[name] = gpu.upload(name, words)
+            passes.strip.buffers[name] = gpu.upload(name, words)
         passes.search_blocks = -(-(reach_px + 1) // constants.TILE_SIZE_PX)
         passes.count_bins()
         assert len(passes.bands) == 1
         passes.reserve_lists()
-        passes.make_lists(0, passes.bin_count)
-        n_bins = passes.bin_count
-        counts = gpu.read(passes.buffers["BIN_COUNTS"], (n_bins, 4), np.uint32)
-        offsets = gpu.read(passes.buffers["BIN_OFFSETS"], (n_bins,), np.uint32)
+        passes.make_lists(0, passes.strip.bin_count)
+        n_bins = passes.strip.bin_count
+        counts = gpu.read(passes.strip.buffers["BIN_COUNTS"], (n_bins, 4), np.uint32)
+        offsets = gpu.read(passes.strip.buffers["BIN_OFFSETS"], (n_bins,), np.uint32)
         entries = gpu.read(
-            passes.buffers["ENTRIES"], (passes.lists.entry_count,), np.uint32
+            passes.strip.buffers["ENTRIES"], (passes.lists.entry_count,), np.uint32
         )
     starts = zip(offsets, counts[:, 0], strict=True)
     return counts, offsets, [entries[start : start + n] for start, n in starts]
@@ -115,15 +114,19 @@ def made_lists(passes, blocks, place, color, *, reach_px):
 @pytest.mark.parametrize("reach_px", [0, 7, 60])
 def test_lists_equal_those_of_all_pairs(bench, rng, rule, surface_count, reach_px):
     paper_rule = rule == "paper"
-    passes = list_passes(bench, paper_rule=paper_rule, surface_count=surface_count)
+    passes = new_passes(bench, paper_rule=paper_rule, surface_count=surface_count)
     buffers = random_buffers(
-        rng, passes.tile_count, passes.grid[0], surface_count, reach_px=reach_px
+        rng,
+        passes.strip.tile_count,
+        passes.strip.grid[0],
+        surface_count,
+        reach_px=reach_px,
     )
     counts, offsets, made = made_lists(passes, *buffers, reach_px=reach_px)
     expected = tile_lists.expected_lists(
         tile_lists.unpack_fragments(*buffers),
         (WIDTH, HEIGHT),
-        hidden_from=passes.tile_count * constants.THREADS,
+        hidden_from=passes.strip.tile_count * constants.THREADS,
         order_always=paper_rule,
     )
     lengths = np.array([len(entries) for entries in expected.entries])
@@ -151,9 +154,9 @@ def test_lists_equal_those_of_all_pairs(bench, rng, rule, surface_count, reach_p
 
 @pytest.mark.parametrize("rule", RULES)
 def test_sorted_lists_are_right_to_the_stated_step_of_depth(bench, rng, rule):
-    passes = list_passes(bench, paper_rule=rule == "paper")
+    passes = new_passes(bench, paper_rule=rule == "paper")
     blocks, place, color = random_buffers(
-        rng, passes.tile_count, passes.grid[0], 1, reach_px=30
+        rng, passes.strip.tile_count, passes.strip.grid[0], 1, reach_px=30
     )
     place[:, 1] |= constants.EDGE_BIT
     color[:, 3] = np.exp(rng.uniform(-1.0, 7.0, len(color)))  # 0.4 m to 1 km
@@ -172,14 +175,14 @@ def test_sorted_lists_are_right_to_the_stated_step_of_depth(bench, rng, rule):
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("reach_px", [4, 60])
 def test_every_size_class_sorts_alike(bench, rng, monkeypatch, rule, reach_px):
-    passes = list_passes(bench, paper_rule=rule == "paper")
+    passes = new_passes(bench, paper_rule=rule == "paper")
     buffers = random_buffers(
-        rng, passes.tile_count, passes.grid[0], 1, reach_px=reach_px
+        rng, passes.strip.tile_count, passes.strip.grid[0], 1, reach_px=reach_px
     )
     buffers[2][:, 3] = rng.random(len(buffers[2]))
     results = []
     for capacities in ((512, 2048), (16, 64), (4,)):
-        monkeypatch.setattr(frame_passes, "SORT_CAPACITIES", capacities)
+        monkeypatch.setattr(list_passes, "SORT_CAPACITIES", capacities)
         *_, made = made_lists(passes, *buffers, reach_px=reach_px)
         results.append(np.concatenate(made))
     assert passes.lists.longest > 16
@@ -259,10 +262,14 @@ def frame_lists(bench):
 @pytest.mark.parametrize("share", [0.0, 0.01, 1.0])
 def test_windows_hold_the_blocks_in_reach_and_no_more(bench, rng, surface_count, share):
     """A share of the blocks reaches far; those of ``share`` 0 leave bins empty."""
-    passes = list_passes(bench, surface_count=surface_count)
+    passes = new_passes(bench, surface_count=surface_count)
     reach_px = 90
     blocks, *others = random_buffers(
-        rng, passes.tile_count, passes.grid[0], surface_count, reach_px=reach_px
+        rng,
+        passes.strip.tile_count,
+        passes.strip.grid[0],
+        surface_count,
+        reach_px=reach_px,
     )
     n_blocks = len(blocks)
     far = rng.random(n_blocks) < share
@@ -272,5 +279,5 @@ def test_windows_hold_the_blocks_in_reach_and_no_more(bench, rng, surface_count,
         blocks[:, 0] *= rng.random(n_blocks) < 0.1
     made_lists(passes, blocks, *others, reach_px=reach_px)
     windows = read(bench, "WINDOWS", (n_bins(), 4), np.int32)
-    expected = tile_lists.expected_windows(blocks, passes.grid, surface_count)
+    expected = tile_lists.expected_windows(blocks, passes.strip.grid, surface_count)
     assert np.array_equal(windows, expected)

@@ -1,8 +1,10 @@
 """The frame engine of OpenGL compute shaders.
 
 renderer         the engine: layers, strips, the answer
-frame_passes     lists, order and splat of a frame
+strip            a frame or strip: size and buffers
 fragment_passes  pixels to fragments
+list_passes      lists, order, splat
+frame_passes     all of them, and the picture
 kernel_passes    a frame's kernels
 list_bands       lists in bands that fit a buffer
 compile_passes   every pass compiled before the first frame

@@ -1,32 +1,15 @@
-"""The passes of one frame or strip of it: what runs when, on which buffers."""
+"""All passes of one frame or strip of it: what runs when, and the picture."""
 
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import (
-    BYTES_PER_WORD,
-    HALVES_PER_WORD,
-    PAPER_SORT_KEY_BITS,
-    RGB,
-    SORT_CAPACITIES,
-    SORT_KEY_BITS,
-    THREADS,
-    TILE_SIZE_PX,
-    TILES_PER_BIN,
-    TOTAL_WORDS,
-)
-from filter_service.rendering.gl import list_bands
-from filter_service.rendering.gl.fragment_passes import FragmentPasses, group_count
+from filter_service.constants import BYTES_PER_WORD, HALVES_PER_WORD, RGB, THREADS
+from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import KernelSet
-
-SOFTWARE_PIXELS_PER_THREAD = 8
-"""2.8 times the evaluations per second of 1 on llvmpipe (8 float lanes)."""
-
-SOFTWARE_LIST_THREADS = 8
-"""Threads that make and sort a bin's list on a software renderer: one vector."""
-
+from filter_service.rendering.gl.list_passes import ListPasses
+from filter_service.rendering.gl.strip import Strip, group_count
 
 ENCODERS = {
     "srgb8": ("encode_srgb", BYTES_PER_WORD, np.uint8),
@@ -35,8 +18,20 @@ ENCODERS = {
 """Outputs that are packed on the GPU: pass, pixels a thread (for RGB words), dtype."""
 
 
-class FramePasses(FragmentPasses):
-    """All passes of one strip, in order."""
+class FramePasses:
+    """All passes of one strip, in order.
+
+    Parameters
+    ----------
+    strip : Strip
+    fragments : FragmentPasses
+        Of the same strip.
+    """
+
+    def __init__(self, strip: Strip, fragments: FragmentPasses):
+        self.strip = strip
+        self.fragments = fragments
+        self.lists: ListPasses | None = None
 
     def run(self, kernels: Callable[[NDArray[np.bool_]], KernelSet]) -> None:
         """Filter the strip; `read_back` fetches the picture.
@@ -46,184 +41,38 @@ class FramePasses(FragmentPasses):
         kernels : callable
             From the used (cell, interval) pairs to the kernels for them.
         """
-        self.upload()
-        self.merge_fragments(kernels(self.build_fragments()))
-        self.count_bins()
-        self.splat_bands()
-
-    def count_bins(self) -> None:
-        """Lengths and offsets of the lists, and the bands they are made in."""
-        self._reserve(
-            BIN_COUNTS=16 * self.bin_count,
-            WINDOWS=16 * self.bin_count,
-            BIN_OFFSETS=4 * (self.bin_count + TOTAL_WORDS),
-        )
-        with self.timer.stage("bin_ms"):
-            self._run(
-                "count_bins",
-                self.bin_grid,
-                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS"),
-                **self._walk,
-                order_always=int(self.paper_rule),
-                defines=self._list_threads,
-            )
-            self._run(
-                "scan_bins",
-                (1, 1),
-                *("BIN_COUNTS", "BIN_OFFSETS"),
-                bin_count=self.bin_count,
-            )
-        with self.timer.wall("plan_ms"):
-            self.bands = self._plan_bands()
-
-    @property
-    def _walk(self) -> dict:
-        """Uniforms of common/binning.glsl, and where a list ends."""
-        return {
-            "tile_grid": self.grid,
-            "search_blocks": self.search_blocks,
-            "surface_count": self.surface_count,
-            "list_capacity": self._list_limit,
-        }
-
-    @property
-    def _list_limit(self) -> int:
-        """Entries of a band, and of the longest list that is kept."""
-        fit = self.gpu.max_block_bytes // list_bands.ENTRY_BYTES
-        return min(list_bands.MAX_BAND_ENTRIES, fit)
-
-    def _plan_bands(self) -> list[tuple[int, int, int]]:
-        """Bands as (first bin, bin count, entries)."""
-        words = self.buffers["BIN_OFFSETS"].read(
-            4 * TOTAL_WORDS, offset=4 * self.bin_count
-        )
-        self.lists = list_bands.read_totals(words)
-        limit = self._list_limit
-        if self.lists.entry_count <= limit and self.bin_count <= list_bands.MAX_GROUPS:
-            return [(0, self.bin_count, self.lists.entry_count)]
-        counts = self.gpu.read(
-            self.buffers["BIN_COUNTS"], (self.bin_count, 4), np.uint32
-        )[:, 0].astype(np.int64)
-        offsets, bands = list_bands.split(counts, limit)
-        self.buffers["BIN_OFFSETS"].write(offsets.astype(np.uint32))
-        return bands
-
-    def reserve_lists(self) -> None:
-        """Buffers for the lists of the longest band."""
-        n_bytes = list_bands.ENTRY_BYTES * max(entries for _, _, entries in self.bands)
-        self._reserve(ENTRIES=n_bytes)
-        needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
-        self._reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
-
-    def splat_bands(self) -> None:
-        """Scatter, sort and splat, band by band."""
-        self.reserve_lists()
-        self._reserve(COLOR_OUT=16 * self.pixel_count)
-        for first_bin, bin_count, _ in self.bands:
-            self.make_lists(first_bin, bin_count)
-            self._splat(first_bin, bin_count)
-
-    def make_lists(self, first_bin: int, bin_count: int) -> None:
-        """Scatter and sort the lists of a band."""
-        with self.timer.stage("bin_ms"):
-            self._run(
-                "scatter_fragments",
-                (bin_count, 1),
-                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_OFFSETS", "ENTRIES"),
-                **self._walk,
-                bin_columns=self.bin_grid[0],
-                first_bin=first_bin,
-                defines=self._list_threads,
-            )
-        with self.timer.stage("sort_ms"):
-            self._sort(first_bin, bin_count)
-
-    def _splat(self, first_bin: int, bin_count: int) -> None:
-        with self.timer.stage("splat_ms"):
-            self._run(
-                "splat_tiles",
-                (TILES_PER_BIN, bin_count),
-                *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
-                *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
-                textures={"ATLAS": self.gpu.atlas("kernels", 1)},
-                frame_size_px=self.size,
-                tile_grid=self.grid,
-                bin_columns=self.bin_grid[0],
-                first_bin=first_bin,
-                blur_px_per_dpt=self.layers.blur_px_per_dpt,
-                defines=self._splat_variant(),
-            )
-
-    def _sort(self, first_bin: int, bin_count: int) -> None:
-        """Sort the lists of a band, a size class at a time.
-
-        A frame of one bin meets every class, so that a warm-up compiles them all.
-        """
-        key_bits = PAPER_SORT_KEY_BITS if self.paper_rule else SORT_KEY_BITS
-        longest_before = 1
-        for capacity in (*SORT_CAPACITIES, 0):
-            if self.lists.longest <= longest_before and bin_count > 1:
-                return
-            spare = () if capacity else ("ENTRIES_SPARE",)
-            self._run(
-                "sort_bins",
-                (bin_count, 1),
-                *("FRAGMENT_COLOR", "BIN_COUNTS", "BIN_OFFSETS", "ENTRIES", *spare),
-                longest_before=longest_before,
-                first_bin=first_bin,
-                defines={
-                    **self._list_threads,
-                    **self._rule,
-                    "CAPACITY": capacity,
-                    "KEY_BITS": key_bits,
-                },
-            )
-            longest_before = capacity
-
-    @property
-    def _rule(self) -> dict[str, int]:
-        return {"PAPER_RULE": 1} if self.paper_rule else {}
-
-    @property
-    def _list_threads(self) -> dict[str, int]:
-        software = self.gpu.is_software
-        return {"GROUP_THREADS": SOFTWARE_LIST_THREADS if software else THREADS}
-
-    def _splat_variant(self) -> dict[str, int]:
-        pixels = SOFTWARE_PIXELS_PER_THREAD if self.gpu.is_software else 1
-        rows = TILE_SIZE_PX // pixels
-        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **self._rule}
+        self.fragments.upload()
+        used = self.fragments.build_fragments()
+        self.fragments.merge_fragments(kernels(used))
+        self.lists = ListPasses(self.strip, self.fragments.search_blocks)
+        self.lists.run()
 
     def read_back(self, output: str) -> NDArray:
         """Fetch the filtered picture, encoded as asked."""
-        width, height = self.size
+        width, height = self.strip.size
         if output == "linear":
-            with self.timer.wall("readback_ms"):
-                pixels = self.gpu.read(
-                    self.buffers["COLOR_OUT"], (height, width, 4), np.float32
+            with self.strip.timer.wall("readback_ms"):
+                pixels = self.strip.gpu.read(
+                    self.strip.buffers["COLOR_OUT"], (height, width, 4), np.float32
                 )
                 return np.ascontiguousarray(pixels[..., :RGB])
         name, pixels_per_thread, dtype = ENCODERS[output]
-        with self.timer.stage("encode_ms"):
-            threads = group_count(self.pixel_count, pixels_per_thread)
-            self._reserve(COLOR_IN=threads * RGB * BYTES_PER_WORD)  # its light is used
-            self._run(
+        with self.strip.timer.stage("encode_ms"):
+            threads = group_count(self.strip.pixel_count, pixels_per_thread)
+            self.strip.reserve(
+                COLOR_IN=threads * RGB * BYTES_PER_WORD
+            )  # its light is used
+            self.strip.run(
                 name,
                 (group_count(threads, THREADS), 1),
                 *("COLOR_OUT", "COLOR_IN"),
-                pixel_count=self.pixel_count,
+                pixel_count=self.strip.pixel_count,
             )
-        with self.timer.wall("readback_ms"):
-            return self.gpu.read(self.buffers["COLOR_IN"], (height, width, RGB), dtype)
+        with self.strip.timer.wall("readback_ms"):
+            return self.strip.gpu.read(
+                self.strip.buffers["COLOR_IN"], (height, width, RGB), dtype
+            )
 
     def counts(self) -> dict[str, int]:
         """Return counts of `Rendered` by name."""
-        fragment_count, merged_count = self.fragment_counts()
-        return {
-            "fragment_count": fragment_count,
-            "merged_count": merged_count,
-            "entry_count": self.lists.entry_count,
-            "overflow_count": self.lists.overflow_count,
-            "kernel_count": self.kernel_count,
-            "kernel_texel_count": self.kernel_texel_count,
-        }
+        return self.fragments.counts() | self.lists.counts()

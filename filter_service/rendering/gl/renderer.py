@@ -22,8 +22,10 @@ from filter_service.rendering.frame import (
 )
 from filter_service.rendering.frame_states import FrameStates, LoadedStore
 from filter_service.rendering.gaze import usable_gaze
+from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kernel_passes import KernelMaker, KernelsTooLarge
+from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.image_cells import ImageCells, image_cells
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import ACCUMULATIONS, OUTPUTS
@@ -228,28 +230,32 @@ class FilterRenderer:
         change_dpt = self._states.corner_change_dpt(timer, layers, image)
         picture = np.empty(whole.color.shape, OUTPUT_DTYPES[options.output])
         counts: Counter[str] = Counter()
-        for strip in _strips(whole, reach_px, self._gpu.max_block_bytes):
-            passes = FramePasses(
+        for rows in _strips(whole, reach_px, self._gpu.max_block_bytes):
+            shared = Strip(
                 self._gpu,
-                strip.view,
+                rows.view,
                 timer,
                 layers=layers,
+                paper_rule=options.paper_rule,
+            )
+            fragments = FragmentPasses(
+                shared,
                 image=image,
                 corner_change_dpt=change_dpt,
-                paper_rule=options.paper_rule,
                 merge=options.merge,
-                first_row=strip.first_row,
+                first_row=rows.first_row,
                 frame_pixel_count=whole.width_px * whole.height_px,
                 image_size_px=(view.width_px, view.height_px),
                 border_px=border_px,
                 white_level=_white_level(view.color),
             )
+            passes = FramePasses(shared, fragments)
             passes.run(
                 lambda used: self._kernels.kernels(
                     handle.store, handle.pages, layers, image, used, timer
                 )
             )
-            picture[strip.wanted] = passes.read_back(options.output)[strip.kept]
+            picture[rows.wanted] = passes.read_back(options.output)[rows.kept]
             counts.update(passes.counts())
         rows, columns = (
             slice(border_px, border_px + n) for n in (view.height_px, view.width_px)
@@ -336,7 +342,7 @@ def _border_px(view: RgbdView, reach_px: int) -> int:
 
 
 @dataclass(frozen=True)
-class _Strip:
+class _Rows:
     """Rows of a frame that go through the passes together.
 
     ``view`` has the rows that send light to the wanted ones; ``wanted`` are the rows of
@@ -349,7 +355,7 @@ class _Strip:
     kept: slice
 
 
-def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Strip]:
+def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Rows]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
     Strips start on rows of bins, so that lists and merged squares are the whole's.
@@ -359,7 +365,7 @@ def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Strip]
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
     rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
-        return [_Strip(view, 0, slice(None), slice(None))]
+        return [_Rows(view, 0, slice(None), slice(None))]
     step = rows - 2 * halo
     if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
@@ -371,7 +377,7 @@ def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Strip]
         bottom = min(top + step, view.height_px)
         first, last = max(top - halo, 0), min(bottom + halo, view.height_px)
         strips.append(
-            _Strip(
+            _Rows(
                 view=_rows_of(view, first, last),
                 first_row=first,
                 wanted=slice(top, bottom),
