@@ -7,8 +7,12 @@ from pathlib import Path
 import msgpack
 import pytest
 
+from estimator.eye.parameters import EyeParameters
+from estimator.profiles.parse import KINDS, parse_profile, preset_names
 from filter_service import errors, messages
 from filter_service.wire import replies, schema
+
+IN_ORDER = ("preset", "prescription", "zernike", "zernike_set", "eye")
 
 PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
 
@@ -25,6 +29,16 @@ def examples():
 
 
 EXAMPLES = examples()
+
+
+def bodies():
+    """Return the profiles that the page shows; the eye's parameters are written out."""
+    eye = json.dumps(EyeParameters.mean_eye().to_mapping())
+    found = []
+    for block in re.findall(r"(?:^    .*\n)+", PAGE, flags=re.MULTILINE):
+        if block.strip().startswith('{"kind"'):
+            found.append(json.loads(re.sub(r'\{"eye_length_mm".*?\}', eye, block)))
+    return found
 
 
 def parts_of(header):
@@ -109,3 +123,15 @@ def test_the_schema_has_the_fields_that_the_page_shows(name):
     properties = schema.protocol_schema()["$defs"][kind.__name__]["properties"]
     assert set(EXAMPLES[name]) == set(properties)
     assert properties["type"] == {"const": name}
+
+
+def test_every_kind_of_profile_is_shown_and_can_be_read():
+    shown = bodies()
+    assert [body["kind"] for body in shown] == sorted(KINDS, key=IN_ORDER.index)
+    for body in shown:
+        assert parse_profile(body).kind in KINDS
+
+
+def test_the_presets_are_named():
+    for name in preset_names():
+        assert f"`{name}`" in PAGE
