@@ -105,8 +105,9 @@ class EyeFilter:
         self._on_event = on_event
         self._is_shared = workshop is None
         self._workshop: Workshop | None = workshop or SHARED.take()
-        self._eyes = StreamEyes(self._take_event, max_cameras)
+        self._eyes = StreamEyes(self._take_event, max_cameras, self.cameras)
         self._workshop.streams.append(self._eyes)
+        self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
         self.ready: EyeReady | None = None
         if first is not None:
@@ -150,7 +151,7 @@ class EyeFilter:
         *,
         settings: FilterSettings = DEFAULTS,
         cameras: Sequence[Camera] = (),
-        profile_id: int = 0,
+        profile_id: int | None = None,
     ) -> AcceptedProfile:
         """Change the eye; frames go through the old one until it is ready.
 
@@ -159,21 +160,22 @@ class EyeFilter:
         cameras : sequence of Camera, optional
             What to prepare for; else the cameras of the last frame, else those of the
             eye in use.
-        profile_id : int
-            The caller's own number; comes back with results.
+        profile_id : int, optional
+            The caller's own number, which comes back with results; else the generation.
 
         Raises
         ------
         ValueError
             The profile is wrong, and the eye stays as it was.
         """
-        return self.workshop.accept(
+        self._newest = self.workshop.accept(
             self._eyes,
             as_profile(profile),
             settings,
-            cameras or (() if self._eyes.eyes else self.cameras),
+            cameras,
             profile_id=profile_id,
         )
+        return self._newest
 
     def advance(self) -> None:
         """Let builds go on where no frames do; `filter` does it by itself."""
@@ -188,24 +190,23 @@ class EyeFilter:
             What the build of the eye ended with, or `ServiceTimeout`.
         """
         deadline_s = time.monotonic() + timeout_s
+        if self._newest is None:
+            raise BadMessage("there is no profile", field="profile")
         while True:
             self.workshop.advance()
-            newest = self._eyes.eyes[0] if self._eyes.eyes else None
-            failure = self._failure
-            if failure is not None:
-                self._failure = None
+            failure, self._failure = self._failure, None
+            if failure is not None and failure.eye is self._newest:
                 raise failure.error
-            if newest is None:
-                raise BadMessage("there is no profile", field="profile")
-            if not newest.wanted and self.ready is not None:
-                return self.ready
+            ready = self.ready
+            if ready is not None and ready.eye is self._newest and ready.is_complete:
+                if not self._newest.wanted:
+                    return ready
             self._wait_for_worker(deadline_s, "the eye to be ready")
 
     def _take_event(self, event: EyeEvent) -> None:
         if isinstance(event, EyeFailed):
             self._failure = event
         elif isinstance(event, EyeReady):
-            self._failure = None
             self.ready = event
         if self._on_event is not None:
             self._on_event(event)

@@ -40,10 +40,13 @@ class StreamEyes:
         Told of every `EyeEvent`.
     max_cameras : int
         Stores that one eye keeps.
+    first_cameras : tuple of Camera
+        What to prepare for while no frame has come.
     """
 
     on_event: Callable[[EyeEvent], None]
     max_cameras: int = 4
+    first_cameras: tuple[Camera, ...] = ()
     ticket: int | None = None
     building: tuple[AcceptedProfile, Camera] | None = None
     look_at: LookAt | None = None  # of the last frame
@@ -93,7 +96,7 @@ class StreamEyes:
         settings: FilterSettings,
         cameras: Sequence[Camera] = (),
         *,
-        profile_id: int = 0,
+        profile_id: int | None = None,
     ) -> AcceptedProfile:
         """Make a profile the newest eye; the one in use stays until then.
 
@@ -104,7 +107,9 @@ class StreamEyes:
         in_use = [old for old in self.eyes if old.stores][:1]
         cameras = cameras or self._last_cameras
         cameras = cameras or [s.camera for old in in_use for s in old.stores]
-        eye = AcceptedProfile(self._n_generations, profile_id, profile, settings)
+        cameras = cameras or self.first_cameras
+        own_id = self._n_generations if profile_id is None else profile_id
+        eye = AcceptedProfile(self._n_generations, own_id, profile, settings)
         eye.want(cameras)
         for old in self.eyes:
             if old not in in_use:

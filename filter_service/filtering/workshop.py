@@ -86,7 +86,7 @@ class Workshop:
         settings: FilterSettings,
         cameras: Sequence[Camera] = (),
         *,
-        profile_id: int = 0,
+        profile_id: int | None = None,
     ) -> AcceptedProfile:
         """Take a profile in; a build of an older one that still runs is cancelled."""
         # Accepted in the same pass counts as well: its build has not begun, but its
@@ -97,8 +97,9 @@ class Workshop:
             replaced.append(unfinished)
         self.cancel(stream)
         for old in replaced:
+            newer = "a newer profile" if profile_id is None else f"profile {profile_id}"
             error = BuildCancelled(
-                f"profile {profile_id} took the place of profile {old.profile_id}"
+                f"{newer} took the place of profile {old.profile_id}"
             )
             stream.on_event(EyeFailed(old, error))
         eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)

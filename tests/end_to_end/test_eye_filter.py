@@ -101,6 +101,7 @@ def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, 
     eye_filter.set_profile(eye(1, build_s=30.0))
     eye_filter.advance()
     eye_filter.set_profile(eye(2))
+    eye_filter.wait(10.0)  # the end of the other is not its own
     assert mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)) == 2
     (failed,) = [event for event in events if isinstance(event, EyeFailed)]
     assert isinstance(failed.error, BuildCancelled)

@@ -1,0 +1,48 @@
+"""The guide's examples run as printed, one after the other, as one script."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import fields
+
+from filter_service import EyeFilter, Filtered, FilterSettings
+from tests.source_tree import ROOT
+
+GUIDE = (ROOT / "GUIDE.md").read_text(encoding="utf-8")
+LIMIT_S = 240
+
+
+def test_the_examples_run_and_print_what_they_say(tmp_path):
+    script = tmp_path / "guide.py"
+    script.write_text("\n".join(re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)))
+    printed = subprocess.run(
+        [sys.executable, script],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+    )
+    assert printed.returncode == 0, printed.stderr
+    lines = printed.stdout.splitlines()
+    assert lines[0].startswith("(90, 160, 3) 1 ")
+    assert lines[1] in ("1", "2")
+    assert lines[3] in GUIDE, "the error that the page shows is another"
+    assert lines[4].startswith("(90, 160, 3) ")
+    eye_length_mm, error_um = map(float, lines[5].split())
+    assert 20.0 < eye_length_mm < 30.0
+    assert error_um < 1e-3
+    assert len(eval(lines[6])) == 2
+
+
+def test_the_page_names_every_setting_call_and_answer():
+    settings = GUIDE[GUIDE.index("Settings (`FilterSettings`") :]
+    for field in fields(FilterSettings):
+        assert f"`{field.name}`" in settings
+    for name in vars(EyeFilter):
+        if not name.startswith("_") and callable(getattr(EyeFilter, name)):
+            assert f"`{name}(" in GUIDE or name in ("advance",), name
+    for field in fields(Filtered):
+        if field.name not in ("profile_id", "pupil_diameter_mm", "focus_dpt"):
+            assert f"`{field.name}`" in GUIDE or field.name == "gaze_deg", field.name
