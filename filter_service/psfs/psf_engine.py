@@ -44,7 +44,7 @@ def psf_engine(choice: str = "auto") -> PsfEngine:
     Parameters
     ----------
     choice : "auto", "cpu" or "gpu"
-        "auto" takes the GPU where it is none that a processor imitates: there the
+        "auto" takes a hardware GPU where there is one: beside a software renderer the
         compiled loops of the CPU are two to four times as fast.
 
     Raises

@@ -40,7 +40,7 @@ class ServiceConfig:
     max_store_mb : int
         A profile that needs more memory for its PSFs is refused.
     psf_engine : "auto", "cpu" or "gpu"
-        What computes PSFs; "auto" is the GPU unless a processor imitates it.
+        What computes PSFs; "auto" takes a hardware GPU where there is one.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
