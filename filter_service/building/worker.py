@@ -29,6 +29,7 @@ from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.building.head_start import HeadStart
+from filter_service.building.jobs import Build, BuildJob, BuiltStore
 from filter_service.building.shared_buffers import write_shared
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
 
@@ -80,12 +81,12 @@ def _named(name: str) -> Callable[..., Any]:
 
 def _build_one(
     pipe: Connection,
-    build: Callable[..., Iterator[Any]],
+    build: Build,
     niceness: int,
     head_start: HeadStart | None,
     *,
     ticket: int,
-    job: object,
+    job: BuildJob,
 ) -> None:
     progress = _throttled_progress(pipe, ticket)
 
@@ -120,7 +121,7 @@ def _run_nicely(niceness: int, work: Callable[[], None]) -> None:
         pool.submit(work).result()
 
 
-def _send_all(pipe: Connection, ticket: int, stores: Iterator[Any]) -> None:
+def _send_all(pipe: Connection, ticket: int, stores: Iterator[BuiltStore]) -> None:
     for built in stores:
         _send_result(pipe, ticket, built)
 
@@ -160,7 +161,7 @@ def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:
     pipe.send(("failed", ticket, error.code, error.message, error.field, error.allowed))
 
 
-def _send_result(pipe: Connection, ticket: int, built: object) -> None:
+def _send_result(pipe: Connection, ticket: int, built: BuiltStore) -> None:
     buffers: list[pickle.PickleBuffer] = []
     head = pickle.dumps(built, protocol=5, buffer_callback=buffers.append)
     arrays = [buffer.raw() for buffer in buffers]

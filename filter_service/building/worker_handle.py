@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from typing import Any
 
+from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.building.shared_buffers import map_shared
 from filter_service.errors import (
     BuildCancelled,
@@ -48,7 +49,7 @@ class BuildDone:
     """What a build made; more may follow, as ``built`` says."""
 
     ticket: int
-    built: Any
+    built: BuiltStore
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class WorkerHandle:
     cancel_grace_s: float = 3.0
     warm_up: str = WARM_UP
     n_restarts: int = 0
-    _queue: deque[tuple[int, Any]] = field(default_factory=deque)
+    _queue: deque[tuple[int, BuildJob]] = field(default_factory=deque)
     _next_ticket: int = 1
     _running: int | None = None
     _kill_at_s: float | None = None
@@ -166,7 +167,7 @@ class WorkerHandle:
         """Return whether poll has something to do although the pipe is silent."""
         return self._worker is None or self._kill_at_s is not None
 
-    def submit(self, job: object) -> int:
+    def submit(self, job: BuildJob) -> int:
         """Put a job at the end of the queue; return its ticket."""
         ticket = self._next_ticket
         self._next_ticket += 1
