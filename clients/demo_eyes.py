@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Eye:
+class DemoEye:
     """A preset, its title, and two lines of caption for each scene."""
 
     preset: str
@@ -13,7 +13,7 @@ class Eye:
 
 
 EYES = (
-    Eye(
+    DemoEye(
         "emmetropia",
         "Emmetropia: no error",
         {
@@ -27,7 +27,7 @@ EYES = (
             ),
         },
     ),
-    Eye(
+    DemoEye(
         "myopia",
         "Myopia, -6 D",
         {
@@ -41,7 +41,7 @@ EYES = (
             ),
         },
     ),
-    Eye(
+    DemoEye(
         "astigmatism",
         "Astigmatism, with myopia",
         {
@@ -55,7 +55,7 @@ EYES = (
             ),
         },
     ),
-    Eye(
+    DemoEye(
         "keratoconus",
         "Keratoconus",
         {
@@ -69,7 +69,7 @@ EYES = (
             ),
         },
     ),
-    Eye(
+    DemoEye(
         "cataract",
         "Cataract (wavefront only)",
         {
@@ -83,7 +83,7 @@ EYES = (
             ),
         },
     ),
-    Eye(
+    DemoEye(
         "post_lasik",
         "After presbyopic LASIK",
         {

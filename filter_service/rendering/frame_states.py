@@ -1,32 +1,35 @@
 """What of a frame depends on the eye's state alone, kept while the state stays."""
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.gl.gpu import Pages, StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 
 
+class Timer(Protocol):
+    """What an engine times its stages with."""
+
+    def wall(self, name: str) -> AbstractContextManager[None]:
+        """Add the time within to a stage."""
+
+
 @dataclass(frozen=True)
-class LoadedStore:
-    """A PSF store whose kernels are on the GPU."""
+class FrameStore:
+    """A PSF store with the image cells of its camera; engines add their own to it."""
 
     store: PsfStore
-    pages: Pages
     image: ImageCells
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
         """Scale of the stored pixels, see `stored_scale`; it takes 3 ms."""
         return stored_scale(self.store.spec, self.store.plan)
-
-    def release(self) -> None:
-        """Free the GPU copy."""
-        self.pages.release()
 
 
 class FrameStates:
@@ -40,21 +43,21 @@ class FrameStates:
     def __init__(self):
         self._start_anew(None)
 
-    def _start_anew(self, handle: LoadedStore | None) -> None:
+    def _start_anew(self, handle: FrameStore | None) -> None:
         self._handle = handle
         self._cell_px: int | None = None
         self._layers: tuple[tuple[float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
 
-    def _forget_others(self, handle: LoadedStore) -> None:
+    def _forget_others(self, handle: FrameStore) -> None:
         if self._handle is not handle:
             self._start_anew(handle)
 
     def layers(
         self,
-        timer: StageTimer,
-        handle: LoadedStore,
+        timer: Timer,
+        handle: FrameStore,
         pupil_diameter_mm: float,
         focus_dpt: float,
     ) -> FrameLayers:
@@ -74,7 +77,7 @@ class FrameStates:
         return self._layers[1]
 
     def cells(
-        self, timer: StageTimer, handle: LoadedStore, gaze_deg: tuple[float, float]
+        self, timer: Timer, handle: FrameStore, gaze_deg: tuple[float, float]
     ) -> ImageCells:
         """Cells of a gaze."""
         self._forget_others(handle)
@@ -96,7 +99,7 @@ class FrameStates:
         return self._image[1]
 
     def corner_change_dpt(
-        self, timer: StageTimer, layers: FrameLayers, image: ImageCells
+        self, timer: Timer, layers: FrameLayers, image: ImageCells
     ) -> NDArray[np.float32]:
         """Change of defocus at the corners of cells, see `FieldDefocus.at`."""
         last = self._change

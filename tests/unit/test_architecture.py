@@ -166,6 +166,16 @@ def test_rooms_import_only_those_before_them(package, room):
     assert not wrong, "\n".join(wrong)
 
 
+def test_what_engines_share_knows_no_engine():
+    wrong = [
+        f"{entry.file}:{entry.line} imports {entry.module}"
+        for path in (ROOT / "filter_service" / "rendering").glob("*.py")
+        for entry in imports_of(path)
+        if _may(entry.module, ("filter_service.gl", "filter_service.rendering.gl"))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
 def test_only_the_service_knows_messages():
     wrong = [
         f"{entry.file}:{entry.line} imports {entry.module}"

@@ -1,11 +1,16 @@
 """Profiles that hold an eye, several measurements, or a retina."""
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.optics.zernike import flip_horizontal
 from estimator.profiles.parse import ProfileError, parse_profile, preset_names
+from tests.source_tree import ROOT
 
 ONE = {"pupil_diameter_mm": 4, "wavelength_nm": 555, "zernike_um": {"2,0": 1.0}}
 EYE = {"kind": "eye", "parameters": EyeParameters.mean_eye().to_mapping()}
@@ -88,3 +93,14 @@ def test_single_measurements_are_their_own_set():
         (only,) = profile.measurements
         assert only.zernike_um is profile.zernike_um
         assert only.is_on_axis
+
+
+def test_a_given_eye_is_read_without_tracing_it():
+    script = (
+        "import json, sys\n"
+        "from estimator.profiles.parse import parse_profile\n"
+        "profile = parse_profile(json.loads(sys.argv[1]))\n"
+        "sys.exit('numba' in sys.modules or 'zernike_um' in vars(profile))"
+    )
+    command = [sys.executable, "-c", script, json.dumps(EYE)]
+    assert subprocess.run(command, cwd=ROOT).returncode == 0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
-from filter_service.gl.gpu import Gpu, StageTimer
+from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame import (
     IMAGES,
@@ -20,7 +20,7 @@ from filter_service.rendering.frame import (
     object_dpt,
     with_clean_hidden,
 )
-from filter_service.rendering.frame_states import FrameStates, LoadedStore
+from filter_service.rendering.frame_states import FrameStates, FrameStore
 from filter_service.rendering.gaze import usable_gaze
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
@@ -92,6 +92,17 @@ class Rendered:
     overflow_count: int = 0
 
 
+@dataclass(frozen=True)
+class GlStore(FrameStore):
+    """A store whose kernels are on the GPU."""
+
+    pages: Pages
+
+    def release(self) -> None:
+        """Free the GPU copy."""
+        self.pages.release()
+
+
 class FilterRenderer:
     """Runs the passes for one view at a time; not thread-safe."""
 
@@ -105,19 +116,19 @@ class FilterRenderer:
         """The OpenGL renderer."""
         return str(self._gpu.info["renderer"])
 
-    def load(self, store: PsfStore) -> LoadedStore:
+    def load(self, store: PsfStore) -> GlStore:
         """Copy a store's kernels to the GPU at once."""
         *_, loaded = self.load_steps(store)
         return loaded
 
     def load_steps(
         self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
-    ) -> Generator[LoadedStore | None]:
+    ) -> Generator[GlStore | None]:
         """Copy a store's kernels in steps of a few MB, so that frames go on between.
 
         Yields
         ------
-        LoadedStore or None
+        GlStore or None
             None after each step, and in the end the loaded store.  The copy is given up
             when the generator is closed before.
         """
@@ -134,14 +145,14 @@ class FilterRenderer:
             pages.release()
             raise
         _ = store.defocus, store.tables  # made here and not by the first frame
-        yield LoadedStore(
+        yield GlStore(
             store=store, pages=pages, image=image_cells(store.spec, store.plan)
         )
 
     def render(
         self,
         view: RgbdView,
-        handle: LoadedStore,
+        handle: GlStore,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
