@@ -130,10 +130,11 @@ class WorkerHandle:
             return
         ours, theirs = socket.socketpair()
         # A plain process: one that multiprocessing spawns would run the main module
-        # again, which a script without a guard does not survive.
+        # again, which a script without a guard does not survive.  Without -P a file
+        # of the current folder would come before every module of its name.
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "filter_service.building.worker"),
+                *(sys.executable, "-P", "-m", "filter_service.building.worker"),
                 *(str(theirs.fileno()), self.build, str(self.niceness), self.warm_up),
             ],
             pass_fds=[theirs.fileno()],
@@ -289,5 +290,5 @@ def _end(process: subprocess.Popen[bytes]) -> int:
 
 
 def _import_path() -> list[str]:
-    """Return where this process imports from; the worker starts in the same folder."""
-    return [entry or os.getcwd() for entry in sys.path]
+    """Return where this process imports from; what is no text it skips, too."""
+    return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
