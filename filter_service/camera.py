@@ -56,9 +56,9 @@ class Camera(Record):
     tangents: Tangents
 
     def __post_init__(self) -> None:
-        """Refuse what no pinhole has; a list of tangents becomes a tuple."""
-        checked(self.width_px, SidePx, "width_px")
-        checked(self.height_px, SidePx, "height_px")
+        """Refuse what no pinhole has; numpy's numbers become Python's, lists tuples."""
+        for name in ("width_px", "height_px"):
+            object.__setattr__(self, name, checked(getattr(self, name), SidePx, name))
         # An alias of a tuple is no type to mypy.
         kind = cast("type[Tangents]", Tangents)
         tangents = checked(self.tangents, kind, "tangents")

@@ -1,5 +1,6 @@
 """Which cameras share a store: by pixel size on axis, by the whole image off it."""
 
+import numpy as np
 import pytest
 
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
@@ -34,3 +35,9 @@ def test_cameras_that_share_a_store_are_counted_once():
     cameras = [CAMERA, LIKE, SHIFTED, COARSER]
     assert distinct_cameras(cameras, follows_field=False) == (CAMERA, COARSER)
     assert distinct_cameras(cameras, follows_field=True) == (CAMERA, SHIFTED, COARSER)
+
+
+def test_sizes_from_numpy_become_numbers_that_travel():
+    camera = Camera(np.int64(200), np.int32(100), CAMERA.tangents)
+    assert camera == CAMERA
+    assert (type(camera.width_px), type(camera.height_px)) == (int, int)
