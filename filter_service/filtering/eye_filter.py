@@ -111,7 +111,11 @@ class EyeFilter:
         self._failure: EyeFailed | None = None
         self.ready: EyeReady | None = None
         if first is not None:
-            self.set_profile(first, settings=settings, cameras=self.cameras)
+            try:
+                self.set_profile(first, settings=settings, cameras=self.cameras)
+            except BaseException:
+                self.close()  # nobody else can: there is no filter to be closed
+                raise
 
     def __enter__(self) -> Self:
         """Return the filter."""
@@ -188,6 +192,8 @@ class EyeFilter:
         ------
         FilterError
             What the build of the eye ended with, or `ServiceTimeout`.
+        BadMessage
+            There is no profile, or no camera that it could be prepared for.
         """
         deadline_s = time.monotonic() + timeout_s
         if self._newest is None:
@@ -197,11 +203,19 @@ class EyeFilter:
             failure, self._failure = self._failure, None
             if failure is not None and failure.eye is self._newest:
                 raise failure.error
-            ready = self.ready
-            if ready is not None and ready.eye is self._newest and ready.is_complete:
-                if not self._newest.wanted:
-                    return ready
+            if not self._newest.wanted:
+                return self._ending(self._newest)
             self._wait_for_worker(deadline_s, "the eye to be ready")
+
+    def _ending(self, eye: AcceptedProfile) -> EyeReady:
+        """Return what came of an eye for which nothing more is built."""
+        if self.ready is not None and self.ready.eye is eye and self.ready.is_complete:
+            return self.ready
+        if eye.failures:  # told before: nothing has changed since
+            raise eye.failures[-1][1].with_traceback(None)
+        raise BadMessage(
+            "it is not known", field="camera", allowed="a camera to prepare for"
+        )
 
     def _take_event(self, event: EyeEvent) -> None:
         if isinstance(event, EyeFailed):

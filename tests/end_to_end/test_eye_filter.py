@@ -97,6 +97,22 @@ def test_a_profile_that_fails_leaves_the_old_eye_in_use(eye_filter, events):
     assert isinstance(events[-1], EyeFailed)
 
 
+def test_a_wait_ends_where_nothing_more_will_come(eye_filter, workshop):
+    eye_filter.set_profile(eye(2, fail=True))
+    for _ in range(2):
+        with pytest.raises(BuildFailed, match="told to fail"):
+            eye_filter.wait(10.0)
+    with EyeFilter(eye(1), workshop=workshop) as blind:
+        with pytest.raises(BadMessage, match="camera: it is not known"):
+            blind.wait(10.0)
+
+
+def test_a_filter_that_could_not_be_made_holds_nothing(workshop):
+    with pytest.raises(AttributeError):
+        EyeFilter(eye(1), CAMERA, {"mode": "on-axis"}, workshop=workshop)
+    assert workshop.streams == []
+
+
 def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, events):
     eye_filter.set_profile(eye(1, build_s=30.0))
     eye_filter.advance()
