@@ -9,9 +9,9 @@ The service holds one of these for each client.
 
 from __future__ import annotations
 
-import select
 import time
 from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Self
 
@@ -232,7 +232,7 @@ class EyeFilter:
         descriptor = self.workshop.worker.file_descriptor
         watched = [] if descriptor is None else [descriptor]
         if not self.workshop.is_loading:
-            select.select(watched, [], [], min(remaining_s, WAIT_SLICE_S))
+            wait(watched, min(remaining_s, WAIT_SLICE_S))  # select ends at 1024
 
     # Frames
 

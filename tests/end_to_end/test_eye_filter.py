@@ -1,9 +1,11 @@
 """`EyeFilter`: the service's own object in this process, with doubles and for real."""
 
 import os
+import resource
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -105,6 +107,22 @@ def test_a_wait_ends_where_nothing_more_will_come(eye_filter, workshop):
     with EyeFilter(eye(1), workshop=workshop) as blind:
         with pytest.raises(BadMessage, match="camera: it is not known"):
             blind.wait(10.0)
+
+
+def test_a_program_with_many_open_files_can_wait():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 2048:
+        pytest.skip("this machine allows no more than a thousand open files")
+    with ExitStack() as closing:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (2048, hard))
+        closing.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        for _ in range(1024):
+            closing.callback(os.close, os.open(os.devnull, os.O_RDONLY))
+        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+        many = Workshop(worker, EngineDouble(0.0), BuildLimits())
+        closing.callback(many.close)
+        with EyeFilter(eye(1), CAMERA, workshop=many) as made:
+            assert made.wait(10.0).is_complete
 
 
 def test_a_filter_that_could_not_be_made_holds_nothing(workshop):
