@@ -123,18 +123,21 @@ def _described(kind: Any) -> kinds.Type:
 def _step(
     value: Any, described: kinds.Type | None, name: str, number: str
 ) -> tuple[Any, kinds.Type | None]:
-    """Go down one step of a path, in the value and in its type."""
+    """Go down one step of a path, in the type and, where that is possible, the value.
+
+    Of a map's values msgspec does not say which it means; the map is shown then.
+    """
     described = _bare(described) if described is not None else None
     if name:
         fields = getattr(described, "fields", ())
         inner = next((f.type for f in fields if f.encode_name == name), None)
-        return value.get(name), inner
-    if number == "...":  # some value of a map: msgspec does not say which
+        return value.get(name) if isinstance(value, dict) else value, inner
+    if number == "...":
         return value, getattr(described, "value_type", None)
-    index = int(number)
+    item = value[int(number)] if isinstance(value, list | tuple) else value
     if isinstance(described, kinds.TupleType):
-        return value[index], described.item_types[index]
-    return value[index], getattr(described, "item_type", None)
+        return item, described.item_types[int(number)]
+    return item, getattr(described, "item_type", None)
 
 
 def _bare(described: kinds.Type) -> kinds.Type:

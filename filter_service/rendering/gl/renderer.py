@@ -174,7 +174,7 @@ class FilterRenderer:
         BadMessage
             Arrays or options that cannot be used.
         CameraMismatch
-            The store is for another camera, see `camera_match`.
+            The store is for another camera, see `camera.is_same_camera`.
         OutOfGpuMemory, RenderFailed
         """
         _check_choice("accumulation", accumulation, ACCUMULATIONS)
