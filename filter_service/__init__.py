@@ -6,6 +6,7 @@ Importing this loads nothing but names: clients stay light.
     camera           a pinhole, and which cameras share PSFs
     rgbd_view        colour, depth and camera of one view
     messages         the wire protocol's types (PROTOCOL.md)
+    protocol_schema  their headers as JSON Schema
     errors           the exceptions
     checked          values against annotated types
     constants        numbers that Python and GLSL share

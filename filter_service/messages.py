@@ -2,7 +2,7 @@
 
 The types live in `wire.requests` and `wire.replies`, images in `wire.images`; settings
 and camera belong to the filter and are here for those who only speak the protocol.
-PROTOCOL.md is the authority; `wire.schema` writes the headers as JSON Schema.
+PROTOCOL.md is the authority; `protocol_schema` writes the headers as JSON Schema.
 
 A message is a list of parts: ``[header, part, part, ...]``.  Nothing here touches a
 socket, and nothing is copied: decoded images are read-only views of the parts.

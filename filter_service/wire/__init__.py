@@ -5,5 +5,4 @@ images     images, formats, views
 requests   what a client says
 replies    what the service answers
 unpacking  bounded unpacking of untrusted bytes
-schema     the headers as JSON Schema
 """

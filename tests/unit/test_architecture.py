@@ -82,6 +82,7 @@ HOME = {
         "filter_service/checked.py",  # values against annotated types
         "filter_service/settings.py",  # their limits
         "filter_service/camera.py",
+        "filter_service/protocol_schema.py",
         "filter_service/wire/*",
     ),
     "lazy_loader": ("*/__init__.py",),  # names without what they load

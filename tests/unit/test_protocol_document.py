@@ -10,7 +10,8 @@ import pytest
 from estimator.eye.parameters import EyeParameters
 from estimator.profiles.parse import KINDS, parse_profile, preset_names
 from filter_service import errors, messages
-from filter_service.wire import replies, schema
+from filter_service import protocol_schema as schema
+from filter_service.wire import replies
 
 IN_ORDER = ("preset", "prescription", "zernike", "zernike_set", "eye")
 

@@ -1,6 +1,6 @@
 """The headers of all messages as JSON Schema, for clients in other languages.
 
-    python -m filter_service.wire.schema
+    python -m filter_service.protocol_schema
 
 writes ``filter_service/protocol.schema.json``.  What a schema cannot say (an edge on
 the wrong side, the size of a part) is in PROTOCOL.md.
@@ -17,7 +17,7 @@ import msgspec
 
 from filter_service.messages import PROTOCOL_VERSION, REPLIES, REQUESTS
 
-SCHEMA_FILE = Path(__file__).resolve().parents[1] / "protocol.schema.json"
+SCHEMA_FILE = Path(__file__).resolve().parent / "protocol.schema.json"
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
