@@ -26,7 +26,7 @@ def thread_count() -> int:
     """
     wanted = os.environ.get(THREADS_VARIABLE, "")
     if wanted:
-        if not wanted.isdigit() or not 1 <= int(wanted) <= MAX_THREADS:
+        if not wanted.isdecimal() or not 1 <= int(wanted) <= MAX_THREADS:
             raise ValueError(
                 f"{THREADS_VARIABLE} is {wanted!r}; allowed: 1 to {MAX_THREADS}"
             )
@@ -55,6 +55,6 @@ def _quota_cores(folder: Path) -> int:
             period = (old / "cpu.cfs_period_us").read_text(encoding="utf-8").strip()
         except OSError:
             return MAX_THREADS
-    if not (quota.isdigit() and period.isdigit() and int(period) > 0):
+    if not (quota.isdecimal() and period.isdecimal() and int(period) > 0):
         return MAX_THREADS
     return max(1, math.ceil(int(quota) / int(period)))

@@ -144,7 +144,11 @@ def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Messa
     BadMessage, UnknownType, VersionMismatch
         With the field at fault and what is allowed.
     """
-    return _decoded(parts, REQUESTS, limits or Limits())
+    limits = limits or Limits()
+    try:
+        return _decoded(parts, REQUESTS, limits)
+    except BadMessage as error:
+        raise limits.narrowed(error) from None
 
 
 def decode_reply(parts: Sequence[Part]) -> Message:

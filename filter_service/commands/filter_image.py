@@ -124,6 +124,7 @@ def filter_image(
     from filter_service.filtering import one_image
 
     image_files.check_output(out)
+    output = _output(out, half=half)
     eye = load_profile(profile)
     view = _read_view(
         color,
@@ -146,7 +147,7 @@ def filter_image(
             spec,
             accumulation=accumulation,
             merge=not no_merge,
-            output=_output(out, half=half),
+            output=output,
             progress=progress,
         )
     image_files.write_image(out, filtered.rendered.color)

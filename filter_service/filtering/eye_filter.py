@@ -64,8 +64,9 @@ class EyeFilter:
     """One stream of frames through one person's eye, which may change on the way.
 
     A change of profile never stops the stream: frames go through the old eye until the
-    new one is ready, first through a small preview of it, then through the whole.  One
-    thread at a time may use it.
+    new one is ready, first through a small preview of it, then through the whole.  All
+    filters of a process share a worker and an engine unless told otherwise: one thread
+    at a time may use them.
 
     Parameters
     ----------
@@ -102,6 +103,7 @@ class EyeFilter:
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+        self.settings = settings
         self._on_event = on_event
         self._is_shared = workshop is None
         self._workshop: Workshop | None = workshop or SHARED.take()
@@ -112,7 +114,7 @@ class EyeFilter:
         self.ready: EyeReady | None = None
         if first is not None:
             try:
-                self.set_profile(first, settings=settings, cameras=self.cameras)
+                self.set_profile(first, cameras=self.cameras)
             except BaseException:
                 self.close()  # nobody else can: there is no filter to be closed
                 raise
@@ -153,7 +155,7 @@ class EyeFilter:
         self,
         profile: Profile,
         *,
-        settings: FilterSettings = DEFAULTS,
+        settings: FilterSettings | None = None,
         cameras: Sequence[Camera] = (),
         profile_id: int | None = None,
     ) -> AcceptedProfile:
@@ -161,6 +163,8 @@ class EyeFilter:
 
         Parameters
         ----------
+        settings : FilterSettings, optional
+            Those of the filter where it is None.
         cameras : sequence of Camera, optional
             What to prepare for; else the cameras of the last frame, else those of the
             eye in use.
@@ -175,7 +179,7 @@ class EyeFilter:
         self._newest = self.workshop.accept(
             self._eyes,
             as_profile(profile),
-            settings,
+            settings or self.settings,
             cameras,
             profile_id=profile_id,
         )

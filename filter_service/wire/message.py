@@ -40,12 +40,13 @@ class Limits(Record):
 
     def narrowed(self, error: BadMessage) -> BadMessage:
         """Return a refusal that states this service's limit, not the protocol's."""
-        name = (error.field or "").rpartition(".")[2]
-        allowed = {
-            "width_px": f"an integer 1 to {self.max_width_px}",
-            "height_px": f"an integer 1 to {self.max_height_px}",
-            "views": f"a list of at most {self.max_views} items",
-        }.get(name, error.allowed)
+        name, allowed = (error.field or "").rpartition(".")[2], error.allowed
+        if allowed and allowed.startswith(("an integer", "a list")):
+            allowed = {
+                "width_px": f"an integer 1 to {self.max_width_px}",
+                "height_px": f"an integer 1 to {self.max_height_px}",
+                "views": f"a list of 1 to {self.max_views} items",
+            }.get(name, allowed)
         return BadMessage(error.message, field=error.field, allowed=allowed)
 
 
@@ -84,10 +85,7 @@ class Message(Record):
             Names the field, the bad value and what is allowed.
         """
         given = {name: value for name, value in header.items() if name != cls.payload}
-        try:
-            return checked(given, cls).with_parts(parts, limits)
-        except BadMessage as error:
-            raise limits.narrowed(error) from None
+        return checked(given, cls).with_parts(parts, limits)
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
         """Return the message with its parts; most have none."""

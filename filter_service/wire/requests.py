@@ -120,7 +120,7 @@ def _check_count(views: Sequence[object], limits: Limits) -> None:
         raise BadMessage(
             f"there are {len(views)}",
             field="views",
-            allowed=f"a list of at most {limits.max_views} items",
+            allowed=f"a list of 1 to {limits.max_views} items",
         )
 
 

@@ -142,6 +142,14 @@ def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, 
     assert failed.eye.generation == 1
 
 
+def test_a_new_eye_keeps_the_settings_unless_told_others(workshop):
+    own = FilterSettings(mode="on-axis")
+    with EyeFilter(None, CAMERA, own, workshop=workshop) as made:
+        assert made.set_profile(eye(1)).settings is own
+        other = FilterSettings(mode="quality")
+        assert made.set_profile(eye(2), settings=other).settings is other
+
+
 def test_streams_share_a_workshop_and_keep_their_eyes(workshop):
     with (
         EyeFilter(eye(1), CAMERA, workshop=workshop) as left,

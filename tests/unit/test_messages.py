@@ -214,6 +214,22 @@ def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):
     assert error.allowed
 
 
+def test_the_limits_stated_are_those_of_the_service():
+    limits = Limits(max_width_px=100, max_views=1)
+    for views, allowed in (
+        ([view_map(width_px=0)], "an integer 1 to 100"),
+        ([view_map(width_px=101)], "an integer 1 to 100"),
+        ([view_map(width_px=None)], "an integer 1 to 100"),
+        ([{"height_px": 3}], "this field is required"),
+        ([], "a list of 1 to 1 items"),
+        ([view_map()] * 2, "a list of 1 to 1 items"),
+        ([view_map()] * 9, "a list of 1 to 1 items"),
+    ):
+        with pytest.raises(errors.BadMessage) as caught:
+            decode_request(frame_parts(views=views), limits)
+        assert caught.value.allowed == allowed
+
+
 @pytest.mark.parametrize(
     ("settings_map", "field"),
     [
