@@ -11,6 +11,7 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.parameters import RetinaShape
+from estimator.field import grid_source
 from estimator.field.aberration_grid import aberration_grid
 from estimator.field.grid_source import GridSource, network_pays
 from estimator.field.network_grid import network_focused, network_grid
@@ -173,12 +174,18 @@ def test_an_eye_with_a_retina_of_its_own_is_traced(monkeypatch, eye):
     assert "retina" in source.uses[0].reason and "retina" in source.focus_reason
 
 
-def test_a_network_pays_for_many_nodes_and_few_weights():
+def test_a_network_pays_for_many_nodes_and_few_weights(monkeypatch):
+    monkeypatch.setattr(grid_source, "relative_core_time", lambda: 1.0)
+    monkeypatch.setattr(grid_source, "thread_count", lambda: 2)
     assert network_pays(5000, n_rays=70, n_weights=100_000)
     assert not network_pays(20, n_rays=70, n_weights=100_000)
     assert not network_pays(5000, n_rays=70, n_weights=10**8)
     few = [network_pays(500, n_rays=n, n_weights=100_000) for n in (70, 192)]
     assert few == [False, True]
+    monkeypatch.setattr(grid_source, "thread_count", lambda: 16)
+    assert not network_pays(500, n_rays=192, n_weights=100_000), "tracing is fast here"
+    monkeypatch.setattr(grid_source, "relative_core_time", lambda: 10.0)
+    assert network_pays(500, n_rays=192, n_weights=100_000)
 
 
 def test_cheaper_traces_few_nodes_and_asks_the_network_for_many(monkeypatch, eye):
