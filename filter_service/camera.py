@@ -33,7 +33,13 @@ Tangents = tuple[Tangent, Tangent, Tangent, Tangent]
 def tangents_from_fov(
     vertical_fov_deg: float, width_px: int, height_px: int
 ) -> tuple[float, float, float, float]:
-    """Return (left, right, up, down) of a symmetric camera with square pixels."""
+    """Return (left, right, up, down) of a symmetric camera with square pixels.
+
+    Raises
+    ------
+    ValueError
+        A field of view that no pinhole has.
+    """
     if not 0 < vertical_fov_deg < 174:
         raise ValueError(f"vertical_fov_deg is {vertical_fov_deg}; allowed: 0 to 174")
     up = math.tan(math.radians(vertical_fov_deg) / 2)
@@ -44,6 +50,12 @@ def tangents_from_fov(
 @dataclass(frozen=True)
 class Camera(Record):
     """A pinhole: image size, tangents to the left, right, upper and lower edge.
+
+    Attributes
+    ----------
+    width_px, height_px : int, 1 to 16384
+    tangents : (left, right, up, down)
+        Of the angles to the image edges, left < right and down < up, within 20.
 
     Raises
     ------
@@ -75,7 +87,13 @@ class Camera(Record):
     def from_fov(
         cls, vertical_fov_deg: float, *, width_px: int, height_px: int
     ) -> Camera:
-        """Return a symmetric camera with square pixels."""
+        """Return a symmetric camera with square pixels.
+
+        Raises
+        ------
+        ValueError
+            A field of view or size that no pinhole has.
+        """
         tangents = tangents_from_fov(vertical_fov_deg, width_px, height_px)
         return cls(width_px, height_px, tangents)
 

@@ -14,24 +14,29 @@ class EyeOptics(Protocol):
 
     Object distance adds its vergence to the total defocus, so a PSF depends on it
     through that sum alone.
+
+    Every array of states may have any shape that broadcasts with the others: fields
+    ``h_deg`` and ``v_deg``, the entrance pupil's diameter in mm, accommodation in dpt,
+    the wavelength in nm.  An eye that was traced for a range raises ValueError where a
+    state lies outside of it.
     """
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Pupil asked for, capped where the eye knows no more."""
+        """Pupil diameter asked for, mm, capped where the eye knows no more."""
 
     def accommodation_dpt(self, focus_dpt: float) -> float:
-        """Accommodation for a focus distance, within reach."""
+        """Accommodation for a focus distance, both dpt, within reach."""
 
     def reachable_focus_dpt(self, focus_dpt: float) -> float:
-        """Distance that the eye is then really focused at."""
+        """Distance that the eye is then really focused at, dpt."""
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say what of a request cannot be met."""
+        """Say what of a request cannot be met, in sentences; empty where all can."""
 
     def accommodation_nodes_dpt(
         self, focus_range_dpt: tuple[float, float]
     ) -> NDArray[np.float64]:
-        """Accommodations (n,), ascending, between which wavefronts are blended."""
+        """Accommodations (n,), dpt, ascending, between which wavefronts are blended."""
 
     def total_defocus_dpt(
         self,
@@ -42,9 +47,14 @@ class EyeOptics(Protocol):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Least-squares refraction for an object at infinity, in the broadcast shape.
+        """Least-squares refraction for an object at infinity, dpt, broadcast shape.
 
         On the circle about the pupil, worn correction included.
+
+        Raises
+        ------
+        ValueError
+            A state outside of what is known of the eye.
         """
 
     def defocus_at(
@@ -52,8 +62,17 @@ class EyeOptics(Protocol):
     ) -> Callable[..., NDArray[np.float64]]:
         """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
 
-        From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the broadcast
-        shape.
+        Returns
+        -------
+        callable
+            From ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers, to dpt
+            in the broadcast shape of the fields and wavelengths.
+
+        Raises
+        ------
+        ValueError
+            A field or wavelength outside of what is known; the callable, for a pupil or
+            accommodation.
         """
 
     def chief_ray_shift_mrad(
@@ -64,7 +83,13 @@ class EyeOptics(Protocol):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Lateral colour against 555 nm along the pupil axes, (..., 2)."""
+        """Lateral colour against 555 nm along the pupil axes, (..., 2), mrad.
+
+        Raises
+        ------
+        ValueError
+            A state outside of what is known of the eye.
+        """
 
     def wavefronts(
         self,
@@ -76,4 +101,15 @@ class EyeOptics(Protocol):
         wavelength_nm: ArrayLike,
         total_defocus_dpt: ArrayLike,
     ) -> FieldWavefronts:
-        """Wavefronts (P,) with the given total defocus, in C order of the broadcast."""
+        """Wavefronts (P,) with the given total defocus, in C order of the broadcast.
+
+        Parameters
+        ----------
+        total_defocus_dpt : array
+            Of eye and object together; it replaces the eye's own.
+
+        Raises
+        ------
+        ValueError
+            A state outside of what is known of the eye.
+        """

@@ -268,7 +268,34 @@ def wavefront_aberrations(
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
 ) -> Aberrations:
-    """Aberrations of one field, wavelength and pupil; see `wavefront_grid`."""
+    """Aberrations of one field, wavelength and pupil, traced exactly.
+
+    Parameters
+    ----------
+    eye : EyeSurfaces
+    wavelength_nm : float
+    stop_diameter_mm or pupil_diameter_mm : float
+        The iris, or the entrance pupil at 555 nm; give one.
+    h_deg, v_deg : float
+        Azimuth and elevation of the source.
+    object_dpt : float
+        Vergence of the source, from the entrance pupil along the chief ray.
+    fit : {"opd", "slope"}
+        Least squares of W, or of its slopes (paper, Algorithm 1).
+    n_rings, n_azimuths : int
+        Sampling of the stop, see `wavefront.nodes`.
+
+    Returns
+    -------
+    Aberrations
+        ``zernike_um`` (28,), on the circle of ``zernike_radius_mm`` about the pupil.
+
+    Raises
+    ------
+    ValueError
+        Values out of range, an eye that cannot be traced, or an entrance pupil asked
+        of an eye that has none.
+    """
     stops_mm = _stop_diameters_mm(eye, stop_diameter_mm, pupil_diameter_mm)
     found = wavefront_grid(
         eye,

@@ -268,12 +268,28 @@ class EyeFilter:
         gaze_deg : (h, v), optional
             Where the eye looks in the image; as in the settings where it is None.
         output : "srgb8", "linear" or "linear16"
+            8-bit sRGB, or linear light in float32 or float16.
+        accumulation : "coverage" or "paper"
+            How light of several distances is put together: nearer surfaces hide what
+            they cover, or the published sum.
+        merge : bool
+            Let near-equal pixels share a splat; off is slower.
+        timeout_s : float
+            For the eye to be prepared.
+
+        Returns
+        -------
+        Filtered
 
         Raises
         ------
         BadMessage
             An argument out of range (a ValueError, too).
-        SessionError, RenderError, ServiceTimeout
+        SessionError
+            There is no profile, or its build failed.
+        RenderError
+            The engine failed.
+        ServiceTimeout
         """
         views = as_views(color, depth_m, next(iter(self.cameras), None))
         deadline_s = time.monotonic() + timeout_s
@@ -303,7 +319,17 @@ class EyeFilter:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
     ) -> Filtered | None:
-        """Filter one frame like `filter`; None while its eye is being prepared."""
+        """Filter one frame like `filter`; None while its eye is being prepared.
+
+        Raises
+        ------
+        BadMessage
+            An argument out of range (a ValueError, too).
+        SessionError
+            There is no profile, or its build failed.
+        RenderError
+            The engine failed.
+        """
         pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
         focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
         if gaze_deg is not None:

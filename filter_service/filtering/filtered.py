@@ -19,7 +19,9 @@ class Filtered:
     Attributes
     ----------
     colors : tuple of (height, width, 3)
-        One picture for each view.
+        One picture for each view: uint8 sRGB, or float32 or float16 linear light.
+    profile_id : int
+        The caller's number of the profile, else the generation.
     generation : int
         Counts the profiles that the filter was given.
     is_complete : bool
@@ -32,6 +34,7 @@ class Filtered:
     notes : tuple of str
         What the user should know, in sentences.
     stage_times_ms : dict
+        Time of each stage of the frame.
     """
 
     colors: tuple[NDArray[Any], ...]
@@ -55,7 +58,7 @@ class Filtered:
 
 @dataclass(frozen=True)
 class BuildingEye:
-    """How far the PSFs of a profile are."""
+    """How far the PSFs of a profile are: the share done, 0 to 1, and the stage."""
 
     eye: AcceptedProfile
     fraction: float
@@ -64,7 +67,20 @@ class BuildingEye:
 
 @dataclass(frozen=True)
 class EyeReady:
-    """The PSFs of a profile are in place for a camera, or a preview of them."""
+    """The PSFs of a profile are in place for a camera, or a preview of them.
+
+    Attributes
+    ----------
+    build_ms : float
+        From the start of the build to here.
+    psf_count : int
+    memory_mb : float
+        What the PSFs take, in 10^6 bytes.
+    notes : tuple of str
+        What the user should know, in sentences.
+    is_complete : bool
+        False for a preview.
+    """
 
     eye: AcceptedProfile
     camera: Camera
