@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ import msgspec
 from filter_service.messages import PROTOCOL_VERSION, REPLIES, REQUESTS
 
 SCHEMA_FILE = Path(__file__).resolve().parent / "protocol.schema.json"
+SECTION = re.compile(r"\n\n\w+\n-{3,}\n")
+"""Where a docstring turns to what concerns Python alone: its attributes and errors."""
+
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
@@ -36,7 +40,8 @@ def protocol_schema() -> dict[str, Any]:
         schema["required"] = ["type", "version", *schema["required"]]
     for schema in parts.values():
         if "description" in schema:
-            schema["description"] = inspect.cleandoc(schema["description"])
+            text = inspect.cleandoc(schema["description"])
+            schema["description"] = SECTION.split(text)[0]
     return {
         "$schema": DRAFT,
         "title": f"Headers of the filter service's protocol {PROTOCOL_VERSION}",
