@@ -1,18 +1,16 @@
 """Stores in which every PSF is one given kernel: filtering has a closed form then."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.signal import fftconvolve
 
-from estimator.profiles.measured_wavefront import MeasuredWavefront
-from estimator.profiles.parse import parse_profile
+from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
-from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
-from filter_service.psfs.store import PsfStore
+from filter_service.rendering.gl.compile_passes import PUPIL_MM, perfect_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
-from tests.grid_specs import grid_spec
 
-PUPIL_MM = 3.0
 PITCH_RAD = 1e-3
 
 
@@ -31,7 +29,9 @@ class OneKernelBench:
         self.tangents = (-right, right, up, -up)
         self.size = (height_px, width_px)
         self.kernel = kernel
-        self.store = _store(kernel, self.tangents, width_px, height_px, spread_px)
+        self.store = _store(
+            kernel, Camera(width_px, height_px, self.tangents), spread_px
+        )
         self.gpu = gpu
         self.renderer = FilterRenderer(gpu)
         self.handle = self.renderer.load(self.store)
@@ -51,35 +51,11 @@ class OneKernelBench:
         return light / fftconvolve(ones, kernel, mode="same", axes=(0, 1))
 
 
-def _store(kernel, tangents, width_px, height_px, spread_px):
-    spec = grid_spec(
-        width_px=width_px,
-        height_px=height_px,
-        tangents=tangents,
-        pupil_range_mm=(PUPIL_MM, PUPIL_MM),
-        focus_range_dpt=(0.0, 0.0),
-        object_range_dpt=(0.0, 2.0),
-    )
-    eye = MeasuredWavefront.from_profile(
-        parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
-    )
+def _store(kernel, camera, spread_px):
     radius_px = kernel.shape[0] // 2
     one = np.ones(RGB)
-    return PsfStore(
-        spec=spec,
-        eye=eye,
-        plan=CachePlan(
-            h_deg=np.zeros(1),
-            v_deg=np.zeros(1),
-            pupils_mm=np.array([PUPIL_MM]),
-            accommodations_dpt=eye.accommodation_nodes_dpt(
-                spec.settings.focus_range_dpt
-            ),
-            defocus=RaggedNodes.of([np.zeros(1)]),
-            channel_shift_dpt=np.zeros((1, RGB)),
-            prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
-            is_limited=np.zeros(1, bool),
-        ),
+    return replace(
+        perfect_store(camera),
         kernels=np.round(kernel / kernel.max() * WEIGHT_MAX).astype(np.uint16).ravel(),
         offsets=np.zeros(RGB, np.int64),
         reach_px=np.full((RGB, 4), radius_px),

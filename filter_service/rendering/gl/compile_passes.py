@@ -32,7 +32,7 @@ def compile_passes(renderer: FilterRenderer) -> float:
         The largest change of a pixel's value, which a perfect eye leaves as it is.
     """
     changes = []
-    handle = renderer.load(_one_pixel_store())
+    handle = renderer.load(perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS)))
     depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
     for dtype, output, accumulations in (
         (np.uint8, "srgb8", ("coverage", "paper")),
@@ -54,10 +54,13 @@ def compile_passes(renderer: FilterRenderer) -> float:
     return float(np.max(changes))
 
 
-def _one_pixel_store() -> PsfStore:
-    """Store of a perfect eye, wide enough on paper for every merging pass to run."""
+def perfect_store(camera: Camera) -> PsfStore:
+    """Return PSFs of one pixel at one pupil, focused at infinity, for 0 to 2 dpt.
+
+    Their spread of 16 px is wide enough on paper for every merging pass to run.
+    """
     spec = GridSpec(
-        Camera(SIDE_PX, SIDE_PX, TANGENTS),
+        camera,
         FilterSettings(
             mode="on-axis",
             pupil_range_mm=(PUPIL_MM, PUPIL_MM),
