@@ -2,8 +2,6 @@
 
 import os
 import resource
-import subprocess
-import sys
 import time
 from contextlib import ExitStack
 
@@ -32,7 +30,7 @@ from filter_service.errors import (
 )
 from filter_service.filtering.workshop import Workshop
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
-from tests.source_tree import ROOT
+from tests.end_to_end.printed_script import printed_by
 
 CAMERA = Camera.from_fov(60.0, width_px=16, height_px=8)
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
@@ -205,15 +203,7 @@ np.save("seen.npy", seen.color)
 
 def test_a_plain_script_gets_the_picture_that_the_service_gives(tmp_path):
     """No guard for the main module, and the same bytes as over the wire."""
-    finished = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert finished.returncode == 0, finished.stderr
+    printed_by("-c", SCRIPT, cwd=tmp_path)
     mine = np.load(tmp_path / "seen.npy")
 
     camera = Camera.from_fov(6.0, width_px=64, height_px=36)

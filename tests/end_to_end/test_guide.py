@@ -1,31 +1,19 @@
 """The guide's examples run as printed, one after the other, as one script."""
 
-import os
 import re
-import subprocess
-import sys
 from dataclasses import fields
 
 from filter_service import EyeFilter, Filtered
+from tests.end_to_end.printed_script import printed_by
 from tests.source_tree import ROOT
 
 GUIDE = (ROOT / "GUIDE.md").read_text(encoding="utf-8")
-LIMIT_S = 240
 
 
 def test_the_examples_run_and_print_what_they_say(tmp_path):
     script = tmp_path / "guide.py"
     script.write_text("\n".join(re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)))
-    printed = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-    )
-    assert printed.returncode == 0, printed.stderr
-    lines = printed.stdout.splitlines()
+    lines = printed_by(script, cwd=tmp_path).splitlines()
     assert lines[0].startswith("(90, 160, 3) 1 ")
     assert lines[1] in ("1", "2")
     assert lines[3] in GUIDE, "the error that the page shows is another"

@@ -1,43 +1,26 @@
 """The README's Python example and the smallest client run as printed."""
 
-import os
 import re
-import subprocess
-import sys
 
 import numpy as np
 from PIL import Image
 
 from clients.service_process import ServiceProcess
+from tests.end_to_end.printed_script import printed_by
 from tests.source_tree import ROOT
-
-RUN_LIMIT_S = 120
-
-
-def run(*arguments, cwd):
-    printed = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=cwd,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=RUN_LIMIT_S,
-    )
-    assert printed.returncode == 0, printed.stderr
-    return printed.stdout
 
 
 def test_the_python_example_prints_a_frame_of_the_size_it_has(tmp_path):
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     example = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
-    printed = run("-c", example, cwd=tmp_path)
+    printed = printed_by("-c", example, cwd=tmp_path)
     assert re.fullmatch(r"\(270, 480, 3\) [\d.]+ ms\n", printed)
 
 
 def test_the_smallest_client_writes_a_blurred_picture(tmp_path):
     out = tmp_path / "seen.png"
     with ServiceProcess() as service:
-        run("-m", "clients.hello", str(out), service.endpoint, cwd=tmp_path)
+        printed_by("-m", "clients.hello", out, service.endpoint, cwd=tmp_path)
     seen = np.asarray(Image.open(out)).astype(int)
     assert seen.shape == (270, 480, 3)
     # squares of 15 px: near on the left, in reach of a myopic eye, lost on the right
