@@ -56,6 +56,12 @@ class EstimatedEye:
 
     Attributes
     ----------
+    name : str
+        Of the profile.
+    parameters : EyeParameters
+        The relaxed eye.
+    profile : EyeProfile
+        What it was estimated from.
     zernike_um, residual_um : (28,), um
         Of the eye, and of the eye less the measurement, on the measured circle
         (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements, the
@@ -69,8 +75,12 @@ class EstimatedEye:
         Where ``refined`` started, of `STARTS` or ``given``; empty for other methods.
     network_reason : str
         Why the network did not answer where it was asked; empty where it did.
+    time_ms, n_iterations, n_evaluations : float, int, int
+        What the search took; an evaluation traces one eye.
     on_bound : tuple of str
         Parameters that sit on a bound of their allowed range.
+    notes : tuple of str
+        What the user should know, in sentences.
     """
 
     name: str

@@ -93,6 +93,12 @@ class EyeProfile:
 
     Attributes
     ----------
+    eye_side : str
+        OD or OS.
+    pupil_diameter_mm, wavelength_nm : float
+        Circle and light of the leading wavefront.
+    age_years : float or None
+        Limits accommodation where it is known.
     max_pupil_diameter_mm : float
         Largest pupil the data speak for (infinite for a prescription).
     correction : Prescription or None
