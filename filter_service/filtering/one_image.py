@@ -15,8 +15,9 @@ from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.gl.renderer import FilterRenderer, Rendered
+from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     MAX_VERGENCE_DPT,
@@ -33,7 +34,7 @@ KEPT_ENERGY_RATIO = 0.998
 class FilteredImage:
     """A filtered image and how it came about."""
 
-    rendered: Rendered
+    rendered: FilteredView
     eye_notes: tuple[str, ...]
     spec: GridSpec
     plan: CachePlan

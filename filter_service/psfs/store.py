@@ -144,6 +144,7 @@ def frame_layers(
     pupil_diameter_mm: float,
     focus_dpt: float,
     object_range_dpt: tuple[float, float] | None = None,
+    step_ratio: float = 1.0,
 ) -> FrameLayers:
     """Plan a frame's layers for a pupil and focus.
 
@@ -153,6 +154,8 @@ def frame_layers(
     ----------
     object_range_dpt : (low, high), optional
         Distances in the frame; default and limit is the cache's range.
+    step_ratio : float
+        Steps between layers against the usual.
 
     References
     ----------
@@ -184,6 +187,7 @@ def frame_layers(
             store.tables, reads, layer_zero_dpt, at_dpt
         ),
         max_blur_step_px=store.spec.max_blur_step_px,
+        step_ratio=step_ratio,
     )
     return FrameLayers(
         layer_dpt=layer_dpt,

@@ -14,7 +14,6 @@ from filter_service.planning.field_directions import (
 )
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import psnr_db, tangents, texture
@@ -31,7 +30,7 @@ def tangents_of(h_low, h_high, v_low, v_high):
 class FieldBench:
     """A traced eye before a camera, ready to render."""
 
-    def __init__(self, gpu, name, view_tangents, size=(WIDTH, HEIGHT), **settings):
+    def __init__(self, engine, name, view_tangents, size=(WIDTH, HEIGHT), **settings):
         self.spec = grid_spec(
             width_px=size[0],
             height_px=size[1],
@@ -44,7 +43,7 @@ class FieldBench:
         profile = parse_profile({"kind": "preset", "name": name})
         self.eye, _ = eye_for_spec(profile, self.spec)
         self.store = build_psf_store(self.eye, self.spec)
-        self.renderer = FilterRenderer(gpu)
+        self.renderer = engine.new_renderer()
         self.handle = self.renderer.load(self.store)
 
     def render(self, color, depth_m):
@@ -96,8 +95,12 @@ def radial_depth_m(spec, distance_m):
         ((2, 12, 4, 11), (-14, 9)),
     ],
 )
-def test_points_of_light_become_the_psf_of_their_direction(gpu, corner_deg, gaze_deg):
-    bench = FieldBench(gpu, "keratoconus", tangents_of(*corner_deg), gaze_deg=gaze_deg)
+def test_points_of_light_become_the_psf_of_their_direction(
+    engine, corner_deg, gaze_deg
+):
+    bench = FieldBench(
+        engine, "keratoconus", tangents_of(*corner_deg), gaze_deg=gaze_deg
+    )
     depth_m = radial_depth_m(bench.spec, OBJECT_M)
     for x, y in [(40, 30), (120, 35), (77, 88)]:
         point = np.zeros((HEIGHT, WIDTH, 3), np.float32)
@@ -144,9 +147,11 @@ def splat_exactly(bench, color, depth_m):
 
 
 @pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
-def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, name):
+def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(engine, rng, name):
     width, height = 96, 72
-    bench = FieldBench(gpu, name, tangents(width, height, 40.0), size=(width, height))
+    bench = FieldBench(
+        engine, name, tangents(width, height, 40.0), size=(width, height)
+    )
     color = texture(rng, height, width, cell_px=3)
     # a floor that comes nearer: half a dioptre to two
     depth_m = 1.0 / np.linspace(0.4, 1.6, height)[:, None] * np.ones((1, width))
@@ -155,7 +160,7 @@ def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, name):
     assert psnr_db(result.color, truth) >= 46.0
 
 
-def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
+def test_perfect_eye_stays_sharp_in_the_corner(engine, rng):
     spec = grid_spec(
         width_px=WIDTH,
         height_px=HEIGHT,
@@ -171,7 +176,7 @@ def test_perfect_eye_stays_sharp_in_the_corner(gpu, rng):
         parse_profile({"kind": "prescription", "sphere_dpt": 0.0}),
         spec.with_settings(eye_model="wavefront"),
     )
-    renderer = FilterRenderer(gpu)
+    renderer = engine.new_renderer()
     handle = renderer.load(build_psf_store(eye, spec))
     image = texture(rng, HEIGHT, WIDTH, cell_px=1)
     view = RgbdView(
