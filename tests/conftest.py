@@ -21,8 +21,6 @@ SESSION_GPU = pytest.StashKey()
 
 ENGINES = ("native", "gl")
 
-SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr")
-
 
 def _seed(node_id: str) -> int:
     """The same for both engines."""
@@ -145,6 +143,6 @@ def hardware_only(request):
     """Skip tests marked ``gpu`` where a software renderer stands in for one."""
     if request.node.get_closest_marker("gpu") is None:
         return
-    renderer = request.getfixturevalue("gpu").info["renderer"]
-    if any(name in renderer.lower() for name in SOFTWARE_RENDERERS):
-        pytest.skip(f"needs a hardware GPU; this is {renderer}")
+    gpu = request.getfixturevalue("gpu")
+    if gpu.is_software:
+        pytest.skip(f"needs a hardware GPU; this is {gpu.info['renderer']}")
