@@ -96,9 +96,9 @@ def test_the_native_engine_s_probe_filters_a_perfect_eye():
 
 def test_without_a_compiled_library_a_compiler_is_named(monkeypatch):
     monkeypatch.setattr(library, "library_path", lambda: None)
-    library.library.cache_clear()
+    library.compiled_library.cache_clear()
     check = check_native(probe_native())
-    library.library.cache_clear()
+    library.compiled_library.cache_clear()
     assert not check.ok and "gcc" in check.fix and "not built" in check.detail
 
 

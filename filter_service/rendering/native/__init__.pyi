@@ -1,3 +1,3 @@
-from .library import library as library
+from .library import compiled_library as compiled_library
 from .library import library_path as library_path
 from .renderer import NativeRenderer as NativeRenderer

@@ -96,7 +96,7 @@ def library_path() -> Path | None:
 
 
 @cache
-def library() -> Library:
+def compiled_library() -> Library:
     """Load the compiled loops, once.
 
     Raises

@@ -26,7 +26,7 @@ from filter_service.rendering.native import native_store
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
-from filter_service.rendering.native.library import Library, library
+from filter_service.rendering.native.library import Library, compiled_library
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
@@ -51,7 +51,7 @@ class NativeRenderer:
     """
 
     def __init__(self, loops: Library | None = None, n_threads: int | None = None):
-        self._loops = loops or library()
+        self._loops = loops or compiled_library()
         self._threads = self._loops.new_threads(n_threads or thread_count())
         self._n_threads = self._loops.thread_count(self._threads)
         self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
