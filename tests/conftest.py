@@ -73,16 +73,17 @@ class Engine:
 
         return FilterRenderer(self.gpu)
 
-    @property
-    def kernel_limits(self):
-        """The module that says how many texels a frame's kernels may take."""
+    def limit_kernels(self, monkeypatch, texel_count, pixel_count):
+        """Let a frame's kernels take no more than so many texels."""
         if self.gpu is None:
             from filter_service.rendering.native import kernel_plan
 
-            return kernel_plan
-        from filter_service.rendering.gl import kernel_passes
+            per_pixel = texel_count / pixel_count
+            monkeypatch.setattr(kernel_plan, "TEXELS_PER_PIXEL", per_pixel)
+        else:
+            from filter_service.rendering.gl import kernel_passes
 
-        return kernel_passes
+            monkeypatch.setattr(kernel_passes, "MAX_KERNEL_TEXELS", texel_count)
 
 
 def pytest_generate_tests(metafunc):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filter_service import constants
-from filter_service.rendering.native.records import BLOCK, FRAGMENT
+from filter_service.rendering.native.records import BLOCK, FRAGMENT, FRAGMENT_LIGHT
 
 
 class Fragments(NamedTuple):
@@ -27,7 +27,8 @@ def made_fragments(bench, width_px, height_px, surface_count=1):
         arrays = bench.renderer._arrays
         counts = arrays.get("blocks", n_blocks, BLOCK)[:n_blocks]["count"]
         made = arrays.get("fragments", n_slots, FRAGMENT)[:n_slots]
-        x, y, rgb, state = made["x"], made["y"], made["rgb"], made["state"]
+        x, y, state = made["x"], made["y"], made["state"]
+        rgb = arrays.get("lights", n_slots, FRAGMENT_LIGHT)[:n_slots]["rgb"]
     else:
         counts = _read(bench.gpu, "BLOCKS", (n_blocks, 4), np.uint32)[:, 0]
         place = _read(bench.gpu, "FRAGMENT_PLACE", (n_slots, 4), np.uint32)

@@ -120,13 +120,13 @@ def test_larger_cells_serve_where_kernels_take_too_much_memory(
     depth_m = np.full((height, width), 2.0, np.float32)
     usual = bench.render(color, depth_m)
     limit = usual.kernel_texel_count // 5
-    monkeypatch.setattr(engine.kernel_limits, "MAX_KERNEL_TEXELS", limit)
+    engine.limit_kernels(monkeypatch, limit, width * height)
     bench.renderer = engine.new_renderer()
     smaller = bench.render(color, depth_m)
     assert smaller.kernel_count < usual.kernel_count // 3
     assert psnr_db(smaller.color, usual.color) >= 40.0
     # Where cells cannot grow any more, memory decides alone.
-    monkeypatch.setattr(engine.kernel_limits, "MAX_KERNEL_TEXELS", 1)
+    engine.limit_kernels(monkeypatch, 1, width * height)
     bench.renderer = engine.new_renderer()
     assert np.isfinite(bench.render(color, depth_m).color).all()
 

@@ -17,6 +17,7 @@ from filter_service.rendering.native.native_store import COARSE_SPREAD_PX, Nativ
 from filter_service.rendering.native.records import (
     BLOCK,
     FRAGMENT,
+    FRAGMENT_LIGHT,
     KERNEL_IMAGE_BYTES,
     RECIPE_IMAGE_BYTES,
     RESOLUTIONS,
@@ -38,7 +39,6 @@ class BlendSizes(NamedTuple):
 
     recipe_texels: int
     kernel_texels: int
-    spans: int
     scratch_floats: int
 
     @classmethod
@@ -47,7 +47,6 @@ class BlendSizes(NamedTuple):
         return cls(
             c.recipe_texel_count,
             c.kernel_texel_count,
-            c.span_count,
             c.blend_scratch_floats,
         )
 
@@ -129,6 +128,7 @@ class FrameRecord:
         c.largest_reach_px = reach_px + REACH_MARGIN_PX + COARSE_MARGIN_PX
         n_blocks = c.surface_count * c.block_columns * c.block_rows
         c.fragments = self._room("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
+        c.lights = self._room("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
         c.blocks = self._room("blocks", n_blocks, BLOCK)
         names = ("kernel_cells", "kernel_parts", "node_near", "node_far")
         for name, array in zip(
@@ -168,7 +168,6 @@ class FrameRecord:
         room = self._room
         c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
         c.kernel_texels = room("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
-        c.spans = room("spans", 2 * sizes.spans, np.uint16)
         c.blend_scratch_floats = sizes.scratch_floats
         n_floats = n_threads * sizes.scratch_floats
         c.blend_scratch = room("blend_scratch", n_floats, np.float32)

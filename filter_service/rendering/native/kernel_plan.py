@@ -21,8 +21,9 @@ from filter_service.rendering.image_cells import (
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.native.records import KERNEL_SHAPE
 
-MAX_KERNEL_TEXELS = 8 * 2**20
-"""Of the single kernels of a frame, before cells are made larger."""
+TEXELS_PER_PIXEL = 10
+"""Of the single kernels of a frame, before cells are made larger: beyond that it takes
+longer to make kernels than to use them."""
 
 MIN_SPREAD_PX = 1e-9
 
@@ -75,7 +76,9 @@ def plan_kernels(
     """
     kernels = frame_kernels(handle.tables, layers, image, used)
     widths, heights = box_sizes(kernels.reach_px)
-    if int((widths * heights).sum()) > MAX_KERNEL_TEXELS and can_coarsen(image):
+    camera = handle.store.spec.camera
+    limit = TEXELS_PER_PIXEL * camera.width_px * camera.height_px
+    if int((widths * heights).sum()) > limit and can_coarsen(image):
         raise KernelsTooLarge
     nodes = kernels.nodes
     sources = (kernels.cells, kernels.parts, nodes.near, nodes.far)

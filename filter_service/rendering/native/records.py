@@ -20,8 +20,6 @@ KERNEL_SHAPE = np.dtype(
 )
 FRAGMENT = np.dtype(
     [
-        ("rgb", "<f4", 3),
-        ("depth", "<f4"),
         ("x", "<u2"),
         ("y", "<u2"),
         ("state", "<u4"),
@@ -30,6 +28,7 @@ FRAGMENT = np.dtype(
         ("reach_px", "u1", 4),
     ]
 )
+FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
 BLOCK = np.dtype(
     [
         ("x0", "<i2"),
@@ -89,6 +88,7 @@ class Frame(c.Structure):
         ("tolerance", c.c_float),
         ("largest_reach_px", c.c_float),
         ("fragments", POINTER),
+        ("lights", POINTER),
         ("blocks", POINTER),
         ("fragment_count", c.c_int64),
         ("merged_count", c.c_int64),
@@ -108,12 +108,10 @@ class Frame(c.Structure):
         ("part_maps", POINTER),
         ("kernels", POINTER),
         ("kernel_texels", POINTER),
-        ("spans", POINTER),
         ("blend_scratch", POINTER),
         ("blend_scratch_floats", c.c_uint64),
         ("recipe_texel_count", c.c_uint64),
         ("kernel_texel_count", c.c_uint64),
-        ("span_count", c.c_uint64),
         ("picture", POINTER),
         ("output_kind", c.c_int32),
         ("failed", c.c_int32),
@@ -146,5 +144,6 @@ SIZES = (
     KERNEL_IMAGE_BYTES,
     RECIPE_IMAGE_BYTES,
     c.sizeof(ShrinkJob),
+    FRAGMENT_LIGHT.itemsize,
 )
 """What `ocu_sizes` must say."""

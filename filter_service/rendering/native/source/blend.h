@@ -38,7 +38,7 @@ INLINE reach wider(reach a, reach b) {
 
 /* Resolution in which a level of a kernel is made: what is blurred enough is coarse. */
 INLINE int resolution_of(const frame *f, const kernel_shape *shape, int level) {
-    float spread = fminf(shape->spread_px[0], shape->spread_px[1]);
+    float spread = smaller_float(shape->spread_px[0], shape->spread_px[1]);
     for (int r = RESOLUTIONS - 1; r > 0; --r)
         if (level > r && spread >= f->coarse_spread_px[r]) return r;
     return 0;
@@ -264,7 +264,7 @@ static void add_mapped(const frame *f, const recipe_image *image, const double *
     const float *texels = f->recipe_texels + 4 * image->first_texel;
     reach stored = read_reach(image->reach_px);
     float own[4] = {(float)map[0], (float)map[1], (float)map[2], (float)map[3]};
-    float side = fmaxf(fabsf(own[0]), fabsf(own[3]));
+    float side = larger_float(fabsf(own[0]), fabsf(own[3]));
     int n_taps = (int)floorf(side) + 2;
     if (side <= 1.0f) n_taps = 2;
     if (n_taps == 2) add_mapped_taps(texels, image->stride, stored, own, weight, box, 2, to);
@@ -290,7 +290,7 @@ static void add_unmoved(const frame *f, const recipe_image *image, float weight,
 static float largest_of(const float *texels, size_t count) {
     f32x4 most = all4(0.0f);
     for (size_t i = 0; i < count; ++i) most = larger4(load4(texels + 4 * i), most);
-    return fmaxf(most[0], fmaxf(most[1], most[2]));
+    return larger_float(most[0], larger_float(most[1], most[2]));
 }
 
 /* Box of a kernel's end: that of its parts, as they are mapped. */
@@ -361,7 +361,6 @@ INLINE int level_extent(int level) { return (1 << level) - 1; }
 /* Places the levels of all kernels that fragments use, one behind the other. */
 static void place_kernels(frame *f) {
     uint64_t texel = 1;
-    uint64_t line = 0;
     uint64_t largest = 0;
     for (int k = 0; k < f->kernel_count; ++k) {
         const kernel_shape *shape = f->shapes + k;
@@ -385,15 +384,12 @@ static void place_kernels(frame *f) {
             image->width = (int16_t)(reach_width(boxes[r]) + beyond);
             image->height = (int16_t)(reach_height(boxes[r]) + beyond);
             image->first_texel = (uint32_t)texel;
-            image->first_span = (uint32_t)line;
             uint64_t texels = (uint64_t)(image->width + 1) * (uint64_t)image->height;
             texel += texels;
-            line += (uint64_t)image->height;
             largest = texels > largest ? texels : largest;
         }
     }
     f->kernel_texel_count = texel + 1;
-    f->span_count = line;
     /* both ends of a kernel at all levels, four floats a texel */
     uint64_t floats = 2 * (MAX_LEVEL + 1) * 4 * (largest + 64);
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;
@@ -422,20 +418,11 @@ INLINE void write_row(const kernel_end *end, int level, int y, const level_image
     }
 }
 
-INLINE span lit_columns(const uint32_t *row, int width) {
-    int first = 0;
-    int end = width;
-    while (first < end && (row[4 * first] | row[4 * first + 1] | row[4 * first + 2]) == 0)
-        ++first;
-    while (end > first && (row[4 * end - 4] | row[4 * end - 3] | row[4 * end - 2]) == 0) --end;
-    return (span){(uint16_t)first, (uint16_t)end};
-}
-
 /* Writes a kernel's level, which is level `own` of its resolution. */
 static void write_level(const frame *f, level_image *image, int own, kernel_end *const *ends) {
     float near = ends[0]->largest[own];
     float far = ends[1]->largest[own];
-    float most = fmaxf(fmaxf(near, far), 1e-30f);
+    float most = larger_float(larger_float(near, far), 1e-30f);
     /* A coarse pixel sends the light of as many pixels as it is then spread over. */
     image->scale = most / (STEPS_15_BITS * STEPS_15_BITS);
     image->near_ratio = STEPS_15_BITS * near / most;
@@ -448,7 +435,6 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
         memset(row, 0, 16 * (size_t)(image->width + 1));
         write_row(ends[0], own, y, image, 0, near_steps, row);
         write_row(ends[1], own, y, image, 1, far_steps, row);
-        f->spans[image->first_span + (uint32_t)y] = lit_columns(row, image->width);
     }
 }
 

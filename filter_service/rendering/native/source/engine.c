@@ -36,6 +36,7 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[4] = (int32_t)sizeof(kernel_image);
     sizes[5] = (int32_t)sizeof(recipe_image);
     sizes[6] = (int32_t)sizeof(shrink_job);
+    sizes[7] = (int32_t)sizeof(fragment_light);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }

@@ -30,29 +30,31 @@ typedef struct {
  * + far * f), f the fraction of the interval. */
 typedef struct {
     uint32_t first_texel;     /* of row 0; a texel of zeros lies before and behind a row */
-    uint32_t first_span;      /* of row 0: its first lit column, and the last plus one */
+    int32_t resolution;
     int16_t left, up;         /* of its first texel from that of the fragment's square */
     int16_t width, height;
     float scale;
     float near_ratio;         /* share of 1 - f in 15 bits */
     float far_ratio;
-    int32_t resolution;
+    int32_t spare;
 } level_image;
 
 typedef struct { level_image level[MAX_LEVEL + 1]; } kernel_image;
 
-typedef struct { uint16_t first, end; } span;
-
-/* A pixel, or a merged square of 2^level pixels, with its blur. */
+/* A pixel, or a merged square of 2^level pixels, with its blur: where its light goes, and
+ * what light it is. */
 typedef struct {
-    float rgb[RGB];
-    float depth;              /* sort depth, smaller is nearer */
     uint16_t x, y;            /* first pixel */
     uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT */
     uint16_t fraction;        /* of the kernel's interval, in parts of 65535 */
     uint16_t radius_px;
     uint8_t reach_px[4];
 } fragment;
+
+typedef struct {
+    float rgb[RGB];
+    float depth;              /* sort depth, smaller is nearer */
+} fragment_light;
 
 #define LEVEL_SHIFT 28
 #define KERNEL_MASK 0xFFFFFFFu
@@ -106,7 +108,7 @@ typedef struct {
 
     const float *layer_dpt;
     int32_t layer_count, interval_count;
-    int32_t cell_px, cell_columns;
+    int32_t cell_px, cell_columns;  /* cell_px is a power of two, or 0: one cell */
     const float *corner_dpt;  /* change of defocus at the corners of the cells */
 
     float *dpt;               /* of each pixel; NOTHING_DPT where nothing is hidden */
@@ -124,6 +126,7 @@ typedef struct {
     float tolerance;          /* of merging, against the usual */
     float largest_reach_px;
     fragment *fragments;      /* 64 places a block */
+    fragment_light *lights;
     block_info *blocks;
     int64_t fragment_count, merged_count;
 
@@ -141,10 +144,9 @@ typedef struct {
     const double *part_weights, *part_maps;        /* (n, 4), (n, 4, 2, 2) */
     kernel_image *kernels;
     uint32_t *kernel_texels;
-    span *spans;
     float *blend_scratch;
     uint64_t blend_scratch_floats;                 /* of one thread */
-    uint64_t recipe_texel_count, kernel_texel_count, span_count;
+    uint64_t recipe_texel_count, kernel_texel_count;
 
     /* The picture. */
     void *picture;            /* (image_height, image_width, 3) */

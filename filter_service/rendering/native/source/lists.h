@@ -9,6 +9,7 @@
 #define BIN_TILES_X 2
 #define BIN_TILES_Y 2
 #define BIN_TILES (BIN_TILES_X * BIN_TILES_Y)
+#define ALL_TILES ((1u << BIN_TILES) - 1u)
 #define BIN_WIDTH (BIN_TILES_X * TILE_SIZE_PX)
 #define BIN_HEIGHT (BIN_TILES_Y * TILE_SIZE_PX)
 
@@ -99,7 +100,7 @@ static int list_fragments(const frame *f, bin_list *list) {
                     const fragment *one = f->fragments + i;
                     if (!lights(one, x0, y0, x1, y1)) continue;
                     edges |= one->state;
-                    *out++ = (entry){i, (1u << BIN_TILES) - 1u};
+                    *out++ = (entry){i, ALL_TILES};
                 }
                 list->count = (int)(out - list->entries);
                 list->any_edge |= (edges & EDGE_BIT) != 0;
@@ -135,7 +136,7 @@ INLINE uint32_t ordered_bits(float value) {
 /* Sorts nearest first; equal depths keep scan order. */
 static void sort_list(const frame *f, bin_list *list) {
     for (int i = 0; i < list->count; ++i)
-        list->keys[i] = ordered_bits(f->fragments[list->entries[i].fragment].depth);
+        list->keys[i] = ordered_bits(f->lights[list->entries[i].fragment].depth);
     if (list->count <= 48) {
         for (int i = 1; i < list->count; ++i) {
             uint32_t key = list->keys[i];

@@ -9,21 +9,29 @@
 
 #define BLOCK_PIXELS (TILE_SIZE_PX * TILE_SIZE_PX)
 
-/* The square that starts at a pixel of a block. */
+#define QUADS_ACROSS (TILE_SIZE_PX / 2)
+#define QUADS (QUADS_ACROSS * QUADS_ACROSS)
+
+/* A merged square; it starts at a quad of pixels. */
 typedef struct {
     f32x4 mean, low, high;    /* linear RGB, dpt */
     float place, nearest, farthest;  /* positions in layers */
     float spread_px;          /* least */
-    uint8_t is_edge;
+    uint32_t kernel;
+    int is_edge;
 } square;
 
 /* A block on its way: its pixels, and the squares that are left. */
 typedef struct {
     const frame *f;
     int surface, x0, y0;      /* first pixel */
-    square squares[BLOCK_PIXELS];
+    f32x4 color[BLOCK_PIXELS];       /* linear RGB, dpt */
+    float place[BLOCK_PIXELS];
+    float spread_px[BLOCK_PIXELS];
     uint32_t kernel[BLOCK_PIXELS];
+    uint8_t is_edge[BLOCK_PIXELS];
     int8_t level[BLOCK_PIXELS];      /* -1: part of another, or nothing */
+    square squares[QUADS];
 } block;
 
 INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
@@ -45,109 +53,168 @@ INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
     return (f32x4){rgb[0], rgb[1], rgb[2], 0.0f};
 }
 
-/* Whether a neighbour lies on another surface, seen through this pupil. */
-INLINE int is_edge_pixel(const frame *f, const float *dpt, int x, int y) {
+/* Notes which pixels have a neighbour on another surface, seen through this pupil. */
+INLINE void find_edges(block *b) {
+    const frame *f = b->f;
+    enum { SIDE = TILE_SIZE_PX + 2 };
+    float dpt[SIDE][SIDE];    /* with those around; beyond the frame as at its edge */
+    for (int y = 0; y < SIDE; ++y) {
+        int row = clamped_int(b->y0 + y - 1, 0, f->height - 1);
+        const float *from = f->dpt + (size_t)row * (size_t)f->width;
+        if (b->x0 > 0 && b->x0 + TILE_SIZE_PX < f->width)
+            memcpy(dpt[y], from + b->x0 - 1, sizeof dpt[y]);
+        else
+            for (int x = 0; x < SIDE; ++x)
+                dpt[y][x] = from[clamped_int(b->x0 + x - 1, 0, f->width - 1)];
+    }
     float limit = DISCONTINUITY_PX;
-    float own = dpt[0];
-    int edge = 0;
-    if (x + 1 < f->width) edge |= fabsf(dpt[1] - own) * f->blur_px_per_dpt > limit;
-    if (x > 0) edge |= fabsf(dpt[-1] - own) * f->blur_px_per_dpt > limit;
-    if (y + 1 < f->height) edge |= fabsf(dpt[f->width] - own) * f->blur_px_per_dpt > limit;
-    if (y > 0) edge |= fabsf(dpt[-f->width] - own) * f->blur_px_per_dpt > limit;
-    return edge;
+    for (int y = 1; y <= TILE_SIZE_PX; ++y) {
+        for (int x = 1; x <= TILE_SIZE_PX; ++x) {
+            float own = dpt[y][x];
+            float across = larger_float(fabsf(dpt[y][x - 1] - own), fabsf(dpt[y][x + 1] - own));
+            float along = larger_float(fabsf(dpt[y - 1][x] - own), fabsf(dpt[y + 1][x] - own));
+            float most = larger_float(across, along) * f->blur_px_per_dpt;
+            b->is_edge[(y - 1) * TILE_SIZE_PX + x - 1] = most > limit;
+        }
+    }
 }
 
-INLINE int cell_of(const frame *f, int x, int y) {
+INLINE int cell_shift(const frame *f) { return __builtin_ctz((unsigned)f->cell_px); }
+
+INLINE int cell_row(const frame *f, int y) {
     if (f->cell_px == 0) return 0;
-    int column = clamped_int(x - f->border_px, 0, f->image_width - 1) / f->cell_px;
-    int row = clamped_int(y - f->border_px, 0, f->image_height - 1) / f->cell_px;
-    return row * f->cell_columns + column;
+    int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
+    return (place >> cell_shift(f)) * f->cell_columns;
 }
 
-/* Reads a block's pixels as squares of one; returns the highest level any may reach. */
+INLINE int cell_column(const frame *f, int x) {
+    if (f->cell_px == 0) return 0;
+    return clamped_int(x - f->border_px, 0, f->image_width - 1) >> cell_shift(f);
+}
+
+/* Reads a block's pixels; returns the highest level that any may merge to. */
 INLINE int read_block(block *b) {
     const frame *f = b->f;
     size_t pixels = (size_t)f->width * (size_t)f->height;
     int highest = 0;
-    for (int i = 0; i < BLOCK_PIXELS; ++i) {
-        int x = b->x0 + i % TILE_SIZE_PX;
-        int y = b->y0 + i / TILE_SIZE_PX;
-        b->level[i] = -1;
-        if (x >= f->width || y >= f->height) continue;
-        size_t own = (size_t)y * (size_t)f->width + (size_t)x;
-        size_t pixel = (size_t)b->surface * pixels + own;
-        float dpt = f->dpt[pixel];
-        if (dpt < 0.0f) continue;
-        float place = f->position[pixel];
-        int interval = position_interval(f, place);
-        uint32_t kernel = f->kernel_of[cell_of(f, x, y) * f->interval_count + interval];
-        const kernel_shape *shape = f->shapes + kernel;
-        square *s = b->squares + i;
-        s->mean = pixel_color(f, b->surface, own);
-        s->mean[3] = dpt;
-        s->low = s->high = s->mean;
-        s->place = s->nearest = s->farthest = place;
-        s->spread_px = shape->spread_px[0]
-                     + (place - (float)interval) * (shape->spread_px[1] - shape->spread_px[0]);
-        s->is_edge = b->surface != 0 || is_edge_pixel(f, f->dpt + pixel, x, y);
-        b->kernel[i] = kernel;
-        b->level[i] = 0;
-        if (shape->highest_level > highest) highest = shape->highest_level;
+    if (b->surface == 0) find_edges(b);
+    else memset(b->is_edge, 1, sizeof b->is_edge);
+    memset(b->level, -1, sizeof b->level);
+    int width = smaller_int(f->width - b->x0, TILE_SIZE_PX);
+    int height = smaller_int(f->height - b->y0, TILE_SIZE_PX);
+    for (int y = 0; y < height; ++y) {
+        size_t first = (size_t)(b->y0 + y) * (size_t)f->width + (size_t)b->x0;
+        const float *dpt = f->dpt + (size_t)b->surface * pixels + first;
+        const float *place = f->position + (size_t)b->surface * pixels + first;
+        int row = cell_row(f, b->y0 + y);
+        for (int x = 0; x < width; ++x) {
+            if (dpt[x] < 0.0f) continue;
+            int i = y * TILE_SIZE_PX + x;
+            int interval = position_interval(f, place[x]);
+            int cell = row + cell_column(f, b->x0 + x);
+            uint32_t kernel = f->kernel_of[cell * f->interval_count + interval];
+            const kernel_shape *shape = f->shapes + kernel;
+            float spread = shape->spread_px[1] - shape->spread_px[0];
+            b->color[i] = pixel_color(f, b->surface, first + (size_t)x);
+            b->color[i][3] = dpt[x];
+            b->place[i] = place[x];
+            b->spread_px[i] = shape->spread_px[0] + (place[x] - (float)interval) * spread;
+            b->kernel[i] = kernel;
+            b->level[i] = 0;
+            if (shape->highest_level > highest) highest = shape->highest_level;
+        }
     }
     return highest;
 }
 
-/* Kernel at the mean position of a square. */
+/* Kernel at the mean position of a square that starts at pixel i. */
 INLINE uint32_t kernel_at(const block *b, int i, float place) {
     const frame *f = b->f;
-    int cell = cell_of(f, b->x0 + i % TILE_SIZE_PX, b->y0 + i / TILE_SIZE_PX);
+    int cell = cell_row(f, b->y0 + i / TILE_SIZE_PX) + cell_column(f, b->x0 + i % TILE_SIZE_PX);
     return f->kernel_of[cell * f->interval_count + position_interval(f, place)];
 }
 
 /* Whether a square of four of the level below may be one fragment.  Seen from a blur of
  * half the size, a square of the next level looks the same: so does its error. */
-INLINE int is_similar(const frame *f, const square *s, uint32_t kernel, int level) {
+INLINE int is_similar(const frame *f, const square *s, int level) {
     float spread = s->spread_px / (float)(1 << (level - 1));
     if (spread < MERGE_MIN_SPREAD_PX) return 0;
     f32x4 contrast = s->high - s->low;
-    float largest = fmaxf(contrast[0], fmaxf(contrast[1], contrast[2]));
-    float blur_step = fmaxf(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * s->spread_px);
+    float largest = larger_float(contrast[0], larger_float(contrast[1], contrast[2]));
     float most = f->white_level * MERGE_CONTRAST * spread * __builtin_sqrtf(spread);
+    if (largest > f->tolerance * most) return 0;
+    float blur_step = larger_float(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * s->spread_px);
+    if (contrast[3] * f->blur_px_per_dpt > f->tolerance * blur_step) return 0;
+    if (__builtin_floorf(s->farthest) - __builtin_floorf(s->nearest) > 1.0f) return 0;
+    const kernel_shape *shape = f->shapes + s->kernel;
+    if (shape->highest_level < level) return 0;
     /* What is brighter than white would show how coarse pixels are. */
-    float brightest = fmaxf(s->high[0], fmaxf(s->high[1], s->high[2]));
-    if (brightest > f->white_level && resolution_of(f, f->shapes + kernel, level)) return 0;
-    return largest <= f->tolerance * most
-        && floorf(s->farthest) - floorf(s->nearest) <= 1.0f
-        && contrast[3] * f->blur_px_per_dpt <= f->tolerance * blur_step
-        && f->shapes[kernel].highest_level >= level;
+    float brightest = larger_float(s->high[0], larger_float(s->high[1], s->high[2]));
+    return brightest <= f->white_level || resolution_of(f, shape, level) == 0;
+}
+
+INLINE void keep_square(block *b, const square *all, int i, int side, int level) {
+    b->level[i] = (int8_t)level;
+    b->level[i + side] = -1;
+    b->level[i + side * TILE_SIZE_PX] = -1;
+    b->level[i + side * (TILE_SIZE_PX + 1)] = -1;
+    b->squares[i / TILE_SIZE_PX / 2 * QUADS_ACROSS + i % TILE_SIZE_PX / 2] = *all;
+}
+
+/* Merges the four pixels of a quad, the first of which is pixel i. */
+INLINE void merge_pixels(block *b, int i) {
+    int members[4] = {i, i + 1, i + TILE_SIZE_PX, i + TILE_SIZE_PX + 1};
+    if ((b->level[members[0]] | b->level[members[1]] | b->level[members[2]]
+         | b->level[members[3]]) != 0)
+        return;
+    float spread = b->spread_px[i];
+    for (int m = 1; m < 4; ++m) spread = smaller_float(spread, b->spread_px[members[m]]);
+    if (spread < MERGE_MIN_SPREAD_PX) return;
+    square all = {.mean = b->color[i], .low = b->color[i], .high = b->color[i],
+                  .place = b->place[i], .nearest = b->place[i], .farthest = b->place[i],
+                  .spread_px = spread, .is_edge = b->is_edge[i]};
+    for (int m = 1; m < 4; ++m) {
+        int at = members[m];
+        all.mean += b->color[at];
+        all.low = smaller4(b->color[at], all.low);
+        all.high = larger4(b->color[at], all.high);
+        all.place += b->place[at];
+        all.nearest = smaller_float(all.nearest, b->place[at]);
+        all.farthest = larger_float(all.farthest, b->place[at]);
+        all.is_edge |= b->is_edge[at];
+    }
+    all.mean *= 0.25f;
+    all.place *= 0.25f;
+    all.kernel = kernel_at(b, i, all.place);
+    if (is_similar(b->f, &all, 1)) keep_square(b, &all, i, 1, 1);
+}
+
+INLINE const square *square_at(const block *b, int i) {
+    return b->squares + i / TILE_SIZE_PX / 2 * QUADS_ACROSS + i % TILE_SIZE_PX / 2;
 }
 
 /* Merges four squares of the level below, the first of which starts at pixel i. */
-INLINE void merge_four(block *b, int i, int level) {
+INLINE void merge_squares(block *b, int i, int level) {
     int side = 1 << (level - 1);
     int members[4] = {i, i + side, i + side * TILE_SIZE_PX, i + side * (TILE_SIZE_PX + 1)};
     for (int m = 0; m < 4; ++m)
         if (b->level[members[m]] != level - 1) return;
-    square all = b->squares[i];
+    square all = *square_at(b, i);
     for (int m = 1; m < 4; ++m) {
-        const square *s = b->squares + members[m];
+        const square *s = square_at(b, members[m]);
         all.mean += s->mean;
         all.low = smaller4(s->low, all.low);
         all.high = larger4(s->high, all.high);
         all.place += s->place;
-        all.nearest = fminf(all.nearest, s->nearest);
-        all.farthest = fmaxf(all.farthest, s->farthest);
-        all.spread_px = fminf(all.spread_px, s->spread_px);
+        all.nearest = smaller_float(all.nearest, s->nearest);
+        all.farthest = larger_float(all.farthest, s->farthest);
+        all.spread_px = smaller_float(all.spread_px, s->spread_px);
         all.is_edge |= s->is_edge;
     }
     all.mean *= 0.25f;
     all.place *= 0.25f;
-    uint32_t kernel = kernel_at(b, i, all.place);
-    if (!is_similar(b->f, &all, kernel, level)) return;
-    b->squares[i] = all;
-    b->kernel[i] = kernel;
-    b->level[i] = (int8_t)level;
-    for (int m = 1; m < 4; ++m) b->level[members[m]] = -1;
+    all.kernel = kernel_at(b, i, all.place);
+    if (is_similar(b->f, &all, level)) keep_square(b, &all, i, side, level);
 }
 
 /* Smaller is nearer. */
@@ -159,27 +226,36 @@ INLINE float sort_depth(const frame *f, int x, int y, float dpt) {
     return distance_m + PAPER_TIE_BREAK_M * scan;
 }
 
-INLINE void write_fragment(const block *b, int i, fragment *to) {
+/* Coarse light is spread over half a pixel of its own, and over one between middles. */
+INLINE void widen(fragment *one, int resolution) {
+    int beyond = 2 << resolution;
+    one->radius_px = (uint16_t)(one->radius_px + beyond);
+    for (int side = 0; side < 4; ++side)
+        one->reach_px[side] = (uint8_t)smaller_int(one->reach_px[side] + beyond, 255);
+}
+
+INLINE void write_fragment(const block *b, int i, fragment *to, fragment_light *light) {
     const frame *f = b->f;
-    const square *s = b->squares + i;
+    int level = b->level[i];
+    const square *s = square_at(b, i);
+    f32x4 color = level ? s->mean : b->color[i];
+    float place = level ? s->place : b->place[i];
+    uint32_t kernel = level ? s->kernel : b->kernel[i];
+    int is_edge = level ? s->is_edge : b->is_edge[i];
     int x = b->x0 + i % TILE_SIZE_PX;
     int y = b->y0 + i / TILE_SIZE_PX;
-    kernel_shape *shape = f->shapes + b->kernel[i];
-    float fraction = s->place - (float)position_interval(f, s->place);
-    for (int c = 0; c < RGB; ++c) to->rgb[c] = s->mean[c];
-    to->depth = sort_depth(f, x, y, s->mean[3]);
+    kernel_shape *shape = f->shapes + kernel;
+    float fraction = place - (float)position_interval(f, place);
+    for (int c = 0; c < RGB; ++c) light->rgb[c] = color[c];
+    light->depth = sort_depth(f, x, y, color[3]);
     to->x = (uint16_t)x;
     to->y = (uint16_t)y;
-    to->state = b->kernel[i] | (uint32_t)b->level[i] << LEVEL_SHIFT
-              | (s->is_edge ? EDGE_BIT : 0u);
+    to->state = kernel | (uint32_t)level << LEVEL_SHIFT | (is_edge ? EDGE_BIT : 0u);
     to->fraction = (uint16_t)(fraction * 65535.0f + 0.5f);
-    /* coarse light is spread over half a pixel of its own, and over one between middles */
-    int r = resolution_of(f, shape, b->level[i]);
-    int beyond = r ? 2 << r : 0;
-    to->radius_px = (uint16_t)(shape->radius_px + beyond);
-    for (int side = 0; side < 4; ++side)
-        to->reach_px[side] = (uint8_t)smaller_int(shape->reach_px[side] + beyond, 255);
-    uint8_t used = (uint8_t)(1 << b->level[i]);
+    to->radius_px = shape->radius_px;
+    memcpy(to->reach_px, shape->reach_px, sizeof to->reach_px);
+    if (level > 1 && resolution_of(f, shape, level)) widen(to, resolution_of(f, shape, level));
+    uint8_t used = (uint8_t)(1 << level);
     if (!(__atomic_load_n(&shape->levels_used, __ATOMIC_RELAXED) & used))
         __atomic_fetch_or(&shape->levels_used, used, __ATOMIC_RELAXED);
 }
@@ -217,6 +293,22 @@ static int edge_in_reach(const frame *f, int column, int row) {
     return 0;
 }
 
+/* Writes what is left of a block, in scan order. */
+static void write_block(const block *b, int index, block_info *info) {
+    fragment *out = b->f->fragments + (size_t)index * BLOCK_PIXELS;
+    fragment_light *lights = b->f->lights + (size_t)index * BLOCK_PIXELS;
+    for (int i = 0; i < BLOCK_PIXELS; ++i) {
+        int level = b->level[i];
+        if (level < 0) continue;
+        write_fragment(b, i, out, lights++);
+        take_in_box(info, out, (1 << level) - 1);
+        info->has_edge |= (out->state & EDGE_BIT) != 0;
+        if (level > 0) info->merged = (uint16_t)(info->merged + (1 << 2 * level));
+        ++info->count;
+        ++out;
+    }
+}
+
 static void merge_block(frame *f, int surface, int column, int row) {
     int index = (surface * f->block_rows + row) * f->block_columns + column;
     block_info info = {.x0 = INT16_MAX, .y0 = INT16_MAX, .x1 = INT16_MIN, .y1 = INT16_MIN};
@@ -226,21 +318,14 @@ static void merge_block(frame *f, int surface, int column, int row) {
     b.x0 = column * TILE_SIZE_PX;
     b.y0 = row * TILE_SIZE_PX;
     if (surface == 0 || edge_in_reach(f, column, row)) {
-        int highest = read_block(&b);
-        highest = highest < f->max_level ? highest : f->max_level;
+        int highest = smaller_int(read_block(&b), f->max_level);
         for (int level = 1; level <= highest; ++level)
             for (int y = 0; y < TILE_SIZE_PX; y += 1 << level)
-                for (int x = 0; x < TILE_SIZE_PX; x += 1 << level)
-                    merge_four(&b, y * TILE_SIZE_PX + x, level);
-        fragment *out = f->fragments + (size_t)index * BLOCK_PIXELS;
-        for (int i = 0; i < BLOCK_PIXELS; ++i) {
-            if (b.level[i] < 0) continue;
-            write_fragment(&b, i, out + info.count);
-            take_in_box(&info, out + info.count, (1 << b.level[i]) - 1);
-            info.has_edge |= b.squares[i].is_edge;
-            if (b.level[i] > 0) info.merged = (uint16_t)(info.merged + (1 << 2 * b.level[i]));
-            ++info.count;
-        }
+                for (int x = 0; x < TILE_SIZE_PX; x += 1 << level) {
+                    if (level == 1) merge_pixels(&b, y * TILE_SIZE_PX + x);
+                    else merge_squares(&b, y * TILE_SIZE_PX + x, level);
+                }
+        write_block(&b, index, &info);
     }
     f->blocks[index] = info;
 }

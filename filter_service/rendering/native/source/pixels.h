@@ -83,7 +83,7 @@ INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt
 /* Cell of a column or row of the frame, and the share of the way through it. */
 INLINE int cell_place(const frame *f, int at, int size, float *share) {
     int place = clamped_int(at - f->border_px, 0, size - 1);
-    int cell = place / f->cell_px;
+    int cell = place >> __builtin_ctz((unsigned)f->cell_px);
     *share = ((float)(place - cell * f->cell_px) + 0.5f) / (float)f->cell_px;
     return cell;
 }

@@ -31,7 +31,7 @@ static void shrink_kernel(const shrink_job *job, int kernel) {
     uint16_t *to = job->to + job->to_first[kernel];
     if (reach_width(coarse) == 1 && reach_height(coarse) == 1) {
         float light = whole_light(from, width * reach_height(own));
-        to[0] = (uint16_t)fminf(light * per_light + 0.5f, 65535.0f);
+        to[0] = (uint16_t)smaller_float(light * per_light + 0.5f, 65535.0f);
         return;
     }
     float line[LONGEST_ROW_PX];

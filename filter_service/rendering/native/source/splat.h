@@ -65,62 +65,78 @@ INLINE i32x8 read_pairs(const uint32_t *from) {
     return pairs;
 }
 
-/* Lit part of a kernel's row in the raster: first pair and the last plus one. */
-INLINE int lit_pairs(const frame *f, const reading *r, const raster *own, int row, int *end) {
-    span lit = f->spans[r->image->first_span + (uint32_t)row];
-    int first = larger_int(r->left + lit.first, 0);
-    int last = smaller_int(r->left + lit.end, own->width);
-    *end = (last + 1) / 2;
-    return first < last ? first / 2 : *end;
-}
-
 INLINE const uint32_t *row_texels(const frame *f, const reading *r, int row) {
     ptrdiff_t texel = (ptrdiff_t)r->image->first_texel + (ptrdiff_t)row * (r->image->width + 1);
     return f->kernel_texels + 4 * (texel - r->left);
 }
 
-/* Adds a fragment's light and coverage to the depth that is open. */
-INLINE void add_fragment(const frame *f, const fragment *one, window *w) {
-    const level_image *image = image_of(f, one);
-    raster *own = w->open + image->resolution;
-    reading r = start_reading(one, image, own);
-    float scale = image->scale;
-    float red = scale * one->rgb[0], green = scale * one->rgb[1], blue = scale * one->rgb[2];
-    f32x8 color = {red, green, blue, 0.0f, red, green, blue, 0.0f};
-    f32x8 scales = all8(scale);
-    int row = larger_int(-r.top, 0);
-    int last = smaller_int(own->height - r.top, image->height);
-    own->is_lit = 1;
-    for (; row < last; ++row) {
-        int end;
-        int pair = lit_pairs(f, &r, own, row, &end);
-        const uint32_t *from = row_texels(f, &r, row);
-        pixel_pair *to = own->pairs + (row + r.top) * own->stride;
-        for (; pair < end; ++pair) {
+/* Pairs and rows of a raster that a kernel's box meets. */
+typedef struct {
+    int pair, pairs;          /* first, and how many */
+    int row, rows;            /* of the kernel */
+} meeting;
+
+INLINE meeting meet(const reading *r, const raster *own) {
+    int pair = larger_int(r->left, 0) / 2;
+    int row = larger_int(-r->top, 0);
+    return (meeting){pair, (smaller_int(r->left + r->image->width, own->width) + 1) / 2 - pair,
+                     row, smaller_int(own->height - r->top, r->image->height) - row};
+}
+
+/* Adds up light and coverage over rows of `count` pairs. */
+INLINE void add_rows(pixel_pair *to, int stride, const uint32_t *from, int from_stride,
+                     int rows, i32x8 factors, f32x8 color, f32x8 scales, int count) {
+    for (int row = 0; row < rows; ++row, to += stride, from += from_stride) {
+        for (int pair = 0; pair < count; ++pair) {
             f32x8 weight = __builtin_convertvector(
-                pair_sums(read_pairs(from + 8 * pair), r.factors), f32x8);
+                pair_sums(read_pairs(from + 8 * pair), factors), f32x8);
             to[pair].light += weight * color;
             to[pair].coverage += weight * scales;
         }
     }
 }
 
-/* The paper's rule: a weight is an opacity; it merges once, four pixels. */
-INLINE void cover_with_fragment(const frame *f, const fragment *one, const window *w) {
+/* Adds a fragment's light and coverage to the depth that is open. */
+INLINE void add_fragment(const frame *f, uint32_t index, window *w) {
+    const fragment *one = f->fragments + index;
+    const float *rgb = f->lights[index].rgb;
     const level_image *image = image_of(f, one);
-    const raster *own = w->open;
+    raster *own = w->open + image->resolution;
     reading r = start_reading(one, image, own);
-    f32x8 color = {one->rgb[0], one->rgb[1], one->rgb[2], 0.0f,
-                   one->rgb[0], one->rgb[1], one->rgb[2], 0.0f};
+    meeting m = meet(&r, own);
+    float scale = image->scale;
+    float red = scale * rgb[0], green = scale * rgb[1], blue = scale * rgb[2];
+    f32x8 color = {red, green, blue, 0.0f, red, green, blue, 0.0f};
+    f32x8 scales = all8(scale);
+    pixel_pair *to = own->pairs + (m.row + r.top) * own->stride + m.pair;
+    const uint32_t *from = row_texels(f, &r, m.row) + 8 * m.pair;
+    int stride = 4 * (image->width + 1);
+    own->is_lit = 1;
+    /* The compiler makes a loop without a jump for each width. */
+#define CASE(count)                                                                         \
+    case count:                                                                             \
+        add_rows(to, own->stride, from, stride, m.rows, r.factors, color, scales, count);   \
+        return;
+    switch (m.pairs) {
+        CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8)
+    default: return; /* it lights another part of the bin */
+    }
+#undef CASE
+}
+
+/* The paper's rule: a weight is an opacity; it merges once, four pixels. */
+INLINE void cover_with_fragment(const frame *f, uint32_t index, const window *w) {
+    const fragment *one = f->fragments + index;
+    const float *rgb = f->lights[index].rgb;
+    const level_image *image = image_of(f, one);
+    reading r = start_reading(one, image, w->open);
+    meeting m = meet(&r, w->open);
+    f32x8 color = {rgb[0], rgb[1], rgb[2], 0.0f, rgb[0], rgb[1], rgb[2], 0.0f};
     int merged = (one->state >> LEVEL_SHIFT & 3) != 0;
-    int row = larger_int(-r.top, 0);
-    int last = smaller_int(own->height - r.top, image->height);
-    for (; row < last; ++row) {
-        int end;
-        int pair = lit_pairs(f, &r, own, row, &end);
-        const uint32_t *from = row_texels(f, &r, row);
-        pixel_pair *to = w->near + (row + r.top) * PAIRS_ACROSS;
-        for (; pair < end; ++pair) {
+    for (int row = m.row; row < m.row + m.rows; ++row) {
+        const uint32_t *from = row_texels(f, &r, row) + 8 * m.pair;
+        pixel_pair *to = w->near + (row + r.top) * PAIRS_ACROSS + m.pair;
+        for (int pair = 0; pair < m.pairs; ++pair) {
             f32x8 weight = __builtin_convertvector(
                 pair_sums(read_pairs(from + 8 * pair), r.factors), f32x8);
             weight *= all8(image->scale);
@@ -206,19 +222,20 @@ INLINE int is_beyond(const frame *f, float depth, float open_depth) {
 
 /* Light of a tile where order matters: one depth after the other. */
 static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, window *w) {
-    float open_depth = f->fragments[list->entries[0].fragment].depth;
+    float open_depth = f->lights[list->entries[0].fragment].depth;
     for (int i = 0; i < list->count; ++i) {
         if (!(list->entries[i].tiles & tile)) continue;
-        const fragment *one = f->fragments + list->entries[i].fragment;
+        uint32_t index = list->entries[i].fragment;
         if (f->paper_rule) {
-            cover_with_fragment(f, one, w);
+            cover_with_fragment(f, index, w);
             continue;
         }
-        if (is_beyond(f, one->depth, open_depth)) {
+        float depth = f->lights[index].depth;
+        if (is_beyond(f, depth, open_depth)) {
             if (!close_depth(w)) return;
-            open_depth = one->depth;
+            open_depth = depth;
         }
-        add_fragment(f, one, w);
+        add_fragment(f, index, w);
     }
     if (!f->paper_rule) close_depth(w);
 }
@@ -227,7 +244,7 @@ static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles
                             window *w) {
     for (int i = 0; i < list->count; ++i)
         if (list->entries[i].tiles & tiles)
-            add_fragment(f, f->fragments + list->entries[i].fragment, w);
+            add_fragment(f, list->entries[i].fragment, w);
     gather_sizes(w);
 }
 
@@ -242,31 +259,30 @@ INLINE void write_pixel(const frame *f, size_t at, const float *rgb) {
     }
 }
 
-/* Writes the pixels of a window: light over coverage, or their own colour where hardly
- * any light arrives. */
+/* Light of a pixel that has hardly any: where a colour lacks it, the pixel's own. */
+static void fill_in_own(const frame *f, int x, int y, const float *coverage, float *rgb) {
+    f32x4 own = pixel_color(f, 0, (size_t)y * (size_t)f->width + (size_t)x);
+    for (int c = 0; c < RGB; ++c)
+        if (!(coverage[c] >= MIN_COVERAGE)) rgb[c] = own[c];
+}
+
+/* Writes the pixels of a window: light over coverage. */
 static void write_window(const frame *f, const window *w, const pixel_pair *sums) {
+    int left = larger_int(w->x0, f->border_px);
     int right = smaller_int(w->x0 + w->width, f->border_px + f->image_width);
     int bottom = smaller_int(w->y0 + w->height, f->border_px + f->image_height);
     for (int y = larger_int(w->y0, f->border_px); y < bottom; ++y) {
-        for (int x = larger_int(w->x0, f->border_px); x < right; ++x) {
-            int at = x - w->x0;
-            const pixel_pair *pair = sums + (y - w->y0) * PAIRS_ACROSS + at / 2;
-            float rgb[RGB];
-            int lacks = 0;
-            for (int c = 0; c < RGB; ++c) {
-                float coverage = pair->coverage[4 * (at & 1) + c];
-                lacks |= !(coverage >= MIN_COVERAGE);
-                rgb[c] = pair->light[4 * (at & 1) + c]
-                       / (coverage > MIN_COVERAGE ? coverage : MIN_COVERAGE);
-            }
-            if (lacks) {
-                f32x4 own = pixel_color(f, 0, (size_t)y * (size_t)f->width + (size_t)x);
-                for (int c = 0; c < RGB; ++c)
-                    if (!(pair->coverage[4 * (at & 1) + c] >= MIN_COVERAGE)) rgb[c] = own[c];
-            }
-            size_t to = (size_t)(y - f->border_px) * (size_t)f->image_width
-                      + (size_t)(x - f->border_px);
-            write_pixel(f, to, rgb);
+        const pixel_pair *row = sums + (y - w->y0) * PAIRS_ACROSS;
+        size_t to = (size_t)(y - f->border_px) * (size_t)f->image_width;
+        for (int x = left; x < right; ++x) {
+            const float *light = (const float *)(row + (x - w->x0) / 2) + 4 * ((x - w->x0) & 1);
+            f32x4 coverage = load4(light + 8);
+            f32x4 least = all4(MIN_COVERAGE);
+            float rgb[4];
+            store4(rgb, load4(light) / larger4(coverage, least));
+            i32x4 lacks = coverage < least;
+            if (lacks[0] | lacks[1] | lacks[2]) fill_in_own(f, x, y, light + 8, rgb);
+            write_pixel(f, to + (size_t)(x - f->border_px), rgb);
         }
     }
 }
@@ -327,13 +343,20 @@ static void splat_bin(void *argument, int item, int thread) {
     list->ordered = 0;
     if (list->count > 0 && (f->paper_rule || list->any_edge)) {
         mark_tiles(f, list);
-        if (f->paper_rule) list->ordered = (1u << BIN_TILES) - 1u;
+        if (f->paper_rule) list->ordered = ALL_TILES;
         if (list->ordered) sort_list(f, list);
     }
     if (list->ordered == 0) {
         window w = open_window(list->x0, list->y0, BIN_WIDTH, BIN_HEIGHT, &s);
         splat_unordered(f, list, ~0u, &w);
         write_window(f, &w, w.open[0].pairs);
+        return;
+    }
+    if (list->ordered == ALL_TILES) {
+        window w = open_window(list->x0, list->y0, BIN_WIDTH, BIN_HEIGHT, &s);
+        clear_pairs(w.near, PAIRS_ACROSS, w.width, w.height);
+        splat_ordered(f, list, ALL_TILES, &w);
+        write_window(f, &w, w.near);
         return;
     }
     for (int tile = 0; tile < BIN_TILES; ++tile) splat_tile(f, list, tile, &s);

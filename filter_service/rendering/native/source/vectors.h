@@ -38,6 +38,10 @@ INLINE f32x8 all8(float value) {
 
 INLINE f32x4 all4(float value) { return (f32x4){value, value, value, value}; }
 
+/* Not those of the library, which it would call. */
+INLINE float larger_float(float a, float b) { return a > b ? a : b; }
+INLINE float smaller_float(float a, float b) { return a < b ? a : b; }
+
 /* Of each pair of numbers the larger or the smaller; the second where one is none. */
 #if defined(__x86_64__)
 INLINE f32x4 larger4(f32x4 a, f32x4 b) { return __builtin_ia32_maxps(a, b); }
