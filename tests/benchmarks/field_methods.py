@@ -203,7 +203,8 @@ class Baseline(Method):
 
 
 QUALITY_WIDE = "ours quality wide"
-PAPER_RULE = (("paper_rule", True),)
+CLAMP_RULE = (("rule", "clamp"),)
+PAPER_RULE = (("rule", "paper"),)
 
 OURS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
@@ -217,12 +218,14 @@ ON_AXIS_BASELINES = (
     Baseline("Barsky", True, False, barsky),
     Baseline("predecessor", True, False, predecessor),
     Baseline("paper on-axis", True, False, paper_on_axis),
+    Baseline("paper clamp 1 tap", True, False, paper_on_axis, CLAMP_RULE),
     Baseline("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
 )
 FIELD_BASELINES = (
     Baseline("Celaya", False, False, celaya),
     Baseline("Gonzalez", False, False, gonzalez),
     Baseline("paper quality", False, False, paper_quality, (), True),
+    Baseline("paper clamp 4 tap", False, False, paper_quality, CLAMP_RULE, True),
     Baseline("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
     Baseline("paper dynamic", False, True, paper_dynamic, (), True),
 )
