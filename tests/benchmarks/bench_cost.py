@@ -8,8 +8,9 @@ camera's pixels are as large as the radius in px asks for.  Frames are a texture
 at infinity and *Courtyard* with its own distances, each with and without merging.
 Kernels are counted over layers (blur step) and over the field (cells).
 
-Every row has the evaluations it took (tile list entries times the pixels of a tile) and
-what merging adds as an error.  Laws are slopes of log time; the unit that a pass's time
+Every row has the evaluations it took, counted fragment by fragment and tile by tile
+(`splat_work`), how many of them lay within a kernel, and what merging adds as an error.
+Laws are slopes of log time; the unit that a pass's time
 follows most closely says what bounds it.
 """
 
@@ -25,7 +26,7 @@ from scipy.signal import fftconvolve
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from filter_service.constants import THREADS, TILE_SIZE_PX
+from filter_service.constants import TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
@@ -43,6 +44,7 @@ from tests.benchmarks.harness import (
     write_report,
 )
 from tests.benchmarks.image_measures import channel_psnr_db
+from tests.benchmarks.splat_work import splat_work
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_view
@@ -207,6 +209,8 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
     for method in methods:
         frames = _frames(case, MERGING[method])
         last = frames[-1]
+        size_px = (view.width_px, view.height_px)
+        work = splat_work(case.gpu, size_px, last.entry_count)
         pictures[method] = last.color.astype(np.float64)
         merging_db = None
         if method == "merged" and "unmerged" in pictures:
@@ -231,7 +235,8 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
                 fragment_count=last.fragment_count,
                 merged_ratio=last.merged_count / pixel_count,
                 entry_count=last.entry_count,
-                evaluation_count=last.entry_count * THREADS,
+                evaluation_count=work.evaluation_count,
+                lit_count=work.lit_count,
                 kernel_count=last.kernel_count,
                 kernel_texel_count=last.kernel_texel_count,
                 layer_count=last.layer_count,
@@ -353,6 +358,7 @@ def _work(row: CostRow) -> str:
     return (
         f"{row.case:<20}{row.method:<10}{row.setting:<18}{row.median_ms:9.1f} ms "
         f"{row.error:5.1f} dB, {row.evaluation_count:.3g} evaluations, "
+        f"{row.lit_count / row.evaluation_count:.0%} lit, "
         f"{row.kernel_count} kernels of {row.layer_count} layers, "
         f"{row.merged_ratio:.0%} merged{merging}"
     )
