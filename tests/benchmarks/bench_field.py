@@ -27,8 +27,8 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from tests.benchmarks.dense_reference import dense_reference
+from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.field_methods import (
     FOCUS_RANGE_DPT,
     METHODS,
@@ -186,14 +186,16 @@ def random_states(eye: str, scene: str, size: str, count: int) -> list[State]:
     ]
 
 
-def bench_eye(gpu, eye: str, part: Part, methods, kept: KeptRows, images) -> list[Row]:
+def bench_eye(
+    renderer, eye: str, part: Part, methods, kept: KeptRows, images
+) -> list[Row]:
     """Rows of one eye and image size."""
     width_px, height_px = part.size
     views = {
         scene: scene_view(scene, width_px=width_px, height_px=height_px)
         for scene in part.scenes
     }
-    bench = EyeBench(gpu, eye, list(views.values()))
+    bench = EyeBench(renderer, eye, list(views.values()))
     rows = []
     for method in methods:
         for scene, view in views.items():
@@ -322,6 +324,7 @@ def print_targets(found: list[dict]) -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="192x108, one eye")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--plot", action="store_true", help="results/field.png")
     parser.add_argument("--resume", action="store_true", help="keep rows of a run")
@@ -356,16 +359,16 @@ def _methods(part: Part, texts: list[str] | None) -> list[Method]:
     ]
 
 
-def run(gpu: Gpu, arguments: argparse.Namespace, origin: str) -> list[FieldRow]:
+def run(renderer, arguments: argparse.Namespace, origin: str) -> list[FieldRow]:
     """Measure all parts; a row that two of them have counts once."""
     kept = KeptRows(KEPT, origin, resumes=arguments.resume)
     parts = _parts(arguments)
-    warmed_up(gpu, scene_view(SCENES[0], width_px=192, height_px=108))
+    warmed_up(scene_view(SCENES[0], width_px=192, height_px=108))
     rows = {}
     for part in parts:
         methods = _methods(part, arguments.methods)
         for eye in part.eyes:
-            for row in bench_eye(gpu, eye, part, methods, kept, arguments.images):
+            for row in bench_eye(renderer, eye, part, methods, kept, arguments.images):
                 rows[row.case, row.setting, row.method] = row
     return list(rows.values())
 
@@ -373,10 +376,10 @@ def run(gpu: Gpu, arguments: argparse.Namespace, origin: str) -> list[FieldRow]:
 def main() -> None:
     """Run, print, and write tests/benchmarks/results/field.json."""
     arguments = _arguments()
-    gpu = Gpu()
-    machine = {**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    origin = f"{commit_id()} {machine['cpu']} {machine['gl_renderer']}"
-    rows = run(gpu, arguments, origin)
+    renderer = open_renderer(arguments.engine)
+    machine = {**machine_info(), "renderer": renderer.name}
+    origin = f"{commit_id()} {machine['cpu']} {machine['renderer']}"
+    rows = run(renderer, arguments, origin)
     targets = target_rows(rows)
     content = {**report(rows, machine=machine), "targets": targets}
     if arguments.json:

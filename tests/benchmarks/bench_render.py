@@ -12,11 +12,10 @@ import time
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.harness import (
     Row,
     machine_info,
@@ -46,7 +45,7 @@ VARIANTS = {
 }
 
 
-def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
+def bench_case(renderer, scene, size, eye, body, repeats) -> list[Row]:
     """Rows of one scene, size and eye."""
     view = scene_view(scene, width_px=size[0], height_px=size[1])
     spec = grid_spec(
@@ -69,7 +68,11 @@ def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
             n=n,
             median_ms=median_ms,
             p95_ms=p95_ms,
-            memory_mb=gpu.memory_mb if method.startswith("tiles") else memory_mb(),
+            memory_mb=(
+                working_memory_mb(renderer)
+                if method.startswith("tiles")
+                else memory_mb()
+            ),
             error_name="psnr_db",
             error=error_db,
             reference=REFERENCE,
@@ -120,9 +123,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="320x180, courtyard only")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     arguments = parser.parse_args()
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
+    renderer = open_renderer(arguments.engine)
     sizes = [(320, 180)] if arguments.quick else [(320, 180), (1280, 720)]
     scenes = ["courtyard"] if arguments.quick else ["courtyard", "primitives"]
     repeats = 3 if arguments.quick else 7
@@ -131,11 +134,9 @@ def main() -> None:
         for size in sizes
         for scene in scenes
         for eye, body in EYES.items()
-        for row in bench_case(renderer, gpu, scene, size, eye, body, repeats)
+        for row in bench_case(renderer, scene, size, eye, body, repeats)
     ]
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
     if arguments.json:
         # JSON has no infinity: the gather is its own reference.
         print(json.dumps(_finite(content)))

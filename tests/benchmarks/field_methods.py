@@ -2,15 +2,12 @@
 
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered
 from tests.benchmarks.dense_reference import EyeState
@@ -78,8 +75,8 @@ class Method:
 class EyeBench:
     """One eye before one camera: states for references, and stores for the renderer."""
 
-    def __init__(self, gpu: Gpu, name: str, views: list[RgbdView]):
-        self._gpu, self._name = gpu, name
+    def __init__(self, renderer, name: str, views: list[RgbdView]):
+        self.renderer, self._name = renderer, name
         self._camera = {
             "width_px": views[0].width_px,
             "height_px": views[0].height_px,
@@ -115,7 +112,7 @@ class EyeBench:
         return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
 
     def store(self, method: "Ours", state: State):
-        """Store of a method of ours, on the GPU, and how long it took to build."""
+        """Store of a method of ours, loaded, and how long it took to build."""
         settings = method.settings(state)
         key = (method.name, *settings.values())
         if key not in self._stores:
@@ -127,13 +124,8 @@ class EyeBench:
             self._stores[key] = (self.renderer.load(store), build_ms)
         return self._stores[key]
 
-    @cached_property
-    def renderer(self) -> FilterRenderer:
-        """Shared by all stores."""
-        return FilterRenderer(self._gpu)
-
     def release(self) -> None:
-        """Free the stores on the GPU."""
+        """Free what the renderer holds of the stores."""
         for handle, _ in self._stores.values():
             handle.release()
         self._stores.clear()
@@ -232,7 +224,7 @@ FIELD_BASELINES = (
 METHODS = (*OURS, *ON_AXIS_BASELINES, *FIELD_BASELINES)
 
 
-def warmed_up(gpu: Gpu, view: RgbdView) -> None:
+def warmed_up(view: RgbdView) -> None:
     """Run every baseline once on a corner of a view, so that all is compiled."""
     left, right, up, down = view.tangents
     share = (48 / view.width_px, 32 / view.height_px)
@@ -247,6 +239,6 @@ def warmed_up(gpu: Gpu, view: RgbdView) -> None:
             up + (down - up) * share[1],
         ),
     )
-    bench = EyeBench(gpu, "emmetropia", [corner])
+    bench = EyeBench(None, "emmetropia", [corner])
     for method in (*ON_AXIS_BASELINES, *FIELD_BASELINES[:3]):
         method.run(bench, corner, State(3.0, 0.5), 1)
