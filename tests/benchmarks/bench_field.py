@@ -12,8 +12,9 @@ of it for references and caches.
 The reference of methods on the axis has the PSF of the axis everywhere; that of the
 others follows the visual field.  Methods that take any pupil and focus are also
 measured at random ones, others for each eye, scene and size, so nearly always between
-nodes.  Time is a frame's, that of the renderer with the kernels that the frame before
-left it; preparation for an eye stands beside it, and so do the paper's figures.
+nodes.  Time is that of a frame whose pupil and focus are not those of the frame before,
+so that its kernels are made anew (`frame_runs`); rows named "frozen" repeat one state.
+Preparation for an eye stands beside it, and so do the paper's figures.
 
 References are kept under out/dense_references; rows are kept as they come, and
 ``--resume`` goes on where a run of the same commit was cut off.
@@ -98,14 +99,15 @@ class Part:
         return f"{self.size[0]}x{self.size[1]}"
 
 
-ALL_BUT_WIDE = tuple(m.name for m in METHODS if m.name != QUALITY_WIDE)
+ON_AXIS_NAMES = tuple(m.name for m in METHODS if m.name.startswith("ours on-axis"))
+ALL_BUT_WIDE = tuple(m.name for m in METHODS if not m.name.startswith(QUALITY_WIDE))
 """The quality mode for all pupils and foci is for smaller frames: at 1280x720 it takes
 minutes to build."""
 
 PARTS = (
     Part((320, 180), scenes=SCENES[:1]),
     Part((640, 360)),
-    Part((1280, 720), methods=("ours on-axis", "ours on-axis wide")),
+    Part((1280, 720), methods=ON_AXIS_NAMES),
     Part((1280, 720), ("myopia", "keratoconus"), SCENES[:1], ALL_BUT_WIDE, 0),
 )
 QUICK_PARTS = (Part((192, 108), ("keratoconus",), SCENES[:1]),)
@@ -271,7 +273,7 @@ def _row(found: _Found, eye, scene, size, method: Method, state: State) -> Field
 
 
 HEADER = (
-    f"{'eye':<12}{'scene, size, pupil, focus':<38}{'method':<19}{'ms':>8}{'dB':>6}"
+    f"{'eye':<12}{'scene, size, pupil, focus':<38}{'method':<25}{'ms':>8}{'dB':>6}"
     f"{'8 bit':>6}{'SSIM':>8}{'dE':>6}{'MB':>8}{'prepare':>9}  published"
 )
 
@@ -283,7 +285,7 @@ def _line(row: FieldRow) -> str:
             **row.published
         )
     return (
-        f"{row.case:<12}{row.setting:<38}{row.method:<19}{row.median_ms:8.1f}"
+        f"{row.case:<12}{row.setting:<38}{row.method:<25}{row.median_ms:8.1f}"
         f"{row.error:6.1f}{row.psnr_srgb8_db:6.1f}{row.ssim_ratio:8.4f}"
         f"{row.mean_delta_e:6.2f}{row.memory_mb:8.1f}{row.prepare_ms:9.0f}  {theirs}"
     )

@@ -1,7 +1,9 @@
 """Frame time against PSNR, by pass, beside the sorted gather in the same run.
 
-Usage: python -m tests.benchmarks.bench_render [--quick] [--json]
+Usage: python -m tests.benchmarks.bench_render [--quick] [--json] [--engine NAME]
 
+Pupil and focus change from frame to frame, so that its kernels are made anew; the row
+"tiles frozen" repeats one state.
 Error: PSNR in linear light against the float64 sorted gather with the same layers.
 """
 
@@ -16,13 +18,13 @@ from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
 from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
+from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.harness import (
     Row,
     machine_info,
     memory_mb,
     print_rows,
     report,
-    time_calls,
     write_report,
 )
 from tests.grid_specs import grid_spec
@@ -40,6 +42,7 @@ EYES = {
 }
 VARIANTS = {
     "tiles": {},
+    "tiles frozen": {"frozen": True},
     "tiles unmerged": {"merge": False},
     "tiles paper rule": {"accumulation": "paper"},
 }
@@ -89,18 +92,13 @@ def bench_case(renderer, scene, size, eye, body, repeats) -> list[Row]:
         for rule, ms in zip(truth, gather_ms, strict=True)
     ]
     for method, options in VARIANTS.items():
-        results = []
-
-        def filtered(options=options, results=results):
-            results.append(renderer.render(view, handle, **STATE, **options))
-
-        median_ms, p95_ms = time_calls(filtered, repeats=repeats)
+        run = timed_frames(renderer, view, handle, **STATE, repeats=repeats, **options)
         error_db = psnr_db(
-            results[-1].color, truth[options.get("accumulation", "coverage")]
+            run.last.color, truth[options.get("accumulation", "coverage")]
         )
-        rows.append(row(method, repeats, median_ms, p95_ms, error_db))
+        rows.append(row(method, repeats, run.median_ms, run.p95_ms, error_db))
         if method == "tiles":
-            rows += pass_rows(row, results[-repeats:], error_db)
+            rows += pass_rows(row, run.frames, error_db)
     handle.release()
     return rows
 

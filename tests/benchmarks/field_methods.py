@@ -1,7 +1,7 @@
 """All methods of `bench_field` on one footing: a view and a state in, an image out."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered
 from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
 from tests.benchmarks.paper_baselines import (
     paper_dynamic,
@@ -52,11 +53,15 @@ class Method:
         Which reference it aims at: one PSF per distance, or the whole visual field.
     any_state : bool
         Whether pupil and focus may be anything without a new preparation.
+    frozen : bool
+        Whether frames repeat one state, and what was made for it, in place of changing
+        it from frame to frame; the name then ends in `FROZEN`.
     """
 
     name: str
     on_axis: bool
     any_state: bool
+    frozen: bool = field(default=False, kw_only=True)
 
     @property
     def published_name(self) -> str | None:
@@ -114,7 +119,7 @@ class EyeBench:
     def store(self, method: "Ours", state: State):
         """Store of a method of ours, loaded, and how long it took to build."""
         settings = method.settings(state)
-        key = (method.name, *settings.values())
+        key = tuple(settings.values())
         if key not in self._stores:
             spec = self.spec(**settings)
             eye = traced_eye(self._name, spec)
@@ -154,26 +159,26 @@ class Ours(Method):
     def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
         handle, build_ms = bench.store(self, state)
-        results = []
-        for _ in range(1 + repeats):
-            start_s = time.perf_counter()
-            rendered = bench.renderer.render(
-                view,
-                handle,
-                pupil_diameter_mm=state.pupil_mm,
-                focus_dpt=state.focus_dpt,
-                accumulation=self.accumulation,
+        run = timed_frames(
+            bench.renderer,
+            view,
+            handle,
+            pupil_diameter_mm=state.pupil_mm,
+            focus_dpt=state.focus_dpt,
+            repeats=repeats,
+            frozen=self.frozen,
+            accumulation=self.accumulation,
+        )
+        return [
+            Filtered(
+                color=frame.color,
+                prepare_ms=build_ms,
+                render_ms=time_ms,
+                memory_mb=handle.store.memory_mb,
+                psf_count=handle.store.psf_count,
             )
-            results.append(
-                Filtered(
-                    color=rendered.color,
-                    prepare_ms=build_ms,
-                    render_ms=1e3 * (time.perf_counter() - start_s),
-                    memory_mb=handle.store.memory_mb,
-                    psf_count=handle.store.psf_count,
-                )
-            )
-        return results[1:]
+            for frame, time_ms in zip(run.frames, run.times_ms, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -198,6 +203,14 @@ QUALITY_WIDE = "ours quality wide"
 CLAMP_RULE = (("rule", "clamp"),)
 PAPER_RULE = (("rule", "paper"),)
 
+FROZEN = " frozen"
+
+
+def frozen(method: Method) -> Method:
+    """The same method where nothing changes between frames."""
+    return replace(method, name=method.name + FROZEN, frozen=True)
+
+
 OURS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
     Ours("ours on-axis wide", on_axis=True, any_state=True, mode="on-axis"),
@@ -221,7 +234,7 @@ FIELD_BASELINES = (
     Baseline("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
     Baseline("paper dynamic", False, True, paper_dynamic, (), True),
 )
-METHODS = (*OURS, *ON_AXIS_BASELINES, *FIELD_BASELINES)
+METHODS = (*OURS, *map(frozen, OURS), *ON_AXIS_BASELINES, *FIELD_BASELINES)
 
 
 def warmed_up(view: RgbdView) -> None:

@@ -101,7 +101,7 @@ def plane_rows(gpu: Gpu):
     found = {}
     for radius_px in (4, 8, 16):
         view = plane_view(*SIZE, BLUR_MRAD / radius_px)
-        case = CostBench(FilterRenderer(gpu), gpu, view)
+        case = CostBench(FilterRenderer(gpu), view)
         for line in bench(case, "radius", "plane", float(radius_px)):
             found[line.method, radius_px] = line
     return found
@@ -123,7 +123,7 @@ def test_evaluations_are_those_of_discs_over_tiles(plane_rows):
 def test_evaluations_are_counted_as_they_happen(gpu, merge):
     """Against comparing every fragment with every pixel; the last tiles are cut."""
     width, height = 77, 43
-    case = CostBench(FilterRenderer(gpu), gpu, plane_view(width, height, BLUR_MRAD / 6))
+    case = CostBench(FilterRenderer(gpu), plane_view(width, height, BLUR_MRAD / 6))
     frame = case.renderer.render(case.view, case.handle, **STATE, merge=merge)
     found = splat_work(gpu, (width, height), frame.entry_count)
     columns, rows = (-(-side // TILE_SIZE_PX) for side in (width, height))
