@@ -1,4 +1,4 @@
-"""Every method against the dense reference: time, memory, and four measures of error.
+"""Every method against the dense reference: work, memory, and four measures of error.
 
     python -m tests.benchmarks.bench_field [--quick] [--json] [--plot] [--resume]
         [--images DIR] [--eyes NAME ...] [--sizes WxH ...] [--scenes NAME ...]
@@ -14,7 +14,10 @@ others follows the visual field.  Methods that take any pupil and focus are also
 measured at random ones, others for each eye, scene and size, so nearly always between
 nodes.  Time is that of a frame whose pupil and focus are not those of the frame before,
 so that its kernels are made anew (`frame_runs`); rows named "frozen" repeat one state.
-Preparation for an eye stands beside it, and so do the paper's figures.
+Methods that convolve are timed likewise, with the PSFs of the new state.  The paper's
+layouts have counted PSF samples in place of a time: they are scatters without tiles or
+merging, which would be another method's time.  Preparation for an eye stands beside it,
+and so do the paper's figures, whose errors are of 8-bit images: beside ours of 8 bits.
 
 References are kept under out/dense_references; rows are kept as they come, and
 ``--resume`` goes on where a run of the same commit was cut off.
@@ -40,7 +43,11 @@ from tests.benchmarks.field_methods import (
     State,
     warmed_up,
 )
-from tests.benchmarks.field_pictures import plot_errors, write_differences
+from tests.benchmarks.field_pictures import (
+    pixels_of,
+    plot_errors,
+    write_differences,
+)
 from tests.benchmarks.harness import (
     OUT,
     RESULTS,
@@ -124,13 +131,21 @@ class FieldRow(Row):
         See `image_measures.Measures`; ``error`` is the linear PSNR.
     prepare_ms : float
         PSFs of the eye, once.
-    psf_count, tap_count : int or None
+    n : int
+        Timed frames; 0 where there is no time.
+    median_ms, p95_ms : float or None
+    psf_count : int
+    tap_count : int or None
+        PSF samples that the frame needs, where they are counted: those within the
+        square or box of a PSF.  Tiles evaluate more, theirs as ours.
     published : dict or None
         The paper's figures for this method, condition and scene, and their hardware.
     """
 
     scene: str
     size: str
+    median_ms: float | None
+    p95_ms: float | None
     psnr_srgb8_db: float
     ssim_ratio: float
     mean_delta_e: float
@@ -246,7 +261,7 @@ def _measured(bench: EyeBench, view, method: Method, state: State) -> _Found:
 def _row(found: _Found, eye, scene, size, method: Method, state: State) -> FieldRow:
     last = found.results[-1]
     errors = measures(last.color, found.reference)
-    times_ms = [result.render_ms for result in found.results]
+    times_ms = [result.render_ms for result in found.results if method.timed]
     theirs = published(method.published_name, eye, scene)
     return FieldRow(
         bench="field",
@@ -254,8 +269,8 @@ def _row(found: _Found, eye, scene, size, method: Method, state: State) -> Field
         case=eye,
         setting=f"{scene} {size} {state}",
         n=len(times_ms),
-        median_ms=float(np.median(times_ms)),
-        p95_ms=float(np.percentile(times_ms, 95)),
+        median_ms=float(np.median(times_ms)) if times_ms else None,
+        p95_ms=float(np.percentile(times_ms, 95)) if times_ms else None,
         memory_mb=last.memory_mb,
         error_name="psnr_db",
         error=errors.psnr_db,
@@ -273,19 +288,21 @@ def _row(found: _Found, eye, scene, size, method: Method, state: State) -> Field
 
 
 HEADER = (
-    f"{'eye':<12}{'scene, size, pupil, focus':<38}{'method':<25}{'ms':>8}{'dB':>6}"
-    f"{'8 bit':>6}{'SSIM':>8}{'dE':>6}{'MB':>8}{'prepare':>9}  published"
+    f"{'eye':<12}{'scene, size, pupil, focus':<38}{'method':<25}{'ms':>8}{'/px':>7}"
+    f"{'dB':>6}{'8 bit':>6}{'SSIM':>8}{'dE':>6}{'MB':>8}{'prepare':>9}  published"
 )
 
 
 def _line(row: FieldRow) -> str:
     theirs = ""
     if row.published is not None:
-        theirs = "{median_ms:g} ms, {error_db} dB, {scene}, {hardware}".format(
-            **row.published
-        )
+        theirs = (
+            "{psnr_srgb8_db} dB of 8 bits, {median_ms:g} ms, {scene}, {hardware}"
+        ).format(**row.published)
+    time = "" if row.median_ms is None else f"{row.median_ms:.1f}"
+    taps = "" if row.tap_count is None else f"{row.tap_count / pixels_of(row.size):.1f}"
     return (
-        f"{row.case:<12}{row.setting:<38}{row.method:<25}{row.median_ms:8.1f}"
+        f"{row.case:<12}{row.setting:<38}{row.method:<25}{time:>8}{taps:>7}"
         f"{row.error:6.1f}{row.psnr_srgb8_db:6.1f}{row.ssim_ratio:8.4f}"
         f"{row.mean_delta_e:6.2f}{row.memory_mb:8.1f}{row.prepare_ms:9.0f}  {theirs}"
     )
