@@ -17,7 +17,9 @@ import argparse
 import json
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.frame_runs import WARM_UPS, states_towards
 from tests.benchmarks.harness import machine_info, report, write_report
 from tests.benchmarks.image_measures import channel_psnr_db
+from tests.benchmarks.peer_blender import blender
 from tests.benchmarks.peer_ffmpeg import FRAMES, varblur
 from tests.benchmarks.peer_layers import fft_layers, opencv_layers
 from tests.benchmarks.peer_problem import LAYER_COUNT, NotInstalled, Peer, Problem
@@ -39,6 +42,8 @@ EYES = {
 }
 SIZE, QUICK_SIZE = (1280, 720), (320, 180)
 REPEATS, QUICK_REPEATS = 5, 3
+
+PACKAGES = ("opencv-python-headless", "imageio-ffmpeg")
 
 ON_AXIS_ONLY = "no field"
 PEERS = (
@@ -70,6 +75,18 @@ PEERS = (
         f"PSF, colour or field; a process of {FRAMES} frames, its start in their time",
         varblur,
         frames_per_call=FRAMES,
+    ),
+    Peer(
+        "Blender Bokeh",
+        "gathers discs of each pixel's own radius in whole px; no occlusion, PSF, "
+        "colour or field; without Blender's start",
+        blender("bokeh"),
+    ),
+    Peer(
+        "Blender Defocus",
+        "gathers discs, less of nearer into farther ones; no PSF, colour or field; "
+        "without Blender's start",
+        blender("defocus"),
     ),
     Peer(
         "sorted gather",
@@ -153,9 +170,10 @@ def measured(problem: Problem, peers: list[Peer], repeats: int) -> list[dict]:
         for line in found:
             peer = line["peer"]
             if peer.name in frames:
-                start_s = time.perf_counter()
-                line["color"] = frames[peer.name](state)
+                frame, start_s = frames[peer.name], time.perf_counter()
+                line["color"] = frame(state)
                 taken_ms = 1e3 * (time.perf_counter() - start_s)
+                taken_ms = getattr(frame, "own_ms", taken_ms)
                 line[kind].append(taken_ms / peer.frames_per_call)
     for line in found:
         del line["times_ms"][:WARM_UPS]
@@ -189,6 +207,15 @@ def peer_rows(problem: Problem, case: str, peers: list[Peer], repeats) -> list[P
             )
         )
     return rows
+
+
+def installed_versions() -> dict[str, str | None]:
+    """Versions of the extra `peers`; None of what is missing."""
+    found: dict[str, str | None] = dict.fromkeys(PACKAGES)
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 HEADER = (
@@ -225,7 +252,8 @@ def main() -> None:
         rows += peer_rows(Problem(view, profile), case, peers, repeats)
         print(*map(line_of, rows[-len(peers) :]), sep="\n", file=sys.stderr)
     names = {name: renderer.name for name, renderer in engines.items()}
-    content = report(rows, machine={**machine_info(), "renderers": names})
+    machine = {**machine_info(), "renderers": names, **installed_versions()}
+    content = report(rows, machine=machine)
     if arguments.json:
         print(json.dumps(content))
         return

@@ -110,7 +110,8 @@ class Peer:
         How it composes, and what it cannot do.
     open : callable
         From a problem to a function of an `EyeState` that gives back linear light
-        (height, width, 3); raises `NotInstalled`.
+        (height, width, 3); raises `NotInstalled`.  A function with an attribute
+        ``own_ms`` says itself how long its last frame took.
     frames_per_call : int
         How many frames one call filters; times are per frame.
     """

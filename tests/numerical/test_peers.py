@@ -27,6 +27,9 @@ EXPECTED_DB = {
     # the same composition with drawn kernels
     "OpenCV disc": (35.0, 40.0),
     "OpenCV Gaussian": (31.0, 35.0),
+    # discs in whole px and in no order, and with some order
+    "Blender Bokeh": (30.0, 36.0),
+    "Blender Defocus": (32.0, 37.0),
     # boxes in no order
     "ffmpeg varblur": (24.0, 29.0),
 }
@@ -36,6 +39,8 @@ PACKAGES = {
     "OpenCV disc": "opencv-python-headless",
     "OpenCV Gaussian": "opencv-python-headless",
     "ffmpeg varblur": "imageio-ffmpeg",
+    "Blender Bokeh": "blender",
+    "Blender Defocus": "blender",
 }
 
 
@@ -77,6 +82,7 @@ def test_errors_are_what_the_methods_should_have(rows, method):
 def test_what_is_missing_is_named_and_the_rest_measured(problem, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
     wanted = [peer for peer in PEERS if peer.name in (*PACKAGES, "FFT over")]
     found = {row.method: row for row in peer_rows(problem, "-6 dpt", wanted, 1)}
     assert {name: found[name].missing for name in PACKAGES} == PACKAGES
