@@ -322,7 +322,7 @@ def main() -> None:
     arguments = parser.parse_args()
     is_whole = arguments.sweeps == SWEEPS and not arguments.quick
     quick = arguments.quick
-    renderer = open_renderer()
+    renderer = open_renderer("gl")  # which tells what it evaluates
     size = QUICK["size"] if quick else SIZE
     rows = []
     if "radius" in arguments.sweeps:

@@ -13,13 +13,13 @@ STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
 OBJECTS = {"object_range_dpt": (0.0, 2.0)}
 
 
-def bench_of(gpu, **spec):
+def bench_of(engine, **spec):
     profile = {"kind": "preset", "name": "myopia"}
-    return Bench(gpu, profile, **SIZE, **spec, **OBJECTS)
+    return Bench(engine, profile, **SIZE, **spec, **OBJECTS)
 
 
-def test_states_come_nearer_within_the_range_and_none_comes_twice(gpu):
-    spec = bench_of(gpu, **WIDE).spec
+def test_states_come_nearer_within_the_range_and_none_comes_twice(engine):
+    spec = bench_of(engine, **WIDE).spec
     for pupil_mm, focus_dpt in ((5.0, 0.5), (3.0, 2.0), (4.2, 0.0)):
         states = states_towards(spec, pupil_mm, focus_dpt, 5)
         pupils, foci = (
@@ -33,9 +33,9 @@ def test_states_come_nearer_within_the_range_and_none_comes_twice(gpu):
             assert np.abs(values - values[-1]).max() <= CHANGE
 
 
-def test_gaze_changes_where_it_was_prepared(gpu):
+def test_gaze_changes_where_it_was_prepared(engine):
     field = {"mode": "dynamic", "tolerance": "loose", **WIDE}
-    spec = bench_of(gpu, **field).spec
+    spec = bench_of(engine, **field).spec
     assert "gaze_deg" not in states_towards(spec, 5.0, 0.5, 3)[0]
     turning = spec.with_settings(gaze_range_deg=(5.0, 3.0))
     gazes_deg = [s["gaze_deg"] for s in states_towards(turning, 5.0, 0.5, 3)]
@@ -44,8 +44,8 @@ def test_gaze_changes_where_it_was_prepared(gpu):
 
 
 @pytest.mark.parametrize("ranges", [WIDE, POINT])
-def test_kernels_are_made_anew_for_every_frame_but_frozen_ones(gpu, rng, ranges):
-    bench = bench_of(gpu, **ranges)
+def test_kernels_are_made_anew_for_every_frame_but_frozen_ones(engine, rng, ranges):
+    bench = bench_of(engine, **ranges)
     view = bench.view(texture(rng, 40, 64), 1.0)
     blends = {}
     for frozen in (False, True):

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.bench_peers import EYES, PEERS, line_of, our_peers, peer_rows
 from tests.benchmarks.peer_layers import drawn_disc
 from tests.benchmarks.peer_problem import KeptForState, Problem
@@ -17,10 +17,10 @@ STEP = Variant("fine steps", {"max_blur_step_px": 0.125}, {"merge": False})
 
 EXPECTED_DB = {
     # a float64 twin of the renderer, and what the renderer leaves unmerged at 128x72
-    "ours gl": (63.0, 66.0),
-    "ours gl unmerged": (63.0, 66.0),
+    "ours native tolerance 1": (62.0, 66.0),
+    "ours native tolerance 0": (63.0, 66.0),
     "sorted gather": (63.0, 66.0),
-    "ours gl fine steps": (66.0, 90.0),
+    "ours native fine steps": (66.0, 90.0),
     # exact PSFs, half a layer away at most; opaque layers let a third shine through
     "FFT linear": (59.0, 63.0),
     "FFT over": (35.0, 40.0),
@@ -51,8 +51,8 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def rows(gpu, problem):
-    ours = our_peers({"gl": FilterRenderer(gpu)}, (*VARIANTS, STEP))
+def rows(problem):
+    ours = our_peers({"native": NativeRenderer()}, (*VARIANTS, STEP))
     found = peer_rows(problem, "-6 dpt", [*ours, *PEERS], REPEATS)
     return {row.method: row for row in found}
 

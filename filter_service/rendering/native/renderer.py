@@ -151,8 +151,7 @@ class NativeRenderer:
                 white_level=white_level(view.color),
             )
             self._loops.run("merge", frame.c)
-        with timer.wall("psf_blend_ms"):
-            self._blend(frame, plan)
+        self._blend(timer, frame, plan)
         with timer.wall("splat_ms"):
             picture = np.empty(view.color.shape, OUTPUT_DTYPES[options.output])
             frame.set_picture(picture)
@@ -208,7 +207,7 @@ class NativeRenderer:
             self._plan = plan_kernels(handle, layers, image, used)
         return self._plan
 
-    def _blend(self, frame: FrameRecord, plan: KernelPlan) -> None:
+    def _blend(self, timer, frame: FrameRecord, plan: KernelPlan) -> None:
         """Make what fragments use of the kernels, unless it is there."""
         levels = plan.shapes["levels_used"]
         if self._blended is not None:
@@ -217,10 +216,11 @@ class NativeRenderer:
                 frame.set_blend_room(sizes, self._n_threads)
                 return
         self._blended = None
-        self._loops.run("place", frame.c)
-        sizes = BlendSizes.of(frame.c)
-        frame.set_blend_room(sizes, self._n_threads)
-        self._loops.run("blend", frame.c)
+        with timer.wall("psf_blend_ms"):
+            self._loops.run("place", frame.c)
+            sizes = BlendSizes.of(frame.c)
+            frame.set_blend_room(sizes, self._n_threads)
+            self._loops.run("blend", frame.c)
         self._blended = plan, levels.copy(), sizes
 
 
