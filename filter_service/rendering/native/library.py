@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
@@ -12,6 +13,7 @@ from filter_service.rendering.native import records
 
 FOLDER = Path(__file__).parent
 STEM = "_loops"
+LIBRARY_VARIABLE = "OCUFILTER_NATIVE_LIBRARY"
 STAGES = ("pixels", "merge", "place", "blend", "splat")
 
 REMEDY = (
@@ -87,7 +89,12 @@ class Library:
 
 
 def library_path() -> Path | None:
-    """Return where the compiled loops lie; None where they were not built."""
+    """Return where the compiled loops lie; None where they were not built.
+
+    The environment variable ``OCUFILTER_NATIVE_LIBRARY`` names another build.
+    """
+    if other := os.environ.get(LIBRARY_VARIABLE):
+        return Path(other)
     for suffix in EXTENSION_SUFFIXES:
         path = FOLDER / (STEM + suffix)
         if path.exists():

@@ -269,8 +269,7 @@ INLINE void take_in_box(block_info *info, const fragment *one, int extent) {
     info->y0 = (int16_t)(y0 < info->y0 ? y0 : info->y0);
     info->x1 = (int16_t)(x1 > info->x1 ? x1 : info->x1);
     info->y1 = (int16_t)(y1 > info->y1 ? y1 : info->y1);
-    float reach = (float)one->radius_px + 0.5f;
-    info->reach_px = reach > info->reach_px ? reach : info->reach_px;
+    info->reach_px = larger_float(info->reach_px, (float)one->radius_px + 0.5f);
 }
 
 /* Whether an edge of what is seen is so close that light from a hidden block may pass. */
@@ -284,10 +283,10 @@ static int edge_in_reach(const frame *f, int column, int row) {
         for (int x = left; x < right; ++x) {
             const block_info *seen = f->blocks + y * f->block_columns + x;
             if (!seen->has_edge) continue;
-            float reach = seen->reach_px + f->largest_reach_px;
+            float farthest = seen->reach_px + f->largest_reach_px;
             int gap_x = clamped_int(abs(x - column) * TILE_SIZE_PX - TILE_SIZE_PX + 1, 0, 1 << 15);
             int gap_y = clamped_int(abs(y - row) * TILE_SIZE_PX - TILE_SIZE_PX + 1, 0, 1 << 15);
-            if ((float)(gap_x * gap_x + gap_y * gap_y) <= reach * reach) return 1;
+            if ((float)(gap_x * gap_x + gap_y * gap_y) <= farthest * farthest) return 1;
         }
     }
     return 0;

@@ -1,0 +1,106 @@
+"""The native engine's sources: numbers, files, warnings, sanitizers."""
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from filter_service import constants
+from filter_service.rendering.native import records
+from tests.native_build import COMPILER, build_library, extension, runtime_of
+from tests.source_tree import ROOT
+
+SOURCE = ROOT / "filter_service" / "rendering" / "native" / "source"
+
+FRAMES = (
+    "tests/numerical/test_renderer_hard.py",
+    "tests/numerical/test_renderer_frames.py",
+    "tests/numerical/test_renderer_hidden.py",
+    "tests/numerical/test_renderer_hdr.py",
+    "tests/numerical/test_native_random.py",
+    "tests/numerical/test_field_layers.py",
+)
+"""Every size and radius, odd depths, hidden layers, kernels over the field."""
+
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+
+
+def test_numbers_of_the_sources_are_those_of_python():
+    text = (SOURCE / "constants.h").read_text(encoding="utf-8")
+    defined = dict(re.findall(r"#define (\w+) (-?[\d.e-]+)f?\n", text))
+    assert len(defined) > 10
+    for name, value in defined.items():
+        assert float(value) == getattr(constants, name), name
+
+
+def test_packed_words_are_those_of_python():
+    text = (SOURCE / "frame.h").read_text(encoding="utf-8")
+    defined = dict(re.findall(r"#define (\w+) (0x[0-9A-Fa-f]+|\d+)u?\n", text))
+    assert int(defined["LEVEL_SHIFT"], 0) == constants.LEVEL_SHIFT
+    assert int(defined["KERNEL_MASK"], 0) == constants.KERNEL_MASK
+    assert int(defined["EDGE_BIT"], 0) == constants.EDGE_BIT
+    assert int(defined["RESOLUTIONS"], 0) == records.RESOLUTIONS
+
+
+def test_fields_of_the_frame_s_record_are_those_of_the_source_in_order():
+    text = (SOURCE / "frame.h").read_text(encoding="utf-8")
+    body = text[text.rindex("typedef struct {") : text.rindex("} frame;")]
+    body = re.sub(r"/\*.*?\*/", "", body, flags=re.S)
+    declared = []
+    for line in body.split(";")[:-1]:
+        names = line.split("{")[-1].strip().split(None, 1)[1]
+        for name in names.split(","):
+            declared.append(re.sub(r"\[.*?\]", "", name).split("*")[-1].split()[-1])
+    assert declared == [name for name, *_ in records.Frame._fields_]
+
+
+def test_the_package_lists_every_source():
+    listed = {*extension()["sources"], *extension()["depends"]}
+    assert listed == {path.relative_to(ROOT).as_posix() for path in SOURCE.iterdir()}
+
+
+@needs_compiler
+@pytest.mark.parametrize("variant", ["-march=x86-64", "-O0"])
+def test_sources_compile_without_a_warning(tmp_path, variant):
+    if np.little_endian and os.uname().machine != "x86_64" and "x86" in variant:
+        pytest.skip("another processor")
+    flags = ("-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Wno-sign-conversion")
+    build_library(tmp_path, *flags, "-Werror", variant)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
+def test_hard_frames_pass_under_sanitizers(tmp_path, sanitizer):
+    runtime = runtime_of(sanitizer)
+    if runtime is None:
+        pytest.skip(f"the compiler has no library for -fsanitize={sanitizer}")
+    flags = ("-O1", "-g", f"-fsanitize={sanitizer}", "-fno-sanitize-recover=all")
+    library = build_library(tmp_path, *flags)
+    environment = {
+        **os.environ,
+        "OCUFILTER_NATIVE_LIBRARY": str(library),
+        "OCUFILTER_THREADS": "4",
+        "LD_PRELOAD": str(runtime),
+        # Python and numba keep memory to their end
+        "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0",
+        "TSAN_OPTIONS": "halt_on_error=1:exitcode=66:ignore_noninstrumented_modules=1",
+    }
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"),
+            *("-k", "native", "-m", "not slow", *FRAMES),
+        ],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1800,
+    )
+    report = finished.stdout[-4000:] + finished.stderr[-4000:]
+    assert finished.returncode == 0, report
+    assert "Sanitizer" not in report, report
+    assert " passed" in finished.stdout
