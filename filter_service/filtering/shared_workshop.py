@@ -26,9 +26,7 @@ def open_workshop(
     from filter_service.gl.gpu import Gpu
     from filter_service.rendering.gl.compile_passes import compile_passes
     from filter_service.rendering.gl.renderer import FilterRenderer
-    from filter_service.threads import require_safe_threading_layer
 
-    require_safe_threading_layer()
     gpu = Gpu()
     closing.callback(gpu.close)
     engine = FilterRenderer(gpu)

@@ -98,8 +98,8 @@ HOME = {
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
-        "filter_service/psfs/read_kernels.py",  # planning a frame
-        "filter_service/rendering/cell_maps.py",
+        "filter_service/psfs/read_loops.py",  # planning a frame
+        "filter_service/rendering/map_loops.py",
         "filter_service/rendering/kernel_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
