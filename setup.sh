@@ -12,7 +12,8 @@ cd "$(dirname "$0")"
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 TEST_PACKAGES="xvfb"
-COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader" # what loops need
+# what the modules with compiled loops import
+COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed

@@ -28,7 +28,7 @@ class Task:
         self.title, self.total, self.unit = title, total, unit
         self.stage = ""
         self.done = 0.0
-        self.started_s = time.monotonic()
+        self._first: tuple[float, float] | None = None  # done, and when
         self._progress = progress
 
     def advance(self) -> None:
@@ -38,8 +38,8 @@ class Task:
     def update(self, done: float, stage: str | None = None) -> None:
         """Say what is done of the total, and what is being done."""
         is_new_stage = stage is not None and stage != self.stage
-        if is_new_stage and done < self.done:
-            self.started_s = time.monotonic()
+        if self._first is None or is_new_stage:
+            self._first = (done, time.monotonic())
         self.done, self.stage = done, self.stage if stage is None else stage
         self._progress._changed(self, is_new_stage)
 
@@ -58,10 +58,13 @@ class Task:
         return f"{self.done:.0f}/{self.total:.0f} {self.unit}{self._time_left()}"
 
     def _time_left(self) -> str:
-        spent_s = time.monotonic() - self.started_s
-        if not 0.0 < self.done < self.total or spent_s < SURE_AFTER_S:
+        """From the pace since the first count: what precedes it is preparation."""
+        if self._first is None:
             return ""
-        return f", {spent_s * (self.total / self.done - 1.0):.0f} s left"
+        done, spent_s = self.done - self._first[0], time.monotonic() - self._first[1]
+        if done <= 0.0 or self.done >= self.total or spent_s < SURE_AFTER_S:
+            return ""
+        return f", {spent_s * (self.total - self.done) / done:.0f} s left"
 
 
 class Progress:

@@ -63,9 +63,12 @@ def test_time_left_is_that_of_the_rest(monkeypatch):
     monkeypatch.setattr("filter_service.progress.time.monotonic", lambda: now_s[0])
     progress = Progress("demo", stream=stream)
     task = progress.task("Frames", total=40)
+    now_s[0] += 60.0  # to the first one it took long
+    task.advance()
+    assert task.count == "1/40 frames"
     now_s[0] += 10.0
-    task.update(10)
-    assert task.count == "10/40 frames, 30 s left"
+    task.update(11)
+    assert task.count == "11/40 frames, 29 s left"
 
 
 def test_a_quiet_one_says_nothing_and_a_terminal_gets_a_bar():
