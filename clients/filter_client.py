@@ -248,6 +248,7 @@ class FilterClient:
         output: Output = "srgb8",
         accumulation: Accumulation = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
         timeout_s: float | None = None,
     ) -> FilteredFrame:
         """Send one frame and return it filtered; `submit` explains the arguments.
@@ -271,6 +272,7 @@ class FilterClient:
                 output=output,
                 accumulation=accumulation,
                 merge=merge,
+                render_tolerance=render_tolerance,
             )
             answer = self._await_frame(frame_id, deadline_s)
             if isinstance(answer, FilteredFrame):
@@ -318,6 +320,7 @@ class FilterClient:
         output: Output = "srgb8",
         accumulation: Accumulation = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
 
@@ -337,6 +340,9 @@ class FilterClient:
             axis; as in the profile's settings where it is None.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
+        render_tolerance : float, 0 to 8
+            Errors of rendering against the usual, which leaves no visible difference;
+            0 is exact, more is faster.
         """
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
@@ -354,7 +360,7 @@ class FilterClient:
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
-            options=FrameOptions(accumulation, merge),
+            options=FrameOptions(accumulation, merge, float(render_tolerance)),
             images=tuple(images),
         )
         self._next_frame_id += 1

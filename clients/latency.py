@@ -111,7 +111,7 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
     )
     first_replies = [client.filter(frame, **look, timeout_s=60) for frame in frames]
     welcome = client.hello()
-    run = LatencyRun(settings.case, settings.setting, welcome.server["gl_renderer"])
+    run = LatencyRun(settings.case, settings.setting, welcome.server["renderer"])
     run.memory_start_mb = read_memory_mb()
     loop = _Loop(client, run, [reply.colors for reply in first_replies])
     start_s = time.monotonic()

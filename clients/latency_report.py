@@ -41,7 +41,7 @@ class LatencyRun:
 
     case: str
     setting: str
-    gl_renderer: str
+    renderer: str
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
     due_s: list[float] = field(default_factory=list)
     drops: Counter = field(default_factory=Counter)
@@ -96,7 +96,7 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
             }
         )
     return {
-        "machine": machine() | {"gl_renderer": run.gl_renderer},
+        "machine": machine() | {"renderer": run.renderer},
         "commit": commit(),
         "rows": rows,
         "frames": {

@@ -172,6 +172,9 @@ BYTE_BITS = 8
 BYTE_MASK = 0xFF
 RGB = 3
 
+ENGINES = ("auto", "gl", "native")
+"""What may filter frames: by what there is, compute shaders, or compiled loops."""
+
 PSF_ENGINES = ("auto", "cpu", "gpu")
 """What may compute PSFs: by measure, compiled loops, or compute shaders."""
 

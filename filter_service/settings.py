@@ -17,12 +17,14 @@ from filter_service.checked import RISING, Record, check_rising, checked
 MIN_PUPIL_MM = 0.5
 MAX_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
+MAX_RENDER_TOLERANCE = 8.0
 MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 
 PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]
 VergenceDpt = Annotated[float, Meta(ge=0.0, le=MAX_VERGENCE_DPT)]
 GazeDeg = Annotated[float, Meta(ge=-MAX_GAZE_DEG, le=MAX_GAZE_DEG)]
 TurnDeg = Annotated[float, Meta(ge=0.0, le=MAX_GAZE_DEG)]
+RenderTolerance = Annotated[float, Meta(ge=0.0, le=MAX_RENDER_TOLERANCE)]
 Years = Annotated[float, Meta(ge=3.0, le=120.0)]
 
 Mode = Literal["on-axis", "quality", "dynamic"]
@@ -30,6 +32,7 @@ Grid = Literal["planned", "paper"]
 Tolerance = Literal["loose", "normal", "fine"]
 EyeModel = Literal["traced", "wavefront"]
 Accuracy = Literal["fast", "balanced", "exact"]
+Engine = Literal["auto", "gl", "native"]
 Accumulation = Literal["coverage", "paper"]
 DepthKind = Literal["planar", "radial"]
 Output = Literal["srgb8", "linear", "linear16"]

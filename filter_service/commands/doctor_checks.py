@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from estimator.threads import thread_count
+from filter_service.gl.hardware import is_software_renderer
 from filter_service.threads import UNSAFE_THREADING_LAYER
 
 SERVICE_PACKAGES = (
@@ -55,6 +56,9 @@ APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
 FIX_DRIVER = "update the graphics driver"
 FIX_WEIGHTS = "git checkout -- estimator/networks/weights" if IN_CHECKOUT else FIX_WHEEL
 FIX_SHADERS = "git checkout -- shaders" if IN_CHECKOUT else FIX_WHEEL
+FIX_COMPILER = f"{APT_INSTALL} gcc libc6-dev, then " + (
+    FIX_SETUP if IN_CHECKOUT else "pip install --force-reinstall --no-deps ocufilter"
+)
 FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
 
@@ -75,11 +79,13 @@ def examine() -> dict:
     -------
     report : dict
         Plain JSON: ``ok`` (the service can run), ``works`` by purpose, ``checks``,
-        ``install`` (commands), ``machine``, ``gl``, ``threading_layer``,
+        ``install`` (commands), ``machine``, ``gl``, ``native`` (the compiled loops),
+        ``threading_layer``,
         ``networks`` (each with its weights' size and expected error), ``packages``.
     """
     gl = run_probe("gl")
     shaders = {} if "error" in gl else run_probe("shaders", SHADERS_TIMEOUT_S)
+    native = run_probe("native")
     threads = run_probe("threads")
     networks = run_probe("networks")
     packages = package_versions()
@@ -90,6 +96,8 @@ def examine() -> dict:
         check_gl(gl),
         check_compute(gl),
         check_shaders(gl, shaders),
+        check_native(native),
+        check_engine(gl, native),
         check_threads(threads),
         check_networks(networks),
         check_packages("client packages", CLIENT_PACKAGES, packages),
@@ -104,6 +112,7 @@ def examine() -> dict:
         "install": install_commands(checks),
         "machine": machine(),
         "gl": gl.get("info", {}) | {"limits": gl.get("limits", {})},
+        "native": native.get("name"),
         "threading_layer": threads.get("layer"),
         "networks": networks.get("cards", {}),
         "packages": packages,
@@ -242,6 +251,29 @@ def check_shaders(gl: dict, shaders: dict) -> Check:
     return Check("shaders", ok, detail, "" if ok else FIX_DRIVER)
 
 
+def check_native(native: dict) -> Check:
+    """Report whether the compiled loops are there and give what they should."""
+    if "error" in native:
+        return Check("native", False, native["error"], FIX_COMPILER)
+    detail = f"{native['name']}; a perfect eye changes a picture by "
+    detail += f"{native['frame_error']:.1g}"
+    ok = native["frame_error"] <= FRAME_ERROR_MAX
+    return Check("native", ok, detail, "" if ok else FIX_COMPILER)
+
+
+def check_engine(gl: dict, native: dict) -> Check:
+    """Say which engine filters frames unless told otherwise, and why."""
+    renderer = gl.get("info", {}).get("renderer", "")
+    if renderer and not is_software_renderer(renderer):
+        return Check("engine", True, f"gl: {renderer} is a hardware GPU")
+    lacks = f"{renderer} is software" if renderer else "no OpenGL"
+    if "error" not in native:
+        return Check("engine", True, f"native: {lacks}")
+    if renderer:
+        return Check("engine", True, f"gl, slowly: {lacks}, and no compiled loops")
+    return Check("engine", False, "neither OpenGL nor compiled loops", FIX_COMPILER)
+
+
 def check_threads(threads: dict) -> Check:
     """Check that two threads may call Numba at once."""
     if "error" in threads:
@@ -279,12 +311,13 @@ def check_display() -> Check:
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
     """Purposes of the program, from the checks each one needs."""
     psf = ok["python"] and ok["service packages"]
-    gpu = psf and ok["gl"] and ok["compute"] and ok["shaders"]
-    serve = gpu and ok["threads"]
-    demo = serve and ok["client packages"]
+    shaders = ok["gl"] and ok["compute"] and ok["shaders"]
+    filters = psf and (ok["native"] or shaders)
+    serve = filters and ok["threads"]
+    demo = serve and ok["client packages"] and ok["gl"]  # it renders its scenes
     return {
         "psf": psf,
-        "filter": gpu,
+        "filter": filters,
         "serve": serve,
         "demo": demo,
         "window": demo and ok["window packages"] and ok["display"],

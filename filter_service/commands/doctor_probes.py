@@ -2,7 +2,7 @@
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
-    python -m filter_service.commands.doctor_probes gl|shaders|threads|networks
+    python -m filter_service.commands.doctor_probes gl|shaders|native|threads|networks
 """
 
 import json
@@ -98,6 +98,18 @@ def probe_shaders() -> dict:
         gpu.close()
 
 
+def probe_native() -> dict:
+    """Filter a perfect eye's frames with the compiled loops."""
+    from filter_service.rendering.native import NativeRenderer
+    from filter_service.rendering.perfect_eye import change_by_perfect_eye
+
+    try:
+        renderer = NativeRenderer()
+    except FilterError as error:
+        return {"error": str(error)}
+    return {"name": renderer.name, "frame_error": change_by_perfect_eye(renderer)}
+
+
 @njit(parallel=True)
 def _sum_of_squares(count: int) -> float:
     total = 0.0
@@ -141,6 +153,7 @@ def probe_networks() -> dict:
 PROBES = {
     "gl": probe_gl,
     "shaders": probe_shaders,
+    "native": probe_native,
     "threads": probe_threads,
     "networks": probe_networks,
 }

@@ -17,10 +17,12 @@ from filter_service.commands.plan_text import plan_summary, say_plan
 from filter_service.commands.setting_options import with_setting_options
 from filter_service.settings import (
     MAX_PUPIL_MM,
+    MAX_RENDER_TOLERANCE,
     MAX_VERGENCE_DPT,
     MIN_PUPIL_MM,
     Accumulation,
     DepthKind,
+    Engine,
     Output,
 )
 
@@ -99,6 +101,16 @@ def filter_image(
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
     ] = False,
+    render_tolerance: Annotated[
+        float,
+        typer.Option(help="Errors of rendering against the usual, 0 to 8: 0 is exact."),
+    ] = 1.0,
+    engine: Annotated[
+        Engine,
+        typer.Option(
+            help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
+        ),
+    ] = "auto",
     half: Annotated[
         bool, typer.Option("--half", help="Half floats in the .npy or .exr.")
     ] = False,
@@ -118,6 +130,7 @@ def filter_image(
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
     check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
+    check_range("--render-tolerance", render_tolerance, (0.0, MAX_RENDER_TOLERANCE))
 
     from estimator.profiles.files import load_profile
     from filter_service.commands import image_files
@@ -147,6 +160,8 @@ def filter_image(
             spec,
             accumulation=accumulation,
             merge=not no_merge,
+            render_tolerance=render_tolerance,
+            engine=engine,
             output=output,
             progress=progress,
         )
@@ -252,7 +267,8 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "start_ms": filtered.start_ms,
         "render_ms": filtered.render_ms,
         "stage_times_ms": dict(rendered.stage_times_ms),
-        "gl_renderer": filtered.gl_renderer,
+        "engine": filtered.engine,
+        "renderer": filtered.renderer,
         "plan": plan_summary(filtered.plan),
         "notes": [*filtered.eye_notes, *rendered.notes],
     }
@@ -269,5 +285,5 @@ def _report(summary: dict) -> None:
         f"{summary['profile']}, pupil {summary['pupil_diameter_mm']:g} mm, "
         f"focus {summary['focus_dpt']:.3g} dpt; "
         f"PSFs {summary['build_ms']:.0f} ms, start {summary['start_ms']:.0f} ms, "
-        f"frame {summary['render_ms']:.0f} ms on {summary['gl_renderer']}"
+        f"frame {summary['render_ms']:.0f} ms on {summary['renderer']}"
     )

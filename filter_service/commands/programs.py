@@ -32,6 +32,7 @@ class Bench(StrEnum):
     OCCLUSION = "occlusion"
     SEQUENCE = "sequence"
     COST = "cost"
+    PEERS = "peers"
     SWITCH = "switch"
     ROUNDTRIP = "roundtrip"
 
@@ -48,6 +49,7 @@ BENCH_MODULES = {
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SEQUENCE: "tests.benchmarks.bench_sequence",
     Bench.COST: "tests.benchmarks.bench_cost",
+    Bench.PEERS: "tests.benchmarks.bench_peers",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ROUNDTRIP: "clients.latency",
 }

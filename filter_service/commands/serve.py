@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from filter_service.settings import Engine
+
 
 def serve(
     bind: Annotated[
@@ -16,6 +18,12 @@ def serve(
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Settings file.")
+    ] = None,
+    engine: Annotated[
+        Engine | None,
+        typer.Option(
+            help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
+        ),
     ] = None,
     ready_file: Annotated[
         Path | None,
@@ -35,4 +43,4 @@ def serve(
 
     if config is not None and not config.is_file():
         raise ValueError(f"--config '{config}': no such file")
-    serving.run(load_config(config, bind=bind, ready_file=ready_file))
+    serving.run(load_config(config, bind=bind, engine=engine, ready_file=ready_file))

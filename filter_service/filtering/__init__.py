@@ -6,6 +6,7 @@ accepted_profile  one profile and the stores of it
 stream_eyes       which eye serves, and what is to be built
 workshop          one worker and one engine for all streams
 shared_workshop   the one that a process shares
+choose_engine     which one filters here, and why
 upload            a store on its way to the engine
 compile_loops     every compiled loop, made ahead on all cores
 load_ahead        what frames need, loaded while nobody asks

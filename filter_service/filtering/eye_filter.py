@@ -25,7 +25,7 @@ from filter_service.checked import checked
 from filter_service.errors import BadMessage, ServiceTimeout
 from filter_service.filtering.accepted_profile import AcceptedProfile
 from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
-from filter_service.filtering.shared_workshop import SHARED
+from filter_service.filtering.shared_workshop import shared
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
@@ -33,6 +33,7 @@ from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
     Accumulation,
+    Engine,
     FilterSettings,
     GazeDeg,
     Output,
@@ -82,6 +83,9 @@ class EyeFilter:
         Where eyes are made; all filters of a process share one unless told otherwise.
     max_cameras : int
         Cameras that are kept prepared.
+    engine : "auto", "gl" or "native"
+        What filters frames where the workshop is shared: compute shaders, or compiled
+        loops on all cores; "auto" takes gl on a hardware GPU, else native.
 
     Raises
     ------
@@ -100,13 +104,14 @@ class EyeFilter:
         on_event: Callable[[EyeEvent], None] | None = None,
         workshop: Workshop | None = None,
         max_cameras: int = 4,
+        engine: Engine = "auto",
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
         self.settings = settings
         self._on_event = on_event
-        self._is_shared = workshop is None
-        self._workshop: Workshop | None = workshop or SHARED.take()
+        self._shared = shared(engine) if workshop is None else None
+        self._workshop: Workshop | None = workshop or shared(engine).take()
         self._eyes = StreamEyes(self._take_event, max_cameras, self.cameras)
         self._workshop.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
@@ -132,8 +137,8 @@ class EyeFilter:
         if self._workshop is None:
             return
         self._workshop.end(self._eyes)
-        if self._is_shared:
-            SHARED.give_back()
+        if self._shared is not None:
+            self._shared.give_back()
         self._workshop = None
 
     @property
@@ -251,6 +256,7 @@ class EyeFilter:
         output: Output = "srgb8",
         accumulation: Accumulation = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
         timeout_s: float = 120.0,
     ) -> Filtered:
         """Filter one frame; waits where its eye is not ready for its camera yet.
@@ -274,6 +280,9 @@ class EyeFilter:
             they cover, or the published sum.
         merge : bool
             Let near-equal pixels share a splat; off is slower.
+        render_tolerance : float, 0 to 8
+            Errors of rendering against the usual, which leaves no visible difference;
+            0 is exact, more is faster.
         timeout_s : float
             For the eye to be prepared.
 
@@ -303,6 +312,7 @@ class EyeFilter:
                 output=output,
                 accumulation=accumulation,
                 merge=merge,
+                render_tolerance=render_tolerance,
             )
             if seen is not None:
                 return seen
@@ -318,6 +328,7 @@ class EyeFilter:
         output: Output = "srgb8",
         accumulation: Accumulation = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
     ) -> Filtered | None:
         """Filter one frame like `filter`; None while its eye is being prepared.
 
@@ -348,6 +359,7 @@ class EyeFilter:
                 focus_dpt=focus_dpt,
                 accumulation=accumulation,
                 merge=merge,
+                render_tolerance=render_tolerance,
                 output=output,
                 gaze_deg=gaze_deg,
             )

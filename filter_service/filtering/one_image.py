@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -9,18 +10,19 @@ from typing import Any
 import numpy as np
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.gl.gpu import Gpu
+from filter_service.filtering.choose_engine import open_engine
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.gl.renderer import FilterRenderer, Rendered
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     MAX_VERGENCE_DPT,
     Accumulation,
+    Engine,
     FilterSettings,
     Output,
 )
@@ -33,11 +35,12 @@ KEPT_ENERGY_RATIO = 0.998
 class FilteredImage:
     """A filtered image and how it came about."""
 
-    rendered: Rendered
+    rendered: FilteredView
     eye_notes: tuple[str, ...]
     spec: GridSpec
     plan: CachePlan
-    gl_renderer: str
+    engine: str
+    renderer: str
     build_ms: float
     start_ms: float
     render_ms: float
@@ -110,15 +113,20 @@ def filter_one_image(
     *,
     accumulation: Accumulation = "coverage",
     merge: bool = True,
+    render_tolerance: float = 1.0,
+    engine: Engine = "auto",
     output: Output = "linear",
     progress: Callable[[float, str], None] | None = None,
 ) -> FilteredImage:
-    """Build the PSFs that one view needs, start the GPU, and filter the view.
+    """Build the PSFs that one view needs, open an engine, and filter the view.
 
     Parameters
     ----------
     spec : GridSpec
         As `image_spec` gives it for the view.
+    render_tolerance : float
+        Errors of rendering against the usual; 0 is exact.
+    engine : "auto", "gl" or "native"
 
     Raises
     ------
@@ -131,27 +139,30 @@ def filter_one_image(
     eye, eye_notes = eye_for_spec(profile, spec)
     store = build_psf_store(eye, spec, progress=progress)
     clock_s.append(time.perf_counter())
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
-    handle = renderer.load(store)
-    clock_s.append(time.perf_counter())
-    rendered = renderer.render(
-        view,
-        handle,
-        pupil_diameter_mm=spec.settings.pupil_range_mm[0],
-        focus_dpt=spec.settings.focus_range_dpt[0],
-        accumulation=accumulation,
-        merge=merge,
-        output=output,
-    )
-    clock_s.append(time.perf_counter())
+    with ExitStack() as closing:
+        chosen = open_engine(engine, closing)
+        handle = chosen.engine.load(store)
+        clock_s.append(time.perf_counter())
+        rendered = chosen.engine.render(
+            view,
+            handle,
+            pupil_diameter_mm=spec.settings.pupil_range_mm[0],
+            focus_dpt=spec.settings.focus_range_dpt[0],
+            accumulation=accumulation,
+            merge=merge,
+            render_tolerance=render_tolerance,
+            output=output,
+        )
+        clock_s.append(time.perf_counter())
+        renderer = chosen.engine.name
     build_ms, start_ms, render_ms = (1000.0 * step for step in np.diff(clock_s))
     return FilteredImage(
         rendered=rendered,
         eye_notes=eye_notes,
         spec=spec,
         plan=store.plan,
-        gl_renderer=gpu.info["renderer"],
+        engine=chosen.name,
+        renderer=renderer,
         build_ms=float(build_ms),
         start_ms=float(start_ms),
         render_ms=float(render_ms),

@@ -1,9 +1,11 @@
-"""The workshop that all filters of a process share, as long as one of them is open."""
+"""The workshops that filters of a process share, one for each choice of engine."""
 
 from __future__ import annotations
 
 import atexit
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import cache
 
 from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.building.worker_handle import WorkerHandle
@@ -11,9 +13,19 @@ from filter_service.filtering.workshop import Workshop
 
 
 def open_workshop(
-    worker: WorkerHandle, limits: BuildLimits, closing: ExitStack
+    worker: WorkerHandle,
+    limits: BuildLimits,
+    closing: ExitStack,
+    *,
+    engine: str = "auto",
 ) -> Workshop:
     """Start the worker, and the engine while it gets ready; ``closing`` ends both.
+
+    Parameters
+    ----------
+    engine : "auto", "gl" or "native"
+        What filters frames; it also says what builds PSFs where the limits leave that
+        open.
 
     Raises
     ------
@@ -23,16 +35,13 @@ def open_workshop(
     closing.callback(worker.close)
     worker.start()
     # What takes long to import is imported while the worker process does the same.
-    from filter_service.gl.gpu import Gpu
-    from filter_service.rendering.gl.compile_passes import compile_passes
-    from filter_service.rendering.gl.renderer import FilterRenderer
+    from filter_service.filtering.choose_engine import open_engine
 
-    gpu = Gpu()
-    closing.callback(gpu.close)
-    engine = FilterRenderer(gpu)
-    compile_passes(engine)
-    # Here mypy sees that the renderer is a `FrameEngine`.
-    workshop = Workshop(worker, engine, limits)
+    chosen = open_engine(engine, closing, warm_up=True)
+    if limits.psf_engine == "auto":
+        limits = replace(limits, psf_engine=chosen.psf_engine)
+    # Here mypy sees that what is chosen is a `FrameEngine`.
+    workshop = Workshop(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(workshop.close)
     return workshop
 
@@ -40,7 +49,8 @@ def open_workshop(
 class _Shared:
     """One workshop and how many use it."""
 
-    def __init__(self) -> None:
+    def __init__(self, engine: str) -> None:
+        self._engine = engine
         self._workshop: Workshop | None = None
         self._closing = ExitStack()
         self._n_users = 0
@@ -51,7 +61,9 @@ class _Shared:
         if self._workshop is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
             with ExitStack() as closing:
-                self._workshop = open_workshop(WorkerHandle(), limits, closing)
+                self._workshop = open_workshop(
+                    WorkerHandle(), limits, closing, engine=self._engine
+                )
                 self._closing.push(closing.pop_all())
         self._n_users += 1
         return self._workshop
@@ -64,4 +76,7 @@ class _Shared:
             self._closing.close()
 
 
-SHARED = _Shared()
+@cache
+def shared(engine: str) -> _Shared:
+    """Return what filters of an engine share."""
+    return _Shared(engine)

@@ -57,6 +57,8 @@ class Workshop:
         Started, or to be started by the first `advance`; `close` ends it.
     engine : FrameEngine
     limits : BuildLimits
+    engine_name : str
+        Of the engine, among those that may be chosen.
     """
 
     def __init__(
@@ -64,9 +66,12 @@ class Workshop:
         worker: WorkerHandle,
         engine: FrameEngine,
         limits: BuildLimits,
+        *,
+        engine_name: str = "",
     ) -> None:
         self.worker = worker
         self.engine = engine
+        self.engine_name = engine_name
         self.streams: list[StreamEyes] = []
         self.frame_s = 0.0  # what the last frame took to filter
         self._limits = limits

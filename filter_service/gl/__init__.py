@@ -1,6 +1,7 @@
 """OpenGL: one owner of the context.
 
 gpu            context, buffers, textures, programs, timers
+hardware       which renderers are a GPU
 shader_source  shader text: includes, defines, line numbers
 """
 

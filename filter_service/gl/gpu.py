@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
+from filter_service.gl.hardware import is_software_renderer
 from filter_service.gl.shader_source import legend, load_shader
 
 Buffer = moderngl.Buffer
@@ -19,8 +20,6 @@ GROWTH = 1.25
 do not reallocate every frame."""
 
 ATLAS_TEXEL_BYTES = 16
-
-SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 
 
 class Gpu:
@@ -51,8 +50,7 @@ class Gpu:
             "vendor": info["GL_VENDOR"],
             "max_storage_block_bytes": info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"],
         }
-        name = self.info["renderer"].lower()
-        self.is_software = any(word in name for word in SOFTWARE_RENDERERS)
+        self.is_software = is_software_renderer(self.info["renderer"])
         self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
         self._buffers: dict[str, moderngl.Buffer] = {}
         self._programs: dict[tuple, moderngl.ComputeShader] = {}

@@ -253,6 +253,7 @@ def layer_distances_dpt(
     focused_dpt: NDArray[np.float64],
     blur_radius_px,
     max_blur_step_px: float,
+    step_ratio: float = 1.0,
 ) -> NDArray[np.float64]:
     """Object distances of a frame's layers, ascending.
 
@@ -264,6 +265,8 @@ def layer_distances_dpt(
     blur_radius_px : callable
         (n,) distances in dpt to (n, 3) blur radii in px.
     max_blur_step_px : float
+    step_ratio : float
+        Steps of blur against the usual.
 
     References
     ----------
@@ -279,7 +282,9 @@ def layer_distances_dpt(
     blur_px = blur_radius_px(base)
     change_px = np.abs(np.diff(blur_px, axis=0)).max(axis=1)
     smaller_px = np.minimum(blur_px[1:], blur_px[:-1]).min(axis=1)
-    step_px = [blur_step_px(px, max_blur_step_px) for px in smaller_px.tolist()]
+    step_px = [
+        step_ratio * blur_step_px(px, max_blur_step_px) for px in smaller_px.tolist()
+    ]
     steps = np.ceil(change_px / step_px - 1e-9).astype(np.int64).clip(min=1)
     return np.append(_between(base[:-1], base[1:], steps), base[-1])
 

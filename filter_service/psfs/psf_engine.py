@@ -8,6 +8,7 @@ from estimator.psf.compute import PsfBatch, compute_psf_batch
 from filter_service.constants import PSF_ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.gl.gpu import Gpu
+from filter_service.gl.hardware import may_have_gpu
 from filter_service.psfs.gpu_build import gpu_psf_batch
 
 CPU_BATCH = 768
@@ -56,7 +57,7 @@ def psf_engine(choice: str = "auto") -> PsfEngine:
     """
     if choice not in PSF_ENGINES:
         raise ValueError(f"psf_engine {choice!r}: allowed are {', '.join(PSF_ENGINES)}")
-    if choice == "cpu":
+    if choice == "cpu" or (choice == "auto" and not may_have_gpu()):
         return CPU
     try:
         gpu = Gpu()

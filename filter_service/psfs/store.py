@@ -138,6 +138,7 @@ def frame_layers(
     pupil_diameter_mm: float,
     focus_dpt: float,
     object_range_dpt: tuple[float, float] | None = None,
+    step_ratio: float = 1.0,
 ) -> FrameLayers:
     """Plan a frame's layers for a pupil and focus.
 
@@ -147,6 +148,8 @@ def frame_layers(
     ----------
     object_range_dpt : (low, high), optional
         Distances in the frame; default and limit is the cache's range.
+    step_ratio : float
+        Steps between layers against the usual.
 
     References
     ----------
@@ -181,6 +184,7 @@ def frame_layers(
             store.tables, reads, layer_zero_dpt, at_dpt
         ),
         max_blur_step_px=store.spec.max_blur_step_px,
+        step_ratio=step_ratio,
     )
     return FrameLayers(
         layer_dpt=layer_dpt,

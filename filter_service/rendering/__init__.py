@@ -1,6 +1,10 @@
 """From a frame and the cache to the filtered picture.
 
 engine         what every frame engine offers
+frame_options  what a frame asks for, checked
+filtered_view  what every engine answers
+white_level    light against which contrast counts
+perfect_eye    a store that changes nothing, to try engines with
 frame          a view made ready: depth filled, colour finite
 gaze           where the eye looks, within what was prepared
 image_cells    cells of the image that share kernels
@@ -9,10 +13,10 @@ map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
-perfect_store  the smallest store, of a perfect eye
 plan_once      what plans need, loaded ahead
 reference      numpy twins of the passes
 gl/            the engine of compute shaders
+native/        the engine of compiled loops
 """
 
 import lazy_loader

@@ -37,8 +37,7 @@ class MapTables(NamedTuple):
 class CellMaps:
     """Maps of cells, each to its four field nodes.
 
-    A kernel's part is mapped where ``change_ratio`` times its radius is more than
-    ``map_loops.UNMOVED_PX``; else it is read as stored.
+    A kernel's part is mapped where `moves` says so; else it is read as stored.
 
     Attributes
     ----------

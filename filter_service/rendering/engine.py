@@ -73,10 +73,16 @@ class FrameEngine(Protocol):
         focus_dpt: float,
         accumulation: Accumulation = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
         output: Output = "linear",
         gaze_deg: tuple[float, float] | None = None,
     ) -> Rendered:
         """Filter one view through the eye of a loaded store.
+
+        Parameters
+        ----------
+        render_tolerance : float
+            0 is exact, 1 leaves no visible difference, more is faster.
 
         Raises
         ------

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.constants import TILE_SIZE_PX
 from filter_service.rgbd_view import RgbdView
 
 IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
@@ -30,6 +31,17 @@ def fill_missing_depth(
         missing, return_distances=False, return_indices=True
     )
     return depth_m[rows, columns], count
+
+
+def border_px_of(view: RgbdView, reach_px: int) -> int:
+    """Return columns and rows to add around a view with a hidden layer, whole tiles.
+
+    Next to the border of an image no surface is whole, for part of its light would come
+    from beyond; what it hides would shine through.  So the image goes on, as its edge.
+    """
+    if view.surface_count == 1:
+        return 0
+    return -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
 
 
 def extended(view: RgbdView, border_px: int) -> RgbdView:

@@ -20,7 +20,8 @@ from filter_service.constants import (
     RGB,
 )
 from filter_service.psfs.boxes import box_sizes, pack_reach
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.read_kernels import StoreTables
+from filter_service.psfs.store import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 
 
@@ -101,7 +102,7 @@ def interval_count(layers: FrameLayers) -> int:
 
 
 def frame_kernels(
-    store: PsfStore,
+    tables: StoreTables,
     layers: FrameLayers,
     image: ImageCells,
     used: NDArray[np.bool_],
@@ -110,6 +111,8 @@ def frame_kernels(
 
     Parameters
     ----------
+    tables : StoreTables
+        Of the store; what it has as offsets stands in the recipes.
     used : (n_cells, n_intervals)
     """
     from filter_service.rendering.kernel_loops import fill_kernels, used_nodes
@@ -122,7 +125,7 @@ def frame_kernels(
         weight_ratio,
         n_fields,
     )
-    nodes = _node_kernels(store, layers, *pairs)
+    nodes = _node_kernels(tables, layers, *pairs)
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
     made = {
         "weight_ratio": np.empty(parts.shape),
@@ -146,7 +149,7 @@ def frame_kernels(
 
 
 def _node_kernels(
-    store: PsfStore, layers: FrameLayers, fields: NDArray, intervals: NDArray
+    tables: StoreTables, layers: FrameLayers, fields: NDArray, intervals: NDArray
 ) -> NodeKernels:
     from filter_service.rendering.kernel_loops import fill_recipes, used_recipes
 
@@ -158,7 +161,7 @@ def _node_kernels(
     reach_px, radius_px = np.empty((count, 4), np.int64), np.empty(count, np.int64)
     peak_ratio, spread_px = np.empty(count), np.empty(count)
     fill_recipes(
-        store.tables,
+        tables,
         layers.reads,
         recipe_fields,
         layers.layer_dpt[recipe_layers, None] + layers.layer_zero_dpt[recipe_fields],

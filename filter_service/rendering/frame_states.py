@@ -1,5 +1,6 @@
 """What of a frame depends on the eye's state alone, kept while the state stays."""
 
+import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,15 @@ from numpy.typing import NDArray
 
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
+
+LAYER_STEP_RATIOS = (0.2, 2.0)
+"""Finest and widest steps of layers against the usual; at the finest, layers leave less
+than the 16 bits of kernels do."""
+
+
+def layer_step_ratio(tolerance: float) -> float:
+    """Return steps of layers against the usual: their error grows as their square."""
+    return min(max(math.sqrt(tolerance), LAYER_STEP_RATIOS[0]), LAYER_STEP_RATIOS[1])
 
 
 class Timer(Protocol):
@@ -46,7 +56,7 @@ class FrameStates:
     def _start_anew(self, handle: FrameStore | None) -> None:
         self._handle = handle
         self._cell_px: int | None = None
-        self._layers: tuple[tuple[float, float], FrameLayers] | None = None
+        self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
 
@@ -60,10 +70,11 @@ class FrameStates:
         handle: FrameStore,
         pupil_diameter_mm: float,
         focus_dpt: float,
+        tolerance: float = 1.0,
     ) -> FrameLayers:
-        """Layers of a pupil and focus."""
+        """Layers of a pupil and focus, at a tolerance of rendering."""
         self._forget_others(handle)
-        state = (pupil_diameter_mm, focus_dpt)
+        state = (pupil_diameter_mm, focus_dpt, tolerance)
         if self._layers is None or self._layers[0] != state:
             with timer.wall("psf_plan_ms"):
                 self._layers = (
@@ -72,6 +83,7 @@ class FrameStates:
                         handle.store,
                         pupil_diameter_mm=pupil_diameter_mm,
                         focus_dpt=focus_dpt,
+                        step_ratio=layer_step_ratio(tolerance),
                     ),
                 )
         return self._layers[1]

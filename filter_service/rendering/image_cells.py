@@ -31,6 +31,10 @@ MAX_CELL_PX = 256
 CORNERS = 4
 
 
+class KernelsTooLarge(Exception):
+    """A frame's kernels take too much; those of larger cells take less."""
+
+
 @dataclass(frozen=True)
 class ImageCells:
     """Cells of an image, in scan order.

@@ -16,7 +16,7 @@ from filter_service.constants import (
     WEIGHT_MAX,
 )
 from filter_service.psfs.read_loops import channel_taps, clipped
-from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, mapped_reach
+from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
 
 CORNERS = 4
 MIN_SPREAD_PX = 1e-9
@@ -169,7 +169,7 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
             for side in range(4):
                 side_px[side] = node_reach_px[part, side]
             area = box = 1.0
-            is_moved = maps.change_ratio[cell, j] * widest_px > UNMOVED_PX
+            is_moved = moves(maps.change_ratio[cell, j], widest_px)
             for row in range(2):
                 for column in range(2):
                     own = maps.node_from_cell[cell, j, row, column]

@@ -8,6 +8,12 @@ UNMOVED_PX = 0.5
 """Light that a map would move by less stays where it is stored: between stored pixels
 it would blur by as much."""
 
+UNMOVED_RATIO = 0.1
+"""Maps that change a kernel's size by less are left out: what four field nodes around a
+cell differ in is blended away.  At 5 mm over the field of the demo that leaves 63 to 69
+dB to the picture with all maps (cataract, myopia, keratoconus), and takes half of the
+time of the blend."""
+
 MAX_REACH_PX = 255
 """A byte a side; light that a map takes beyond it is cut."""
 
@@ -29,6 +35,12 @@ def fill_ratios(maps, inverse, ratios):
             ratios[2, cell, j] = longest / abs(area)
             off = (a - 1.0) ** 2 + b**2 + c**2 + (d - 1.0) ** 2
             ratios[3, cell, j] = math.sqrt(off)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def moves(change_ratio, radius_px):
+    """Whether a map is worth applying to a kernel."""
+    return change_ratio > UNMOVED_RATIO and change_ratio * radius_px > UNMOVED_PX
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

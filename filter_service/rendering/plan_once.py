@@ -17,10 +17,12 @@ from filter_service.rendering.frame_kernels import (
     work_list,
 )
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.perfect_store import PUPIL_MM, perfect_store
-
-SIDE_PX = 16
-TANGENTS = (-0.01, 0.01, 0.01, -0.01)
+from filter_service.rendering.perfect_eye import (
+    PUPIL_MM,
+    SIDE_PX,
+    TANGENTS,
+    perfect_store,
+)
 
 
 def plan_once() -> None:
@@ -31,7 +33,7 @@ def plan_once() -> None:
     layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
     image = image_cells(store.spec, store.plan)
     used = np.ones((image.count, interval_count(layers)), bool)
-    kernels = frame_kernels(store, layers, image, used)
+    kernels = frame_kernels(store.tables, layers, image, used)
     node_table(kernels.nodes)
     _, n_texels = kernel_table(kernels)
     work_list(n_texels[:, 0], SIDE_PX)

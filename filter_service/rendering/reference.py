@@ -193,7 +193,7 @@ def gather(
     cell = np.broadcast_to(cell_index(view, image, border_px), holds.shape)
     used = np.zeros((image.count, n_intervals), bool)
     used[cell[holds], interval[holds]] = True
-    kernels = frame_kernels(store, layers, image, used)
+    kernels = frame_kernels(store.tables, layers, image, used)
     kernel_of = np.zeros(used.shape, np.int64)
     kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     kernel = kernel_of[cell, interval]

@@ -10,7 +10,7 @@ from typing import Any
 
 from estimator.threads import MAX_THREADS
 from filter_service.building.jobs import BuildLimits, default_cache_dir
-from filter_service.constants import PSF_ENGINES
+from filter_service.constants import ENGINES, PSF_ENGINES
 from filter_service.messages import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
@@ -39,8 +39,12 @@ class ServiceConfig:
         A profile that needs a wider kernel is refused.
     max_store_mb : int
         A profile that needs more memory for its PSFs is refused.
+    engine : "auto", "gl" or "native"
+        What filters frames and, unless ``psf_engine`` says otherwise, computes PSFs:
+        a GPU's compute shaders, or compiled loops on all cores.  "auto" takes gl on a
+        hardware GPU, else native.
     psf_engine : "auto", "cpu" or "gpu"
-        What computes PSFs; "auto" takes a hardware GPU where there is one.
+        What computes PSFs, where it shall be another than the engine's.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
@@ -73,6 +77,7 @@ class ServiceConfig:
     max_profile_kb: int = 1024
     max_blur_radius_px: int = 255
     max_store_mb: int = 2000
+    engine: str = "auto"
     psf_engine: str = "auto"
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
@@ -86,10 +91,11 @@ class ServiceConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot work, naming the setting."""
         _check_bind(self.bind, self.allow_remote)
-        if self.psf_engine not in PSF_ENGINES:
-            raise ValueError(
-                f"psf_engine is {self.psf_engine!r}; allowed: {', '.join(PSF_ENGINES)}"
-            )
+        for name, allowed in (("engine", ENGINES), ("psf_engine", PSF_ENGINES)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}"
+                )
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:

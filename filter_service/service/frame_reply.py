@@ -35,6 +35,7 @@ def frame_reply(
             output=OUTPUT_OF_FORMAT[frame.output],
             accumulation=frame.options.accumulation,
             merge=frame.options.merge,
+            render_tolerance=frame.options.render_tolerance,
         )
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)

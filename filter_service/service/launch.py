@@ -71,5 +71,7 @@ def run(config: ServiceConfig) -> None:
         from filter_service.building.read_profile import read_profile
         from filter_service.filtering.shared_workshop import open_workshop
 
-        workshop = open_workshop(worker, config.build_limits, closing)
+        workshop = open_workshop(
+            worker, config.build_limits, closing, engine=config.engine
+        )
         serve(config, workshop=workshop, read_profile=read_profile)

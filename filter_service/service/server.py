@@ -229,7 +229,9 @@ class FilterServer:
         server = {
             "name": "ocufilter",
             "version": package_version(),
-            "gl_renderer": self._workshop.engine.name,
+            "engine": self._workshop.engine_name,
+            "renderer": self._workshop.engine.name,
+            "gl_renderer": self._workshop.engine.name,  # what it was called before
         }
         transport = self.endpoint.split("://", 1)[0]
         self._send(

@@ -18,6 +18,7 @@ from filter_service.settings import (
     FilterSettings,
     GazeDeg,
     PupilMm,
+    RenderTolerance,
     VergenceDpt,
 )
 from filter_service.wire.images import (
@@ -83,6 +84,7 @@ class FrameOptions(Record):
 
     accumulation: Accumulation = "coverage"
     merge: bool = True
+    render_tolerance: RenderTolerance = 1.0
 
 
 @dataclass(frozen=True)

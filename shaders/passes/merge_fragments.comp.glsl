@@ -30,6 +30,7 @@ uniform ivec2 frame_size_px;
 uniform int layer_count;
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 uniform float white_level;
+uniform float tolerance;          // of merging, against the usual
 uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
 uniform int paper_order;          // sort as the paper does: metres plus scan position
@@ -116,9 +117,10 @@ bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
     // Neighbouring intervals at most: the kernel of the mean is then one of theirs.
     return spread >= MERGE_MIN_SPREAD_PX
         && floor(place.z) - floor(place.y) <= 1.0
-        && largest <= white_level * MERGE_CONTRAST * pow(spread, MERGE_CONTRAST_POWER)
+        && largest <= tolerance * white_level * MERGE_CONTRAST
+                      * pow(spread, MERGE_CONTRAST_POWER)
         && (most.a - least.a) * blur_px_per_dpt
-           <= max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
+           <= tolerance * max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
         && kernel_has_level(kernel, level);
 }
 

@@ -23,7 +23,8 @@ class Filtered:
         PSFs as the method keeps them, at the bytes a texel that it is published with.
     psf_count : int
     tap_count : int
-        PSF samples read for the frame; 0 for methods that convolve by FFT.
+        PSF samples that the frame needs, without those that a tile reads beyond a PSF;
+        0 where nothing counts them, as with methods that convolve by FFT.
     """
 
     color: NDArray[np.float64]

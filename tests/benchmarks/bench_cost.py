@@ -8,8 +8,9 @@ camera's pixels are as large as the radius in px asks for.  Frames are a texture
 at infinity and *Courtyard* with its own distances, each with and without merging.
 Kernels are counted over layers (blur step) and over the field (cells).
 
-Every row has the evaluations it took (tile list entries times the pixels of a tile) and
-what merging adds as an error.  Laws are slopes of log time; the unit that a pass's time
+Every row has the evaluations it took, counted fragment by fragment and tile by tile
+(`splat_work`), how many of them lay within a kernel, and what merging adds as an error.
+Laws are slopes of log time; the unit that a pass's time
 follows most closely says what bounds it.
 """
 
@@ -25,16 +26,16 @@ from scipy.signal import fftconvolve
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from filter_service.constants import THREADS, TILE_SIZE_PX
-from filter_service.gl.gpu import Gpu
+from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
 from tests.benchmarks.dense_reference import EyeState, dense_reference, linear_color
+from tests.benchmarks.engines import counted_work, open_renderer, working_memory_mb
 from tests.benchmarks.field_pictures import plot_costs
+from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.harness import (
     OUT,
     RESULTS,
@@ -122,8 +123,8 @@ VIEWS = {"plane": plane_view, "courtyard": courtyard_view}
 class CostBench:
     """One view before the eye of -6 dpt, on axis."""
 
-    def __init__(self, renderer: FilterRenderer, gpu: Gpu, view: RgbdView, **settings):
-        self.renderer, self.gpu, self.view = renderer, gpu, view
+    def __init__(self, renderer, view: RgbdView, **settings):
+        self.renderer, self.view = renderer, view
         with np.errstate(divide="ignore"):
             nearest_dpt = float(np.nanmax(1.0 / view.depth_m))
         self.spec = grid_spec(
@@ -154,8 +155,8 @@ class CostBench:
 class FieldBench(CostBench):
     """*Courtyard* through a traced eye, on axis or over the visual field."""
 
-    def __init__(self, renderer: FilterRenderer, gpu: Gpu, size, mode: str):
-        self.renderer, self.gpu = renderer, gpu
+    def __init__(self, renderer, size, mode: str):
+        self.renderer = renderer
         up = math.tan(math.radians(VERTICAL_FOV_DEG / 2))
         self.view = courtyard_view(*size, 2000.0 * up / size[1])
         self.spec = grid_spec(
@@ -207,6 +208,7 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
     for method in methods:
         frames = _frames(case, MERGING[method])
         last = frames[-1]
+        work = counted_work(case.renderer, view, last)
         pictures[method] = last.color.astype(np.float64)
         merging_db = None
         if method == "merged" and "unmerged" in pictures:
@@ -221,7 +223,7 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
                 n=len(frames),
                 median_ms=float(np.median(totals_ms)),
                 p95_ms=float(np.percentile(totals_ms, 95)),
-                memory_mb=case.gpu.memory_mb,
+                memory_mb=working_memory_mb(case.renderer),
                 error_name="psnr_db",
                 error=channel_psnr_db(pictures[method], truth),
                 reference=case.reference_name,
@@ -231,7 +233,8 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
                 fragment_count=last.fragment_count,
                 merged_ratio=last.merged_count / pixel_count,
                 entry_count=last.entry_count,
-                evaluation_count=last.entry_count * THREADS,
+                evaluation_count=work.evaluation_count,
+                lit_count=work.lit_count,
                 kernel_count=last.kernel_count,
                 kernel_texel_count=last.kernel_texel_count,
                 layer_count=last.layer_count,
@@ -245,15 +248,15 @@ def bench(case: CostBench, sweep: str, name: str, radius_px: float) -> list[Cost
 
 
 def _frames(case: CostBench, merge: bool) -> list:
-    """Frames whose kernels are made anew; the first compiles, unless it is all."""
-    frames, budget_ms = [], BUDGET_MS
-    while budget_ms > 0.0 and len(frames) <= MAX_REPEATS:
-        frame = FilterRenderer(case.gpu).render(
-            case.view, case.handle, **case.state, merge=merge
+    """Frames whose kernels are made anew: one, or as many as the budget allows."""
+    options = {**case.state, "merge": merge}
+    run = timed_frames(case.renderer, case.view, case.handle, repeats=1, **options)
+    repeats = min(int(BUDGET_MS / run.median_ms), MAX_REPEATS)
+    if repeats > 1:
+        run = timed_frames(
+            case.renderer, case.view, case.handle, repeats=repeats, **options
         )
-        frames.append(frame)
-        budget_ms -= sum(frame.stage_times_ms.values())
-    return frames[1:] or frames
+    return run.frames
 
 
 def _stages(frames: list) -> dict[str, float]:
@@ -265,14 +268,14 @@ def _stages(frames: list) -> dict[str, float]:
     }
 
 
-def radius_rows(renderer, gpu, radii, size) -> list[CostRow]:
+def radius_rows(renderer, radii, size) -> list[CostRow]:
     """Blur radius at one resolution."""
     return [
         row
         for name, make in VIEWS.items()
         for radius_px in radii
         for row in bench(
-            CostBench(renderer, gpu, make(*size, BLUR_MRAD / radius_px)),
+            CostBench(renderer, make(*size, BLUR_MRAD / radius_px)),
             "radius",
             name,
             float(radius_px),
@@ -280,7 +283,7 @@ def radius_rows(renderer, gpu, radii, size) -> list[CostRow]:
     ]
 
 
-def resolution_rows(renderer, gpu, sizes) -> list[CostRow]:
+def resolution_rows(renderer, sizes) -> list[CostRow]:
     """Resolution at one radius, and at one field of view, whose blur grows with it."""
     rows = []
     for size in sizes:
@@ -290,21 +293,21 @@ def resolution_rows(renderer, gpu, sizes) -> list[CostRow]:
             f"plane, {VERTICAL_FOV_DEG:.0f} deg": 2000.0 * up / size[1],
         }
         for name, pixel_mrad in pixels_mrad.items():
-            case = CostBench(renderer, gpu, plane_view(*size, pixel_mrad))
+            case = CostBench(renderer, plane_view(*size, pixel_mrad))
             rows += bench(case, "resolution", name, BLUR_MRAD / pixel_mrad)
     return rows
 
 
-def kernel_rows(renderer, gpu, size, steps_px, modes) -> list[CostRow]:
+def kernel_rows(renderer, size, steps_px, modes) -> list[CostRow]:
     """Kernels by layers (finer blur steps) and by cells (over the field)."""
     rows = []
     view = courtyard_view(*size, BLUR_MRAD / STEPS_RADIUS_PX)
     view = replace(view, depth_m=view.depth_m / LAYERS_NEARER)
     for step_px in steps_px:
-        case = CostBench(renderer, gpu, view, max_blur_step_px=step_px)
+        case = CostBench(renderer, view, max_blur_step_px=step_px)
         rows += bench(case, "kernels", "courtyard, layers", float(STEPS_RADIUS_PX))
     for mode in modes:
-        case = FieldBench(renderer, gpu, size, mode)
+        case = FieldBench(renderer, size, mode)
         rows += bench(case, "kernels", "courtyard, cells", 0.0)
     return rows
 
@@ -319,21 +322,18 @@ def main() -> None:
     arguments = parser.parse_args()
     is_whole = arguments.sweeps == SWEEPS and not arguments.quick
     quick = arguments.quick
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
+    renderer = open_renderer("gl")  # which tells what it evaluates
     size = QUICK["size"] if quick else SIZE
     rows = []
     if "radius" in arguments.sweeps:
-        rows += radius_rows(renderer, gpu, QUICK["radii"] if quick else RADII_PX, size)
+        rows += radius_rows(renderer, QUICK["radii"] if quick else RADII_PX, size)
     if "resolution" in arguments.sweeps:
-        rows += resolution_rows(renderer, gpu, QUICK["sizes"] if quick else SIZES)
+        rows += resolution_rows(renderer, QUICK["sizes"] if quick else SIZES)
     if "kernels" in arguments.sweeps:
         steps_px = BLUR_STEPS_PX[::2] if quick else BLUR_STEPS_PX
         modes = FIELD_MODES[:2] if quick else FIELD_MODES
-        rows += kernel_rows(renderer, gpu, size, steps_px, modes)
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+        rows += kernel_rows(renderer, size, steps_px, modes)
+    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
     content["laws"] = [asdict(law) for law in laws(rows)]
     content["bounds"] = [asdict(bound) for bound in bounds(rows)]
     if arguments.json:
@@ -353,6 +353,7 @@ def _work(row: CostRow) -> str:
     return (
         f"{row.case:<20}{row.method:<10}{row.setting:<18}{row.median_ms:9.1f} ms "
         f"{row.error:5.1f} dB, {row.evaluation_count:.3g} evaluations, "
+        f"{row.lit_count / row.evaluation_count:.0%} lit, "
         f"{row.kernel_count} kernels of {row.layer_count} layers, "
         f"{row.merged_ratio:.0%} merged{merging}"
     )

@@ -1,7 +1,9 @@
 """Frame time against PSNR, by pass, beside the sorted gather in the same run.
 
-Usage: python -m tests.benchmarks.bench_render [--quick] [--json]
+Usage: python -m tests.benchmarks.bench_render [--quick] [--json] [--engine NAME]
 
+Pupil and focus change from frame to frame, so that its kernels are made anew; the row
+"tiles frozen" repeats one state.
 Error: PSNR in linear light against the float64 sorted gather with the same layers.
 """
 
@@ -12,18 +14,17 @@ import time
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
+from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.harness import (
     Row,
     machine_info,
     memory_mb,
     print_rows,
     report,
-    time_calls,
     write_report,
 )
 from tests.grid_specs import grid_spec
@@ -41,12 +42,13 @@ EYES = {
 }
 VARIANTS = {
     "tiles": {},
+    "tiles frozen": {"frozen": True},
     "tiles unmerged": {"merge": False},
     "tiles paper rule": {"accumulation": "paper"},
 }
 
 
-def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
+def bench_case(renderer, scene, size, eye, body, repeats) -> list[Row]:
     """Rows of one scene, size and eye."""
     view = scene_view(scene, width_px=size[0], height_px=size[1])
     spec = grid_spec(
@@ -69,7 +71,11 @@ def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
             n=n,
             median_ms=median_ms,
             p95_ms=p95_ms,
-            memory_mb=gpu.memory_mb if method.startswith("tiles") else memory_mb(),
+            memory_mb=(
+                working_memory_mb(renderer)
+                if method.startswith("tiles")
+                else memory_mb()
+            ),
             error_name="psnr_db",
             error=error_db,
             reference=REFERENCE,
@@ -86,18 +92,13 @@ def bench_case(renderer, gpu, scene, size, eye, body, repeats) -> list[Row]:
         for rule, ms in zip(truth, gather_ms, strict=True)
     ]
     for method, options in VARIANTS.items():
-        results = []
-
-        def filtered(options=options, results=results):
-            results.append(renderer.render(view, handle, **STATE, **options))
-
-        median_ms, p95_ms = time_calls(filtered, repeats=repeats)
+        run = timed_frames(renderer, view, handle, **STATE, repeats=repeats, **options)
         error_db = psnr_db(
-            results[-1].color, truth[options.get("accumulation", "coverage")]
+            run.last.color, truth[options.get("accumulation", "coverage")]
         )
-        rows.append(row(method, repeats, median_ms, p95_ms, error_db))
+        rows.append(row(method, repeats, run.median_ms, run.p95_ms, error_db))
         if method == "tiles":
-            rows += pass_rows(row, results[-repeats:], error_db)
+            rows += pass_rows(row, run.frames, error_db)
     handle.release()
     return rows
 
@@ -120,9 +121,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="320x180, courtyard only")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     arguments = parser.parse_args()
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
+    renderer = open_renderer(arguments.engine)
     sizes = [(320, 180)] if arguments.quick else [(320, 180), (1280, 720)]
     scenes = ["courtyard"] if arguments.quick else ["courtyard", "primitives"]
     repeats = 3 if arguments.quick else 7
@@ -131,11 +132,9 @@ def main() -> None:
         for size in sizes
         for scene in scenes
         for eye, body in EYES.items()
-        for row in bench_case(renderer, gpu, scene, size, eye, body, repeats)
+        for row in bench_case(renderer, scene, size, eye, body, repeats)
     ]
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
     if arguments.json:
         # JSON has no infinity: the gather is its own reference.
         print(json.dumps(_finite(content)))

@@ -26,9 +26,11 @@ class CostRow(Row):
         Scene, with what else is fixed.
     radius_px : float
         Blur of the farthest point by geometrical optics.
-    entry_count, evaluation_count : int
-        Tile list entries, and PSF weights read for them: one for each of a tile's
-        pixels.
+    entry_count : int
+        Of the bins' lists; each stands for one to four tiles.
+    evaluation_count, lit_count : int
+        PSF weights read: for each fragment of a tile one at each of its pixels; and
+        those of them within the kernel's box.
     merged_ratio : float
         Of the pixels.
     merging_db : float or None
@@ -44,6 +46,7 @@ class CostRow(Row):
     merged_ratio: float
     entry_count: int
     evaluation_count: int
+    lit_count: int
     kernel_count: int
     kernel_texel_count: int
     layer_count: int

@@ -1,10 +1,20 @@
 """Dense reference: every source pixel through the exact PSF of its own direction.
 
-Nothing is shared with the renderer but the eye and the PSF engine: no grid of PSFs,
-no cells, no layers, no merging, no tiles.  Sources are sorted near to far once and
-splat in that order, which gives every output pixel the sequence that a sorted gather
-gives it: one depth after the other shares what nearer ones leave free, and light over
-coverage in the end.
+No grid of PSFs, no cells, no layers, no merging, no tiles.  Sources are sorted near to
+far once and splat in that order, which gives every output pixel the sequence that a
+sorted gather gives it: one depth after the other shares what nearer ones leave free,
+and light over coverage in the end.
+
+Shared with the renderer, so that errors there do not show:
+
+- the eye, the PSF engine, and the pinhole's geometry (direction and scale of a pixel);
+- the rule of accumulation: what is one depth (`DISCONTINUITY_PX` of geometrical blur),
+  that its sources share the room, and what counts as no light (`MIN_COVERAGE`).  That
+  it is right is for `lens_reference` to say;
+- missing depth: the function that fills it.
+
+Distances, colours, order and sums are this file's own, or the float64 twins' of what
+the renderer's passes compute.
 
 PSFs are computed in batches along the order, so memory does not grow with the image.
 Results are kept under out/, by what went in: pictures, camera, eye, state and PSFs.
@@ -222,10 +232,7 @@ def _filtered(
     coverage = np.zeros_like(light)
     # Of the depth that is being added to each pixel: nearest distance, light, coverage.
     depths = np.zeros((3, *light.shape))
-    step_dpt = np.inf
-    if accumulation == "coverage":
-        blur_px_per_dpt = state.spec.blur_px_per_dpt(state.pupil_diameter_mm)
-        step_dpt = DISCONTINUITY_PX / blur_px_per_dpt
+    step_dpt = depth_step_dpt(state)
     for part, found, place_of in _batches(places):
         psfs = state.exact_psfs(*found.T)
         pixels = order[part]
@@ -242,11 +249,13 @@ def _filtered(
             light,
             coverage,
         )
-    if accumulation == "coverage":
-        share = np.minimum((1.0 - coverage) / np.maximum(depths[2], MIN_COVERAGE), 1.0)
-        light += share * depths[1]
-        coverage += share * depths[2]
+    close_depths(depths, light, coverage)
     return normalised(light, coverage, linear_color(view))
+
+
+def depth_step_dpt(state: EyeState) -> float:
+    """Distance up to which sources are at one depth: `DISCONTINUITY_PX` of blur."""
+    return DISCONTINUITY_PX / state.spec.blur_px_per_dpt(state.pupil_diameter_mm)
 
 
 def _batches(places: NDArray):
@@ -278,14 +287,32 @@ def normalised(
     return np.where(covered, light / np.where(covered, coverage, 1.0), unfiltered)
 
 
+def close_depths(depths: NDArray, light: NDArray, coverage: NDArray) -> None:
+    """`close_depth` of all pixels at once."""
+    share = np.minimum((1.0 - coverage) / np.maximum(depths[2], MIN_COVERAGE), 1.0)
+    light += share * depths[1]
+    coverage += share * depths[2]
+
+
 @njit(cache=True)
-def _close_depth(at, depths, light, coverage):
+def close_depth(at, depths, light, coverage):
     """Add what a pixel has of one depth: its share of what nearer ones leave free."""
     share = min((1.0 - coverage[at]) / max(depths[2][at], MIN_COVERAGE), 1.0)
     light[at] += share * depths[1][at]
     coverage[at] += share * depths[2][at]
     depths[1][at] = 0.0
     depths[2][at] = 0.0
+
+
+@njit(cache=True)
+def add_to_depth(at, weight, color, distance_dpt, step_dpt, depths, light, coverage):
+    """Add a source to the depth that a pixel is at, or begin the next one with it."""
+    if depths[0][at] - distance_dpt > step_dpt:
+        close_depth(at, depths, light, coverage)
+    if depths[2][at] == 0.0:
+        depths[0][at] = distance_dpt
+    depths[1][at] += weight * color
+    depths[2][at] += weight
 
 
 @njit(parallel=True, cache=True)
@@ -337,12 +364,16 @@ def add_sources(
                             continue
                         if rule == 0:
                             at = (c, to_y, to_x)
-                            if depths[0][at] - distance_dpt[n] > step_dpt:
-                                _close_depth(at, depths, light, coverage)
-                            if depths[2][at] == 0.0:
-                                depths[0][at] = distance_dpt[n]
-                            depths[1][at] += weight * color[n, c]
-                            depths[2][at] += weight
+                            add_to_depth(
+                                at,
+                                weight,
+                                color[n, c],
+                                distance_dpt[n],
+                                step_dpt,
+                                depths,
+                                light,
+                                coverage,
+                            )
                             continue
                         if rule == 1:
                             weight = weight * (1.0 - coverage[c, to_y, to_x])

@@ -1,19 +1,18 @@
 """All methods of `bench_field` on one footing: a view and a state in, an image out."""
 
 import time
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered
 from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.engines import counted_work
+from tests.benchmarks.frame_runs import WARM_UPS, timed_frames
 from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
 from tests.benchmarks.paper_baselines import (
     paper_dynamic,
@@ -55,17 +54,26 @@ class Method:
         Which reference it aims at: one PSF per distance, or the whole visual field.
     any_state : bool
         Whether pupil and focus may be anything without a new preparation.
+    frozen : bool
+        Whether frames repeat one state, and what was made for it, in place of changing
+        it from frame to frame; the name then ends in `FROZEN`.
+    timed : bool
+        Whether its frames are timed, all alike: after a warm-up, several times.  Others
+        are written to be right and not to be fast; their work is counted.
     """
 
     name: str
     on_axis: bool
     any_state: bool
+    frozen: bool = field(default=False, kw_only=True)
+    timed: bool = field(default=True, kw_only=True)
 
     @property
     def published_name(self) -> str | None:
         """What of the paper's tables stands beside this method."""
-        if self.name in ON_AXIS:
-            return self.name
+        name = self.name.removesuffix(FROZEN)
+        if name in ON_AXIS:
+            return name
         if self.name.startswith(("ours", "paper")):
             return "paper on-axis" if self.on_axis else OFF_AXIS
         return None
@@ -78,8 +86,8 @@ class Method:
 class EyeBench:
     """One eye before one camera: states for references, and stores for the renderer."""
 
-    def __init__(self, gpu: Gpu, name: str, views: list[RgbdView]):
-        self._gpu, self._name = gpu, name
+    def __init__(self, renderer, name: str, views: list[RgbdView]):
+        self.renderer, self._name = renderer, name
         self._camera = {
             "width_px": views[0].width_px,
             "height_px": views[0].height_px,
@@ -92,6 +100,13 @@ class EyeBench:
         steps = np.ceil(nearest_dpt / DISTANCE_STEP_DPT)
         self._object_range_dpt = (0.0, float(DISTANCE_STEP_DPT * steps))
         self._stores = {}
+        self._runs = {}
+
+    def once(self, key: tuple, run) -> list:
+        """Return what ``run`` does, of this very key for the first time."""
+        if key not in self._runs:
+            self._runs[key] = run()
+        return self._runs[key]
 
     def spec(self, mode: str, **settings) -> GridSpec:
         """Spec for this camera and these depths."""
@@ -115,9 +130,9 @@ class EyeBench:
         return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
 
     def store(self, method: "Ours", state: State):
-        """Store of a method of ours, on the GPU, and how long it took to build."""
+        """Store of a method of ours, loaded, and how long it took to build."""
         settings = method.settings(state)
-        key = (method.name, *settings.values())
+        key = tuple(settings.values())
         if key not in self._stores:
             spec = self.spec(**settings)
             eye = traced_eye(self._name, spec)
@@ -127,16 +142,12 @@ class EyeBench:
             self._stores[key] = (self.renderer.load(store), build_ms)
         return self._stores[key]
 
-    @cached_property
-    def renderer(self) -> FilterRenderer:
-        """Shared by all stores."""
-        return FilterRenderer(self._gpu)
-
     def release(self) -> None:
-        """Free the stores on the GPU."""
+        """Free what the renderer holds of the stores."""
         for handle, _ in self._stores.values():
             handle.release()
         self._stores.clear()
+        self._runs.clear()
 
 
 @dataclass(frozen=True)
@@ -162,26 +173,28 @@ class Ours(Method):
     def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
         handle, build_ms = bench.store(self, state)
-        results = []
-        for _ in range(1 + repeats):
-            start_s = time.perf_counter()
-            rendered = bench.renderer.render(
-                view,
-                handle,
-                pupil_diameter_mm=state.pupil_mm,
-                focus_dpt=state.focus_dpt,
-                accumulation=self.accumulation,
+        run = timed_frames(
+            bench.renderer,
+            view,
+            handle,
+            pupil_diameter_mm=state.pupil_mm,
+            focus_dpt=state.focus_dpt,
+            repeats=repeats,
+            frozen=self.frozen,
+            accumulation=self.accumulation,
+        )
+        work = counted_work(bench.renderer, view, run.last)
+        return [
+            Filtered(
+                color=frame.color,
+                prepare_ms=build_ms,
+                render_ms=time_ms,
+                memory_mb=handle.store.memory_mb,
+                psf_count=handle.store.psf_count,
+                tap_count=0 if work is None else work.lit_count,
             )
-            results.append(
-                Filtered(
-                    color=rendered.color,
-                    prepare_ms=build_ms,
-                    render_ms=1e3 * (time.perf_counter() - start_s),
-                    memory_mb=handle.store.memory_mb,
-                    psf_count=handle.store.psf_count,
-                )
-            )
-        return results[1:]
+            for frame, time_ms in zip(run.frames, run.times_ms, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -193,17 +206,38 @@ class Baseline(Method):
     needs_whole_grid: bool = False
 
     def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
-        """Filter once: preparation and frame are timed apart, and take long."""
-        del repeats
-        if self.needs_whole_grid:
-            at = bench.grid_state(state)
-        else:
-            at = bench.exact_state(state, on_axis=self.on_axis)
-        return [self.function(view, at, **dict(self.options))]
+        """Filter once, or where it is timed ``repeats`` times after a warm-up.
+
+        A frame of another state needs its PSFs first: its time is that of both.
+        """
+
+        def filtered() -> list:
+            if self.needs_whole_grid:
+                at = bench.grid_state(state)
+            else:
+                at = bench.exact_state(state, on_axis=self.on_axis)
+            count, first = (WARM_UPS + repeats, WARM_UPS) if self.timed else (1, 0)
+            options = dict(self.options)
+            return [self.function(view, at, **options) for _ in range(count)][first:]
+
+        key = (self.function, self.options, id(view), state, repeats)
+        results = bench.once(key, filtered)
+        if self.frozen:
+            return results
+        return [replace(r, render_ms=r.prepare_ms + r.render_ms) for r in results]
 
 
 QUALITY_WIDE = "ours quality wide"
-PAPER_RULE = (("paper_rule", True),)
+CLAMP_RULE = (("rule", "clamp"),)
+PAPER_RULE = (("rule", "paper"),)
+
+FROZEN = " frozen"
+
+
+def frozen(method: Method) -> Method:
+    """The same method where nothing changes between frames."""
+    return replace(method, name=method.name + FROZEN, frozen=True)
+
 
 OURS = (
     Ours("ours on-axis", on_axis=True, any_state=False, mode="on-axis"),
@@ -213,23 +247,40 @@ OURS = (
     Ours("ours dynamic", on_axis=False, any_state=True),
     Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
 )
-ON_AXIS_BASELINES = (
+CONVOLVED = (
     Baseline("Barsky", True, False, barsky),
-    Baseline("predecessor", True, False, predecessor),
-    Baseline("paper on-axis", True, False, paper_on_axis),
-    Baseline("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
-)
-FIELD_BASELINES = (
     Baseline("Celaya", False, False, celaya),
     Baseline("Gonzalez", False, False, gonzalez),
-    Baseline("paper quality", False, False, paper_quality, (), True),
-    Baseline("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
-    Baseline("paper dynamic", False, True, paper_dynamic, (), True),
 )
-METHODS = (*OURS, *ON_AXIS_BASELINES, *FIELD_BASELINES)
 
 
-def warmed_up(gpu: Gpu, view: RgbdView) -> None:
+def _counted(name, *arguments, **options) -> Baseline:
+    return Baseline(name, *arguments, **options, timed=False)
+
+
+ON_AXIS_TEXTURES = (
+    _counted("predecessor", True, False, predecessor),
+    _counted("paper on-axis", True, False, paper_on_axis),
+    _counted("paper clamp 1 tap", True, False, paper_on_axis, CLAMP_RULE),
+    _counted("paper alpha 1 tap", True, False, paper_on_axis, PAPER_RULE),
+)
+FIELD_TEXTURES = (
+    _counted("paper quality", False, False, paper_quality, (), True),
+    _counted("paper clamp 4 tap", False, False, paper_quality, CLAMP_RULE, True),
+    _counted("paper alpha 4 tap", False, False, paper_quality, PAPER_RULE, True),
+    _counted("paper dynamic", False, True, paper_dynamic, (), True),
+)
+METHODS = (
+    *OURS,
+    *map(frozen, OURS),
+    *CONVOLVED,
+    *map(frozen, CONVOLVED),
+    *ON_AXIS_TEXTURES,
+    *FIELD_TEXTURES,
+)
+
+
+def warmed_up(view: RgbdView) -> None:
     """Run every baseline once on a corner of a view, so that all is compiled."""
     left, right, up, down = view.tangents
     share = (48 / view.width_px, 32 / view.height_px)
@@ -244,6 +295,6 @@ def warmed_up(gpu: Gpu, view: RgbdView) -> None:
             up + (down - up) * share[1],
         ),
     )
-    bench = EyeBench(gpu, "emmetropia", [corner])
-    for method in (*ON_AXIS_BASELINES, *FIELD_BASELINES[:3]):
+    bench = EyeBench(None, "emmetropia", [corner])
+    for method in (*CONVOLVED, *ON_AXIS_TEXTURES, FIELD_TEXTURES[0]):
         method.run(bench, corner, State(3.0, 0.5), 1)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -14,43 +15,87 @@ DIFFERENCE_GAIN = 16.0
 """Of linear light: a difference of 1/16 is white."""
 
 
-def plot_errors(rows: list, path: Path) -> None:
-    """Log-log plot of error against time: a line a method, a point a size.
+FROZEN_SUFFIX = " frozen"
 
-    Points are medians over eyes, scenes and states; the paper's stand apart, hollow.
+
+def pixels_of(size: str) -> int:
+    """Pixels of a size in words, as 640x360."""
+    width, height = size.split("x")
+    return int(width) * int(height)
+
+
+def plot_errors(rows: list, path: Path) -> None:
+    """Write `error_figure` to a file."""
+    figure = error_figure(rows)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    figure.clear()
+
+
+def error_figure(rows: list):
+    """Error against time and against work, and 8-bit errors beside published ones.
+
+    Points are medians over eyes, scenes and states, one for each size.  A time stands
+    only for methods that are timed alike; the paper's times are of other hardware and
+    do not appear.
 
     Parameters
     ----------
     rows : list of bench_field.FieldRow
     """
-    mpl.use("Agg")
-    from matplotlib import pyplot
+    figure = Figure(figsize=(21, 8), layout="constrained")
+    panels = figure.subplots(1, 3)
+    timed = [row for row in rows if row.median_ms is not None]
+    counted = [row for row in rows if row.tap_count is not None]
+    names = dict.fromkeys(row.method.removesuffix(FROZEN_SUFFIX) for row in rows)
+    palette = mpl.colormaps["tab20"](np.arange(20))
+    colors = dict(zip(names, np.resize(palette, (len(names), 4)), strict=True))
+    _error_lines(panels[0], timed, lambda row: row.median_ms, colors)
+    _error_lines(
+        panels[1], counted, lambda row: row.tap_count / pixels_of(row.size), colors
+    )
+    panels[0].set(xlabel="time of a frame, ms (hollow: its state is the last one's)")
+    panels[1].set(xlabel="PSF samples needed, per pixel")
+    _published_bars(panels[2], rows, colors)
+    return figure
 
-    figure, axes = pyplot.subplots(figsize=(10, 7), layout="constrained")
-    colors = pyplot.get_cmap("tab20")(np.arange(20))
-    for k, name in enumerate(dict.fromkeys(row.method for row in rows)):
-        points = _medians(
-            [(row.size, row.median_ms, row.error) for row in rows if row.method == name]
-        )
-        axes.loglog(*points, marker="os"[k % 2], color=colors[k % 20], label=name)
-    theirs = {
-        (row.published["method"], row.case, row.published["scene"]): row.published
-        for row in rows
-        if row.published is not None
-    }
-    for k, name in enumerate(dict.fromkeys(key[0] for key in theirs)):
-        own = [row for key, row in theirs.items() if key[0] == name]
-        points = _medians([(name, row["median_ms"], row["error_db"]) for row in own])
-        label = f"{name}, published: {own[0]['hardware']}, 8 bits"
-        axes.loglog(
-            *points, "v^<>"[k % 4], color="black", fillstyle="none", label=label
-        )
-    axes.set(xlabel="time of a frame, ms", ylabel="RMS error, linear light")
+
+def _error_lines(axes, rows: list, work_of, colors: dict) -> None:
+    """Log-log lines of linear RMS error against work, a line a method."""
+    for name in dict.fromkeys(row.method for row in rows):
+        own = [
+            (row.size, work_of(row), row.error) for row in rows if row.method == name
+        ]
+        is_frozen = name.endswith(FROZEN_SUFFIX)
+        style = {"linestyle": ":", "fillstyle": "none"} if is_frozen else {}
+        color = colors[name.removesuffix(FROZEN_SUFFIX)]
+        axes.loglog(*_medians(own), marker="o", color=color, label=name, **style)
+    axes.set(ylabel="RMS error, linear light")
     axes.grid(which="both", alpha=0.3)
-    axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    if rows:
+        axes.legend(fontsize="x-small")
+
+
+def _published_bars(axes, rows: list, colors: dict) -> None:
+    """8-bit PSNR of each method over eyes and scenes, and the paper's of the same."""
+    for k, name in enumerate(colors):
+        own = [row for row in rows if row.method == name]
+        if not own:
+            continue
+        ours = [row.psnr_srgb8_db for row in own]
+        axes.plot([min(ours), max(ours)], [k, k], color=colors[name])
+        axes.plot(np.median(ours), k, "o", color=colors[name])
+        theirs = {
+            (row.case, row.scene): row.published["psnr_srgb8_db"]
+            for row in own
+            if row.published is not None
+        }
+        if theirs:
+            axes.plot(np.median(list(theirs.values())), k, "kD", fillstyle="none")
+    axes.set_yticks(range(len(colors)), colors)
+    axes.invert_yaxis()
+    axes.set(xlabel="PSNR of 8-bit sRGB, dB: measured; hollow: published, 1280x720")
+    axes.grid(axis="x", alpha=0.3)
 
 
 def _medians(points: list[tuple[str, float, float]]) -> tuple[list, list]:

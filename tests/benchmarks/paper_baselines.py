@@ -1,10 +1,11 @@
 """The paper's renderer and its predecessor's on the processor: splats from textures.
 
 What is compared is how PSFs are laid out and interpolated: every source is splat near
-to far as in the dense reference, with coverage accumulation, or with the paper's own
-rule.  Tiles and merging only save time, so they are left out: the time of these rows
-is that of a scatter over all cores, and `tap_count` says how many samples the layout
-reads.
+to far as in the dense reference, and by its rule of coverage.  Two more rules are rows
+of their own: coverage where each single source takes what it wants until a pixel is
+full ("clamp"), and the paper's alpha.  Tiles and merging only save time, so they are
+left out: these rows scatter over all cores, and `tap_count` says how many samples the
+layout reads.
 """
 
 from dataclasses import replace
@@ -20,6 +21,9 @@ from tests.benchmarks.dense_reference import (
     BAND_ROWS,
     EyeState,
     Sources,
+    add_to_depth,
+    close_depths,
+    depth_step_dpt,
     linear_color,
     normalised,
     view_sources,
@@ -35,6 +39,10 @@ from tests.benchmarks.paper_layout import (
 )
 from tests.benchmarks.resized_psfs import full_radius_px, resized
 
+RULES = ("coverage", "clamp", "paper")
+"""How sources add up: those of one depth share what nearer ones leave free; each takes
+what it wants while there is room; or a weight is an opacity."""
+
 PREDECESSOR_TAPS = 6
 ON_AXIS_TAPS = 1
 OFF_AXIS_TAPS = 4
@@ -48,7 +56,7 @@ def predecessor(
     state: EyeState,
     *,
     grid: PaperGrid = ON_AXIS,
-    paper_rule: bool = False,
+    rule: str = "coverage",
 ) -> Filtered:
     """Stack of every PSF at every blur radius: six samples a chromatic value.
 
@@ -80,12 +88,13 @@ def predecessor(
             weights.append(share * scale)
     color, evaluations = _splat(
         view,
+        state,
         sources,
         stack,
         np.stack(layers, axis=-1),
         np.stack(weights, axis=-1),
         np.ceil(own_px.max(axis=1) - 1e-9),
-        paper_rule,
+        rule,
     )
     return Filtered(
         color=color,
@@ -98,7 +107,7 @@ def predecessor(
 
 
 def paper_on_axis(
-    view: RgbdView, state: EyeState, *, paper_rule: bool = False
+    view: RgbdView, state: EyeState, *, rule: str = "coverage"
 ) -> Filtered:
     """Layers by distance with transitional ones between: one sample (Eq. 8, 6.1-6.2).
 
@@ -108,7 +117,7 @@ def paper_on_axis(
     ----------
     Csoba & Kunkli 2023, sections 6.1 and 6.2.
     """
-    return _from_texture(view, state, ON_AXIS, ON_AXIS_TAPS, paper_rule)
+    return _from_texture(view, state, ON_AXIS, ON_AXIS_TAPS, rule)
 
 
 def paper_quality(
@@ -116,7 +125,7 @@ def paper_quality(
     state: EyeState,
     *,
     grid: PaperGrid = QUALITY,
-    paper_rule: bool = False,
+    rule: str = "coverage",
 ) -> Filtered:
     """Blocks of layers by direction, 31 x 21 x 9 and transitional ones: four samples.
 
@@ -124,7 +133,7 @@ def paper_quality(
     ----------
     Csoba & Kunkli 2023, section 6.3 (Eqs. 9 to 13, s = 1, p = 1/2) and 7.2.2.
     """
-    return _from_texture(view, state, grid, OFF_AXIS_TAPS, paper_rule)
+    return _from_texture(view, state, grid, OFF_AXIS_TAPS, rule)
 
 
 def paper_dynamic(
@@ -132,7 +141,7 @@ def paper_dynamic(
     state: EyeState,
     *,
     grid: PaperGrid = DYNAMIC,
-    paper_rule: bool = False,
+    rule: str = "coverage",
 ) -> Filtered:
     """Blocks of 23 x 13 x 9 PSFs without transitional layers, blended over the state.
 
@@ -162,7 +171,7 @@ def paper_dynamic(
     radius_px = np.max([texture.radius_px for _, texture in corners], axis=0)
     texture = replace(first, weights=blended, radius_px=radius_px)
     states = DYNAMIC_PUPILS_MM.size * DYNAMIC_FOCI_DPT.size
-    color, evaluations = _splat_texture(view, state, texture, paper_rule)
+    color, evaluations = _splat_texture(view, state, texture, rule)
     return Filtered(
         color=color,
         prepare_ms=prepare_ms,
@@ -173,10 +182,10 @@ def paper_dynamic(
     )
 
 
-def _from_texture(view, state, grid, taps, paper_rule) -> Filtered:
+def _from_texture(view, state, grid, taps, rule) -> Filtered:
     texture, prepare_ms = kept_texture(state, grid)
     watch = Stopwatch()
-    color, evaluations = _splat_texture(view, state, texture, paper_rule)
+    color, evaluations = _splat_texture(view, state, texture, rule)
     return Filtered(
         color=color,
         prepare_ms=prepare_ms,
@@ -194,7 +203,7 @@ def _ends(nodes: NDArray, value: float) -> list[tuple[float, float]]:
 
 
 def _splat_texture(
-    view: RgbdView, state: EyeState, texture: PaperTexture, paper_rule: bool
+    view: RgbdView, state: EyeState, texture: PaperTexture, rule: str
 ) -> tuple[NDArray, int]:
     """Splat every pixel with two layers of each of the blocks around its direction."""
     sources = view_sources(view, state.spec)
@@ -223,42 +232,49 @@ def _splat_texture(
     used_px = np.where(weights > 0.0, texture.radius_px[layers], 0.0)
     return _splat(
         view,
+        state,
         sources,
         texture.weights,
         np.repeat(layers[:, None], 3, axis=1),
         np.repeat(weights[:, None], 3, axis=1),
         np.ceil(used_px.max(axis=1) - 1e-9),
-        paper_rule,
+        rule,
     )
 
 
 def _splat(
     view: RgbdView,
+    state: EyeState,
     sources: Sources,
     texture: NDArray,
     layers: NDArray,
     weights: NDArray,
     radius_px: NDArray,
-    paper_rule: bool,
+    rule: str,
 ) -> tuple[NDArray, int]:
     """Splat sources near to far; image, and how many PSF values were made."""
     order = sources.near_first()
     light = np.zeros((3, view.height_px, view.width_px))
     coverage = np.zeros_like(light)
     radius_px = np.minimum(radius_px.astype(np.int64), texture.shape[2] // 2)
+    depths = np.zeros((3, *light.shape))
     evaluations = np.zeros(-(-view.height_px // BAND_ROWS), np.int64)
     _add_layers(
         *np.divmod(order, view.width_px),
+        sources.distance_dpt[order],
         sources.color[order],
         layers[order],
         weights[order].astype(np.float32),
         radius_px[order],
         texture,
-        paper_rule,
+        RULES.index(rule),
+        depth_step_dpt(state),
+        depths,
         light,
         coverage,
         evaluations,
     )
+    close_depths(depths, light, coverage)
     picture = normalised(light, coverage, linear_color(view))
     return picture, int(evaluations.sum())
 
@@ -283,12 +299,15 @@ def _padded_stack(flat, starts, radius) -> NDArray[np.float32]:
 def _add_layers(
     rows,
     columns,
+    distance_dpt,
     color,
     layers,
     shares,
     radius_px,
     texture,
-    paper_rule,
+    rule,
+    step_dpt,
+    depths,
     light,
     coverage,
     evaluations,
@@ -316,7 +335,22 @@ def _add_layers(
                             line[k] += share * psf[left + k - x + full]
                     for k in range(right - left):
                         weight = np.float64(line[k])
-                        room = 1.0 - coverage[c, to_y, left + k]
-                        weight = weight * room if paper_rule else min(weight, room)
-                        light[c, to_y, left + k] += weight * color[n, c]
-                        coverage[c, to_y, left + k] += weight
+                        if weight == 0.0:
+                            continue
+                        at = (c, to_y, left + k)
+                        if rule == 0:
+                            add_to_depth(
+                                at,
+                                weight,
+                                color[n, c],
+                                distance_dpt[n],
+                                step_dpt,
+                                depths,
+                                light,
+                                coverage,
+                            )
+                            continue
+                        room = 1.0 - coverage[at]
+                        weight = weight * room if rule == 2 else min(weight, room)
+                        light[at] += weight * color[n, c]
+                        coverage[at] += weight

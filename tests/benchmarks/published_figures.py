@@ -95,12 +95,18 @@ OFF_AXIS = "paper off-axis"
 
 @dataclass(frozen=True)
 class Published:
-    """Figures of a method, condition and scene."""
+    """Figures of a method, condition and scene.
+
+    Attributes
+    ----------
+    psnr_srgb8_db : float
+        Of 8-bit images: it stands beside our 8-bit figures, never beside linear ones.
+    """
 
     method: str
     scene: str
     median_ms: float
-    error_db: float
+    psnr_srgb8_db: float
     table: str
     hardware: str = f"{HARDWARE}, 1280x720"
 

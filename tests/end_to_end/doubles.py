@@ -69,6 +69,7 @@ class EngineDouble:
         focus_dpt,
         accumulation="coverage",
         merge=True,
+        render_tolerance=1.0,
         output="linear",
         gaze_deg=None,
     ):

@@ -7,8 +7,7 @@ from scipy.signal import fftconvolve
 
 from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
-from filter_service.rendering.gl.compile_passes import PUPIL_MM, perfect_store
-from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rendering.perfect_eye import PUPIL_MM, perfect_store
 from filter_service.rgbd_view import RgbdView
 
 PITCH_RAD = 1e-3
@@ -24,7 +23,7 @@ def disc(radius_px):
 class OneKernelBench:
     """A camera of 1 mrad a pixel before an eye with one square kernel."""
 
-    def __init__(self, gpu, kernel, *, width_px, height_px, spread_px=0.0):
+    def __init__(self, engine, kernel, *, width_px, height_px, spread_px=0.0):
         right, up = PITCH_RAD * width_px / 2, PITCH_RAD * height_px / 2
         self.tangents = (-right, right, up, -up)
         self.size = (height_px, width_px)
@@ -32,8 +31,8 @@ class OneKernelBench:
         self.store = _store(
             kernel, Camera(width_px, height_px, self.tangents), spread_px
         )
-        self.gpu = gpu
-        self.renderer = FilterRenderer(gpu)
+        self.gpu = engine.gpu
+        self.renderer = engine.new_renderer()
         self.handle = self.renderer.load(self.store)
 
     def render(self, color, depth_m=1.0, **options):

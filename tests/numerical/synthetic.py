@@ -8,7 +8,6 @@ from scipy.ndimage import zoom
 from estimator.profiles.parse import parse_profile
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_twin import layer_blur_px
@@ -27,6 +26,15 @@ def texture(rng, height_px, width_px, cell_px=4):
     return np.clip(fine, 0.0, 1.0).astype(np.float32)
 
 
+def depth_scene():
+    """Depth (101, 150): near disc, slanted floor and far wall; edges, slopes, flats."""
+    y, x = np.mgrid[0:101, 0:150]
+    floor = 1.0 / (0.1 + 1.5 * np.clip(y - 60, 0, None) / 40)
+    depth_m = np.where(y > 60, floor, 8.0)
+    disc = (x - 60) ** 2 + (y - 40) ** 2 < 20**2
+    return np.where(disc, 0.4, depth_m).astype(np.float32)
+
+
 def psnr_db(image, reference):
     """Linear light, peak 1, mean over channels."""
     error = np.mean((np.asarray(image, float) - reference) ** 2)
@@ -36,15 +44,17 @@ def psnr_db(image, reference):
 class Bench:
     """One camera and eye, ready to render."""
 
-    def __init__(self, gpu, profile, *, width_px, height_px, vertical_fov_deg, **spec):
+    def __init__(
+        self, engine, profile, *, width_px, height_px, vertical_fov_deg, **spec
+    ):
         self.width_px, self.height_px = width_px, height_px
         self.tangents = tangents(width_px, height_px, vertical_fov_deg)
         self.spec = grid_spec(
             width_px=width_px, height_px=height_px, tangents=self.tangents, **spec
         )
         self.store = build_psf_store(parse_profile(profile), self.spec)
-        self.gpu = gpu
-        self.renderer = FilterRenderer(gpu)
+        self.gpu = engine.gpu
+        self.renderer = engine.new_renderer()
         self.handle = self.renderer.load(self.store)
 
     def view(self, color, depth_m, depth_kind="planar"):

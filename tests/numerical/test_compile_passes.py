@@ -8,9 +8,10 @@ from filter_service.psfs import read_loops
 from filter_service.rendering import kernel_loops, map_loops
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
 
-INNER = {"clipped", "bracket", "channel_taps", "number_used", "mapped_reach"}
+INNER = {"clipped", "bracket", "channel_taps", "number_used", "mapped_reach", "moves"}
 """Called by other loops alone: where those are read from disk, they are not."""
 
 
@@ -31,7 +32,7 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
     sorts = sum(name == "sort_bins" for name, *_ in gpu._programs)
     assert sorts == 2 * (len(SORT_CAPACITIES) + 1)
     bench = Bench(
-        gpu,
+        Engine("gl", gpu),
         {"kind": "preset", "name": "myopia"},
         width_px=96,
         height_px=64,

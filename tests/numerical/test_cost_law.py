@@ -7,9 +7,17 @@ from PIL import Image
 from filter_service.constants import THREADS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.gl.renderer import FilterRenderer
-from tests.benchmarks.bench_cost import BLUR_MRAD, CostBench, bench, plane_view
+from tests.benchmarks.bench_cost import (
+    BLUR_MRAD,
+    STATE,
+    CostBench,
+    bench,
+    plane_view,
+)
 from tests.benchmarks.cost_law import CostRow, bounds, exponent, laws
 from tests.benchmarks.field_pictures import plot_costs
+from tests.benchmarks.splat_work import splat_work
+from tests.numerical.tile_lists import expected_lists, lights_tile, unpack_fragments
 
 SIZE = (96, 64)
 
@@ -20,6 +28,7 @@ def row(radius_px, median_ms, stage_ms, **counts):
         "fragment_count": 900,
         "entry_count": 10,
         "evaluation_count": 640,
+        "lit_count": 320,
         "kernel_count": 1,
         "kernel_texel_count": 50,
         **counts,
@@ -92,7 +101,7 @@ def plane_rows(gpu: Gpu):
     found = {}
     for radius_px in (4, 8, 16):
         view = plane_view(*SIZE, BLUR_MRAD / radius_px)
-        case = CostBench(FilterRenderer(gpu), gpu, view)
+        case = CostBench(FilterRenderer(gpu), view)
         for line in bench(case, "radius", "plane", float(radius_px)):
             found[line.method, radius_px] = line
     return found
@@ -103,10 +112,45 @@ def test_evaluations_are_those_of_discs_over_tiles(plane_rows):
         line = plane_rows["unmerged", radius_px]
         # A pixel's disc meets tiles within its own reach, and no others.
         across = (2.0 * radius_px + TILE_SIZE_PX) / TILE_SIZE_PX
-        tiles = line.entry_count / line.pixel_count
+        tiles = line.evaluation_count / THREADS / line.pixel_count
         assert np.pi * radius_px**2 / THREADS < tiles <= (across + 0.5) ** 2
-        assert line.evaluation_count == THREADS * line.entry_count
+        # An entry is of a bin of four tiles.
+        assert 1.0 < line.evaluation_count / THREADS / line.entry_count < 4.0
         assert line.error >= 60.0
+
+
+@pytest.mark.parametrize("merge", [False, True])
+def test_evaluations_are_counted_as_they_happen(gpu, merge):
+    """Against comparing every fragment with every pixel; the last tiles are cut."""
+    width, height = 77, 43
+    case = CostBench(FilterRenderer(gpu), plane_view(width, height, BLUR_MRAD / 6))
+    frame = case.renderer.render(case.view, case.handle, **STATE, merge=merge)
+    found = splat_work(gpu, (width, height), frame.entry_count)
+    columns, rows = (-(-side // TILE_SIZE_PX) for side in (width, height))
+    with gpu.context:
+        blocks, place, color = (
+            gpu.read(gpu.storage(name, 1), (columns * rows * n, 4), dtype)
+            for name, n, dtype in (
+                ("BLOCKS", 1, np.uint32),
+                ("FRAGMENT_PLACE", THREADS, np.uint32),
+                ("FRAGMENT_COLOR", THREADS, np.float32),
+            )
+        )
+    fragments = unpack_fragments(blocks, place, color)
+    assert len(fragments.slots) == frame.fragment_count
+    low = fragments.first - fragments.sides[:, [0, 2]]
+    high = fragments.last + fragments.sides[:, [1, 3]]
+    evaluations = lit = 0
+    for y, x in np.ndindex(rows * TILE_SIZE_PX, columns * TILE_SIZE_PX):
+        left, top = x - x % TILE_SIZE_PX, y - y % TILE_SIZE_PX
+        of_tile = lights_tile(fragments, left, top)
+        evaluations += of_tile.sum()
+        lit += (of_tile & (low <= (x, y)).all(1) & ((x, y) <= high).all(1)).sum()
+    assert (found.evaluation_count, found.lit_count) == (evaluations, lit)
+    lists = expected_lists(fragments, (width, height), hidden_from=len(place))
+    assert found.entry_count == lists.offsets[-1]
+    with pytest.raises(ValueError, match="entries of the fragments in the buffers"):
+        splat_work(gpu, (width, height), frame.entry_count + 1)
 
 
 def test_merged_work_does_not_grow_with_the_square_of_the_radius(plane_rows):

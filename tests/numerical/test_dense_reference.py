@@ -9,6 +9,8 @@ from tests.benchmarks.dense_reference import EyeState, dense_reference, view_sou
 from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
 from tests.benchmarks.paper_baselines import (
+    RULES,
+    _splat,
     paper_dynamic,
     paper_on_axis,
     paper_quality,
@@ -124,10 +126,12 @@ def gathered(state, view, rule):
         for distance_dpt in np.unique(sources.distance_dpt)[::-1]:
             here = [n for n in order if sources.distance_dpt[n] == distance_dpt]
             own = weights[here, c, y, x].astype(float)
-            if rule == "paper":
+            if rule != "coverage":
                 for n, weight in zip(here, own, strict=True):
-                    light += weight * (1.0 - coverage) * sources.color[n, c]
-                    coverage += weight * (1.0 - coverage)
+                    room = 1.0 - coverage
+                    weight = weight * room if rule == "paper" else min(weight, room)
+                    light += weight * sources.color[n, c]
+                    coverage += weight
                 continue
             share = min((1.0 - coverage) / max(own.sum(), 1e-12), 1.0)
             light += share * (own @ sources.color[here, c])
@@ -136,15 +140,40 @@ def gathered(state, view, rule):
     return out
 
 
-@pytest.mark.parametrize("rule", ["coverage", "paper"])
-def test_surfaces_in_front_of_each_other_equal_a_sorted_gather(rng, rule):
+def four_depths(rng, mode="quality"):
     size = (20, 14)
-    state = eye_state("emmetropia", tangents_of(10, 14, 5, 8), size=size)
+    state = eye_state("emmetropia", tangents_of(10, 14, 5, 8), mode, size=size)
     color = rng.random((size[1], size[0], 3))
     distance_dpt = rng.choice([0.25, 2.0, 4.0, 6.0], size=color.shape[:2])
-    view = radial_view(state, color, distance_dpt)
+    return state, radial_view(state, color, distance_dpt)
+
+
+@pytest.mark.parametrize("rule", ["coverage", "paper"])
+def test_surfaces_in_front_of_each_other_equal_a_sorted_gather(rng, rule):
+    state, view = four_depths(rng)
     seen = dense_reference(view, state, bins=False, accumulation=rule, kept=False)
     assert np.allclose(seen, gathered(state, view, rule), atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_baselines_add_up_as_they_say(rng, rule):
+    """Layers of exact PSFs, so that nothing but the rule is left."""
+    state, view = four_depths(rng, mode="on-axis")
+    sources = view_sources(view, state.spec)
+    nodes_dpt, node_of = np.unique(sources.distance_dpt, return_inverse=True)
+    psfs = state.exact_psfs(*np.zeros((2, nodes_dpt.size)), nodes_dpt)
+    radius = int(psfs.radius_px.max())
+    layers = np.zeros((nodes_dpt.size, 3, 2 * radius + 1, 2 * radius + 1), np.float32)
+    for n, psf in enumerate(psfs):
+        inner = slice(radius - psf.radius_px, radius + psf.radius_px + 1)
+        layers[n // 3, n % 3, inner, inner] = psf.kernel
+    layer_of = np.repeat(node_of.reshape(-1, 1, 1), 3, axis=1)
+    each = np.full(node_of.size, radius)
+    ones = np.ones(layer_of.shape)
+    seen, _ = _splat(view, state, sources, layers, layer_of, ones, each, rule)
+    assert np.allclose(seen, gathered(state, view, rule), atol=1e-6)
+    shared = dense_reference(view, state, bins=False, kept=False)
+    assert np.allclose(seen, shared, atol=1e-6) == (rule == "coverage")
 
 
 def test_a_near_plane_hides_the_blur_of_a_far_one():

@@ -13,7 +13,7 @@ from tests.benchmarks.bench_field import (
     target_rows,
 )
 from tests.benchmarks.field_methods import FOCUS_RANGE_DPT, METHODS, PAPER_RANGES
-from tests.benchmarks.field_pictures import _medians, plot_errors
+from tests.benchmarks.field_pictures import _medians, error_figure, plot_errors
 from tests.benchmarks.published_figures import CONDITIONS, published
 from tests.numerical.scene_frames import SCENES
 
@@ -87,15 +87,22 @@ def test_published_figures_stand_beside_their_methods():
     assert beside["Barsky"] == "Barsky"
     assert beside["ours on-axis"] == beside["paper alpha 1 tap"] == "paper on-axis"
     assert beside["ours dynamic"] == beside["paper quality"] == "paper off-axis"
+    assert beside["Barsky frozen"] == "Barsky"
     assert beside["Celaya"] is None
     # Tables 7 and 10 of the paper
     on_axis = published("paper on-axis", "keratoconus", "primitives")
-    assert (on_axis.median_ms, on_axis.error_db) == (12.93, 45.77)
+    assert (on_axis.median_ms, on_axis.psnr_srgb8_db) == (12.93, 45.77)
     assert "TITAN Xp" in on_axis.hardware
     off_axis = published("paper off-axis", "cataract", "primitives")
-    assert (off_axis.median_ms, off_axis.error_db) == (13.4, 44.8)
+    assert (off_axis.median_ms, off_axis.psnr_srgb8_db) == (13.4, 44.8)
     assert published("paper off-axis", "cataract", "courtyard") is None
     assert published(None, "cataract", "courtyard") is None
+
+
+def test_layouts_that_are_not_written_to_be_fast_have_no_time():
+    timed = {method.name for method in METHODS if method.timed}
+    assert {"ours dynamic", "ours dynamic frozen", "Gonzalez", "Barsky frozen"} <= timed
+    assert not any(name.startswith(("paper", "predecessor")) for name in timed)
 
 
 def test_the_plot_has_a_point_for_each_size():
@@ -105,9 +112,26 @@ def test_the_plot_has_a_point_for_each_size():
     assert errors == pytest.approx([0.1, 0.01])
 
 
-def test_the_plot_shows_published_figures_too(tmp_path):
+def _points(axes):
+    """Points (n, 2) of each line by its label or number."""
+    return {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+
+
+def test_each_axis_has_one_kind_of_error_and_only_times_taken_alike(tmp_path):
     theirs = asdict(published("paper on-axis", "myopia", "courtyard"))
-    rows = [ROW, replace(ROW, size="640x360", median_ms=80.0, published=theirs)]
+    rows = [
+        ROW,
+        replace(ROW, method="ours quality frozen", median_ms=10.0),
+        replace(ROW, size="640x360", median_ms=80.0, published=theirs),
+        replace(ROW, method="paper quality", n=0, median_ms=None, tap_count=10**6),
+    ]
+    time, work, eight_bits = error_figure(rows).axes
+    assert set(_points(time)) == {"ours quality", "ours quality frozen"}
+    rms = 10 ** (-ROW.error / 20)
+    assert np.allclose(_points(time)["ours quality"], [[20.0, rms], [80.0, rms]])
+    assert np.allclose(_points(work)["paper quality"], [[1e6 / (320 * 180), rms]])
+    shown_db = np.concatenate([points[:, 0] for points in _points(eight_bits).values()])
+    assert set(shown_db) == {ROW.psnr_srgb8_db, theirs["psnr_srgb8_db"]}
     plot_errors(rows, tmp_path / "field.png")
     with Image.open(tmp_path / "field.png") as picture:
         assert picture.size[0] > 300

@@ -11,8 +11,6 @@ from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.store import frame_layers
-from filter_service.rendering.gl import kernel_passes
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import spec_for, traced_eye
@@ -59,11 +57,11 @@ GAZE_RANGE_DEG = (14.0, 8.0)
 
 
 @pytest.mark.parametrize("gaze_deg", [(0.0, 0.0), (14.0, -8.0), (-9.0, 4.0)])
-def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, gaze_deg):
+def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(engine, rng, gaze_deg):
     """Kernels are mapped to pixels that differ by a third from those stored."""
     width, height = 96, 72
     bench = FieldBench(
-        gpu,
+        engine,
         "emmetropia",
         tangents(width, height, 55.0),
         size=(width, height),
@@ -82,7 +80,7 @@ def test_a_turned_field_agrees_with_the_exact_psf_of_every_pixel(gpu, rng, gaze_
     assert psnr_db(result.color, truth) >= 44.0
 
 
-def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
+def test_a_perfect_eye_stays_sharp_wherever_it_looks(engine, rng):
     width, height = 128, 72
     spec = grid_spec(
         width_px=width,
@@ -98,7 +96,7 @@ def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
     )
     profile = parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
     eye, _ = eye_for_spec(profile, spec.with_settings(eye_model="wavefront"))
-    renderer = FilterRenderer(gpu)
+    renderer = engine.new_renderer()
     handle = renderer.load(build_psf_store(eye, spec))
     image = texture(rng, height, width, cell_px=1)
     far_m = np.full(image.shape[:2], np.inf, np.float32)
@@ -113,22 +111,23 @@ def test_a_perfect_eye_stays_sharp_wherever_it_looks(gpu, rng):
         assert psnr_db(seen, image) >= 60.0
 
 
-def test_larger_cells_serve_where_kernels_take_too_much_memory(gpu, rng, monkeypatch):
+def test_larger_cells_serve_where_kernels_take_too_much_memory(
+    engine, rng, monkeypatch
+):
     width, height = 96, 72
-    bench = FieldBench(gpu, "myopia", tangents(width, height, 40.0), (width, height))
+    bench = FieldBench(engine, "myopia", tangents(width, height, 40.0), (width, height))
     color = texture(rng, height, width, cell_px=3)
     depth_m = np.full((height, width), 2.0, np.float32)
     usual = bench.render(color, depth_m)
-    monkeypatch.setattr(
-        kernel_passes, "MAX_KERNEL_TEXELS", usual.kernel_texel_count // 5
-    )
-    bench.renderer = FilterRenderer(gpu)
+    limit = usual.kernel_texel_count // 5
+    engine.limit_kernels(monkeypatch, limit, width * height)
+    bench.renderer = engine.new_renderer()
     smaller = bench.render(color, depth_m)
-    assert smaller.kernel_texel_count <= usual.kernel_texel_count // 5
+    assert smaller.kernel_count < usual.kernel_count // 3
     assert psnr_db(smaller.color, usual.color) >= 40.0
     # Where cells cannot grow any more, memory decides alone.
-    monkeypatch.setattr(kernel_passes, "MAX_KERNEL_TEXELS", 1)
-    bench.renderer = FilterRenderer(gpu)
+    engine.limit_kernels(monkeypatch, 1, width * height)
+    bench.renderer = engine.new_renderer()
     assert np.isfinite(bench.render(color, depth_m).color).all()
 
 

@@ -144,7 +144,7 @@ def test_defocus_is_the_eyes(case):
 
 def test_kernels_equal_the_plain_statement(case):
     store, layers, image, used = case
-    kernels = frame_kernels.frame_kernels(store, layers, image, used)
+    kernels = frame_kernels.frame_kernels(store.tables, layers, image, used)
     nodes, expected = plan_twin.frame_kernels(store, layers, image, used)
     recipes, plain = kernels.nodes.recipes, nodes.pop("recipes")
     words = slice(0, 2 * RECIPE_TAPS)
@@ -164,7 +164,7 @@ def test_kernels_equal_the_plain_statement(case):
 
 def test_tables_equal_the_plain_statement(case):
     store, layers, image, used = case
-    kernels = frame_kernels.frame_kernels(store, layers, image, used)
+    kernels = frame_kernels.frame_kernels(store.tables, layers, image, used)
     table, sizes = frame_kernels.kernel_table(kernels)
     texels, starts, scale = plan_twin.kernel_levels(
         kernels.reach_px, kernels.spread_px, kernels.peak_ratio

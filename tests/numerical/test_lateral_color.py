@@ -16,7 +16,6 @@ from estimator.wavefront.chief_rays import chief_shift_mrad
 from filter_service.planning.field_directions import field_deg
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import NO_LATERAL_COLOR, eye_for_spec
-from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.schematic_eyes import (
@@ -173,7 +172,7 @@ SIZE, PITCH_MRAD = 96, 1.15
 """Pixels of 720p at 67 degrees, and a window onto the edge of its field."""
 
 
-def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
+def look(engine, profile, h_deg, *, lateral_color=True, eye_model="traced"):
     """Centroids (3, 2) of a white point from itself, x to the right and y up, px."""
     half = 0.5e-3 * SIZE * PITCH_MRAD
     middle = np.tan(np.radians(h_deg))
@@ -192,7 +191,7 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
     eye, notes = eye_for_spec(
         parse_profile(profile), spec.with_settings(eye_model=eye_model)
     )
-    renderer = FilterRenderer(gpu)
+    renderer = engine.new_renderer()
     handle = renderer.load(build_psf_store(eye, spec))
     color = np.zeros((SIZE, SIZE, 3), np.float32)
     row, column = 40, (40 if h_deg < 0.0 else SIZE - 1 - 40)  # the middles of cells
@@ -215,11 +214,11 @@ def look(gpu, profile, h_deg, *, lateral_color=True, eye_model="traced"):
 EMMETROPIA = {"kind": "preset", "name": "emmetropia"}
 
 
-def test_red_and_blue_lie_beside_green_by_the_table(gpu):
+def test_red_and_blue_lie_beside_green_by_the_table(engine):
     lateral_px = {}
     for h_deg in (-20.0, 0.0, 20.0):
-        with_it, eye, spec, field, _ = look(gpu, EMMETROPIA, h_deg)
-        without, *_ = look(gpu, EMMETROPIA, h_deg, lateral_color=False)
+        with_it, eye, spec, field, _ = look(engine, EMMETROPIA, h_deg)
+        without, *_ = look(engine, EMMETROPIA, h_deg, lateral_color=False)
         moved_px = with_it - without
         shift_mrad = eye.chief_ray_shift_mrad(
             h_deg=field[0],
@@ -238,10 +237,10 @@ def test_red_and_blue_lie_beside_green_by_the_table(gpu):
     np.testing.assert_allclose(lateral_px[0.0], 0.0, atol=0.05)
 
 
-def test_a_measured_wavefront_has_none_and_says_so(gpu):
-    with_it, eye, _, _, notes = look(gpu, EMMETROPIA, 20.0, eye_model="wavefront")
+def test_a_measured_wavefront_has_none_and_says_so(engine):
+    with_it, eye, _, _, notes = look(engine, EMMETROPIA, 20.0, eye_model="wavefront")
     without, *_ = look(
-        gpu, EMMETROPIA, 20.0, eye_model="wavefront", lateral_color=False
+        engine, EMMETROPIA, 20.0, eye_model="wavefront", lateral_color=False
     )
     assert isinstance(eye, MeasuredWavefront)
     assert notes == (NO_LATERAL_COLOR,)

@@ -1,6 +1,7 @@
 """PSFs by the GPU's passes against the float64 quadrature and the CPU's engines."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from estimator.psf.kernel_types import disc_mask
 from estimator.psf.reference import reference_kernel
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.constants import WEIGHT_MAX
+from filter_service.gl.shader_source import SHADER_ROOT
 from filter_service.psfs import (
     gpu_build,
     gpu_build_constants,
@@ -91,13 +93,35 @@ def test_work_groups_stay_within_what_core_opengl_promises(length):
     assert 16 * defines["FFT_LINES"] * length <= 16384
 
 
+GLSL_BASE = {"vec4": "f4", "ivec4": "i4"}
+"""Of 16 bytes, and aligned to that in std430."""
+
+
+def shader_members():
+    """Members of `PsfRecord` as the shader declares them: name, type, count."""
+    text = (SHADER_ROOT / "common/psf_record.glsl").read_text(encoding="utf-8")
+    text = re.sub(r"//.*", "", text)
+    body = re.search(r"struct PsfRecord \{(.*?)\};", text, re.DOTALL)[1]
+    found = []
+    for declaration in body.split(";")[:-1]:
+        kind, name, count = re.fullmatch(
+            r"\s*(\w+) (\w+)(?:\[(\d+)\])?", declaration
+        ).groups()
+        found.append((name, kind, int(count or 1)))
+    return found
+
+
 def test_records_have_the_layout_of_the_shader():
-    """std430: members of 16 bytes in the order of common/psf_record.glsl."""
-    offsets = [
-        gpu_build_records.RECORD.fields[n][1] for n in gpu_build_records.RECORD.names
-    ]
-    assert all(offset % 16 == 0 for offset in offsets)
-    assert gpu_build_records.RECORD.itemsize == 22 * 16
+    """std430: members one behind the other, as the struct of the shader has them."""
+    record, offset = gpu_build_records.RECORD, 0
+    members = shader_members()
+    assert tuple(name for name, _, _ in members) == record.names
+    for name, kind, count in members:
+        base, shape = record[name].subdtype
+        assert (base, np.prod(shape)) == (np.dtype(GLSL_BASE[kind]), 4 * count), name
+        assert record.fields[name][1] == offset, name
+        offset += 16 * count
+    assert record.itemsize == offset
 
 
 # ----- against the quadrature

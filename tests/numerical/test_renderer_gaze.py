@@ -19,10 +19,10 @@ RANGE_DEG = (10.0, 6.0)
 
 
 @pytest.fixture(scope="module")
-def bench(gpu):
+def bench(engine):
     view_tangents = tangents(WIDTH, HEIGHT, 24.0)
     return FieldBench(
-        gpu,
+        engine,
         "keratoconus",
         view_tangents,
         size=(WIDTH, HEIGHT),

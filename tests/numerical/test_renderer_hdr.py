@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from filter_service.constants import HALF_MAX
-from filter_service.gl.gpu import Gpu
 from filter_service.rendering import reference
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
@@ -13,8 +12,8 @@ MYOPIA = {"kind": "preset", "name": "myopia"}
 
 
 @pytest.fixture(scope="module")
-def bench(gpu: Gpu):
-    return Bench(gpu, MYOPIA, width_px=WIDTH, height_px=HEIGHT, vertical_fov_deg=5.0)
+def bench(engine):
+    return Bench(engine, MYOPIA, width_px=WIDTH, height_px=HEIGHT, vertical_fov_deg=5.0)
 
 
 def hdr_scene(rng):

@@ -10,6 +10,7 @@ from filter_service.errors import BadMessage
 from filter_service.rendering import reference
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
+from tests.numerical.made_fragments import made_fragments
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
 EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0}
@@ -23,8 +24,8 @@ NEAR_DPT, FAR_DPT = 2.5, 0.5
 
 
 @pytest.fixture(scope="module")
-def bench(gpu):
-    return Bench(gpu, EMMETROPE, **SIZE, **PURE)
+def bench(engine):
+    return Bench(engine, EMMETROPE, **SIZE, **PURE)
 
 
 def layered(bench, mask, near, far, *, near_dpt=NEAR_DPT, far_dpt=FAR_DPT):
@@ -142,11 +143,6 @@ def test_nothing_hidden_changes_nothing_and_is_never_filled_in(bench, rng, nothi
     assert np.abs(some - bench.render(view, **STATE).color).max() > 0.01
 
 
-def read(bench, name, shape, dtype):
-    with bench.gpu.context:
-        return bench.gpu.read(bench.gpu.storage(name, 1), shape, dtype)
-
-
 def test_what_no_edge_uncovers_makes_no_fragments(bench, rng):
     """A wall hides a whole room; and a disc only as far as its blur lets light pass."""
     wall = np.full((HEIGHT, WIDTH), True)
@@ -171,7 +167,8 @@ def test_hidden_pixels_just_behind_what_is_seen_make_no_fragments(bench, rng):
     assert counts[1] > counts[0] + 1000
 
 
-def test_strips_change_nothing(bench, rng, monkeypatch):
+def test_strips_change_nothing(gl_engine, rng, monkeypatch):
+    bench = Bench(gl_engine, EMMETROPE, **SIZE, **PURE)
     view = disc_view(bench, rng)
     whole = bench.render(view, **STATE)
     rows = 2 * 24 + 64  # halos, and tile rows between
@@ -212,9 +209,9 @@ def test_bad_colour_counts_only_where_something_is_hidden(bench, rng):
 # Other stores come last: a renderer keeps its kernels on the GPU for the next frame.
 
 
-def test_two_layers_of_odd_bytes_over_the_field_equal_the_gather(gpu, rng):
+def test_two_layers_of_odd_bytes_over_the_field_equal_the_gather(engine, rng):
     size = {"width_px": 45, "height_px": 33, "vertical_fov_deg": 40.0}
-    bench = Bench(gpu, EMMETROPE, **size, mode="dynamic")
+    bench = Bench(engine, EMMETROPE, **size, mode="dynamic")
     color, hidden = rng.integers(0, 256, (2, 33, 45, 3), dtype=np.uint8)
     mask = np.arange(45)[None, :] < 20
     depth_m = np.where(mask, 0.15, 4.0)
@@ -226,27 +223,22 @@ def test_two_layers_of_odd_bytes_over_the_field_equal_the_gather(gpu, rng):
     assert psnr_db(result.color, truth) >= 60.0
 
 
-def test_surfaces_never_merge_with_each_other(gpu):
-    bench = Bench(gpu, {"kind": "prescription", "sphere_dpt": -6.0}, **SIZE)
+def test_surfaces_never_merge_with_each_other(engine):
+    bench = Bench(engine, {"kind": "prescription", "sphere_dpt": -6.0}, **SIZE)
     red, blue = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     view = layered(bench, DISC, red, blue, near_dpt=1.2, far_dpt=0.2)
     result = bench.render(view)
     border_px = 8 * -(-(bench.layers().max_radius_px + 2) // 8)
-    tiles = -(-(WIDTH + 2 * border_px) // 8) * -(-(HEIGHT + 2 * border_px) // 8)
-    counts = read(bench, "BLOCKS", (2 * tiles, 4), np.uint32)
-    assert counts[tiles:, 3].sum() > 0  # merged pixels, hidden ones among them
-    alive = np.arange(constants.THREADS) < counts[:, :1]
-    colors = read(bench, "FRAGMENT_COLOR", (*alive.shape, 4), np.float32)
-    assert set(map(tuple, colors[:tiles][alive[:tiles]][:, :3])) == {
-        tuple(red),
-        tuple(blue),
-    }
-    assert set(map(tuple, colors[tiles:][alive[tiles:]][:, :3])) == {tuple(blue)}
-    assert counts[:, 0].sum() == result.fragment_count
+    made = made_fragments(bench, WIDTH + 2 * border_px, HEIGHT + 2 * border_px, 2)
+    hidden = made.surface == 1
+    assert (made.edge_px[hidden] > 1).any()
+    assert set(map(tuple, made.rgb[~hidden])) == {tuple(red), tuple(blue)}
+    assert set(map(tuple, made.rgb[hidden])) == {tuple(blue)}
+    assert hidden.size == result.fragment_count
 
 
-def test_hidden_depth_beyond_the_prepared_distances_is_counted(gpu, rng):
-    bench = Bench(gpu, EMMETROPE, **SIZE, object_range_dpt=(0.5, 2.0))
+def test_hidden_depth_beyond_the_prepared_distances_is_counted(engine, rng):
+    bench = Bench(engine, EMMETROPE, **SIZE, object_range_dpt=(0.5, 2.0))
     view = disc_view(bench, rng, near_dpt=1.5, far_dpt=0.25)
     result = bench.render(view, **STATE)
     # Everything far, and what the disc hides of it.

@@ -22,8 +22,8 @@ RULES = ("coverage", "paper")
 
 
 @pytest.fixture(scope="module")
-def bench(gpu):
-    return Bench(gpu, MYOPIA, **SIZE)
+def bench(gl_engine):
+    return Bench(gl_engine, MYOPIA, **SIZE)
 
 
 def depth_scene():

@@ -8,7 +8,6 @@ from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
@@ -33,9 +32,9 @@ def eye_store(eye, scene):
 @pytest.mark.parametrize("accumulation", ["coverage", "paper"])
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("eye", preset_names())
-def test_passes_agree_with_the_sorted_gather(gpu, eye, scene, accumulation):
+def test_passes_agree_with_the_sorted_gather(engine, eye, scene, accumulation):
     view, store = scene_view(scene, **SIZE), eye_store(eye, scene)
-    renderer = FilterRenderer(gpu)
+    renderer = engine.new_renderer()
     handle = renderer.load(store)
     truth = reference.gather(
         view, store, frame_layers(store, **STATE), accumulation=accumulation

@@ -53,9 +53,9 @@ def convolve(image, kernels):
     [(np.inf, "planar", 0.0), (0.8, "radial", 1.25)],
 )
 def test_perfect_eye_gives_the_input_back_over_a_90_degree_field(
-    gpu, rng, depth_m, depth_kind, focus_dpt
+    engine, rng, depth_m, depth_kind, focus_dpt
 ):
-    bench = Bench(gpu, EMMETROPE, **SIZE, vertical_fov_deg=90.0, **PURE)
+    bench = Bench(engine, EMMETROPE, **SIZE, vertical_fov_deg=90.0, **PURE)
     image = texture(rng, 120, 160, cell_px=1)
     result = bench.render(bench.view(image, depth_m, depth_kind), focus_dpt=focus_dpt)
     assert psnr_db(result.color, image) >= 60.0
@@ -83,8 +83,8 @@ def airy_kernel(*, pupil_mm, wavelength_nm, pitch_mrad, radius_px):
 
 
 @pytest.mark.parametrize("pupil_mm", [2.0, 4.0])
-def test_diffraction_alone_is_the_pixel_integrated_airy_disc(gpu, rng, pupil_mm):
-    bench = Bench(gpu, EMMETROPE, **NARROW, chromatic=False)
+def test_diffraction_alone_is_the_pixel_integrated_airy_disc(engine, rng, pupil_mm):
+    bench = Bench(engine, EMMETROPE, **NARROW, chromatic=False)
     image = texture(rng, 120, 160, cell_px=2)
     result = bench.render(bench.view(image, np.inf), pupil_diameter_mm=pupil_mm)
     kernel = airy_kernel(
@@ -100,8 +100,10 @@ def test_diffraction_alone_is_the_pixel_integrated_airy_disc(gpu, rng, pupil_mm)
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_uniform_image_stays_uniform_for_every_preset(gpu, name):
-    bench = Bench(gpu, {"kind": "preset", "name": name}, **SIZE, vertical_fov_deg=50.0)
+def test_uniform_image_stays_uniform_for_every_preset(engine, name):
+    bench = Bench(
+        engine, {"kind": "preset", "name": name}, **SIZE, vertical_fov_deg=50.0
+    )
     colour = np.array([0.8, 0.4, 0.1], np.float32)
     image = np.broadcast_to(colour, (120, 160, 3)).copy()
     depth_m = np.where(np.arange(160) < 80, 0.3, 6.0)[None, :]
@@ -118,18 +120,20 @@ SKEWED = {
 }
 
 
-def bright_pixel(gpu, profile, **spec):
-    bench = Bench(gpu, profile, **{**NARROW, **spec})
+def bright_pixel(engine, profile, **spec):
+    bench = Bench(engine, profile, **{**NARROW, **spec})
     image = np.zeros((120, 160, 3), np.float32)
     image[60, 80] = 1.0
     result = bench.render(bench.view(image, np.inf), merge=False)
     return bench, result.color.astype(np.float64)
 
 
-def test_one_bright_pixel_is_the_psf_with_its_sum_and_centroid(gpu):
+def test_one_bright_pixel_is_the_psf_with_its_sum_and_centroid(engine):
     # Small pixels, for binning a caustic into large ones moves its centroid by 0.07 px;
     # no diffraction, for where its tails are cut moves it by 0.02 px.
-    bench, answer = bright_pixel(gpu, SKEWED, vertical_fov_deg=3.0, diffraction=False)
+    bench, answer = bright_pixel(
+        engine, SKEWED, vertical_fov_deg=3.0, diffraction=False
+    )
     eye = MeasuredWavefront.from_profile(parse_profile(SKEWED))
     y, x = np.mgrid[0:120, 0:160]
     for channel, wavelength_nm in enumerate(RGB_WAVELENGTHS_NM):
@@ -154,9 +158,9 @@ def test_one_bright_pixel_is_the_psf_with_its_sum_and_centroid(gpu):
         assert (spot * y).sum() == pytest.approx(expected_y, abs=0.02)
 
 
-def test_bright_pixel_is_neither_rotated_nor_mirrored(gpu):
+def test_bright_pixel_is_neither_rotated_nor_mirrored(engine):
     """Coma and oblique astigmatism tell all eight orientations apart."""
-    bench, answer = bright_pixel(gpu, SKEWED)
+    bench, answer = bright_pixel(engine, SKEWED)
     eye = MeasuredWavefront.from_profile(parse_profile(SKEWED))
     truth = exact_kernels(eye, bench, d=0.0, radius_px=30)
     spot = answer[30:91, 50:111]
@@ -173,8 +177,8 @@ def test_bright_pixel_is_neither_rotated_nor_mirrored(gpu):
 
 
 @pytest.mark.parametrize("object_dpt", [0.25, 1.0, 2.6])
-def test_plane_through_a_myope_is_true_convolution(gpu, rng, object_dpt):
-    bench = Bench(gpu, MYOPE, **NARROW)
+def test_plane_through_a_myope_is_true_convolution(engine, rng, object_dpt):
+    bench = Bench(engine, MYOPE, **NARROW)
     eye = MeasuredWavefront.from_profile(parse_profile(MYOPE))
     image = texture(rng, 120, 160)
     view = bench.view(image, 1.0 / object_dpt, "radial")
@@ -184,8 +188,8 @@ def test_plane_through_a_myope_is_true_convolution(gpu, rng, object_dpt):
     assert psnr_db(result.color[inside, inside], truth[inside, inside]) >= 60.0
 
 
-def test_slanted_plane_is_the_normalised_gather(gpu, rng):
-    bench = Bench(gpu, MYOPE, **NARROW)
+def test_slanted_plane_is_the_normalised_gather(engine, rng):
+    bench = Bench(engine, MYOPE, **NARROW)
     eye = MeasuredWavefront.from_profile(parse_profile(MYOPE))
     # blur 0.1 px per px across the image: d from 0.5 dpt on
     px_per_dpt = bench.spec.blur_px_per_dpt(5.0)
@@ -213,8 +217,8 @@ def test_slanted_plane_is_the_normalised_gather(gpu, rng):
     assert psnr_db(result.color[inside], truth[inside]) >= 50.0
 
 
-def test_two_planes_of_equal_colour_stay_flat_across_their_edge(gpu):
-    bench = Bench(gpu, MYOPE, **NARROW)
+def test_two_planes_of_equal_colour_stay_flat_across_their_edge(engine):
+    bench = Bench(engine, MYOPE, **NARROW)
     image = np.full((120, 160, 3), 0.5, np.float32)
     depth_m = np.where(np.arange(160) < 80, 0.4, 4.0)[None, :]
     result = bench.render(bench.view(image, depth_m))
@@ -229,8 +233,8 @@ def two_layer_truth(near, far, alpha, near_kernels, far_kernels):
     )
 
 
-def edge_scene(gpu, rng, *, focus_dpt, near_dpt, far_dpt):
-    bench = Bench(gpu, EMMETROPE, **NARROW, chromatic=False)
+def edge_scene(engine, rng, *, focus_dpt, near_dpt, far_dpt):
+    bench = Bench(engine, EMMETROPE, **NARROW, chromatic=False)
     eye = MeasuredWavefront.from_profile(parse_profile(EMMETROPE))
     near = texture(rng, 120, 160, cell_px=8) * 0.5 + 0.5
     far = texture(rng, 120, 160, cell_px=8) * 0.5
@@ -246,14 +250,14 @@ def edge_scene(gpu, rng, *, focus_dpt, near_dpt, far_dpt):
     return (result.color - truth)[inside, inside]
 
 
-def test_sharp_near_plane_over_a_blurred_far_one(gpu, rng):
-    error = edge_scene(gpu, rng, focus_dpt=2.5, near_dpt=2.5, far_dpt=0.5)
+def test_sharp_near_plane_over_a_blurred_far_one(engine, rng):
+    error = edge_scene(engine, rng, focus_dpt=2.5, near_dpt=2.5, far_dpt=0.5)
     assert np.sqrt(np.mean(error**2)) < 0.02
     assert np.abs(error).max() < 0.06
 
 
-def test_blurred_near_plane_over_a_sharp_far_one_is_bounded(gpu, rng):
+def test_blurred_near_plane_over_a_sharp_far_one_is_bounded(engine, rng):
     """One layer lacks what the near edge hides: the bound is the measured limit."""
-    error = edge_scene(gpu, rng, focus_dpt=0.5, near_dpt=2.5, far_dpt=0.5)
+    error = edge_scene(engine, rng, focus_dpt=0.5, near_dpt=2.5, far_dpt=0.5)
     assert np.sqrt(np.mean(error**2)) < 0.05
     assert np.abs(error).max() < 0.5

@@ -129,7 +129,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     used = np.zeros((1, interval_count(layers)), bool)
     used[0, k] = True
     image = image_cells(spec, store.plan)
-    kernels = frame_kernels(store, layers, image, used)
+    kernels = frame_kernels(store.tables, layers, image, used)
     blended = reference.kernel_pairs(store, kernels)[0, 0, ..., 1]
     direct = wavefront_aberrations(
         estimated.surfaces(focus_dpt), wavelength_nm=549.0, pupil_diameter_mm=pupil_mm

@@ -173,12 +173,27 @@ def test_rooms_import_only_those_before_them(package, room):
     assert not wrong, "\n".join(wrong)
 
 
+ENGINE_PARTS = (
+    "filter_service.gl",
+    "filter_service.rendering.gl",
+    "filter_service.rendering.native",
+)
+
+
+def test_engines_do_not_know_each_other():
+    native = package_imports("filter_service/rendering/native")
+    gl = package_imports("filter_service/rendering/gl")
+    assert native and gl
+    assert not [e for e in native if _may(e.module, ENGINE_PARTS[:2])]
+    assert not [e for e in gl if _may(e.module, ENGINE_PARTS[2:])]
+
+
 def test_what_engines_share_knows_no_engine():
     wrong = [
         f"{entry.file}:{entry.line} imports {entry.module}"
         for path in (ROOT / "filter_service" / "rendering").glob("*.py")
         for entry in imports_of(path)
-        if _may(entry.module, ("filter_service.gl", "filter_service.rendering.gl"))
+        if _may(entry.module, ENGINE_PARTS)
     ]
     assert not wrong, "\n".join(wrong)
 

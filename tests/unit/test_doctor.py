@@ -3,10 +3,16 @@
 import pytest
 
 from filter_service.commands import doctor_checks
-from filter_service.commands.doctor_checks import check_packages, check_shaders
-from filter_service.commands.doctor_probes import probe_shaders
+from filter_service.commands.doctor_checks import (
+    check_engine,
+    check_native,
+    check_packages,
+    check_shaders,
+)
+from filter_service.commands.doctor_probes import probe_native, probe_shaders
 from filter_service.gl import shader_source
 from filter_service.gl.gpu import Gpu
+from filter_service.rendering.native import library
 
 GOOD = {"program_count": 27, "frame_error": 0.0, "psf_error": 0.04}
 
@@ -66,13 +72,54 @@ def test_without_opengl_shaders_are_not_tried():
     assert not check.ok and "not tried" in check.detail
 
 
+CHECKS = (
+    *("python", "service packages", "gl", "compute", "shaders", "native", "threads"),
+    *("client packages", "window packages", "display"),
+)
+
+
 @pytest.mark.parametrize("lost", ["gl", "compute", "shaders"])
-def test_filter_and_serve_need_the_shaders(lost):
-    names = ("python", "service packages", "gl", "compute", "shaders", "threads")
-    ok = dict.fromkeys((*names, "client packages", "window packages", "display"), True)
+def test_filter_and_serve_need_the_shaders_or_the_loops(lost):
+    ok = dict.fromkeys(CHECKS, True)
     assert all(doctor_checks.what_works(ok).values())
     works = doctor_checks.what_works(ok | {lost: False})
+    assert works["filter"] and works["serve"]
+    assert works["demo"] == (lost != "gl")  # its scenes are rendered with OpenGL
+    works = doctor_checks.what_works(ok | {lost: False, "native": False})
     assert [name for name, it_works in works.items() if it_works] == ["psf"]
+
+
+def test_the_native_engine_s_probe_filters_a_perfect_eye():
+    check = check_native(probe_native())
+    assert check.ok and not check.fix and "threads" in check.detail
+
+
+def test_without_a_compiled_library_a_compiler_is_named(monkeypatch):
+    monkeypatch.setattr(library, "library_path", lambda: None)
+    library.compiled_library.cache_clear()
+    check = check_native(probe_native())
+    library.compiled_library.cache_clear()
+    assert not check.ok and "gcc" in check.fix and "not built" in check.detail
+
+
+LLVMPIPE = {"info": {"renderer": "llvmpipe (LLVM 15)"}}
+NATIVE = {"name": "native (avx2, 2 threads)", "frame_error": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("gl", "native", "says"),
+    [
+        ({"info": {"renderer": "NVIDIA H100"}}, NATIVE, "gl: NVIDIA H100"),
+        (LLVMPIPE, NATIVE, "native: llvmpipe"),
+        ({"error": "no libEGL"}, NATIVE, "native: no OpenGL"),
+        (LLVMPIPE, {"error": "not built"}, "gl, slowly"),
+        ({"error": "no libEGL"}, {"error": "not built"}, "neither"),
+    ],
+)
+def test_the_engine_that_will_be_chosen_is_named_with_the_reason(gl, native, says):
+    check = check_engine(gl, native)
+    assert check.detail.startswith(says)
+    assert check.ok == (says != "neither")
 
 
 def test_a_wheel_s_missing_packages_are_installed_with_pip(monkeypatch):

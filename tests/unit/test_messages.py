@@ -206,6 +206,7 @@ def refusal(parts, error=errors.BadMessage):
         ({"output": {"dtype": "uint16", "space": "srgb"}}, "output.dtype"),
         ({"options": {"accumulation": "sum"}}, "options.accumulation"),
         ({"options": {"merge": 1}}, "options.merge"),
+        ({"options": {"render_tolerance": -1.0}}, "options.render_tolerance"),
     ],
 )
 def test_a_wrong_frame_field_is_named_with_what_is_allowed(changes, field):

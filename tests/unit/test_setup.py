@@ -28,6 +28,7 @@ def _required() -> list[str]:
     project = tomllib.loads(text)["project"]
     extras = project["optional-dependencies"]
     listed = [*project["dependencies"], *extras["clients"], *extras["dev"]]
+    listed += extras["peers"]
     return [re.match(r"[\w.-]+", requirement)[0] for requirement in listed]
 
 

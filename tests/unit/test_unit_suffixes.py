@@ -26,6 +26,8 @@ DIMENSIONLESS = {
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
+    "tolerance": "errors over the usual ones",
+    "render_tolerance": "errors over the usual ones",
     "oversampling": "samples per sample",
     "conic_constant": "shape of a conic, 0 sphere, -1 paraboloid",
     "margin": "in lambda/D",

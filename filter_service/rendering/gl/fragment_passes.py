@@ -35,7 +35,8 @@ class FragmentPasses:
         Cells of the whole frame.
     corner_change_dpt : (rows + 1, columns + 1), float32
         Change of defocus at the corners of the cells.
-    merge : bool
+    tolerance : float
+        Of merging, against the usual; 0: nothing merges.
     first_row : int
         Of the strip within the frame.
     frame_pixel_count : int, optional
@@ -59,7 +60,7 @@ class FragmentPasses:
         *,
         image: ImageCells,
         corner_change_dpt: NDArray[np.float32],
-        merge: bool,
+        tolerance: float,
         first_row: int = 0,
         frame_pixel_count: int | None = None,
         image_size_px: tuple[int, int] | None = None,
@@ -69,7 +70,7 @@ class FragmentPasses:
         self.strip = strip
         self.image = image
         self.corner_change_dpt = corner_change_dpt
-        self.merge = merge
+        self.tolerance = tolerance
         self.first_row = first_row
         self.scan = (
             first_row * strip.view.width_px,
@@ -165,6 +166,7 @@ class FragmentPasses:
                     blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                     max_level=self._max_level,
                     white_level=self.white_level,
+                    tolerance=self.tolerance,
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,
                     surface=surface,
@@ -178,7 +180,7 @@ class FragmentPasses:
     @property
     def _max_level(self) -> int:
         """Level up to which fragments merge; the paper merges once."""
-        if not self.merge:
+        if self.tolerance == 0.0:
             return 0
         most = 1 if self.strip.paper_rule else MAX_LEVEL
         cell_px = self.image.cell_px

@@ -20,7 +20,11 @@ from filter_service.rendering.frame_kernels import (
     part_table,
     work_list,
 )
-from filter_service.rendering.image_cells import ImageCells, can_coarsen
+from filter_service.rendering.image_cells import (
+    ImageCells,
+    KernelsTooLarge,
+    can_coarsen,
+)
 
 MAX_GROUPS = 65535
 """Work groups along one axis that every OpenGL 4.3 allows."""
@@ -28,10 +32,6 @@ MAX_GROUPS = 65535
 
 MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
-
-
-class KernelsTooLarge(Exception):
-    """A frame's kernels take too much memory; those of larger cells take less."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class KernelMaker:
                 return self._set
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
-            kernels = frame_kernels(store, layers, image, used)
+            kernels = frame_kernels(store.tables, layers, image, used)
             table, sizes = kernel_table(kernels)
             n_texels = int(sizes.sum())
         if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):

@@ -9,87 +9,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
-from filter_service.errors import BadMessage, CameraMismatch, OutOfGpuMemory
+from filter_service.errors import OutOfGpuMemory
 from filter_service.gl.gpu import Gpu, Pages, StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import (
     IMAGES,
+    border_px_of,
     extended,
     fill_missing_depth,
     finite_color,
     object_dpt,
     with_clean_hidden,
 )
+from filter_service.rendering.frame_options import (
+    OUTPUT_DTYPES,
+    FrameOptions,
+    frame_options,
+)
 from filter_service.rendering.frame_states import FrameStates, FrameStore
-from filter_service.rendering.gaze import usable_gaze
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
-from filter_service.rendering.gl.kernel_passes import KernelMaker, KernelsTooLarge
+from filter_service.rendering.gl.kernel_passes import KernelMaker
 from filter_service.rendering.gl.strip import Strip
-from filter_service.rendering.image_cells import ImageCells, image_cells
+from filter_service.rendering.image_cells import (
+    ImageCells,
+    KernelsTooLarge,
+    image_cells,
+)
+from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import ACCUMULATIONS, OUTPUTS
 
 BYTES_PER_PIXEL = 16
 """Of the largest buffers, per pixel and surface: a strip's must fit a storage block."""
 
 UPLOAD_LINES = 512
 """Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
-
-OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
-
-WHITE_STEP_PX = 8
-"""Every so many pixels count for the level of white."""
-
-WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
-"""White of a linear image is its brightest light, but no more than so many times what
-nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """A filtered view and how it was made.
-
-    Attributes
-    ----------
-    color : (height, width, 3)
-        float32 or float16 linear light, or uint8 sRGB.
-    stage_times_ms : dict
-        By stage; their sum is the time spent in the renderer.
-    missing_depth_count, clamped_depth_count, bad_color_count : int
-        Pixels whose depth was filled in, lay outside the prepared distances, or whose
-        colour was not finite (taken as black); the last two with those of a hidden
-        layer that hold something.
-    pupil_diameter_mm, focus_dpt : float
-        As used.
-    gaze_deg : (h, v)
-        As used.
-    fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and entries of the bins' lists; rows that
-        two strips of a very large frame share count twice, and with a hidden layer the
-        repeated border counts.
-    overflow_count : int
-        Entries that could not be kept, for want of room; their light is missing.
-    kernel_count, kernel_texel_count : int
-        Kernels in use, and texels of all their levels.
-    """
-
-    color: NDArray
-    stage_times_ms: dict[str, float]
-    missing_depth_count: int
-    clamped_depth_count: int
-    bad_color_count: int
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
-    fragment_count: int
-    merged_count: int
-    entry_count: int
-    kernel_count: int
-    kernel_texel_count: int
-    layer_count: int
-    notes: list[str]
-    overflow_count: int = 0
 
 
 @dataclass(frozen=True)
@@ -158,9 +113,10 @@ class FilterRenderer:
         focus_dpt: float,
         accumulation: str = "coverage",
         merge: bool = True,
+        render_tolerance: float = 1.0,
         output: str = "linear",
         gaze_deg: tuple[float, float] | None = None,
-    ) -> Rendered:
+    ) -> FilteredView:
         """Filter one view through the eye of a loaded store.
 
         Parameters
@@ -168,6 +124,8 @@ class FilterRenderer:
         gaze_deg : (h, v), optional
             Where the eye looks in the image, clamped to what was prepared with a note;
             the store's where it is None.
+        render_tolerance : float
+            Errors of merging and layers against the usual; 0 is exact.
 
         Raises
         ------
@@ -177,18 +135,22 @@ class FilterRenderer:
             The store is for another camera, see `camera.is_same_camera`.
         OutOfGpuMemory, RenderFailed
         """
-        _check_choice("accumulation", accumulation, ACCUMULATIONS)
-        _check_choice("output", output, OUTPUTS)
-        _check_camera(view, handle.store)
-        gaze = usable_gaze(handle.store.spec, gaze_deg)
-        options = _Options(accumulation == "paper", merge, output, gaze)
+        options = frame_options(
+            view,
+            handle.store,
+            accumulation=accumulation,
+            merge=merge,
+            render_tolerance=render_tolerance,
+            output=output,
+            gaze_deg=gaze_deg,
+        )
         # Another library's context (a renderer of the input) may be current.
         with self._gpu.context:
             return self._render(view, handle, pupil_diameter_mm, focus_dpt, options)
 
     def _render(
-        self, view, handle, pupil_diameter_mm, focus_dpt, options: "_Options"
-    ) -> Rendered:
+        self, view, handle, pupil_diameter_mm, focus_dpt, options: FrameOptions
+    ) -> FilteredView:
         timer = StageTimer(self._gpu)
         with timer.wall("prepare_ms"):
             depth = self._prepared_depth(view, handle.store)
@@ -197,16 +159,12 @@ class FilterRenderer:
             if view.surface_count > 1:
                 whole, bad_count = with_clean_hidden(whole)
                 bad_color_count += bad_count
-        layers = self._states.layers(timer, handle, pupil_diameter_mm, focus_dpt)
-        gaze_deg, gaze_notes = options.gaze
+        layers = self._states.layers(
+            timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
+        )
         picture, counts = self._filtered(timer, whole, handle, layers, options)
         self._gpu.check("render")
-        notes = [*layers.notes, *gaze_notes]
-        if bad_color_count:
-            notes.append(
-                f"{bad_color_count} pixels with non-finite colour taken as black"
-            )
-        return Rendered(
+        return FilteredView(
             color=picture,
             stage_times_ms=timer.result_ms(),
             missing_depth_count=depth.missing_count,
@@ -214,28 +172,28 @@ class FilterRenderer:
             bad_color_count=bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            gaze_deg=gaze_deg,
+            gaze_deg=options.gaze_deg,
             **counts,
             layer_count=len(layers.layer_dpt),
-            notes=notes,
+            notes=[*layers.notes, *options.gaze_notes, *color_notes(bad_color_count)],
         )
 
     def _filtered(
-        self, timer, view: RgbdView, handle, layers: FrameLayers, options: "_Options"
+        self, timer, view: RgbdView, handle, layers: FrameLayers, options: FrameOptions
     ) -> tuple[NDArray, dict[str, int]]:
         """Picture and counts; with larger cells where kernels take too much memory."""
         while True:
-            image = self._states.cells(timer, handle, options.gaze[0])
+            image = self._states.cells(timer, handle, options.gaze_deg)
             try:
                 return self._in_strips(timer, view, handle, layers, image, options)
             except KernelsTooLarge:
                 self._states.coarsen(image)
 
     def _in_strips(
-        self, timer, view, handle, layers, image: ImageCells, options: "_Options"
+        self, timer, view, handle, layers, image: ImageCells, options: FrameOptions
     ) -> tuple[NDArray, dict[str, int]]:
         reach_px = ceil(image.maps.largest_stretch_ratio * layers.max_radius_px) + 2
-        border_px = _border_px(view, reach_px)
+        border_px = border_px_of(view, reach_px)
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = self._states.corner_change_dpt(timer, layers, image)
@@ -253,12 +211,12 @@ class FilterRenderer:
                 shared,
                 image=image,
                 corner_change_dpt=change_dpt,
-                merge=options.merge,
+                tolerance=options.tolerance if options.merge else 0.0,
                 first_row=rows.first_row,
                 frame_pixel_count=whole.width_px * whole.height_px,
                 image_size_px=(view.width_px, view.height_px),
                 border_px=border_px,
-                white_level=_white_level(view.color),
+                white_level=white_level(view.color),
             )
             passes = FramePasses(shared, fragments)
             passes.run(
@@ -296,60 +254,11 @@ def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16
     return part.reshape(-1, STORE_SIDE)
 
 
-def _white_level(color: NDArray) -> float:
-    """Light against which a merged quad's contrast counts.
-
-    1 for 8-bit input.  Linear light may have any unit, so that merging, and with it the
-    whole filter, must scale with the light.
-    """
-    if color.dtype == np.uint8:
-        return 1.0
-    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
-    lit = light[light > 0.0]
-    if lit.size == 0:
-        return 0.0
-    return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))
-
-
-@dataclass(frozen=True)
-class _Options:
-    """How a frame is filtered; gaze (h, v) with notes."""
-
-    paper_rule: bool
-    merge: bool
-    output: str
-    gaze: tuple[tuple[float, float], tuple[str, ...]]
-
-
 @dataclass(frozen=True)
 class _Depth:
     depth_m: NDArray[np.float32]
     missing_count: int
     clamped_count: int
-
-
-def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:
-    if value not in options:
-        raise BadMessage(f"{value!r}", field=field, allowed=", ".join(options))
-
-
-def _check_camera(view: RgbdView, store: PsfStore) -> None:
-    if not store.spec.serves(view.camera):
-        raise CameraMismatch(
-            f"PSFs are for {store.spec.camera}, the view's is {view.camera}",
-            field="tangents",
-        )
-
-
-def _border_px(view: RgbdView, reach_px: int) -> int:
-    """Columns and rows to add all around a view with a hidden layer, whole tiles.
-
-    Next to the border of an image no surface is whole, for part of its light would come
-    from beyond; what it hides would shine through.  So the image goes on, as its edge.
-    """
-    if view.surface_count == 1:
-        return 0
-    return -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
 
 
 @dataclass(frozen=True)

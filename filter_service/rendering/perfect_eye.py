@@ -1,4 +1,4 @@
-"""PSFs of a perfect eye: the smallest store that frames can be filtered with."""
+"""The store of a perfect eye, which leaves every picture as it is."""
 
 import numpy as np
 
@@ -9,9 +9,47 @@ from filter_service.constants import RGB, WEIGHT_MAX
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.engine import FrameEngine
+from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 
 PUPIL_MM = 3.0
+SIDE_PX = 16
+TANGENTS = (-0.01, 0.01, 0.01, -0.01)
+
+VARIANTS = (
+    (np.uint8, "srgb8", "coverage"),
+    (np.uint8, "srgb8", "paper"),
+    (np.float32, "linear", "coverage"),
+    (np.float16, "linear16", "coverage"),
+)
+"""Colour, output and rule of frames that differ in what an engine does."""
+
+
+def change_by_perfect_eye(engine: FrameEngine) -> float:
+    """Filter a tiny frame in every variant that clients may ask for.
+
+    Returns
+    -------
+    float
+        The largest change of a pixel's value, which a perfect eye leaves as it is.
+    """
+    *_, handle = engine.load_steps(perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS)))
+    depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
+    changes = []
+    for dtype, output, accumulation in VARIANTS:
+        view = RgbdView(np.ones((SIDE_PX, SIDE_PX, RGB), dtype), depth_m, TANGENTS)
+        rendered = engine.render(
+            view,
+            handle,
+            pupil_diameter_mm=PUPIL_MM,
+            focus_dpt=0.0,
+            accumulation=accumulation,
+            output=output,
+        )
+        changes.append(np.abs(rendered.color.astype(np.float32) - view.color))
+    handle.release()
+    return float(np.max(changes))
 
 
 def perfect_store(camera: Camera) -> PsfStore:

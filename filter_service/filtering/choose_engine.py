@@ -1,0 +1,109 @@
+"""Which engine filters frames on this machine, and why."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from filter_service.constants import ENGINES
+from filter_service.errors import RenderFailed
+from filter_service.gl.hardware import may_have_gpu
+
+
+@dataclass(frozen=True)
+class ChosenEngine:
+    """A frame engine that is ready for stores.
+
+    Attributes
+    ----------
+    name : "gl" or "native"
+    engine : FrameEngine
+    reason : str
+        Why this one, in a few words.
+    psf_engine : "auto" or "cpu"
+        What builds PSFs beside it, unless told otherwise.
+    """
+
+    name: str
+    engine: Any
+    reason: str
+
+    @property
+    def psf_engine(self) -> str:
+        """The processor builds where it filters; beside gl a hardware GPU does."""
+        return "cpu" if self.name == "native" else "auto"
+
+
+def open_engine(
+    choice: str, closing: ExitStack, *, warm_up: bool = False
+) -> ChosenEngine:
+    """Open the engine of a choice.
+
+    Parameters
+    ----------
+    choice : "auto", "gl" or "native"
+        "auto" takes gl on a hardware GPU, else native.
+    closing : ExitStack
+        Ends it.
+    warm_up : bool
+        Compile shaders now, and not in the first frames.
+
+    Raises
+    ------
+    ValueError
+        Another choice.
+    RenderFailed
+        It does not work on this machine; names what to install.
+    """
+    if choice not in ENGINES:
+        raise ValueError(f"engine {choice!r}; allowed: {', '.join(ENGINES)}")
+    if choice == "native":
+        return _native(closing, "as asked")
+    if choice == "gl":
+        return _gl(closing, "as asked", warm_up=warm_up)
+    return _automatic(closing, warm_up=warm_up)
+
+
+def _automatic(closing: ExitStack, *, warm_up: bool) -> ChosenEngine:
+    if not may_have_gpu():
+        return _native_or_gl(closing, "no GPU on this machine", warm_up=warm_up)
+    with ExitStack() as own:
+        try:
+            found = _gl(own, "a hardware GPU", warm_up=warm_up, hardware_only=True)
+        except RenderFailed as error:
+            return _native_or_gl(closing, f"no GPU: {error}", warm_up=warm_up)
+        closing.push(own.pop_all())
+    return found
+
+
+def _native_or_gl(closing: ExitStack, reason: str, *, warm_up: bool) -> ChosenEngine:
+    try:
+        return _native(closing, reason)
+    except RenderFailed as error:
+        return _gl(closing, f"{reason}, and {error}", warm_up=warm_up)
+
+
+def _native(closing: ExitStack, reason: str) -> ChosenEngine:
+    from filter_service.rendering.native.renderer import NativeRenderer
+
+    renderer = NativeRenderer()
+    closing.callback(renderer.close)
+    return ChosenEngine("native", renderer, reason)
+
+
+def _gl(
+    closing: ExitStack, reason: str, *, warm_up: bool, hardware_only: bool = False
+) -> ChosenEngine:
+    from filter_service.gl.gpu import Gpu
+    from filter_service.rendering.gl.compile_passes import compile_passes
+    from filter_service.rendering.gl.renderer import FilterRenderer
+
+    gpu = Gpu()
+    closing.callback(gpu.close)
+    if hardware_only and gpu.is_software:
+        raise RenderFailed(f"{gpu.info['renderer']} is software")
+    renderer = FilterRenderer(gpu)
+    if warm_up:
+        compile_passes(renderer)
+    return ChosenEngine("gl", renderer, reason)

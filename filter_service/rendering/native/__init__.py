@@ -1,0 +1,15 @@
+"""The frame engine of compiled loops, for machines without a GPU.
+
+renderer       the engine: stages, what is kept between frames
+native_store   a store with its coarse kernels
+kernel_plan    the kernels that a frame needs
+frame_record   what the loops are told
+records        their records, field by field
+arrays         memory that frames use again
+library        the compiled loops
+source/        the loops, in C
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

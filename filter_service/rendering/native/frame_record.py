@@ -1,0 +1,178 @@
+"""Fills in the record that the compiled loops work on."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import MAX_LEVEL, TILE_SIZE_PX
+from filter_service.psfs.store import FrameLayers
+from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.image_cells import ImageCells
+from filter_service.rendering.native.arrays import Arrays
+from filter_service.rendering.native.kernel_plan import KernelPlan
+from filter_service.rendering.native.native_store import COARSE_SPREAD_PX, NativeStore
+from filter_service.rendering.native.records import (
+    BLOCK,
+    FRAGMENT,
+    FRAGMENT_LIGHT,
+    KERNEL_IMAGE_BYTES,
+    RECIPE_IMAGE_BYTES,
+    RESOLUTIONS,
+    Frame,
+)
+from filter_service.rgbd_view import RgbdView
+
+COLOR_KINDS = {"uint8": 0, "float32": 1, "float16": 2}
+BLOCK_PIXELS = TILE_SIZE_PX**2
+CLAMP_MARGIN_RATIO = 1e-6
+COARSE_MARGIN_PX = 8.0
+"""Light of coarse kernels goes that much farther, see merge.h."""
+
+REACH_MARGIN_PX = 1.5
+
+
+class BlendSizes(NamedTuple):
+    """Sizes of what blending makes, as `place` found them."""
+
+    recipe_texels: int
+    kernel_texels: int
+    scratch_floats: int
+
+    @classmethod
+    def of(cls, c: Frame) -> "BlendSizes":
+        """Read them off a record."""
+        return cls(
+            c.recipe_texel_count,
+            c.kernel_texel_count,
+            c.blend_scratch_floats,
+        )
+
+
+@dataclass
+class FrameRecord:
+    """The record of one frame, with the arrays that it points to.
+
+    Attributes
+    ----------
+    c : Frame
+    """
+
+    c: Frame
+    arrays: Arrays
+    kept: list[NDArray]
+
+    @classmethod
+    def new(cls, threads: int, arrays: Arrays) -> "FrameRecord":
+        """Return an empty record for loops on these threads."""
+        return cls(Frame(threads=threads), arrays, [])
+
+    def _keep(self, array: NDArray) -> int:
+        """Keep an array as long as the record; return where it lies."""
+        self.kept.append(array)
+        return int(array.ctypes.data)
+
+    def _room(self, name: str, count: int, dtype=np.uint8) -> int:
+        return self.arrays.address(name, count, dtype)
+
+    def set_view(self, view: RgbdView, border_px: int) -> None:
+        """Point to the images of a view that has a border around it."""
+        c = self.c
+        c.width, c.height = view.width_px, view.height_px
+        c.surface_count, c.border_px = view.surface_count, border_px
+        c.image_width = view.width_px - 2 * border_px
+        c.image_height = view.height_px - 2 * border_px
+        c.block_columns = -(-view.width_px // TILE_SIZE_PX)
+        c.block_rows = -(-view.height_px // TILE_SIZE_PX)
+        c.color_kind = COLOR_KINDS[view.color.dtype.name]
+        for s, (color, depth_m) in enumerate(
+            zip(view.surface_colors, view.surface_depths_m, strict=True)
+        ):
+            c.color[s] = self._keep(np.ascontiguousarray(color))
+            c.depth_m[s] = self._keep(np.ascontiguousarray(depth_m))
+        c.depth_is_planar = view.depth_kind == "planar"
+        c.tangents[:] = view.tangents
+        n_pixels = view.surface_count * view.width_px * view.height_px
+        c.dpt = self._room("dpt", n_pixels, np.float32)
+        c.position = self._room("position", n_pixels, np.float32)
+
+    def set_state(
+        self,
+        layers: FrameLayers,
+        image: ImageCells,
+        corner_change_dpt: NDArray[np.float32],
+    ) -> NDArray[np.bool_]:
+        """Point to layers and cells; returns where used pairs will be noted."""
+        c = self.c
+        c.object_low_dpt, c.object_high_dpt = layers.object_range_dpt
+        c.object_margin_dpt = CLAMP_MARGIN_RATIO * max(layers.object_range_dpt[1], 1.0)
+        c.blur_px_per_dpt = layers.blur_px_per_dpt
+        c.layer_dpt = self._keep(layers.layer_dpt.astype(np.float32))
+        c.layer_count = len(layers.layer_dpt)
+        c.interval_count = interval_count(layers)
+        c.cell_px, c.cell_columns = image.cell_px, image.grid[0]
+        c.corner_dpt = self._keep(np.ascontiguousarray(corner_change_dpt, np.float32))
+        used = np.zeros((image.count, c.interval_count), np.bool_)
+        c.used = self._keep(used)
+        return used
+
+    def set_kernels(self, plan: KernelPlan) -> None:
+        """Point to planned kernels and to room for fragments."""
+        c = self.c
+        c.kernel_of = self._keep(plan.kernel_of)
+        c.shapes = self._keep(plan.shapes)
+        c.kernel_count = plan.kernels.count
+        reach_px = float(plan.kernels.reach_px.max())
+        c.largest_reach_px = reach_px + REACH_MARGIN_PX + COARSE_MARGIN_PX
+        n_blocks = c.surface_count * c.block_columns * c.block_rows
+        c.fragments = self._room("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
+        c.lights = self._room("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
+        c.blocks = self._room("blocks", n_blocks, BLOCK)
+        names = ("kernel_cells", "kernel_parts", "node_near", "node_far")
+        for name, array in zip(
+            (*names, "part_weights", "part_maps", "recipes"), plan.sources, strict=True
+        ):
+            setattr(c, name, self._keep(array))
+        c.recipe_count = len(plan.kernels.nodes.recipes)
+        n_images = RESOLUTIONS * c.recipe_count
+        c.recipe_images = self._room("recipe_images", n_images * RECIPE_IMAGE_BYTES)
+        c.kernels = self._room("kernels", c.kernel_count * KERNEL_IMAGE_BYTES)
+
+    def set_merging(
+        self, *, tolerance: float, paper_rule: bool, white_level: float
+    ) -> None:
+        """Say how pixels become fragments, and those light; the paper merges once."""
+        c = self.c
+        c.paper_rule, c.white_level = paper_rule, white_level
+        most = 1 if paper_rule else MAX_LEVEL
+        if c.cell_px:
+            most = min(most, c.cell_px.bit_length() - 1)
+        c.max_level = most if tolerance > 0.0 else 0
+        c.tolerance = tolerance
+        for r in range(1, RESOLUTIONS):
+            spread_px = COARSE_SPREAD_PX[r] / tolerance if tolerance > 0.0 else math.inf
+            c.coarse_spread_px[r] = max(spread_px, COARSE_SPREAD_PX[r])
+
+    def set_store(self, handle: NativeStore) -> None:
+        """Point to the cached kernels."""
+        for r, stored in enumerate(handle.resolutions):
+            self.c.store[r] = self._keep(stored.words)
+            self.c.store_first[r] = self._keep(stored.first_texel)
+            self.c.store_reach[r] = self._keep(stored.reach)
+
+    def set_blend_room(self, sizes: BlendSizes, n_threads: int) -> None:
+        """Point to kernels, or room for them."""
+        c = self.c
+        room = self._room
+        c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
+        c.kernel_texels = room("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
+        c.blend_scratch_floats = sizes.scratch_floats
+        n_floats = n_threads * sizes.scratch_floats
+        c.blend_scratch = room("blend_scratch", n_floats, np.float32)
+
+    def set_picture(self, picture: NDArray) -> None:
+        """Point to where the picture goes."""
+        self.c.picture = self._keep(picture)
+        self.c.output_kind = COLOR_KINDS[picture.dtype.name]

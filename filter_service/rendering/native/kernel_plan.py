@@ -1,0 +1,108 @@
+"""Which kernels a frame needs, as the compiled loops read it; kept between frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX
+from filter_service.psfs.boxes import box_sizes
+from filter_service.psfs.store import FrameLayers
+from filter_service.rendering.frame_kernels import (
+    FrameKernels,
+    frame_kernels,
+    pair_index,
+)
+from filter_service.rendering.image_cells import (
+    ImageCells,
+    KernelsTooLarge,
+    can_coarsen,
+)
+from filter_service.rendering.native.native_store import NativeStore
+from filter_service.rendering.native.records import KERNEL_SHAPE
+
+TEXELS_PER_PIXEL = 10
+"""Of the single kernels of a frame, before cells are made larger: beyond that it takes
+longer to make kernels than to use them."""
+
+MIN_SPREAD_PX = 1e-9
+
+
+@dataclass(frozen=True)
+class KernelPlan:
+    """Kernels of a frame in one state.
+
+    Attributes
+    ----------
+    state : (NativeStore, FrameLayers, ImageCells)
+        What they are for.
+    used : (n_cells, n_intervals), bool
+        Pairs that have one.
+    kernels : FrameKernels
+    kernel_of : (n_cells, n_intervals), uint32
+    shapes : (n,), KERNEL_SHAPE
+        `levels_used` is filled in by merging.
+    sources : tuple of arrays
+        What blending reads, each in one piece: cells, parts, near and far recipes,
+        weights, maps, recipes.
+    """
+
+    state: tuple[NativeStore, FrameLayers, ImageCells]
+    used: NDArray[np.bool_]
+    kernels: FrameKernels
+    kernel_of: NDArray[np.uint32]
+    shapes: NDArray[np.void]
+    sources: tuple[NDArray, ...]
+
+    def serves(self, state: tuple, used: NDArray[np.bool_]) -> bool:
+        """Whether a frame in a state that uses these pairs finds all of them."""
+        if any(own is not other for own, other in zip(self.state, state, strict=True)):
+            return False
+        return not np.any(used & ~self.used)
+
+
+def plan_kernels(
+    handle: NativeStore,
+    layers: FrameLayers,
+    image: ImageCells,
+    used: NDArray[np.bool_],
+) -> KernelPlan:
+    """Plan the kernels of used pairs.
+
+    Raises
+    ------
+    KernelsTooLarge
+        With larger cells there would be fewer.
+    """
+    kernels = frame_kernels(handle.tables, layers, image, used)
+    widths, heights = box_sizes(kernels.reach_px)
+    camera = handle.store.spec.camera
+    limit = TEXELS_PER_PIXEL * camera.width_px * camera.height_px
+    if int((widths * heights).sum()) > limit and can_coarsen(image):
+        raise KernelsTooLarge
+    nodes = kernels.nodes
+    sources = (kernels.cells, kernels.parts, nodes.near, nodes.far)
+    return KernelPlan(
+        state=(handle, layers, image),
+        used=used,
+        kernels=kernels,
+        kernel_of=pair_index(kernels, used.shape),
+        shapes=_shapes(kernels),
+        sources=(
+            *(np.ascontiguousarray(numbers, np.int64) for numbers in sources),
+            np.ascontiguousarray(kernels.weight_ratio, np.float64),
+            np.ascontiguousarray(kernels.maps, np.float64),
+            np.ascontiguousarray(nodes.recipes, np.uint32),
+        ),
+    )
+
+
+def _shapes(kernels: FrameKernels) -> NDArray[np.void]:
+    shapes = np.zeros(kernels.count, KERNEL_SHAPE)
+    shapes["spread_px"] = kernels.spread_px
+    shapes["radius_px"] = kernels.radius_px
+    shapes["reach_px"] = kernels.reach_px
+    widest_px = np.maximum(kernels.spread_px.max(axis=1), MIN_SPREAD_PX)
+    steps = np.floor(np.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
+    shapes["highest_level"] = np.clip(steps, 0, MAX_LEVEL)
+    return shapes

@@ -1,0 +1,110 @@
+"""The compiled loops: where they lie, what they are called with, what to do without."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+
+from filter_service.errors import RenderFailed
+from filter_service.rendering.native import records
+
+FOLDER = Path(__file__).parent
+STEM = "_loops"
+STAGES = ("pixels", "merge", "place", "blend", "splat")
+
+REMEDY = (
+    "install a C compiler (apt-get install gcc libc6-dev) and the package again, "
+    "or choose the engine gl"
+)
+
+
+class Library:
+    """The loops of `source/`, one function a stage.
+
+    Calls give up Python's lock, so that other threads go on while a frame is made.
+
+    Parameters
+    ----------
+    path : Path
+        The shared library.
+    portable : bool
+        Leave out what only some processors have; for tests.
+
+    Raises
+    ------
+    RenderFailed
+        It cannot be loaded, or was built from another version of this package.
+    """
+
+    def __init__(self, path: Path, *, portable: bool = False):
+        try:
+            self._c = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise RenderFailed(
+                f"{path.name} cannot be loaded ({error}); {REMEDY}"
+            ) from error
+        self._c.ocu_start.restype = ctypes.c_char_p
+        self._c.ocu_pool_new.restype = ctypes.c_void_p
+        self._c.ocu_pool_free.argtypes = (ctypes.c_void_p,)
+        self._c.ocu_pool_size.argtypes = (ctypes.c_void_p,)
+        self._check_sizes(path)
+        self.variant = self._c.ocu_start(int(portable)).decode()
+        self._stages = {name: getattr(self._c, f"ocu_{name}") for name in STAGES}
+
+    def _check_sizes(self, path: Path) -> None:
+        sizes = (ctypes.c_int32 * len(records.SIZES))()
+        self._c.ocu_sizes(sizes)
+        if tuple(sizes) != records.SIZES:
+            raise RenderFailed(
+                f"{path.name} was built from another version (records of "
+                f"{tuple(sizes)} bytes, not {records.SIZES}): install the package again"
+            )
+
+    def run(self, stage: str, frame: records.Frame) -> None:
+        """Run one of `STAGES` on a frame."""
+        self._stages[stage](ctypes.byref(frame))
+
+    def shrink(self, job: records.ShrinkJob) -> None:
+        """Make kernels of a store coarse."""
+        self._c.ocu_shrink(ctypes.byref(job))
+
+    def new_threads(self, count: int) -> int:
+        """Start threads that loops share, the caller among them; returns a handle."""
+        threads = self._c.ocu_pool_new(count)
+        if not threads:
+            raise RenderFailed(f"{count} threads cannot be started: out of memory")
+        return int(threads)
+
+    def thread_count(self, threads: int) -> int:
+        """Return how many threads there really are."""
+        return int(self._c.ocu_pool_size(threads))
+
+    def end_threads(self, threads: int) -> None:
+        """End them."""
+        self._c.ocu_pool_free(threads)
+
+
+def library_path() -> Path | None:
+    """Return where the compiled loops lie; None where they were not built."""
+    for suffix in EXTENSION_SUFFIXES:
+        path = FOLDER / (STEM + suffix)
+        if path.exists():
+            return path
+    return None
+
+
+@cache
+def compiled_library() -> Library:
+    """Load the compiled loops, once.
+
+    Raises
+    ------
+    RenderFailed
+        They were not built, or cannot be loaded; says what to do.
+    """
+    path = library_path()
+    if path is None:
+        raise RenderFailed(f"the native engine was not built here; {REMEDY}")
+    return Library(path)

@@ -1,0 +1,149 @@
+"""Records of `source/frame.h`, field by field."""
+
+import ctypes as c
+
+import numpy as np
+
+POINTER = c.c_void_p
+
+
+RESOLUTIONS = 3
+"""Kernels in pixels of 1, 2 and 4 px."""
+
+KERNEL_SHAPE = np.dtype(
+    {
+        "names": ["spread_px", "highest_level", "radius_px", "reach_px", "levels_used"],
+        "formats": [("<f4", 2), "<i4", "<u2", ("u1", 4), "u1"],
+        "offsets": [0, 8, 12, 14, 18],
+        "itemsize": 20,
+    }
+)
+FRAGMENT = np.dtype(
+    [
+        ("x", "<u2"),
+        ("y", "<u2"),
+        ("state", "<u4"),
+        ("fraction", "<u2"),
+        ("radius_px", "<u2"),
+        ("reach_px", "u1", 4),
+    ]
+)
+FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
+BLOCK = np.dtype(
+    [
+        ("x0", "<i2"),
+        ("y0", "<i2"),
+        ("x1", "<i2"),
+        ("y1", "<i2"),
+        ("count", "u1"),
+        ("has_edge", "u1"),
+        ("merged", "<u2"),
+        ("reach_px", "<f4"),
+    ]
+)
+KERNEL_IMAGE_BYTES = 128
+RECIPE_IMAGE_BYTES = 16
+
+
+class Frame(c.Structure):
+    """The one record that all stages take; `source/frame.h` says what is in it."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("width", c.c_int32),
+        ("height", c.c_int32),
+        ("surface_count", c.c_int32),
+        ("border_px", c.c_int32),
+        ("image_width", c.c_int32),
+        ("image_height", c.c_int32),
+        ("block_columns", c.c_int32),
+        ("block_rows", c.c_int32),
+        ("color", POINTER * 2),
+        ("color_kind", c.c_int32),
+        ("depth_is_planar", c.c_int32),
+        ("depth_m", POINTER * 2),
+        ("tangents", c.c_float * 4),
+        ("object_low_dpt", c.c_float),
+        ("object_high_dpt", c.c_float),
+        ("object_margin_dpt", c.c_float),
+        ("blur_px_per_dpt", c.c_float),
+        ("layer_dpt", POINTER),
+        ("layer_count", c.c_int32),
+        ("interval_count", c.c_int32),
+        ("cell_px", c.c_int32),
+        ("cell_columns", c.c_int32),
+        ("corner_dpt", POINTER),
+        ("dpt", POINTER),
+        ("position", POINTER),
+        ("used", POINTER),
+        ("missing_count", c.c_int64),
+        ("clamped_count", c.c_int64),
+        ("bad_color_count", c.c_int64),
+        ("kernel_of", POINTER),
+        ("shapes", POINTER),
+        ("kernel_count", c.c_int32),
+        ("max_level", c.c_int32),
+        ("paper_rule", c.c_int32),
+        ("white_level", c.c_float),
+        ("tolerance", c.c_float),
+        ("largest_reach_px", c.c_float),
+        ("fragments", POINTER),
+        ("lights", POINTER),
+        ("blocks", POINTER),
+        ("fragment_count", c.c_int64),
+        ("merged_count", c.c_int64),
+        ("store", POINTER * RESOLUTIONS),
+        ("store_first", POINTER * RESOLUTIONS),
+        ("store_reach", POINTER * RESOLUTIONS),
+        ("coarse_spread_px", c.c_float * RESOLUTIONS),
+        ("recipes", POINTER),
+        ("recipe_count", c.c_int32),
+        ("recipe_images", POINTER),
+        ("recipe_texels", POINTER),
+        ("kernel_cells", POINTER),
+        ("kernel_parts", POINTER),
+        ("node_near", POINTER),
+        ("node_far", POINTER),
+        ("part_weights", POINTER),
+        ("part_maps", POINTER),
+        ("kernels", POINTER),
+        ("kernel_texels", POINTER),
+        ("blend_scratch", POINTER),
+        ("blend_scratch_floats", c.c_uint64),
+        ("recipe_texel_count", c.c_uint64),
+        ("kernel_texel_count", c.c_uint64),
+        ("picture", POINTER),
+        ("output_kind", c.c_int32),
+        ("failed", c.c_int32),
+        ("entry_count", c.c_int64),
+    )
+
+
+class ShrinkJob(c.Structure):
+    """Kernels of a store to be made coarse."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("from_words", POINTER),
+        ("from_first", POINTER),
+        ("from_reach", POINTER),
+        ("to_words", POINTER),
+        ("to_first", POINTER),
+        ("to_reach", POINTER),
+        ("resolution", c.c_int32),
+        ("first", c.c_int32),
+        ("last", c.c_int32),
+    )
+
+
+SIZES = (
+    c.sizeof(Frame),
+    FRAGMENT.itemsize,
+    BLOCK.itemsize,
+    KERNEL_SHAPE.itemsize,
+    KERNEL_IMAGE_BYTES,
+    RECIPE_IMAGE_BYTES,
+    c.sizeof(ShrinkJob),
+    FRAGMENT_LIGHT.itemsize,
+)
+"""What `ocu_sizes` must say."""

@@ -1,0 +1,243 @@
+"""Filters one view on the processor: the stages, and what is kept between frames."""
+
+import time
+import weakref
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.threads import thread_count
+from filter_service.errors import RenderFailed
+from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.rendering.filtered_view import FilteredView, color_notes
+from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame_options import (
+    OUTPUT_DTYPES,
+    FrameOptions,
+    frame_options,
+)
+from filter_service.rendering.frame_states import FrameStates
+from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
+from filter_service.rendering.native import native_store
+from filter_service.rendering.native.arrays import Arrays
+from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
+from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
+from filter_service.rendering.native.library import Library, compiled_library
+from filter_service.rendering.native.native_store import NativeStore
+from filter_service.rendering.white_level import white_level
+from filter_service.rgbd_view import RgbdView
+
+
+class NativeRenderer:
+    """Runs the compiled loops for one view at a time; not thread-safe.
+
+    Python's lock is free while they run.
+
+    Parameters
+    ----------
+    loops : Library, optional
+        Others than those that this machine runs best.
+    n_threads : int, optional
+        Instead of one a core.
+
+    Raises
+    ------
+    RenderFailed
+        The loops were not built here.
+    """
+
+    def __init__(self, loops: Library | None = None, n_threads: int | None = None):
+        self._loops = loops or compiled_library()
+        self._threads = self._loops.new_threads(n_threads or thread_count())
+        self._n_threads = self._loops.thread_count(self._threads)
+        self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
+        self._states = FrameStates()
+        self._arrays = Arrays()
+        self._plan: KernelPlan | None = None
+        self._blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
+
+    @property
+    def name(self) -> str:
+        """What the loops are compiled for, and on how many threads they run."""
+        return f"native ({self._loops.variant}, {self._n_threads} threads)"
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory that frames use again."""
+        return self._arrays.memory_mb
+
+    def close(self) -> None:
+        """End the threads; the renderer is of no use after."""
+        self._end()
+
+    def load(self, store: PsfStore) -> NativeStore:
+        """Take a store at once."""
+        *_, loaded = self.load_steps(store)
+        return loaded
+
+    def load_steps(self, store: PsfStore) -> Generator[NativeStore | None]:
+        """Take a store in steps of a few ms; see `native_store.load_steps`."""
+        return native_store.load_steps(self._loops, self._threads, store)
+
+    def render(
+        self,
+        view: RgbdView,
+        handle: NativeStore,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        accumulation: str = "coverage",
+        merge: bool = True,
+        render_tolerance: float = 1.0,
+        output: str = "linear",
+        gaze_deg: tuple[float, float] | None = None,
+    ) -> FilteredView:
+        """Filter one view through the eye of a loaded store.
+
+        Parameters
+        ----------
+        gaze_deg : (h, v), optional
+            Where the eye looks in the image, clamped to what was prepared with a note;
+            the store's where it is None.
+        render_tolerance : float
+            Errors of merging, coarse kernels and layers against the usual; 0 is exact.
+
+        Raises
+        ------
+        BadMessage
+            Arrays or options that cannot be used.
+        CameraMismatch
+            The store is for another camera, see `camera.is_same_camera`.
+        RenderFailed
+            Memory ran out.
+        """
+        options = frame_options(
+            view,
+            handle.store,
+            accumulation=accumulation,
+            merge=merge,
+            render_tolerance=render_tolerance,
+            output=output,
+            gaze_deg=gaze_deg,
+        )
+        timer = StageTimes()
+        layers = self._states.layers(
+            timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
+        )
+        while True:
+            image = self._states.cells(timer, handle, options.gaze_deg)
+            try:
+                return self._render(timer, view, handle, layers, image, options)
+            except KernelsTooLarge:
+                self._states.coarsen(image)
+
+    def _render(
+        self, timer, view, handle, layers: FrameLayers, image, options: FrameOptions
+    ) -> FilteredView:
+        frame = FrameRecord.new(self._threads, self._arrays)
+        missing_count, used = self._pixels(timer, frame, view, layers, image)
+        with timer.wall("psf_plan_ms"):
+            plan = self._planned(handle, layers, image, used)
+            frame.set_kernels(plan)
+            frame.set_store(handle)
+        with timer.wall("merge_ms"):
+            frame.set_merging(
+                tolerance=options.tolerance if options.merge else 0.0,
+                paper_rule=options.paper_rule,
+                white_level=white_level(view.color),
+            )
+            self._loops.run("merge", frame.c)
+        self._blend(timer, frame, plan)
+        with timer.wall("splat_ms"):
+            picture = np.empty(view.color.shape, OUTPUT_DTYPES[options.output])
+            frame.set_picture(picture)
+            self._loops.run("splat", frame.c)
+        if frame.c.failed:
+            raise RenderFailed("memory ran out for the lists of a frame")
+        return FilteredView(
+            color=picture,
+            stage_times_ms=timer.result_ms(),
+            missing_depth_count=missing_count,
+            clamped_depth_count=frame.c.clamped_count,
+            bad_color_count=frame.c.bad_color_count,
+            pupil_diameter_mm=layers.pupil_diameter_mm,
+            focus_dpt=layers.focus_dpt,
+            gaze_deg=options.gaze_deg,
+            fragment_count=frame.c.fragment_count,
+            merged_count=frame.c.merged_count,
+            entry_count=frame.c.entry_count,
+            kernel_count=plan.kernels.count,
+            kernel_texel_count=self._blended[2].kernel_texels,
+            layer_count=len(layers.layer_dpt),
+            notes=[
+                *layers.notes,
+                *options.gaze_notes,
+                *color_notes(frame.c.bad_color_count),
+            ],
+        )
+
+    def _pixels(
+        self, timer, frame: FrameRecord, view, layers, image: ImageCells
+    ) -> tuple[int, NDArray[np.bool_]]:
+        """Distances, positions and used pairs; pixels whose depth was filled in."""
+        with timer.wall("prepare_ms"):
+            filled_m, missing_count = fill_missing_depth(view.depth_m)
+            whole = replace(view, depth_m=filled_m)
+            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
+                whole = replace(whole, hidden_color=None, hidden_depth_m=None)
+            reach = image.maps.largest_stretch_ratio * layers.max_radius_px
+            border_px = border_px_of(whole, ceil(reach) + 2)
+            whole = extended(whole, border_px)
+        change_dpt = self._states.corner_change_dpt(timer, layers, image)
+        with timer.wall("fragments_ms"):
+            frame.set_view(whole, border_px)
+            used = frame.set_state(layers, image, change_dpt)
+            self._loops.run("pixels", frame.c)
+        return missing_count, used
+
+    def _planned(self, handle, layers, image, used) -> KernelPlan:
+        """Plan kernels, or return the last frame's if they serve."""
+        state = (handle, layers, image)
+        if self._plan is None or not self._plan.serves(state, used):
+            self._plan = None  # stays so if what follows fails
+            self._plan = plan_kernels(handle, layers, image, used)
+        return self._plan
+
+    def _blend(self, timer, frame: FrameRecord, plan: KernelPlan) -> None:
+        """Make what fragments use of the kernels, unless it is there."""
+        levels = plan.shapes["levels_used"]
+        if self._blended is not None:
+            of_plan, made, sizes = self._blended
+            if of_plan is plan and not np.any(levels & ~made):
+                frame.set_blend_room(sizes, self._n_threads)
+                return
+        self._blended = None
+        with timer.wall("psf_blend_ms"):
+            self._loops.run("place", frame.c)
+            sizes = BlendSizes.of(frame.c)
+            frame.set_blend_room(sizes, self._n_threads)
+            self._loops.run("blend", frame.c)
+        self._blended = plan, levels.copy(), sizes
+
+
+class StageTimes:
+    """Wall times of named stages, ms."""
+
+    def __init__(self) -> None:
+        self._ms: dict[str, float] = {}
+
+    @contextmanager
+    def wall(self, name: str):
+        """Time a stage; entering a name twice adds up."""
+        started_s = time.perf_counter()
+        yield
+        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
+
+    def result_ms(self) -> dict[str, float]:
+        """Return times by stage."""
+        return dict(self._ms)

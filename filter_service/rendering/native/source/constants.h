@@ -1,0 +1,22 @@
+/* Numbers of filter_service/constants.py, by the same names; a test compares them. */
+#ifndef OCU_CONSTANTS_H
+#define OCU_CONSTANTS_H
+
+#define TILE_SIZE_PX 8
+#define MAX_LEVEL 3
+#define DISCONTINUITY_PX 0.25f
+#define NOTHING_DPT -1.0f
+#define MERGE_MIN_SPREAD_PX 1.5f
+#define MERGE_CONTRAST 0.03f
+#define MERGE_MAX_BLUR_STEP_PX 0.25f
+#define MERGE_MAX_BLUR_RATIO 0.08f
+#define PAPER_TIE_BREAK_M 0.01f
+#define PAPER_FAR_M 1000.0f
+#define MIN_COVERAGE 1.0e-4f
+#define MIN_BLUR_RANGE 1.0e-12f
+#define HALF_MAX 65504.0f
+#define RGB 3
+#define RECIPE_TAPS 8
+#define FIELD_CORNERS 4
+
+#endif

@@ -1,0 +1,158 @@
+/* What the stages of a frame share.  Arrays belong to the caller (records.py mirrors
+ * the layout); images are rows downwards, surfaces one behind the other. */
+#ifndef OCU_FRAME_H
+#define OCU_FRAME_H
+
+#include <stdint.h>
+
+#include "constants.h"
+#include "pool.h"
+
+enum { COLOR_SRGB8 = 0, COLOR_LINEAR = 1, COLOR_HALF = 2 };
+
+/* How wide a kernel of the frame is.  radius_px: it lies within
+ * dx^2 + dy^2 <= (radius + 0.5)^2; reach: left, right, up, down. */
+typedef struct {
+    float spread_px[2];       /* at the near and the far end of its interval */
+    int32_t highest_level;    /* squares of up to 2^level pixels may merge under it */
+    uint16_t radius_px;
+    uint8_t reach_px[4];
+    uint8_t levels_used;      /* a bit per level; merging sets it */
+    uint8_t spare;
+} kernel_shape;
+
+/* Kernels exist in pixels of 1, 2 and 4 px; those of a coarse resolution r reach pixels
+ * of 2^r px, whose light is interpolated between their middles. */
+#define RESOLUTIONS 3
+
+/* A kernel as fragments of one level read it: texels of four pairs (red, green, blue,
+ * nothing) of 15-bit weights at the near and far end.  weight = scale * (near * (1 - f)
+ * + far * f), f the fraction of the interval. */
+typedef struct {
+    uint32_t first_texel;     /* of row 0; a texel of zeros lies before and behind a row */
+    int32_t resolution;
+    int16_t left, up;         /* of its first texel from that of the fragment's square */
+    int16_t width, height;
+    float scale;
+    float near_ratio;         /* share of 1 - f in 15 bits */
+    float far_ratio;
+    int32_t spare;
+} level_image;
+
+typedef struct { level_image level[MAX_LEVEL + 1]; } kernel_image;
+
+/* A pixel, or a merged square of 2^level pixels, with its blur: where its light goes, and
+ * what light it is. */
+typedef struct {
+    uint16_t x, y;            /* first pixel */
+    uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT */
+    uint16_t fraction;        /* of the kernel's interval, in parts of 65535 */
+    uint16_t radius_px;
+    uint8_t reach_px[4];
+} fragment;
+
+typedef struct {
+    float rgb[RGB];
+    float depth;              /* sort depth, smaller is nearer */
+} fragment_light;
+
+#define LEVEL_SHIFT 28
+#define KERNEL_MASK 0xFFFFFFFu
+#define EDGE_BIT 0x40000000u
+
+/* A block of 8 x 8 pixels and the box that its fragments light. */
+typedef struct {
+    int16_t x0, y0, x1, y1;   /* last ones included */
+    uint8_t count;
+    uint8_t has_edge;
+    uint16_t merged;
+    float reach_px;
+} block_info;
+
+/* A node kernel at one resolution: floats in fours (red, green, blue, 0), texels of zeros
+ * around.  stride is 0 where no kernel needs it. */
+typedef struct {
+    uint64_t first_texel;
+    int32_t stride;           /* texels from row to row */
+    uint8_t reach_px[4];
+} recipe_image;
+
+/* Kernels of a store to be made coarse; see shrink.h. */
+typedef struct {
+    pool *threads;
+    const uint16_t *from;
+    const uint64_t *from_first;
+    const uint32_t *from_reach;
+    uint16_t *to;
+    const uint64_t *to_first;
+    const uint32_t *to_reach;
+    int32_t resolution;
+    int32_t first, last;      /* kernels */
+} shrink_job;
+
+typedef struct {
+    pool *threads;
+
+    /* The frame, and the image within its border. */
+    int32_t width, height, surface_count;
+    int32_t border_px, image_width, image_height;
+    int32_t block_columns, block_rows;
+
+    const void *color[2];
+    int32_t color_kind;
+    int32_t depth_is_planar;
+    const float *depth_m[2];
+    float tangents[4];        /* left, right, up, down */
+    float object_low_dpt, object_high_dpt, object_margin_dpt;
+    float blur_px_per_dpt;
+
+    const float *layer_dpt;
+    int32_t layer_count, interval_count;
+    int32_t cell_px, cell_columns;  /* cell_px is a power of two, or 0: one cell */
+    const float *corner_dpt;  /* change of defocus at the corners of the cells */
+
+    float *dpt;               /* of each pixel; NOTHING_DPT where nothing is hidden */
+    float *position;          /* in layers */
+    uint8_t *used;            /* (cells, intervals) */
+    int64_t missing_count, clamped_count, bad_color_count;
+
+    /* Fragments. */
+    const uint32_t *kernel_of;  /* (cells, intervals) */
+    kernel_shape *shapes;
+    int32_t kernel_count;
+    int32_t max_level;
+    int32_t paper_rule;
+    float white_level;
+    float tolerance;          /* of merging, against the usual */
+    float largest_reach_px;
+    fragment *fragments;      /* 64 places a block */
+    fragment_light *lights;
+    block_info *blocks;
+    int64_t fragment_count, merged_count;
+
+    /* Kernels. */
+    const uint16_t *store[RESOLUTIONS];
+    const uint64_t *store_first[RESOLUTIONS];      /* of each cached kernel */
+    const uint32_t *store_reach[RESOLUTIONS];      /* four bytes: left, right, up, down */
+    float coarse_spread_px[RESOLUTIONS];           /* least spread that may use it */
+    const uint32_t *recipes;  /* (n, 3, 24): cached kernels, nothing, weights */
+    int32_t recipe_count;
+    recipe_image *recipe_images;                   /* (n, RESOLUTIONS) */
+    float *recipe_texels;
+    const int64_t *kernel_cells, *kernel_parts;    /* (n), (n, 4) */
+    const int64_t *node_near, *node_far;
+    const double *part_weights, *part_maps;        /* (n, 4), (n, 4, 2, 2) */
+    kernel_image *kernels;
+    uint32_t *kernel_texels;
+    float *blend_scratch;
+    uint64_t blend_scratch_floats;                 /* of one thread */
+    uint64_t recipe_texel_count, kernel_texel_count;
+
+    /* The picture. */
+    void *picture;            /* (image_height, image_width, 3) */
+    int32_t output_kind;      /* as color_kind */
+    int32_t failed;           /* memory ran out */
+    int64_t entry_count;
+} frame;
+
+#endif

@@ -1,0 +1,171 @@
+/* The fragments whose light reaches a bin of tiles, in scan order; and nearest first where
+ * two surfaces meet.  Twins: count_bins, scatter_fragments and sort_bins. */
+
+#include <stdlib.h>
+
+#include "frame.h"
+#include "vectors.h"
+
+#define BIN_TILES_X 2
+#define BIN_TILES_Y 2
+#define BIN_TILES (BIN_TILES_X * BIN_TILES_Y)
+#define ALL_TILES ((1u << BIN_TILES) - 1u)
+#define BIN_WIDTH (BIN_TILES_X * TILE_SIZE_PX)
+#define BIN_HEIGHT (BIN_TILES_Y * TILE_SIZE_PX)
+
+typedef struct {
+    uint32_t fragment;
+    uint32_t tiles;           /* a bit for each tile of the bin that it lights */
+} entry;
+
+/* What one thread needs for a bin; grows as lists do. */
+typedef struct {
+    entry *entries, *spare;
+    uint32_t *keys, *spare_keys;
+    int capacity;
+    int count;
+    int x0, y0;               /* first pixel of the bin */
+    int any_edge;
+    uint32_t ordered;         /* tiles where order matters */
+} bin_list;
+
+static int grow(bin_list *list) {
+    int capacity = list->capacity ? 2 * list->capacity : 1024;
+    entry *entries = realloc(list->entries, sizeof *entries * (size_t)capacity);
+    if (entries == NULL) return 0;
+    list->entries = entries;
+    entry *spare = realloc(list->spare, sizeof *spare * (size_t)capacity);
+    if (spare == NULL) return 0;
+    list->spare = spare;
+    uint32_t *keys = realloc(list->keys, sizeof *keys * (size_t)capacity);
+    if (keys == NULL) return 0;
+    list->keys = keys;
+    keys = realloc(list->spare_keys, sizeof *keys * (size_t)capacity);
+    if (keys == NULL) return 0;
+    list->spare_keys = keys;
+    list->capacity = capacity;
+    return 1;
+}
+
+static void free_list(bin_list *list) {
+    free(list->entries);
+    free(list->spare);
+    free(list->keys);
+    free(list->spare_keys);
+}
+
+INLINE int gap_between(int first_a, int last_a, int first_b, int last_b) {
+    int gap = larger_int(first_b - last_a, first_a - last_b);
+    return gap > 0 ? gap : 0;
+}
+
+/* Whether a fragment lights pixels x0..x1, y0..y1: within the box of its kernel, and a
+ * disc about one of its pixels. */
+INLINE int lights(const fragment *one, int x0, int y0, int x1, int y1) {
+    int extent = (1 << (one->state >> LEVEL_SHIFT & 3)) - 1;
+    int x = one->x, y = one->y;
+    if (x - one->reach_px[0] > x1 || x + one->reach_px[1] + extent < x0
+        || y - one->reach_px[2] > y1 || y + one->reach_px[3] + extent < y0)
+        return 0;
+    int gap_x = gap_between(x, x + extent, x0, x1);
+    int gap_y = gap_between(y, y + extent, y0, y1);
+    int radius = one->radius_px; /* gaps are whole: (r + 0.5)^2 = r^2 + r + 0.25 */
+    return gap_x * gap_x + gap_y * gap_y <= radius * radius + radius;
+}
+
+/* Lists what reaches the bin; false where memory ran out. */
+static int list_fragments(const frame *f, bin_list *list) {
+    list->count = 0;
+    list->any_edge = 0;
+    int x0 = list->x0, y0 = list->y0;
+    int x1 = x0 + BIN_WIDTH - 1, y1 = y0 + BIN_HEIGHT - 1;
+    int search = (int)f->largest_reach_px + TILE_SIZE_PX;
+    int left = larger_int((x0 - search) / TILE_SIZE_PX, 0);
+    int top = larger_int((y0 - search) / TILE_SIZE_PX, 0);
+    int right = smaller_int((x1 + search) / TILE_SIZE_PX + 1, f->block_columns);
+    int bottom = smaller_int((y1 + search) / TILE_SIZE_PX + 1, f->block_rows);
+    for (int surface = 0; surface < f->surface_count; ++surface) {
+        for (int row = top; row < bottom; ++row) {
+            int line = (surface * f->block_rows + row) * f->block_columns;
+            for (int column = left; column < right; ++column) {
+                const block_info *info = f->blocks + line + column;
+                if (info->x0 > x1 || info->x1 < x0 || info->y0 > y1 || info->y1 < y0)
+                    continue;
+                while (list->capacity < list->count + info->count)
+                    if (!grow(list)) return 0;
+                uint32_t first = (uint32_t)(line + column) * BLOCK_PIXELS;
+                entry *out = list->entries + list->count;
+                uint32_t edges = 0;
+                for (uint32_t i = first; i < first + info->count; ++i) {
+                    const fragment *one = f->fragments + i;
+                    if (!lights(one, x0, y0, x1, y1)) continue;
+                    edges |= one->state;
+                    *out++ = (entry){i, ALL_TILES};
+                }
+                list->count = (int)(out - list->entries);
+                list->any_edge |= (edges & EDGE_BIT) != 0;
+            }
+        }
+    }
+    return 1;
+}
+
+/* Notes which tiles each entry lights, and in which order matters. */
+static void mark_tiles(const frame *f, bin_list *list) {
+    list->ordered = 0;
+    for (int i = 0; i < list->count; ++i) {
+        const fragment *one = f->fragments + list->entries[i].fragment;
+        uint32_t tiles = 0;
+        for (int tile = 0; tile < BIN_TILES; ++tile) {
+            int x0 = list->x0 + tile % BIN_TILES_X * TILE_SIZE_PX;
+            int y0 = list->y0 + tile / BIN_TILES_X * TILE_SIZE_PX;
+            int lit = lights(one, x0, y0, x0 + TILE_SIZE_PX - 1, y0 + TILE_SIZE_PX - 1);
+            tiles |= (uint32_t)lit << tile;
+        }
+        list->entries[i].tiles = tiles;
+        if (one->state & EDGE_BIT) list->ordered |= tiles;
+    }
+}
+
+/* Bits of a float that order like it. */
+INLINE uint32_t ordered_bits(float value) {
+    uint32_t bits = bits_of(value);
+    return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
+}
+
+/* Sorts nearest first; equal depths keep scan order. */
+static void sort_list(const frame *f, bin_list *list) {
+    for (int i = 0; i < list->count; ++i)
+        list->keys[i] = ordered_bits(f->lights[list->entries[i].fragment].depth);
+    if (list->count <= 48) {
+        for (int i = 1; i < list->count; ++i) {
+            uint32_t key = list->keys[i];
+            entry own = list->entries[i];
+            int at = i;
+            for (; at > 0 && list->keys[at - 1] > key; --at) {
+                list->keys[at] = list->keys[at - 1];
+                list->entries[at] = list->entries[at - 1];
+            }
+            list->keys[at] = key;
+            list->entries[at] = own;
+        }
+        return;
+    }
+    for (int shift = 0; shift < 32; shift += 8) {
+        uint32_t starts[257] = {0};
+        for (int i = 0; i < list->count; ++i) ++starts[(list->keys[i] >> shift & 255) + 1];
+        if (starts[(list->keys[0] >> shift & 255) + 1] == (uint32_t)list->count) continue;
+        for (int digit = 0; digit < 256; ++digit) starts[digit + 1] += starts[digit];
+        for (int i = 0; i < list->count; ++i) {
+            uint32_t at = starts[list->keys[i] >> shift & 255]++;
+            list->spare_keys[at] = list->keys[i];
+            list->spare[at] = list->entries[i];
+        }
+        uint32_t *keys = list->keys;
+        list->keys = list->spare_keys;
+        list->spare_keys = keys;
+        entry *entries = list->entries;
+        list->entries = list->spare;
+        list->spare = entries;
+    }
+}

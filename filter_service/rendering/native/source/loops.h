@@ -1,0 +1,75 @@
+/* All loops of a frame, compiled once for each kind of processor; see variants below. */
+
+#include "frame.h"
+
+typedef struct {
+    const char *name;
+    void (*pixels)(frame *f);
+    void (*merge)(frame *f);
+    void (*place)(frame *f);
+    void (*blend)(frame *f);
+    void (*splat)(frame *f);
+    void (*shrink)(shrink_job *job);
+} loops;
+
+#ifdef OCU_VARIANT
+
+#include "vectors.h"
+
+#include "color.h"
+#include "pixels.h"
+#include "blend.h"
+#include "merge.h"
+#include "lists.h"
+#include "splat.h"
+#include "shrink.h"
+
+static void all_pixels(frame *f) {
+    f->missing_count = f->clamped_count = f->bad_color_count = 0;
+    pool_run(f->threads, f->height, pixel_row, f);
+}
+
+static void all_merges(frame *f) {
+    f->fragment_count = f->merged_count = 0;
+    for (int surface = 0; surface < f->surface_count; ++surface) {
+        merge_job job = {f, surface};
+        pool_run(f->threads, f->block_rows, merge_row, &job);
+    }
+}
+
+static void all_places(frame *f) {
+    place_recipes(f);
+    place_kernels(f);
+}
+
+static void all_blends(frame *f) {
+    pool_run(f->threads, RESOLUTIONS * f->recipe_count, blend_recipe, f);
+    int items = (f->kernel_count + KERNELS_AN_ITEM - 1) / KERNELS_AN_ITEM;
+    pool_run(f->threads, items, blend_kernels, f);
+}
+
+static void all_splats(frame *f) {
+    f->entry_count = 0;
+    f->failed = 0;
+    int n_threads = pool_size(f->threads);
+    splat_job job = {f, (f->width + BIN_WIDTH - 1) / BIN_WIDTH,
+                     (f->height + BIN_HEIGHT - 1) / BIN_HEIGHT,
+                     calloc((size_t)n_threads, sizeof(bin_list))};
+    if (job.lists == NULL) {
+        f->failed = 1;
+        return;
+    }
+    pool_run(f->threads, job.columns * job.rows, splat_bin, &job);
+    for (int thread = 0; thread < n_threads; ++thread) free_list(job.lists + thread);
+    free(job.lists);
+}
+
+static void all_shrinks(shrink_job *job) {
+    int items = (job->last - job->first + SHRUNK_AN_ITEM - 1) / SHRUNK_AN_ITEM;
+    pool_run(job->threads, items, shrink_some, job);
+}
+
+const loops OCU_VARIANT = {OCU_NAME,   all_pixels, all_merges, all_places,
+                           all_blends, all_splats, all_shrinks};
+
+#endif

@@ -1,0 +1,184 @@
+/* Depth of every pixel to object distance and layer position, and which pairs of cell
+ * and layer interval the frame uses.  Twin: build_fragments.comp.glsl. */
+
+#include <math.h>
+
+#include "frame.h"
+#include "vectors.h"
+
+/* Whether the pair has been noted already is asked first: most pixels find it so. */
+INLINE void note_use(uint8_t *mark) {
+    if (!__atomic_load_n(mark, __ATOMIC_RELAXED)) __atomic_store_n(mark, 1, __ATOMIC_RELAXED);
+}
+
+INLINE int clamped_int(int value, int low, int high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+/* Layer position of a distance; `low` is where the last one was found. */
+INLINE float layer_position(const frame *f, float dpt, int *low) {
+    const float *layers = f->layer_dpt;
+    int last = f->layer_count - 2;
+    int at = *low;
+    if (last < 0) return 0.0f;
+    if (!(layers[at] <= dpt)) {
+        int first = 0;
+        int end = at;      /* the interval lies in first..end */
+        while (first < end) {
+            int middle = (first + end + 1) / 2;
+            if (layers[middle] <= dpt) first = middle;
+            else end = middle - 1;
+        }
+        at = first;
+    } else if (at < last && layers[at + 1] <= dpt) {
+        int first = at + 1;
+        int end = last;
+        while (first < end) {
+            int middle = (first + end + 1) / 2;
+            if (layers[middle] <= dpt) first = middle;
+            else end = middle - 1;
+        }
+        at = first;
+    }
+    *low = at;
+    float span = layers[at + 1] - layers[at];
+    float share = (dpt - layers[at]) / (span > MIN_BLUR_RANGE ? span : MIN_BLUR_RANGE);
+    share = share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share;
+    return (float)at + share;
+}
+
+INLINE int position_interval(const frame *f, float position) {
+    int interval = (int)position;
+    return interval < f->interval_count - 1 ? interval : f->interval_count - 1;
+}
+
+/* Object distance of a row of pixels, not clamped; missing depth gives what it gives. */
+INLINE void row_distances(const frame *f, const float *depth_m, int y, float *dpt) {
+    int width = f->width;
+    if (!f->depth_is_planar) {
+        for (int x = 0; x < width; ++x) dpt[x] = 1.0f / depth_m[x];
+        return;
+    }
+    float across = (f->tangents[1] - f->tangents[0]) / (float)width;
+    float down = (f->tangents[3] - f->tangents[2]) / (float)f->height;
+    float ty = f->tangents[2] + ((float)y + 0.5f) * down;
+    float along = 1.0f + ty * ty;
+    for (int x = 0; x < width; ++x) {
+        float tx = f->tangents[0] + ((float)x + 0.5f) * across;
+        dpt[x] = 1.0f / (depth_m[x] * __builtin_sqrtf(along + tx * tx));
+    }
+}
+
+/* Empties a row of the hidden surface where it holds nothing, or blurs like what lies
+ * before it. */
+INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt,
+                     float *dpt) {
+    for (int x = 0; x < f->width; ++x) {
+        float behind_px = (seen_dpt[x] - dpt[x]) * f->blur_px_per_dpt;
+        int holds = depth_m[x] > 0.0f && behind_px > DISCONTINUITY_PX;
+        dpt[x] = holds ? dpt[x] : NOTHING_DPT;
+    }
+}
+
+/* Cell of a column or row of the frame, and the share of the way through it. */
+INLINE int cell_place(const frame *f, int at, int size, float *share) {
+    int place = clamped_int(at - f->border_px, 0, size - 1);
+    int cell = place >> __builtin_ctz((unsigned)f->cell_px);
+    *share = ((float)(place - cell * f->cell_px) + 0.5f) / (float)f->cell_px;
+    return cell;
+}
+
+/* Positions and used pairs of one row of one surface, from its clamped distances. */
+static void row_positions(const frame *f, const float *dpt, int y, float *position) {
+    int low = 0;
+    int noted = -1;
+    float down = 0.0f;
+    const float *above = NULL;
+    int first_cell = 0;
+    if (f->cell_px) {
+        int row = cell_place(f, y, f->image_height, &down);
+        above = f->corner_dpt + row * (f->cell_columns + 1);
+        first_cell = row * f->cell_columns;
+    }
+    for (int x = 0; x < f->width; ++x) {
+        if (dpt[x] < 0.0f) continue;
+        float change = 0.0f;
+        int cell = 0;
+        if (f->cell_px) {
+            float across;
+            int column = cell_place(f, x, f->image_width, &across);
+            const float *below = above + f->cell_columns + 1;
+            float high = above[column] + across * (above[column + 1] - above[column]);
+            float deep = below[column] + across * (below[column + 1] - below[column]);
+            change = high + down * (deep - high);
+            cell = first_cell + column;
+        }
+        position[x] = layer_position(f, dpt[x] + change, &low);
+        int pair = cell * f->interval_count + position_interval(f, position[x]);
+        if (pair != noted) note_use(f->used + pair);
+        noted = pair;
+    }
+}
+
+/* Whether all of a pixel's light is a number. */
+INLINE int is_finite_pixel(const frame *f, int surface, size_t pixel) {
+    for (size_t c = 3 * pixel; c < 3 * pixel + RGB; ++c) {
+        if (f->color_kind == COLOR_LINEAR) {
+            if (!isfinite(((const float *)f->color[surface])[c])) return 0;
+        } else if ((((const uint16_t *)f->color[surface])[c] & 0x7C00u) == 0x7C00u) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Pixels of a row of the image whose light is not all numbers, and which count. */
+static int64_t bad_colors(const frame *f, int surface, size_t first, const float *depth_m) {
+    if (f->color_kind == COLOR_SRGB8) return 0;
+    int64_t count = 0;
+    for (int x = f->border_px; x < f->border_px + f->image_width; ++x)
+        if (surface == 0 || depth_m[x] > 0.0f)
+            count += !is_finite_pixel(f, surface, first + (size_t)x);
+    return count;
+}
+
+/* One row of all surfaces. */
+static void pixel_row(void *argument, int y, int thread) {
+    frame *f = argument;
+    (void)thread;
+    int64_t clamped = 0;
+    int64_t missing = 0;
+    int64_t bad = 0;
+    size_t pixels = (size_t)f->width * (size_t)f->height;
+    size_t first = (size_t)y * (size_t)f->width;
+    int in_image = y >= f->border_px && y < f->border_px + f->image_height;
+    for (int s = f->surface_count - 1; s >= 0; --s) {
+        const float *depth_m = f->depth_m[s] + first;
+        float *dpt = f->dpt + (size_t)s * pixels + first;
+        row_distances(f, depth_m, y, dpt);
+        float low = f->object_low_dpt - f->object_margin_dpt;
+        float high = f->object_high_dpt + f->object_margin_dpt;
+        int last = f->border_px + f->image_width;
+        for (int x = f->border_px; x < last; ++x) {
+            int holds = depth_m[x] > 0.0f;
+            clamped += holds && (dpt[x] < low || dpt[x] > high) && in_image;
+            missing += !holds && in_image && s == 0;
+        }
+        if (in_image) bad += bad_colors(f, s, first, depth_m);
+    }
+    for (int s = f->surface_count - 1; s > 0; --s)
+        hide_row(f, f->depth_m[s] + first, f->dpt + first,
+                 f->dpt + (size_t)s * pixels + first);
+    for (int s = 0; s < f->surface_count; ++s) {
+        float *dpt = f->dpt + (size_t)s * pixels + first;
+        for (int x = 0; x < f->width; ++x) {
+            float kept = dpt[x] < f->object_low_dpt ? f->object_low_dpt : dpt[x];
+            kept = kept > f->object_high_dpt ? f->object_high_dpt : kept;
+            dpt[x] = dpt[x] < 0.0f ? NOTHING_DPT : kept;
+        }
+        row_positions(f, dpt, y, f->position + (size_t)s * pixels + first);
+    }
+    if (clamped) __atomic_fetch_add(&f->clamped_count, clamped, __ATOMIC_RELAXED);
+    if (bad) __atomic_fetch_add(&f->bad_color_count, bad, __ATOMIC_RELAXED);
+    if (missing) __atomic_fetch_add(&f->missing_count, missing, __ATOMIC_RELAXED);
+}

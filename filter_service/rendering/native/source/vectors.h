@@ -1,0 +1,91 @@
+/* Vectors of eight (two texels) and four, without a word on which machine has them. */
+#ifndef OCU_VECTORS_H
+#define OCU_VECTORS_H
+
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef float f32x4 __attribute__((vector_size(16)));
+typedef float f32x8 __attribute__((vector_size(32)));
+typedef int32_t i32x4 __attribute__((vector_size(16)));
+typedef int32_t i32x8 __attribute__((vector_size(32)));
+typedef int16_t i16x16 __attribute__((vector_size(32)));
+typedef uint16_t u16x8 __attribute__((vector_size(16)));
+
+#define INLINE static inline __attribute__((always_inline, unused))
+
+INLINE f32x4 load4(const float *from) {
+    f32x4 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+INLINE void store4(float *to, f32x4 value) { memcpy(to, &value, sizeof value); }
+
+INLINE f32x8 load8(const float *from) {
+    f32x8 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+INLINE void store8(float *to, f32x8 value) { memcpy(to, &value, sizeof value); }
+
+INLINE f32x8 all8(float value) {
+    return (f32x8){value, value, value, value, value, value, value, value};
+}
+
+INLINE f32x4 all4(float value) { return (f32x4){value, value, value, value}; }
+
+/* Not those of the library, which it would call. */
+INLINE float larger_float(float a, float b) { return a > b ? a : b; }
+INLINE float smaller_float(float a, float b) { return a < b ? a : b; }
+
+/* Of each pair of numbers the larger or the smaller; the second where one is none. */
+#if defined(__x86_64__)
+INLINE f32x4 larger4(f32x4 a, f32x4 b) { return __builtin_ia32_maxps(a, b); }
+INLINE f32x4 smaller4(f32x4 a, f32x4 b) { return __builtin_ia32_minps(a, b); }
+#else
+INLINE f32x4 larger4(f32x4 a, f32x4 b) {
+    i32x4 first = a > b;
+    return (f32x4)((first & (i32x4)a) | (~first & (i32x4)b));
+}
+
+INLINE f32x4 smaller4(f32x4 a, f32x4 b) {
+    i32x4 first = a < b;
+    return (f32x4)((first & (i32x4)a) | (~first & (i32x4)b));
+}
+#endif
+
+#ifdef OCU_AVX2
+INLINE f32x8 larger8(f32x8 a, f32x8 b) { return __builtin_ia32_maxps256(a, b); }
+INLINE f32x8 smaller8(f32x8 a, f32x8 b) { return __builtin_ia32_minps256(a, b); }
+#else
+INLINE f32x8 larger8(f32x8 a, f32x8 b) {
+    i32x8 first = a > b;
+    return (f32x8)((first & (i32x8)a) | (~first & (i32x8)b));
+}
+
+INLINE f32x8 smaller8(f32x8 a, f32x8 b) {
+    i32x8 first = a < b;
+    return (f32x8)((first & (i32x8)a) | (~first & (i32x8)b));
+}
+#endif
+
+/* Eight 16-bit words as floats. */
+INLINE f32x8 floats_of(u16x8 words) {
+    return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);
+}
+
+/* For each pair of 16-bit numbers a * c + b * d, exactly. */
+INLINE i32x8 pair_sums(i32x8 pairs, i32x8 factors) {
+#ifdef OCU_AVX2
+    return (i32x8)__builtin_ia32_pmaddwd256((i16x16)pairs, (i16x16)factors);
+#else
+    i32x8 low = ((pairs << 16) >> 16) * ((factors << 16) >> 16);
+    return low + (pairs >> 16) * (factors >> 16);
+#endif
+}
+
+#endif

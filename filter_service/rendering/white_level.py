@@ -1,0 +1,26 @@
+"""Light against which the contrast of pixels that may merge counts."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+WHITE_STEP_PX = 8
+"""Every so many pixels count for the level of white."""
+
+WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
+"""White of a linear image is its brightest light, but no more than so many times what
+nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
+
+
+def white_level(color: NDArray) -> float:
+    """Return the white of an image: 1 for 8-bit input.
+
+    Linear light may have any unit, so that merging, and with it the whole filter, must
+    scale with the light.
+    """
+    if color.dtype == np.uint8:
+        return 1.0
+    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
+    lit = light[light > 0.0]
+    if lit.size == 0:
+        return 0.0
+    return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))

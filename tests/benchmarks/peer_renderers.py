@@ -1,0 +1,73 @@
+"""Ours among its peers, and the sorted gather over the same kernels."""
+
+from dataclasses import dataclass, field
+
+from numpy.typing import NDArray
+
+from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering import reference
+from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.peer_problem import KeptForState, Problem
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Settings of ours that make a row of their own, as points of time and error.
+
+    Attributes
+    ----------
+    label : str
+        Behind the name of the engine.
+    settings : dict
+        Of the store, as ``{"tolerance": "fine"}``.
+    options : dict
+        Of each frame, as ``{"merge": False}``.
+    """
+
+    label: str = ""
+    settings: dict = field(default_factory=dict)
+    options: dict = field(default_factory=dict)
+
+
+TOLERANCES = (0.0, 0.05, 0.2, 1.0, 3.0, 8.0)
+"""From exact to fast: the curve of time against error."""
+
+VARIANTS = tuple(
+    Variant(f"tolerance {tolerance:g}", options={"render_tolerance": tolerance})
+    for tolerance in TOLERANCES
+)
+
+
+def ours(renderer, variant: Variant):
+    """Open a renderer with a store for all pupils and foci."""
+
+    def opened(problem: Problem):
+        spec = problem.spec_with(**variant.settings)
+        handle = renderer.load(build_psf_store(problem.eye, spec))
+
+        def frame(state: EyeState) -> NDArray:
+            return renderer.render(
+                problem.view,
+                handle,
+                pupil_diameter_mm=state.pupil_diameter_mm,
+                focus_dpt=state.focus_dpt,
+                **variant.options,
+            ).color
+
+        return frame
+
+    return opened
+
+
+def sorted_gather(problem: Problem):
+    """Open the gather in float64, which sorts what reaches each pixel."""
+    store = build_psf_store(problem.eye, problem.spec)
+    layers = KeptForState(
+        lambda state: frame_layers(
+            store,
+            pupil_diameter_mm=state.pupil_diameter_mm,
+            focus_dpt=state.focus_dpt,
+        )
+    )
+    return lambda state: reference.gather(problem.view, store, layers.get(state))

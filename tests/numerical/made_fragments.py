@@ -1,0 +1,54 @@
+"""The fragments that an engine made of its last frame, read off its memory."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filter_service import constants
+from filter_service.rendering.native.records import BLOCK, FRAGMENT, FRAGMENT_LIGHT
+
+
+class Fragments(NamedTuple):
+    """Fragments in scan order, arrays (n,); rgb (n, 3)."""
+
+    surface: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    edge_px: np.ndarray
+    rgb: np.ndarray
+
+
+def made_fragments(bench, width_px, height_px, surface_count=1):
+    """Fragments of a frame of that size, border included."""
+    columns, rows = (-(-n // constants.TILE_SIZE_PX) for n in (width_px, height_px))
+    n_blocks = surface_count * columns * rows
+    n_slots = n_blocks * constants.THREADS
+    if bench.gpu is None:
+        arrays = bench.renderer._arrays
+        counts = arrays.get("blocks", n_blocks, BLOCK)[:n_blocks]["count"]
+        made = arrays.get("fragments", n_slots, FRAGMENT)[:n_slots]
+        x, y, state = made["x"], made["y"], made["state"]
+        rgb = arrays.get("lights", n_slots, FRAGMENT_LIGHT)[:n_slots]["rgb"]
+    else:
+        counts = _read(bench.gpu, "BLOCKS", (n_blocks, 4), np.uint32)[:, 0]
+        place = _read(bench.gpu, "FRAGMENT_PLACE", (n_slots, 4), np.uint32)
+        x = place[:, 0] & constants.PLACE_MASK
+        y = place[:, 0] >> constants.PLACE_BITS
+        rgb = _read(bench.gpu, "FRAGMENT_COLOR", (n_slots, 4), np.float32)[:, :3]
+        state = place[:, 1]
+    slot = np.arange(n_slots)
+    alive = slot % constants.THREADS < np.repeat(counts, constants.THREADS)
+    level = (state[alive] >> constants.LEVEL_SHIFT) & constants.LEVEL_MASK
+    surface = slot[alive] // (columns * rows * constants.THREADS)
+    return Fragments(
+        surface,
+        x[alive].astype(int),
+        y[alive].astype(int),
+        2 ** level.astype(int),
+        rgb[alive],
+    )
+
+
+def _read(gpu, name, shape, dtype):
+    with gpu.context:
+        return gpu.read(gpu.storage(name, 1), shape, dtype)

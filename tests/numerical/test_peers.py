@@ -1,0 +1,108 @@
+"""The table of peers: every row, times beside errors, and errors as they should be."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from filter_service.rendering.native import NativeRenderer
+from tests.benchmarks.bench_peers import EYES, PEERS, line_of, our_peers, peer_rows
+from tests.benchmarks.peer_layers import drawn_disc
+from tests.benchmarks.peer_problem import KeptForState, Problem
+from tests.benchmarks.peer_renderers import VARIANTS, Variant
+from tests.numerical.scene_frames import scene_view
+
+REPEATS = 2
+STEP = Variant("fine steps", {"max_blur_step_px": 0.125}, {"merge": False})
+
+EXPECTED_DB = {
+    # a float64 twin of the renderer, and what the renderer leaves unmerged at 128x72
+    "ours native tolerance 1": (62.0, 66.0),
+    "ours native tolerance 0": (63.0, 66.0),
+    "sorted gather": (63.0, 66.0),
+    "ours native fine steps": (66.0, 90.0),
+    # exact PSFs, half a layer away at most; opaque layers let a third shine through
+    "FFT linear": (59.0, 63.0),
+    "FFT over": (35.0, 40.0),
+    # the same composition with drawn kernels
+    "OpenCV disc": (35.0, 40.0),
+    "OpenCV Gaussian": (31.0, 35.0),
+    # discs in whole px and in no order, and with some order
+    "Blender Bokeh": (30.0, 36.0),
+    "Blender Defocus": (32.0, 37.0),
+    # boxes in no order
+    "ffmpeg varblur": (24.0, 29.0),
+}
+"""For -6 dpt; whoever is far off has another kernel or composition than it says."""
+
+PACKAGES = {
+    "OpenCV disc": "opencv-python-headless",
+    "OpenCV Gaussian": "opencv-python-headless",
+    "ffmpeg varblur": "imageio-ffmpeg",
+    "Blender Bokeh": "blender",
+    "Blender Defocus": "blender",
+}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    view = scene_view("courtyard", width_px=128, height_px=72)
+    return Problem(view, EYES["-6 dpt"])
+
+
+@pytest.fixture(scope="module")
+def rows(problem):
+    ours = our_peers({"native": NativeRenderer()}, (*VARIANTS, STEP))
+    found = peer_rows(problem, "-6 dpt", [*ours, *PEERS], REPEATS)
+    return {row.method: row for row in found}
+
+
+def test_every_method_has_a_row_installed_or_not(rows):
+    assert set(EXPECTED_DB) <= set(rows)
+    for name, row in rows.items():
+        if row.missing is not None:
+            assert row.missing.startswith(PACKAGES[name])
+            assert f"not installed: {row.missing}" in line_of(row)
+            continue
+        assert row.n == REPEATS
+        assert 0.0 < row.min_ms <= row.median_ms
+        assert 0.0 < row.frozen_min_ms <= row.frozen_median_ms
+        assert row.differs in line_of(row)
+
+
+@pytest.mark.parametrize("method", EXPECTED_DB)
+def test_errors_are_what_the_methods_should_have(rows, method):
+    row = rows[method]
+    if row.missing is not None:
+        pytest.skip(f"not installed: {row.missing}")
+    low_db, high_db = EXPECTED_DB[method]
+    assert low_db <= row.error <= high_db
+
+
+def test_what_is_missing_is_named_and_the_rest_measured(problem, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
+    wanted = [peer for peer in PEERS if peer.name in (*PACKAGES, "FFT over")]
+    found = {row.method: row for row in peer_rows(problem, "-6 dpt", wanted, 1)}
+    assert {name: found[name].missing for name in PACKAGES} == PACKAGES
+    assert all(found[name].error is None for name in PACKAGES)
+    assert found["FFT over"].missing is None and found["FFT over"].error > 30.0
+
+
+def test_what_a_state_needs_is_made_when_the_state_is_new(problem):
+    made = []
+    kept = KeptForState(lambda state: made.append(state.pupil_diameter_mm))
+    for pupil_mm in (5.0, 5.0, 5.001, 5.0):
+        kept.get(problem.state(pupil_diameter_mm=pupil_mm, focus_dpt=0.5))
+    assert made == [5.0, 5.001, 5.0]
+
+
+@pytest.mark.parametrize("radius_px", [2.3, 4.5, 7.0])
+def test_drawn_discs_hold_the_light_of_one_and_are_as_wide_as_they_say(radius_px):
+    disc = drawn_disc(radius_px).astype(float)
+    at = np.arange(disc.shape[0]) - disc.shape[0] // 2
+    assert disc.sum() == pytest.approx(1.0, abs=1e-5)
+    # the variance of a disc, and of the pixel that integrates it
+    variance_px2 = (disc.sum(axis=0) * at**2).sum()
+    assert variance_px2 == pytest.approx(radius_px**2 / 4 + 1 / 12, rel=0.03)

@@ -1,0 +1,169 @@
+"""What must hold for every frame and every engine."""
+
+import numpy as np
+import pytest
+
+from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.rendering import reference
+from filter_service.rgbd_view import RgbdView
+from tests.numerical.made_fragments import made_fragments
+from tests.numerical.synthetic import Bench, depth_scene, psnr_db, tangents, texture
+
+MYOPIA = {"kind": "preset", "name": "myopia"}
+SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
+
+
+@pytest.fixture(scope="module")
+def bench(engine):
+    return Bench(engine, MYOPIA, **SIZE)
+
+
+@pytest.fixture
+def view(bench, rng):
+    return bench.view(texture(rng, 101, 150), depth_scene())
+
+
+def test_layers_are_no_farther_apart_than_the_blur_step(bench):
+    assert np.all(np.diff(bench.layers().layer_dpt) > 0)
+    change_px = np.abs(np.diff(bench.blur_px(), axis=0))
+    assert change_px.max() <= bench.spec.max_blur_step_px + 1e-9
+
+
+@pytest.mark.both_engines
+def test_merging_keeps_every_pixel_once(bench, view):
+    result = bench.render(view, pupil_diameter_mm=5.0)
+    made = made_fragments(bench, 150, 101)
+    assert result.fragment_count == made.x.size
+    assert np.square(made.edge_px)[made.edge_px > 1].sum() == result.merged_count
+    assert {1, 2, 4} <= set(made.edge_px)
+    covered = np.zeros((101, 150), int)
+    for x, y, edge_px in zip(made.x, made.y, made.edge_px, strict=True):
+        covered[y : y + edge_px, x : x + edge_px] += 1
+    assert np.all(covered == 1)
+
+
+def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
+    image, depth_m = texture(rng, 101, 150), depth_scene()
+    merged = [
+        bench.render(bench.view(image * np.float32(unit), depth_m)).merged_count
+        for unit in (10.0, 1000.0)
+    ]
+    assert merged[0] == merged[1] > 0
+
+
+@pytest.mark.both_engines
+@pytest.mark.both_engines
+@pytest.mark.both_engines
+@pytest.mark.both_engines
+def test_eight_bit_output_is_the_encoded_linear_output(bench, rng):
+    color = rng.integers(0, 256, (101, 150, 3), dtype=np.uint8)
+    view = bench.view(color, depth_scene())
+    linear = bench.render(view, output="linear").color
+    encoded = bench.render(view, output="srgb8").color
+    twin = reference.srgb_from_linear(linear)
+    # pow() of the shader may round a value that lies on a step the other way
+    assert np.abs(encoded.astype(int) - twin).max() <= 1
+    assert np.mean(encoded != twin) < 1e-3
+
+
+@pytest.mark.both_engines
+@pytest.mark.parametrize("accumulation", ["coverage", "paper"])
+def test_same_input_gives_the_same_bytes(bench, view, accumulation):
+    first = bench.render(view, accumulation=accumulation).color
+    again = bench.render(view, accumulation=accumulation).color
+    assert first.tobytes() == again.tobytes()
+
+
+def test_a_new_store_is_not_mistaken_for_the_last(engine, rng):
+    first = Bench(engine, MYOPIA, **SIZE)
+    second = Bench(engine, {"kind": "preset", "name": "cataract"}, **SIZE)
+    view = first.view(texture(rng, 101, 150), 1.0)
+    expected = second.render(view).color
+    first.render(view)
+    handle = first.renderer.load(second.store)
+    options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0}
+    mixed = first.renderer.render(view, handle, **options).color
+    assert mixed.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("width_px", "height_px"),
+    [
+        *[(1, 1), (3, 2), (8, 8), (9, 17), (257, 33)],
+        pytest.param(1283, 517, marks=pytest.mark.slow),
+    ],
+)
+def test_every_frame_size_agrees_with_the_gather(engine, rng, width_px, height_px):
+    # 1.2 mrad a pixel whatever the size
+    fov_deg = 2 * np.degrees(np.arctan(0.6e-3 * height_px))
+    bench = Bench(
+        engine,
+        MYOPIA,
+        width_px=width_px,
+        height_px=height_px,
+        vertical_fov_deg=fov_deg,
+    )
+    depth_m = np.where(np.arange(width_px) % 40 < 20, 0.5, 3.0)[None, :]
+    view = bench.view(texture(rng, height_px, width_px), depth_m)
+    result = bench.render(view, merge=False)
+    truth = reference.gather(view, bench.store, bench.layers())
+    assert result.color.shape == (height_px, width_px, 3)
+    assert psnr_db(result.color, truth) >= 50.0
+
+
+@pytest.mark.parametrize("fill", [0.0, -1.0, np.nan])
+def test_missing_depth_takes_the_nearest_and_is_counted(bench, rng, fill):
+    image = texture(rng, 101, 150)
+    whole = bench.view(image, np.where(np.arange(150) < 75, 0.5, 4.0)[None, :])
+    holes = whole.depth_m.copy()
+    holes[20:30, 10:14] = fill
+    result = bench.render(RgbdView(image, holes, whole.tangents))
+    assert result.missing_depth_count == 40
+    assert result.color.tobytes() == bench.render(whole).color.tobytes()
+
+
+def test_all_depth_missing_is_infinity(bench, rng):
+    image = texture(rng, 101, 150)
+    nothing = bench.render(bench.view(image, np.nan))
+    assert nothing.missing_depth_count == 101 * 150
+    assert np.array_equal(nothing.color, bench.render(bench.view(image, np.inf)).color)
+
+
+def test_colour_that_is_not_finite_is_black_and_counted(bench, rng):
+    image = texture(rng, 101, 150)
+    image[5, 7] = np.nan
+    image[6, 9, 1] = np.inf
+    result = bench.render(bench.view(image, 2.0))
+    assert result.bad_color_count == 2
+    assert np.isfinite(result.color).all()
+    assert any("non-finite" in note for note in result.notes)
+
+
+def test_depth_nearer_than_prepared_is_counted(engine, rng):
+    bench = Bench(engine, MYOPIA, **SIZE, object_range_dpt=(0.0, 2.0))
+    depth_m = np.where(np.arange(150) < 30, 0.2, 1.0)[None, :]
+    result = bench.render(bench.view(texture(rng, 101, 150), depth_m, "radial"))
+    assert result.clamped_depth_count == 30 * 101
+
+
+def test_wrong_arrays_and_cameras_are_refused(bench, rng):
+    image, depth_m = texture(rng, 101, 150), depth_scene()
+    bad = [
+        (image[..., :2], depth_m, bench.tangents),
+        (image.astype(np.float64), depth_m, bench.tangents),
+        (image, depth_m[:50], bench.tangents),
+        (image, depth_m, bench.tangents, "sideways"),
+    ]
+    for parts in bad:
+        with pytest.raises(BadMessage):
+            bench.render(RgbdView(*parts))
+    with pytest.raises(CameraMismatch):
+        bench.render(RgbdView(image, depth_m, tangents(150, 101, 20.0)))
+    with pytest.raises(BadMessage, match="accumulation"):
+        bench.render(bench.view(image, depth_m), accumulation="average")
+
+
+def test_pupil_outside_the_prepared_range_is_clamped_with_a_note(bench, view):
+    result = bench.render(view, pupil_diameter_mm=1.0)
+    assert result.pupil_diameter_mm == pytest.approx(2.0)
+    assert any("prepared" in note for note in result.notes)
