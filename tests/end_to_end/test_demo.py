@@ -59,7 +59,7 @@ def test_demo_streams_every_frame_through_every_eye(demo_run):
         assert eye["drops"] == {}
         ages = eye["frame_age_ms"]
         assert 0 < ages["p50"] <= ages["p95"] <= ages["p99"]
-        assert {"splat_ms", "readback_ms"} <= set(eye["stages_ms"])
+        assert "splat_ms" in eye["stages_ms"]  # of either engine
 
 
 def test_demo_changes_eyes_while_frames_go_on_through_the_old_one(demo_run):
