@@ -12,6 +12,8 @@ cd "$(dirname "$0")"
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 TEST_PACKAGES="xvfb"
+# what the modules with compiled loops import
+COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
@@ -106,11 +108,23 @@ install_packages() {
     rm -f $STAMP $TRAINING_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
+    $pip install -c constraints.txt $COMPILER_PACKAGES
+    compile_beside
+    say "installing the other packages meanwhile"
     $pip install -c constraints.txt setuptools
     $pip install -c constraints.txt --no-build-isolation -e '.[clients,dev]'
     # apart and without its dependencies: it pins a PyOpenGL that is too old
     $pip install --no-deps pyrender==0.1.45
+    say "the packages are installed"
+    trap - EXIT
+    wait "$compiling" || say "compiling failed: the service will do it when it starts"
     echo "$wanted" >$STAMP
+}
+
+compile_beside() { # numba's loops, a minute of two cores, while packages come
+    $VENV/bin/python -m filter_service.filtering.compile_loops &
+    compiling=$!
+    trap 'kill "$compiling" 2>/dev/null || true' EXIT
 }
 
 install_training_packages() { # on top of the others; the service never needs them

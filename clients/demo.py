@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from clients.demo_eyes import EYES
 from clients.extra import what_to_install
@@ -36,6 +34,7 @@ from clients.sheet import (
     video_frame,
 )
 from filter_service.errors import FilterError, RenderFailed
+from filter_service.progress import Progress
 
 try:
     from clients.pyrender_stream import parse_size, path_settings
@@ -52,6 +51,7 @@ FRAMES_PER_SECOND = 12
 # Upper left corner, as parts of width and height, of what the sheet magnifies.
 DETAIL_CORNERS = {"courtyard": (0.32, 0.19), "primitives": (0.42, 0.30)}
 LOG_TAIL_LINES = 12
+START_TIMEOUT_S = 180.0  # a slow machine's first start compiles
 
 
 class DemoFailed(Exception):
@@ -113,19 +113,13 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         The service does not start, fails on the way or does not answer.
     """
     start_s = time.monotonic()
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-        disable=options.json,
-    )
-    with bar:
+    with Progress("demo", quiet=options.json) as progress:
         with _service() as service:  # it gets ready while the scenes are rendered
-            shots = _rendered(options, bar)
-            server, films = _through(service, shots, options.size, bar)
-        video = _written(options, shots, films, bar)
+            shots = _rendered(options, progress)
+            progress.task("Waiting for the service")
+            _await_ready(service)
+            server, films = _through(service, shots, options.size, progress)
+        video = _written(options, shots, films, progress)
     report = {
         "machine": {"cpu_count": os.cpu_count(), "platform": platform.platform()},
         "server": server,
@@ -147,28 +141,32 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 def _service() -> ServiceProcess:
     """Start a service on a free port of this machine."""
+    return ServiceProcess(wait=False)
+
+
+def _await_ready(service: ServiceProcess) -> None:
     try:
-        return ServiceProcess()
+        service.await_ready(START_TIMEOUT_S)
     except RuntimeError as error:  # the text ends with what it printed
         raise DemoFailed(str(error)) from None
 
 
-def _through(service: ServiceProcess, shots: list[Shot], size_px, bar: Progress):
+def _through(service: ServiceProcess, shots: list[Shot], size_px, progress: Progress):
     """Film every eye through a service; return its name and the films."""
     try:
         with FilterClient(service.endpoint, client_name="demo", timeout_s=30) as client:
             server = dict(client.welcome.server)
-            return server, _filmed(client, shots, size_px, bar)
+            return server, _filmed(client, shots, size_px, progress)
     except FilterError as error:
         tail = "\n".join(service.log.splitlines()[-LOG_TAIL_LINES:])
         text = textwrap.shorten(str(error), 300, placeholder=" ...")
         raise DemoFailed(f"{text}\nThe service's last lines:\n{tail}") from None
 
 
-def _rendered(options: argparse.Namespace, bar: Progress) -> list[Shot]:
+def _rendered(options: argparse.Namespace, progress: Progress) -> list[Shot]:
     """Render both scenes: two thirds of the frames Courtyard, one third Primitives."""
     n_courtyard = max(1, round(options.frames * 2 / 3))
-    task = bar.add_task("Rendering the scenes", total=options.frames)
+    task = progress.task("Rendering the scenes", total=options.frames)
     shots = []
     # The sheet shows the courtyard with a wide pupil focused far (the path's middle)
     # and the primitives focused on the letter.
@@ -181,32 +179,27 @@ def _rendered(options: argparse.Namespace, bar: Progress) -> list[Shot]:
         frames = []
         for frame in scene_frames(build_scene(name), None, count, options.size):
             frames.append(frame)
-            bar.advance(task)
+            task.advance()
         shots.append(Shot(name, frames, int(share * (count - 1))))
     return shots
 
 
-def _filmed(client, shots: list[Shot], size_px, bar: Progress) -> list[EyeFilm]:
+def _filmed(client, shots: list[Shot], size_px, progress: Progress) -> list[EyeFilm]:
     """Stream every frame through every eye; the stream goes on between the eyes."""
     frames = [frame for shot in shots for frame in shot.frames]
     settings = path_settings(*(shot.scene for shot in shots))
     films: list[EyeFilm] = []
     for eye in EYES:
-        task = bar.add_task(eye.title, total=len(frames))
-
-        def on_progress(fraction, stage, task=task, eye=eye):
-            text = f"{eye.title}: {stage} {100 * fraction:.0f} %"
-            bar.update(task, description=text)
-
+        task = progress.task(eye.title, total=1.0, unit="%")
         change = change_eye(
             client,
             {"kind": "preset", "name": eye.preset},
             settings=settings,
             frames=frames,
             has_eye=bool(films),
-            on_progress=on_progress,
+            on_progress=task.update,
         )
-        bar.update(task, description=eye.title)
+        task = progress.task(eye.title, total=len(frames))
         film = EyeFilm([], {}, FrameLog(), change.summary())
         wanted = _sheet_positions(shots)
         cell_px = cell_size_px(size_px)
@@ -220,7 +213,7 @@ def _filmed(client, shots: list[Shot], size_px, bar: Progress) -> list[EyeFilm]:
             film.small.append(fitted(answer.color, cell_px).copy())
             if position in wanted:
                 film.full[position] = answer
-            bar.advance(task)
+            task.advance()
         films.append(film)
     return films
 
@@ -234,16 +227,19 @@ def _sheet_positions(shots: list[Shot]) -> list[int]:
     ]
 
 
-def _written(options, shots: list[Shot], films: list[EyeFilm], bar: Progress) -> Path:
+def _written(
+    options, shots: list[Shot], films: list[EyeFilm], progress: Progress
+) -> Path:
     """Write the contact sheet and the video; return the video's path."""
+    progress.task("Writing the contact sheet")
     _contact_sheet(shots, films, options.size).save(options.out / "contact_sheet.png")
     n_frames = sum(len(shot.frames) for shot in shots)
-    task = bar.add_task("Writing the video", total=n_frames)
+    task = progress.task("Writing the video", total=n_frames)
 
     def pages():
         for page in _video_pages(shots, films, options.size):
             yield page
-            bar.advance(task)
+            task.advance()
 
     return write_video(options.out / "demo", pages, FRAMES_PER_SECOND)
 

@@ -30,6 +30,8 @@ class ServiceProcess:
         What is started; ``--config FILE`` is appended.
     start_timeout_s : float
         The longest wait for the service to be ready.
+    wait : bool
+        Whether to wait for it here; otherwise `await_ready` does, after other work.
 
     Examples
     --------
@@ -43,6 +45,7 @@ class ServiceProcess:
         *,
         command: Sequence[str] = SERVE_COMMAND,
         start_timeout_s: float = 60.0,
+        wait: bool = True,
     ) -> None:
         self.endpoint = ""
         self._folder = tempfile.TemporaryDirectory(prefix="ocufilter-")
@@ -61,14 +64,11 @@ class ServiceProcess:
                 stderr=subprocess.STDOUT,
                 cwd=SERVICE_FOLDER,
             )
-        try:
-            self._await_ready(start_timeout_s)
-        except BaseException:
-            self.kill()
-            raise
+        if wait:
+            self.await_ready(start_timeout_s)
 
     def __enter__(self) -> ServiceProcess:
-        """Return the service, which is ready."""
+        """Return the service, ready if it was waited for."""
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -108,6 +108,20 @@ class ServiceProcess:
         self.process.kill()
         self.process.wait()
         self._folder.cleanup()
+
+    def await_ready(self, timeout_s: float = 60.0) -> None:
+        """Return when frames may come; a service that fails to start is ended.
+
+        Raises
+        ------
+        RuntimeError
+            It has ended or takes too long; says what it has printed.
+        """
+        try:
+            self._await_ready(timeout_s)
+        except BaseException:
+            self.kill()
+            raise
 
     def _await_ready(self, timeout_s: float) -> None:
         deadline_s = time.monotonic() + timeout_s

@@ -9,6 +9,7 @@ Importing this loads nothing but names: clients stay light.
     protocol_schema  their headers as JSON Schema
     errors           the exceptions
     checked          values against annotated types
+    progress         how far long work is, said on stderr
     constants        numbers that Python and GLSL share
     threads          numba's thread layer
     one_blas_thread  numpy on one thread

@@ -10,6 +10,7 @@ from filter_service.commands.console import CommandFailed
 from filter_service.commands.doctor import doctor
 from filter_service.commands.estimate import estimate
 from filter_service.commands.filter_image import filter_image
+from filter_service.commands.prepare import prepare
 from filter_service.commands.programs import bench, demo
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
@@ -36,6 +37,7 @@ app.command()(estimate)
 app.command()(wavefront)
 app.command()(psf)
 app.command()(bench)
+app.command()(prepare)
 app.command()(doctor)
 
 

@@ -167,7 +167,9 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
     boxes, weights = np.empty((6, n_cells), np.float32), np.empty(n_cells, np.float32)
     row = np.empty((3, 7), np.float32)
     room = 1.0 - shear * shear
-    is_apodised = np.any(log_amplitude != 0.0)
+    is_apodised = False
+    for c in log_amplitude:
+        is_apodised = is_apodised or c != 0.0
     # Within this the whole cell lies inside: the ellipse is least curved-in there.
     inner = max(0.0, 1.0 - 0.75 * cell / math.sqrt(1.0 - abs(shear)))
     total = 0.0
@@ -369,7 +371,10 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
             min(MAX_CELLS, n_cells),
             image,
         )
-        image *= np.float32(1.0 / weight)
+        scale = np.float32(1.0 / weight)
+        for row in range(side):
+            for column in range(side):
+                image[row, column] *= scale
         if is_diffracting:
             add_edge_light(
                 dense,
@@ -383,8 +388,12 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
             )
             # Beside a caustic the edge's fringes can outweigh the rays: no light is
             # negative.
-            np.maximum(image, np.float32(0.0), image)
-            add_tail(image, nowhere, FAR_PX, edge[b], half[b], shear[b], edge_um[b])
+            for row in range(side):
+                for column in range(side):
+                    image[row, column] = max(image[row, column], np.float32(0.0))
+            add_tail(
+                image, nowhere, float(FAR_PX), edge[b], half[b], shear[b], edge_um[b]
+            )
         total[b] = finish_kernel(
             image, share[b], flat[offset[b] : offset[b] + side * side]
         )

@@ -92,7 +92,8 @@ def _substitute(source, matrix, shift, nodes, from_nodes, power_x, power_y, out)
 def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shear):
     """Fill the arrays of `PupilFrames`, one pupil after the other."""
     nodes, from_nodes, power_x, power_y = tables
-    matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.eye(2)
+    matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.zeros((2, 2))
+    lower[0, 0] = 1.0
     zero = np.zeros(2)
     for p in range(polynomial.shape[0]):
         cx, cy, major, minor, angle = ellipse[p]
@@ -118,7 +119,8 @@ def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shea
         is_same = is_same and abs(matrix[0, 1]) + abs(matrix[1, 0]) == 0.0
         is_same = is_same and abs(matrix[0, 0] - 1.0) + abs(matrix[1, 1] - 1.0) < 1e-14
         if is_same:
-            box[p] = polynomial[p]
+            for k in range(1, polynomial.shape[1]):
+                box[p, k] = polynomial[p, k]
             box[p, 0] = 0.0
         else:
             _substitute(
@@ -132,7 +134,8 @@ def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shea
                 box[p],
             )
         if shear[p] == 0.0:
-            disc[p] = box[p]
+            for k in range(box.shape[1]):
+                disc[p, k] = box[p, k]
         else:
             lower[1, 0] = shear[p]
             lower[1, 1] = math.sqrt(1.0 - shear[p] * shear[p])

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED
+from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED, put
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.fit import N_ELLIPSE, fit_ellipse, fit_zernike, rim_radius
 from estimator.wavefront.kernels import (
@@ -60,9 +60,10 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     status = chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag)
     if status != TRACED:
         return status, math.nan
-    chief[0] = ray[:3]
-    chief[1] = ray[:3]
-    frame[2] = -ray[3:6]
+    put(ray, chief[0])
+    put(ray, chief[1])
+    for i in range(3):
+        frame[2, i] = -ray[3 + i]
     across(frame[2], frame)
     status = back_to_stop(packed, indices, chief, frame, 0.0, 0.0, ray, sag)
     if status != TRACED:
@@ -71,7 +72,7 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     status = leave_eye(packed, indices, chief, axes, 0.0, ray, sample, sag)
     if status != TRACED:
         return status, math.nan
-    chief[1] = ray[:3]
+    put(ray, chief[1])
     path_mm = ray[6]
     status = stop_response(packed, indices, chief, frame, ray, response, sag)
     return status, path_mm
@@ -123,7 +124,7 @@ def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
         status = _shoot(light, x, y, tolerance, guess, inverse, ray, out[ring - 1], sag)
         if status != TRACED:
             return ring - 1, status
-        solution[ring] = guess
+        put(guess, solution[ring])
     return radii.shape[0] - 1, TRACED
 
 
@@ -137,17 +138,17 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
     inverse, known = np.empty((2, 2)), inner.copy()
     for _ in range(_EDGE_HALVINGS):
         radius = 0.5 * (low + high)
-        inverse[:] = response
-        guess[:] = known
-        if low > 0.0:
-            guess *= radius / low
+        share = radius / low if low > 0.0 else 1.0
+        for i in range(2):
+            put(response[i], inverse[i])
+            guess[i] = share * known[i]
         x, y = radius * azimuth[0], radius * azimuth[1]
         status = _shoot(
             light, x, y, _AIM_TOLERANCE_MM, guess, inverse, ray, sample, sag
         )
         if status == TRACED:
             low = radius
-            known[:] = guess
+            put(guess, known)
         else:
             high = radius
     return low
@@ -166,7 +167,8 @@ def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, s
     for k in range(azimuths.shape[0]):
         edge[k] = 1.0
         for attempt in range(2):
-            radii[1:] = stop_radius * edge[k] * rings
+            for ring in range(n_rings):
+                radii[ring + 1] = stop_radius * edge[k] * rings[ring]
             done, status = _walk_spoke(
                 light, radii, azimuths[k], response, solution, samples[k], sag
             )
@@ -212,7 +214,8 @@ def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
         area = edge[k] * edge[k] / n_azimuths
         share += area
         if edge[k] > 0.0:
-            weights[k] = area * ring_weights
+            for ring in range(n_rings):
+                weights[k, ring] = area * ring_weights[ring]
             rim[0, n_rim], rim[1, n_rim] = samples[k, -1, X], samples[k, -1, Y]
             n_rim += 1
         else:
@@ -271,8 +274,8 @@ def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
         result[WORST_STATUS] = sample_pupil(
             light, response, stop_radii[s], rings, azimuths, samples, edge, sag
         )
-        result[RETINA_POINT : RETINA_POINT + 3] = chief[0]
-        result[PLANE_POINT : PLANE_POINT + 3] = chief[1]
+        put(chief[0], result[RETINA_POINT : RETINA_POINT + 3])
+        put(chief[1], result[PLANE_POINT : PLANE_POINT + 3])
         _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result)
 
 

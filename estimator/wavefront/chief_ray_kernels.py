@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED
+from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED, put
 from estimator.wavefront.kernels import (
     N_SAMPLE,
     SLOPE_X,
@@ -39,9 +39,10 @@ def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
             status = chief_ray(packed, indices[w], h_rad, v_rad, axes, start, ray, sag)
             if status != TRACED:
                 continue
-            chief[0] = ray[:3]
+            put(ray, chief[0])
             chief[1] = 0.0  # any plane outside does: only the slope is read
-            frame[2] = -ray[3:6]
+            for i in range(3):
+                frame[2, i] = -ray[3 + i]
             across(frame[2], frame)
             status = stop_response(packed, reference, chief, frame, ray, inverse, sag)
             if status != TRACED:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import NOT_CONVERGED, RAY_SIZE, TRACED
+from estimator.optics.raytrace_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.bundle import extrapolate, prepare_chief
 from estimator.wavefront.fit import fit_zernike
@@ -33,6 +33,8 @@ _STEPS = 20
 _SMALLEST_SHARE = 1e-2
 _DIFFERENCE_COSINE = 1e-6
 _FEWEST_RAYS = 2 * N_TERMS
+_BY_VALUES = np.bool_(False)
+"""A plain False is a type of its own, for which the fit is compiled twice."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -100,7 +102,8 @@ def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
     if status != TRACED:
         return status
     radii, solution = np.zeros(n_rings + 1), np.zeros((n_rings + 1, 2))
-    radii[1:] = radius_mm * rings
+    for ring in range(n_rings):
+        radii[ring + 1] = radius_mm * rings[ring]
     for k in range(azimuths.shape[0]):
         inverse = response.copy()
         for ring in range(1, n_rings + 1):
@@ -116,9 +119,17 @@ def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
                 samples[k, ring - 1 :] = 0.0
                 weights[k, ring - 1 :] = 0.0
                 break
-            solution[ring] = guess
-            samples[k, ring - 1] = sample
+            put(guess, solution[ring])
+            put(sample, samples[k, ring - 1])
     return worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_used(weights):
+    count = 0
+    for weight in weights.flat:
+        count += weight > 0.0
+    return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -162,7 +173,8 @@ def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, stat
         if code != TRACED:
             continue
         for k in range(n_azimuths):
-            weights[k] = ring_weights / n_azimuths
+            for ring in range(n_rings):
+                weights[k, ring] = ring_weights[ring] / n_azimuths
         light = (packed[e], indices[e], chief, frame, axes, path)
         code = _circle_samples(
             light, radii_mm[e], rings, azimuths, samples, weights, sag
@@ -175,5 +187,5 @@ def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, stat
                     total += projection[j, r] * flat[r, W]
                 zernike_um[e, j] = total
             zernike_um[e, 0] = 0.0
-        elif np.sum(weights.ravel() > 0.0) >= _FEWEST_RAYS:
-            fit_zernike(flat, weights.ravel(), radii_mm[e], False, zernike_um[e])
+        elif _count_used(weights) >= _FEWEST_RAYS:
+            fit_zernike(flat, weights.ravel(), radii_mm[e], _BY_VALUES, zernike_um[e])

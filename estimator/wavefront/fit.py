@@ -14,6 +14,8 @@ _PIVOT_LIMIT = 1e-13
 """Smallest pivot, relative to its diagonal, of a fit that means something."""
 
 _RIM_STEPS = 20
+_NO_DERIVATIVE = np.int64(0)
+"""A plain 0 is a type of its own, for which loops are compiled twice."""
 
 # --- columns of the ellipse ---
 CENTRE_X, CENTRE_Y, SEMI_MAJOR, SEMI_MINOR, MAJOR_AXIS_RAD = 0, 1, 2, 3, 4
@@ -111,7 +113,7 @@ def zernike_basis(x, y):
     """Values (28, n) of the polynomials at points (n,) of the unit circle."""
     basis = np.empty((N_TERMS, x.shape[0]))
     px, py = _powers(x, y)
-    _combine(px, py, 0, 0, basis)
+    _combine(px, py, _NO_DERIVATIVE, _NO_DERIVATIVE, basis)
     return basis
 
 
@@ -155,11 +157,11 @@ def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
         for d_y in range(2):
             _combine(px, py, 1 - d_y, d_y, basis)
             slopes = samples[:, SLOPE_Y if d_y else SLOPE_X] * radius_mm
-            _add_normal_equations(basis, slopes, weights, 1, matrix, right)
-    _combine(px, py, 0, 0, basis)
+            _add_normal_equations(basis, slopes, weights, first, matrix, right)
+    _combine(px, py, _NO_DERIVATIVE, _NO_DERIVATIVE, basis)
     rest = samples[:, W].copy()
     if not use_slopes:
-        _add_normal_equations(basis, rest, weights, 0, matrix, right)
+        _add_normal_equations(basis, rest, weights, first, matrix, right)
     if not cholesky_solve(matrix, right):
         zernike_um[:] = math.nan
         return math.nan

@@ -17,6 +17,7 @@ from estimator.optics.raytrace_kernels import (
     TRACED,
     inwards,
     outwards,
+    put,
     to_retina,
     to_stop,
 )
@@ -40,6 +41,8 @@ _AIM_STEPS = 25
 _HALVINGS = 12
 _SMALLEST_SHARE = 1e-3
 _CONTINUATION_STEPS = 10
+_FIRST = np.int64(0)
+"""Of the surfaces: a plain 0 is a type of its own, for which all is compiled twice."""
 
 # --- columns of one sample of the wavefront ---
 X, Y, W, SLOPE_X, SLOPE_Y = 0, 1, 2, 3, 4
@@ -84,7 +87,7 @@ def _chief_shot(packed, indices, axes, base_z, a, b, ray, sag):
     ray[2] += base_z
     ray[6], ray[7] = 0.0, 0.0
     n_before = int(packed[-1, N_BEFORE_STOP])
-    status = inwards(packed, indices, ray, 0, n_before, sag)
+    status = inwards(packed, indices, ray, _FIRST, n_before, sag)
     if status == TRACED:
         to_stop(packed, ray, indices[n_before])
     return status
@@ -179,9 +182,10 @@ def magnification(packed, indices):
         b = start[1] + (h if i == 2 else -h if i == 3 else 0.0)
         if _chief_shot(packed, indices, axes, base_z, a, b, ray, sag) != TRACED:
             return math.nan
-        ends[i] = ray[:2]
-    da, db = (ends[0] - ends[1]) / (2.0 * h), (ends[2] - ends[3]) / (2.0 * h)
-    return 1.0 / math.sqrt(abs(da[0] * db[1] - da[1] * db[0]))
+        put(ray, ends[i])
+    ax, ay = ends[0, 0] - ends[1, 0], ends[0, 1] - ends[1, 1]
+    bx, by = ends[2, 0] - ends[3, 0], ends[2, 1] - ends[3, 1]
+    return 2.0 * h / math.sqrt(abs(ax * by - ay * bx))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -222,7 +226,7 @@ def launch(chief, frame, a, b, ray):
 def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
     """From the stop out to the plane through ``chief[1]``, and the sample there."""
     n_before = int(packed[-1, N_BEFORE_STOP])
-    status = outwards(packed, indices, ray, 0, n_before, sag)
+    status = outwards(packed, indices, ray, _FIRST, n_before, sag)
     if status != TRACED:
         return status
     x, y, z = ray[0] - chief[1, 0], ray[1] - chief[1, 1], ray[2] - chief[1, 2]
@@ -265,7 +269,7 @@ def stop_response(packed, indices, chief, frame, ray, inverse, sag):
         status = back_to_stop(packed, indices, chief, frame, a, b, ray, sag)
         if status != TRACED:
             return status
-        ends[i] = ray[:2]
+        put(ray, ends[i])
     xa, ya = (ends[1, 0] - ends[0, 0]) / h, (ends[1, 1] - ends[0, 1]) / h
     xb, yb = (ends[2, 0] - ends[0, 0]) / h, (ends[2, 1] - ends[0, 1]) / h
     determinant = xa * yb - xb * ya

@@ -9,6 +9,7 @@ worker_handle   the service's end of it
 shared_buffers  large arrays between the two
 head_start      work begun before it is asked for
 compile_builds  every loop compiled before the first build
+helper_process  another program beside, while it is needed
 """
 
 import lazy_loader

@@ -1,13 +1,17 @@
 """Has the loops that trace and integrate compiled before the worker's first build.
 
-numba compiles them at their first call on a machine and keeps them on disk: most of a
-minute of one core, then 0.5 s to read them.  Both are done while the worker is idle.
+numba compiles them at their first call on a machine and keeps them on disk: a minute of
+one core, then 0.5 s to read them.  Both are done while the worker is idle.
 """
 
+from dataclasses import replace
+
 from estimator.profiles.parse import parse_profile
-from filter_service.building.from_profile import build
+from filter_service.building.from_profile import build, grid_spec
+from filter_service.building.helper_process import HelperProcess
 from filter_service.building.jobs import BuildJob
 from filter_service.camera import Camera
+from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.settings import FilterSettings
 
 FEW_PSFS = BuildJob(
@@ -21,8 +25,36 @@ FEW_PSFS = BuildJob(
     camera=Camera(32, 18, (-0.02, 0.02, 0.01, -0.01)),
 )
 
+HELPER = ("filter_service.filtering.compile_loops", "psfs", "frames")
+"""Module and arguments of what compiles beside: in another order than `build_a_few`."""
+
+HELP_AFTER_S = 1.0
+"""Reading what is compiled already takes less."""
+
 
 def build_a_few() -> None:
     """Build some 200 PSFs, which takes every compiled loop of a build; 0.2 s."""
     for _ in build(FEW_PSFS, progress=lambda *_: None, cancelled=lambda: False):
+        pass
+
+
+def build_a_few_with_help() -> None:
+    """`build_a_few`; where it has to compile, another process does so from the end.
+
+    They meet: what one has compiled, the other reads.
+    """
+    with HelperProcess(*HELPER, after_s=HELP_AFTER_S):
+        build_a_few()
+
+
+def trace_an_eye() -> None:
+    """Estimate and trace one eye, for the first half of the loops."""
+    eye_for_spec(FEW_PSFS.profile, grid_spec(FEW_PSFS))
+
+
+def build_without_tracing() -> None:
+    """Build PSFs of a given wavefront, for the other half."""
+    settings = replace(FEW_PSFS.settings, eye_model="wavefront", mode="on-axis")
+    job = replace(FEW_PSFS, settings=settings)
+    for _ in build(job, progress=lambda *_: None, cancelled=lambda: False):
         pass

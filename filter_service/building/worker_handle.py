@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from typing import Any
 
+from filter_service.building.helper_process import import_path
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.building.shared_buffers import map_shared
 from filter_service.errors import (
@@ -30,7 +31,7 @@ RESTART_DELAY_S = 1.0  # after a worker that never got ready
 STOP_GRACE_S = 1.0
 
 BUILD = "filter_service.building.from_profile:build"
-WARM_UP = "filter_service.building.compile_builds:build_a_few"
+WARM_UP = "filter_service.building.compile_builds:build_a_few_with_help"
 
 log = logging.getLogger("ocufilter.worker")
 
@@ -139,7 +140,7 @@ class WorkerHandle:
             ],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(_import_path())},
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
         )
         theirs.close()
         self._worker = _Worker(process, Connection(ours.detach()))
@@ -287,8 +288,3 @@ def _end(process: subprocess.Popen[bytes]) -> int:
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
-
-
-def _import_path() -> list[str]:
-    """Return where this process imports from; what is no text it skips, too."""
-    return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]

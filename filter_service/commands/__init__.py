@@ -4,6 +4,7 @@ console          output, errors, progress
 setting_options  options made from `FilterSettings`
 programs         demo and bench: programs of the clients and the checkout
 serve            the service
+prepare          loops compiled ahead
 filter_image     one picture
 image_files      pictures and depth in files
 plan_text        a plan in words

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from filter_service.progress import Progress
+
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object and nothing else.")
 ]
@@ -42,18 +44,10 @@ def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
 
 @contextmanager
 def progress_bar(title: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
-    """Give a function (fraction, stage) that draws a bar on stderr, if a person looks.
+    """Give a function (fraction, stage) that says on stderr how far work is.
 
-    Nothing is drawn when ``quiet`` or when stderr is not a terminal.
+    A bar on a terminal, now and then a line elsewhere; nothing when ``quiet``.
     """
-    if quiet or not sys.stderr.isatty():
-        yield lambda fraction, stage: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(title, total=1.0)
-        yield lambda fraction, stage: progress.update(
-            task, completed=fraction, description=f"{title}: {stage}"
-        )
+    with Progress(quiet=quiet) as progress:
+        task = progress.task(title, total=1.0, unit="%")
+        yield task.update

@@ -8,6 +8,8 @@ workshop          one worker and one engine for all streams
 shared_workshop   the one that a process shares
 choose_engine     which one filters here, and why
 upload            a store on its way to the engine
+compile_loops     every compiled loop, made ahead on all cores
+load_ahead        what frames need, loaded while nobody asks
 one_image         a single picture, planned for itself
 """
 

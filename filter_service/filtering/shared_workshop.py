@@ -36,9 +36,7 @@ def open_workshop(
     worker.start()
     # What takes long to import is imported while the worker process does the same.
     from filter_service.filtering.choose_engine import open_engine
-    from filter_service.threads import require_safe_threading_layer
 
-    require_safe_threading_layer()
     chosen = open_engine(engine, closing, warm_up=True)
     if limits.psf_engine == "auto":
         limits = replace(limits, psf_engine=chosen.psf_engine)

@@ -7,10 +7,12 @@ gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers
 gpu_build_passes     their passes
 gpu_build_records    their records
+boxes                what kernels are cut to
 pack                 kernels cut to boxes, in 16 bits
 store                the cache, and the layers of a frame
 field_defocus        change of defocus over the field
-read_kernels         which cached kernels a state reads
+read_kernels         which cached kernels a state reads, as plain arrays
+read_loops           the compiled loops that read them
 store_cache          stores kept on disk
 store_codec          objects as JSON and arrays
 store_file           the file they go to

@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import RectBivariateSpline
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GREEN, GridSpec
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RectBivariateSpline
 
 COLUMNS, ROWS = 13, 9
 """Directions at which the eye is asked.  Between them, over +-40 x 25 deg at 5 mm, the
@@ -36,7 +39,9 @@ class FieldDefocus:
         return cls(np.zeros(1), np.zeros(1), np.zeros((1, 1)))
 
     @cached_property
-    def _spline(self) -> RectBivariateSpline:
+    def _spline(self) -> "RectBivariateSpline":
+        from scipy.interpolate import RectBivariateSpline
+
         return RectBivariateSpline(self.v_deg, self.h_deg, self.change_dpt)
 
     @property

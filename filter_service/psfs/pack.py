@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
 from filter_service.constants import WEIGHT_MAX
+from filter_service.psfs.boxes import SIDES, box_sizes
 
 MAX_CENTROID_SHIFT_RATIO = 0.005
 """Cutting may move a kernel's centroid by this share of its spread, and of a pixel for
@@ -23,10 +24,6 @@ sharper ones; `GridSpec.kept_energy_ratio` states what cutting costs in all."""
 CUT_STEPS = 7
 """Halvings of the light that may be cut, until the centroid stays; then none is."""
 
-MAX_REACH_PX = 255
-"""Four reaches share a word."""
-
-SIDES = 4
 PSFS_PER_TASK = 64
 
 
@@ -58,32 +55,6 @@ class PackedKernels:
     peak_ratio: NDArray[np.float64]
     spread_px: NDArray[np.float64]
     lost_energy_ratio: NDArray[np.float64]
-
-
-def box_sizes(reach_px: NDArray) -> tuple[NDArray, NDArray]:
-    """Widths and heights (...) of kernels with reaches (..., 4)."""
-    left, right, up, down = np.moveaxis(np.asarray(reach_px), -1, 0)
-    return left + right + 1, up + down + 1
-
-
-def pack_reach(reach_px: NDArray) -> NDArray[np.uint32]:
-    """Four reaches (..., 4) as the bytes of a word, left lowest."""
-    return (np.asarray(reach_px, np.uint32) << np.array([0, 8, 16, 24], np.uint32)).sum(
-        axis=-1, dtype=np.uint32
-    )
-
-
-def square_kernel(
-    weights: NDArray[np.uint16], offset: int, reach_px: NDArray, radius_px: int
-) -> NDArray[np.float64]:
-    """Kernel (2 R + 1, 2 R + 1) in its steps, about its centre."""
-    left, right, up, down = (int(r) for r in reach_px)
-    width, height = left + right + 1, up + down + 1
-    square = np.zeros((2 * radius_px + 1,) * 2)
-    square[
-        radius_px - up : radius_px + down + 1, radius_px - left : radius_px + right + 1
-    ] = weights[offset : offset + width * height].reshape(height, width)
-    return square
 
 
 def pack_kernels(

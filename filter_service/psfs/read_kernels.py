@@ -1,16 +1,9 @@
-"""How an eye's state reads its cache: compiled loops over field nodes and layers.
-
-Two nodes of defocus for each cached neighbour in pupil and accommodation.  Arrays of a
-few thousand entries, once per frame whose pupil or focus has changed.
-"""
+"""How an eye's state reads its cache: the plain arrays that `read_loops.py` takes."""
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
-
-from filter_service.constants import RGB
 
 
 class StoreTables(NamedTuple):
@@ -63,97 +56,3 @@ class StateReads(NamedTuple):
     groups: NDArray[np.int64]
     scales: NDArray[np.float64]
     weights: NDArray[np.float64]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def clipped(value, low, high):
-    """Bring a value into a range."""
-    return min(max(value, low), high)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def bracket(tables, group, t, start):
-    """Lower and upper node of a total defocus within a group; share of the upper.
-
-    As `RaggedNodes.bracket` has them.  The search begins at a node of the group: the
-    upper one of the last and smaller t, which is mostly the one that is sought, where
-    the halves of an interval are guessed wrongly every other time.
-    """
-    values_dpt, keys_dpt = tables.values_dpt, tables.keys_dpt
-    first, last = tables.starts[group], tables.starts[group + 1] - 1
-    t = clipped(t, values_dpt[first], values_dpt[last])
-    key = t - tables.lowest_dpt + tables.span_dpt * group
-    upper = max(start, min(first + 1, last))
-    while upper < last and keys_dpt[upper] < key:
-        upper += 1
-    lower = max(upper - 1, first)
-    span = values_dpt[upper] - values_dpt[lower]
-    share = (t - values_dpt[lower]) / (span if span > 0.0 else 1.0)
-    return lower, upper, clipped(share, 0.0, 1.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def layer_blur_px(tables, reads, zero_dpt, at_dpt):
-    """Geometric blur radius (n, n_fields * 3), px, of n layers, ascending."""
-    n_fields = zero_dpt.shape[0]
-    found_px = np.zeros((n_fields * RGB, at_dpt.size))
-    for field in range(n_fields):
-        for corner in range(reads.groups.size):
-            group = field * tables.groups_per_field + reads.groups[corner]
-            weight, scale = reads.weights[corner], reads.scales[corner]
-            for channel in range(RGB):
-                of_layer = found_px[field * RGB + channel]
-                zero = zero_dpt[field, channel]
-                shift_dpt = tables.channel_shift_dpt[group, channel]
-                upper = tables.starts[group]
-                for k in range(at_dpt.size):
-                    t = (at_dpt[k] + zero) * scale - shift_dpt
-                    lower, upper, share = bracket(tables, group, t, upper)
-                    low_px = tables.blur_px[RGB * lower + channel]
-                    high_px = tables.blur_px[RGB * upper + channel]
-                    of_layer[k] += low_px * (weight * (1.0 - share))
-                    of_layer[k] += high_px * (weight * share)
-    return found_px.T.copy()
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def largest_radius_px(tables, reads, zero_dpt, low_dpt, high_dpt):
-    """Largest kernel that layers from one distance to another can read."""
-    largest = 0
-    for field in range(zero_dpt.shape[0]):
-        for corner in range(reads.groups.size):
-            group = field * tables.groups_per_field + reads.groups[corner]
-            scale, low, high = reads.scales[corner], np.inf, -np.inf
-            for channel in range(RGB):
-                shift_dpt = tables.channel_shift_dpt[group, channel]
-                zero = zero_dpt[field, channel]
-                low = min(low, (zero + low_dpt) * scale - shift_dpt)
-                high = max(high, (zero + high_dpt) * scale - shift_dpt)
-            first, start, _ = bracket(tables, group, low, tables.starts[group])
-            _, last, _ = bracket(tables, group, high, start)
-            for psf in range(RGB * first, RGB * (last + 1)):
-                largest = max(largest, tables.radius_px[psf])
-    return largest
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def channel_taps(tables, reads, group, channel, total_dpt, uppers, psfs, weights):
-    """PSFs and weights (2 n_corners,) that make up one channel of a total defocus.
-
-    Parameters
-    ----------
-    group : int
-        First of the field node.
-    uppers : (n_corners,)
-        Upper nodes of a smaller total defocus, or the groups' first; brought up to
-        date.
-    """
-    for corner in range(reads.groups.size):
-        own = group + reads.groups[corner]
-        t = total_dpt * reads.scales[corner] - tables.channel_shift_dpt[own, channel]
-        lower, upper, share = bracket(tables, own, t, uppers[corner])
-        uppers[corner] = upper
-        psfs[2 * corner] = RGB * lower + channel
-        psfs[2 * corner + 1] = RGB * upper + channel
-        weights[2 * corner] = reads.weights[corner] * (1.0 - share)
-        weights[2 * corner + 1] = reads.weights[corner] * share

@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GridSpec, layer_distances_dpt
-from filter_service.planning.nodes import bracket_axis
-from filter_service.planning.plan import CachePlan
+from filter_service.planning.nodes import CachePlan, bracket_axis
+from filter_service.psfs.boxes import pack_reach
 from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
-from filter_service.psfs.pack import pack_reach
-from filter_service.psfs.read_kernels import (
-    StateReads,
-    StoreTables,
-    largest_radius_px,
-    layer_blur_px,
-)
+from filter_service.psfs.read_kernels import StateReads, StoreTables
 
 
 @dataclass(frozen=True)
@@ -161,6 +155,9 @@ def frame_layers(
     ----------
     Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
     """
+    # Whoever holds a store need not load numba: the service gets ready before.
+    from filter_service.psfs.read_loops import largest_radius_px, layer_blur_px
+
     plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
     notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)

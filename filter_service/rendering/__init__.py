@@ -9,9 +9,11 @@ frame          a view made ready: depth filled, colour finite
 gaze           where the eye looks, within what was prepared
 image_cells    cells of the image that share kernels
 cell_maps      from their pixels to those of stored kernels
+map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
+plan_once      what plans need, loaded ahead
 reference      numpy twins of the passes
 gl/            the engine of compute shaders
 native/        the engine of compiled loops

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.rgbd_view import RgbdView
@@ -26,6 +25,8 @@ def fill_missing_depth(
         return depth_m, 0
     if count == depth_m.size:
         return np.full_like(depth_m, np.inf), count
+    from scipy.ndimage import distance_transform_edt
+
     rows, columns = distance_transform_edt(
         missing, return_distances=False, return_indices=True
     )

@@ -2,7 +2,8 @@
 
 A frame's kernels are (image cell, layer interval) pairs, one for each that its pixels
 use.  A kernel holds both ends of its interval.  It is blended from node kernels, which
-are (field node, layer interval) pairs, and those from the cache.
+are (field node, layer interval) pairs, and those from the cache.  Its loops are loaded
+when a frame first needs them: numba takes 0.3 s to import.
 """
 
 from dataclasses import dataclass
@@ -18,18 +19,10 @@ from filter_service.constants import (
     RECIPE_TAPS,
     RGB,
 )
-from filter_service.psfs.pack import box_sizes, pack_reach
+from filter_service.psfs.boxes import box_sizes, pack_reach
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
-from filter_service.rendering.kernel_loops import (
-    fill_kernels,
-    fill_levels,
-    fill_recipes,
-    fill_work,
-    used_nodes,
-    used_recipes,
-)
 
 
 @dataclass(frozen=True)
@@ -122,6 +115,8 @@ def frame_kernels(
         Of the store; what it has as offsets stands in the recipes.
     used : (n_cells, n_intervals)
     """
+    from filter_service.rendering.kernel_loops import fill_kernels, used_nodes
+
     n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
     weight_ratio = np.ascontiguousarray(image.weight_ratio)
     cells, intervals, parts, *pairs = used_nodes(
@@ -156,6 +151,8 @@ def frame_kernels(
 def _node_kernels(
     tables: StoreTables, layers: FrameLayers, fields: NDArray, intervals: NDArray
 ) -> NodeKernels:
+    from filter_service.rendering.kernel_loops import fill_recipes, used_recipes
+
     near, far, recipe_fields, recipe_layers = used_recipes(
         fields, intervals, len(layers.layer_zero_dpt), len(layers.layer_dpt)
     )
@@ -204,6 +201,8 @@ def kernel_table(
 
     Each is followed by its merged forms: the kernel summed over squares of pixels.
     """
+    from filter_service.rendering.kernel_loops import fill_levels
+
     sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
     starts, scale = np.empty(sizes.shape, np.uint32), np.empty(sizes.shape, np.float32)
     fill_levels(
@@ -240,6 +239,8 @@ def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint
 
 def work_list(n_texels: NDArray[np.int64], threads: int) -> NDArray[np.uint32]:
     """Work groups (n, 2) over kernels of different size: kernel, its first texel."""
+    from filter_service.rendering.kernel_loops import fill_work
+
     groups = int((-(-n_texels // threads)).sum())
     work = np.empty((groups, 2), np.uint32)
     fill_work(np.ascontiguousarray(n_texels), threads, work)

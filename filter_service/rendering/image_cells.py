@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import bracket_axis
-from filter_service.planning.plan import CachePlan
+from filter_service.planning.nodes import CachePlan, bracket_axis
 from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}

@@ -15,8 +15,8 @@ from filter_service.constants import (
     RGB,
     WEIGHT_MAX,
 )
-from filter_service.psfs.read_kernels import channel_taps, clipped
-from filter_service.rendering.cell_maps import MAX_REACH_PX, mapped_reach, moves
+from filter_service.psfs.read_loops import channel_taps, clipped
+from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
 
 CORNERS = 4
 MIN_SPREAD_PX = 1e-9
@@ -109,7 +109,10 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
     for n in range(fields.size):
         group = fields[n] * tables.groups_per_field
         if n == 0 or fields[n] != fields[n - 1]:
-            uppers[:] = tables.starts[group + reads.groups]
+            for corner in range(reads.groups.size):
+                first = tables.starts[group + reads.groups[corner]]
+                for channel in range(RGB):
+                    uppers[channel, corner] = first
         left = right = up = down = widest_px = 0
         highest, narrowest_px = 0.0, np.inf
         for channel in range(RGB):

@@ -20,7 +20,7 @@ from filter_service.constants import (
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
 )
-from filter_service.psfs.pack import square_kernel
+from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame import extended, fill_missing_depth, object_dpt
 from filter_service.rendering.frame_kernels import (

@@ -29,6 +29,7 @@ def serve(
 
     Must run in the main thread of a process that owns the engine's GL context.
     """
+    from filter_service.filtering.load_ahead import load_ahead
     from filter_service.service.server import FilterServer
 
     server = FilterServer(config, workshop=workshop, read_profile=read_profile)
@@ -38,6 +39,7 @@ def serve(
         signal.set_wakeup_fd(server.wake_file_descriptor, warn_on_full_buffer=False)
     try:
         _announce(config, server.endpoint)
+        load_ahead()
         server.run()
     finally:
         if threading.current_thread() is threading.main_thread():

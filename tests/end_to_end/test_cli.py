@@ -374,5 +374,5 @@ def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
 def test_help_without_arguments_teaches_the_commands():
     finished = run()
     assert finished.returncode == 0
-    for command in ("demo", "serve", "filter", "psf", "bench", "doctor"):
+    for command in ("demo", "serve", "filter", "psf", "bench", "doctor", "prepare"):
         assert f"\n  {command} " in finished.stdout

@@ -4,6 +4,7 @@ import functools
 import json
 import subprocess
 import sys
+import time
 from itertools import pairwise
 
 import imageio_ffmpeg
@@ -17,6 +18,7 @@ from clients.pyrender_stream import parse_size, path_settings, profile_body
 from clients.scenes.catalogue import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from clients.streaming import FrameLog, percentiles
+from filter_service.progress import INTERVAL_S
 
 N_FRAMES = 4
 SIZE_PX = (160, 90)
@@ -27,27 +29,41 @@ def demo_run(tmp_path_factory):
     """One small demo in a process of its own: its folder and what it printed."""
     folder = tmp_path_factory.mktemp("demo")
     command = [sys.executable, "-m", "clients.demo", "--out", str(folder)]
-    command += ["--frames", str(N_FRAMES), "--size", "160x90", "--json"]
-    finished = subprocess.run(
-        command, cwd=CHECKOUT, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert finished.returncode == 0, finished.stderr
-    return folder, json.loads(finished.stdout)
+    command += ["--frames", str(N_FRAMES), "--size", "160x90"]
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=CHECKOUT, **output) as process:
+        lines = [(line, time.monotonic()) for line in process.stderr]
+        said = process.stdout.read()
+    assert process.returncode == 0, "".join(line for line, _ in lines)
+    assert "contact_sheet.png" in said
+    report = json.loads((folder / "latency.json").read_text())
+    return folder, report, [*lines, ("", time.monotonic())]
+
+
+def test_demo_says_into_a_pipe_what_it_does(demo_run):
+    *_, lines = demo_run
+    text = "".join(line for line, _ in lines)
+    stages = ["Rendering the scenes", *(eye.title for eye in EYES), "the video"]
+    places = [text.index(stage) for stage in stages]
+    assert places == sorted(places)
+    assert f"{N_FRAMES}/{N_FRAMES} frames" in text
+    silences_s = [after - before for (_, before), (_, after) in pairwise(lines)]
+    assert max(silences_s) < 2 * INTERVAL_S
 
 
 def test_demo_streams_every_frame_through_every_eye(demo_run):
-    _, report = demo_run
+    _, report, _ = demo_run
     assert list(report["eyes"]) == [eye.preset for eye in EYES]
     for eye in report["eyes"].values():
         assert eye["frames"] == N_FRAMES
         assert eye["drops"] == {}
         ages = eye["frame_age_ms"]
         assert 0 < ages["p50"] <= ages["p95"] <= ages["p99"]
-        assert {"splat_ms", "readback_ms"} <= set(eye["stages_ms"])
+        assert "splat_ms" in eye["stages_ms"]  # of either engine
 
 
 def test_demo_changes_eyes_while_frames_go_on_through_the_old_one(demo_run):
-    _, report = demo_run
+    _, report, _ = demo_run
     changes = [eye["eye_change"] for eye in report["eyes"].values()]
     for before, after in pairwise(changes):
         assert after["generation"] > before["generation"]
@@ -56,7 +72,7 @@ def test_demo_changes_eyes_while_frames_go_on_through_the_old_one(demo_run):
 
 
 def test_demo_writes_a_video_of_all_frames_and_a_contact_sheet(demo_run):
-    folder, report = demo_run
+    folder, report, _ = demo_run
     assert json.loads((folder / "latency.json").read_text()) == report
     # Four pictures across, four rows of them.
     with Image.open(folder / "contact_sheet.png") as sheet_image:
@@ -106,8 +122,8 @@ def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_pa
     def primitives_only(name):
         return build_scene("primitives")
 
-    def recorded():
-        services.append(ServiceProcess())
+    def recorded(**options):
+        services.append(ServiceProcess(**options))
         return services[0]
 
     def change_then_kill(*args, **settings):

@@ -20,7 +20,8 @@ from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.paper_grid import DISTANCES_DPT
 from filter_service.planning.sampled_use import FIELD_OF_AXIS, sample_use
 from filter_service.planning.slopes import PupilStates
-from filter_service.psfs.pack import pack_kernels, square_kernel
+from filter_service.psfs.boxes import square_kernel
+from filter_service.psfs.pack import pack_kernels
 from tests.grid_specs import grid_spec
 
 SPECTRUM_SIDE_PX = 256

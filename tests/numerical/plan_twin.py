@@ -17,8 +17,8 @@ from filter_service.constants import (
     WEIGHT_MAX,
 )
 from filter_service.planning.grid import BASE_OBJECT_STEP_DPT, blur_step_px
-from filter_service.psfs.pack import box_sizes, pack_reach
-from filter_service.rendering.cell_maps import MAX_REACH_PX, UNMOVED_PX, UNMOVED_RATIO
+from filter_service.psfs.boxes import box_sizes, pack_reach
+from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, UNMOVED_RATIO
 
 
 def neighbours(store, reads, fields, total_dpt):

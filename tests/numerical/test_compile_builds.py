@@ -1,4 +1,4 @@
-"""What the worker compiles ahead is all that the builds of profiles need."""
+"""What is compiled ahead, in two halves, is all that builds of profiles need."""
 
 import subprocess
 import sys
@@ -11,6 +11,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.messages import Camera, FilterSettings
 from filter_service.building.from_profile import build
 from filter_service.building.compile_builds import FEW_PSFS, build_a_few
+from filter_service.filtering.compile_loops import compile_part
 
 def compiled():
     modules = [m for name, m in sys.modules.items()
@@ -20,9 +21,11 @@ def compiled():
     return {(f.__module__, f.__name__, str(s)) for f in found.values()
             for s in f.signatures}
 
-build_a_few()
+compile_part("tracing")
+compile_part("psfs")
 before = compiled()
 assert len(before) > 8, before
+build_a_few()
 camera = Camera(160, 90, (-0.5, 0.5, 0.28, -0.28))
 for sphere_dpt in (0.0, -6.0):
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "cylinder_dpt": -1.0,
@@ -41,7 +44,7 @@ for missed in sorted(compiled() - before):
 """
 
 
-def test_builds_after_the_warm_up_compile_nothing():
+def test_builds_after_either_warm_up_compile_nothing():
     ran = subprocess.run(
         [sys.executable, "-c", SCRIPT],
         capture_output=True,

@@ -9,7 +9,7 @@ from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from filter_service.constants import MAX_LEVEL, RECIPE_TAPS, RGB, THREADS
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.read_kernels import layer_blur_px
+from filter_service.psfs.read_loops import layer_blur_px
 from filter_service.psfs.store import PsfStore, frame_layers
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.cell_maps import CellMaps

@@ -20,9 +20,9 @@ from filter_service.psfs import (
     gpu_build_constants,
     gpu_build_records,
 )
+from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.gpu_build import gpu_psf_batch
-from filter_service.psfs.pack import square_kernel
 from filter_service.psfs.psf_engine import psf_engine
 from tests.grid_specs import grid_spec
 from tests.numerical.psf_cases import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimator.psf.compute import PsfTooLarge
-from filter_service.psfs.pack import MAX_REACH_PX
+from filter_service.psfs.boxes import MAX_REACH_PX
 from filter_service.rendering import reference
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, psnr_db, texture

@@ -24,7 +24,13 @@ MAY_IMPORT = {
     "estimator": ("estimator",),
     "filter_service": ("filter_service", "estimator"),
     "training": ("training", "estimator"),
-    "clients": ("clients", "filter_service.messages", "filter_service.errors", *FACE),
+    "clients": (
+        "clients",
+        "filter_service.messages",
+        "filter_service.errors",
+        "filter_service.progress",  # of long programs
+        *FACE,
+    ),
 }
 """Ours that each package may import, as dotted prefixes."""
 
@@ -92,8 +98,8 @@ HOME = {
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
-        "filter_service/psfs/read_kernels.py",  # planning a frame
-        "filter_service/rendering/cell_maps.py",
+        "filter_service/psfs/read_loops.py",  # planning a frame
+        "filter_service/rendering/map_loops.py",
         "filter_service/rendering/kernel_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
@@ -117,7 +123,7 @@ HOME = {
         "clients/*",  # captions, textures, contact sheet
     ),
     "typer": ("filter_service/__main__.py", "filter_service/commands/*"),
-    "rich": ("filter_service/commands/*", "clients/*", "training/*"),  # progress bars
+    "rich": ("filter_service/progress.py", "clients/*", "training/*"),  # bars, tables
     "hypothesis": ("tests/*",),
     "pytest": ("tests/*",),
 }

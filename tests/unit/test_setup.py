@@ -1,6 +1,8 @@
 """What installs the project agrees with itself, and commands start what exists."""
 
 import re
+import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -39,6 +41,33 @@ def test_pyrender_is_installed_in_the_pinned_version():
     setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
     for text in (setup, INSTALL, FIX_PYRENDER):
         assert f"--no-deps pyrender=={PINS['pyrender']}" in text
+
+
+IMPORTED_TO_COMPILE = """
+import sys
+from filter_service.building import compile_builds
+from filter_service.filtering import compile_loops
+from filter_service.rendering import kernel_loops, map_loops, plan_once
+for name, module in sys.modules.items():
+    if "." not in name and "site-packages" in (getattr(module, "__file__", "") or ""):
+        print(name)
+"""
+
+
+def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
+    setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
+    first = re.search(r'^COMPILER_PACKAGES="(.*)"$', setup, re.MULTILINE)[1].split()
+    brought_along = {"llvmlite", "glcontext", "typing_extensions"}  # by the others
+    ran = subprocess.run(
+        [sys.executable, "-c", IMPORTED_TO_COMPILE],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = {name for name in ran.stdout.split() if not name.startswith("_")}
+    assert {"numba", "scipy"} <= found
+    assert found - brought_along <= {name.replace("-", "_") for name in first}
 
 
 @pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])

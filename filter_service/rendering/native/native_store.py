@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.psfs.pack import pack_reach
+from filter_service.psfs.boxes import pack_reach
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore

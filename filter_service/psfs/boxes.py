@@ -1,0 +1,35 @@
+"""The boxes that kernels are cut to: sizes, packed reaches, a kernel out of its box."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_REACH_PX = 255
+"""Four reaches share a word."""
+
+SIDES = 4
+
+
+def box_sizes(reach_px: NDArray) -> tuple[NDArray, NDArray]:
+    """Widths and heights (...) of kernels with reaches (..., 4)."""
+    left, right, up, down = np.moveaxis(np.asarray(reach_px), -1, 0)
+    return left + right + 1, up + down + 1
+
+
+def pack_reach(reach_px: NDArray) -> NDArray[np.uint32]:
+    """Four reaches (..., 4) as the bytes of a word, left lowest."""
+    return (np.asarray(reach_px, np.uint32) << np.array([0, 8, 16, 24], np.uint32)).sum(
+        axis=-1, dtype=np.uint32
+    )
+
+
+def square_kernel(
+    weights: NDArray[np.uint16], offset: int, reach_px: NDArray, radius_px: int
+) -> NDArray[np.float64]:
+    """Kernel (2 R + 1, 2 R + 1) in its steps, about its centre."""
+    left, right, up, down = (int(r) for r in reach_px)
+    width, height = left + right + 1, up + down + 1
+    square = np.zeros((2 * radius_px + 1,) * 2)
+    square[
+        radius_px - up : radius_px + down + 1, radius_px - left : radius_px + right + 1
+    ] = weights[offset : offset + width * height].reshape(height, width)
+    return square

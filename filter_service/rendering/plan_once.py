@@ -1,0 +1,42 @@
+"""Plans a tiny frame, so that what plans need is loaded before the first client's.
+
+Importing numba and scipy and reading the compiled loops takes 1 s, which a service
+spends after it is ready; compiling them, once on a machine, 10 s.
+"""
+
+import numpy as np
+
+from filter_service.camera import Camera
+from filter_service.psfs.store import frame_layers
+from filter_service.rendering.frame import fill_missing_depth
+from filter_service.rendering.frame_kernels import (
+    frame_kernels,
+    interval_count,
+    kernel_table,
+    node_table,
+    work_list,
+)
+from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.perfect_eye import (
+    PUPIL_MM,
+    SIDE_PX,
+    TANGENTS,
+    perfect_store,
+)
+
+
+def plan_once() -> None:
+    """Go through every loop that a frame's plan may need, but for the rendering."""
+    from scipy import interpolate  # noqa: F401  (changes over the field)
+
+    store = perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS))
+    layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
+    image = image_cells(store.spec, store.plan)
+    used = np.ones((image.count, interval_count(layers)), bool)
+    kernels = frame_kernels(store.tables, layers, image, used)
+    node_table(kernels.nodes)
+    _, n_texels = kernel_table(kernels)
+    work_list(n_texels[:, 0], SIDE_PX)
+    depth_m = np.ones((2, 2), np.float32)
+    depth_m[0, 0] = np.nan
+    fill_missing_depth(depth_m)

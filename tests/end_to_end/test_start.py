@@ -1,0 +1,72 @@
+"""What a start of the service loads before it says that it is ready, and after."""
+
+import json
+import subprocess
+import sys
+
+from tests.source_tree import ROOT
+
+UP_TO_READY = """
+import json, sys
+from filter_service import __main__
+from filter_service.service import launch
+from filter_service.service.config import load_config
+
+def report(config, endpoint):
+    print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+    raise SystemExit
+
+launch._announce = report
+launch.run(load_config(bind="tcp://127.0.0.1:*", engine="native"))
+"""
+
+AFTER_READY = """
+import json, sys
+from filter_service.rendering.plan_once import plan_once
+from numba.core.registry import CPUDispatcher
+
+def compiled():
+    loops = [f for name, module in sys.modules.items()
+             if name.startswith("filter_service")
+             for f in vars(module).values() if isinstance(f, CPUDispatcher)]
+    return {(f.__module__, f.__name__, str(s)) for f in loops for s in f.signatures}
+
+plan_once()
+before, libraries = compiled(), {m for m in sys.modules if m.startswith("scipy.")}
+assert len(before) > 8, before
+assert {"scipy.interpolate", "scipy.ndimage"} <= libraries, libraries
+
+from contextlib import ExitStack
+from filter_service.filtering.choose_engine import open_engine
+from filter_service.rendering.perfect_eye import change_by_perfect_eye
+with ExitStack() as closing:
+    for engine in ("native", "gl"):
+        change_by_perfect_eye(open_engine(engine, closing).engine)
+print(json.dumps(sorted(compiled() - before)))
+"""
+
+NOT_BEFORE_READY = {"numba", "llvmlite", "scipy", "matplotlib", "rich", "PIL"}
+"""By the native engine; that of GL plans frames when it compiles its shaders."""
+
+
+def _printed(script):
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_a_service_is_ready_before_it_loads_numba_or_scipy():
+    loaded = set(_printed(UP_TO_READY))
+    assert {"zmq", "numpy"} <= loaded, "it has not come to the end"
+    assert not loaded & NOT_BEFORE_READY
+
+
+def test_what_is_loaded_ahead_is_all_that_frames_need():
+    assert _printed(AFTER_READY) == []
