@@ -6,11 +6,13 @@
 #   sh setup.sh training  the first, and what training the networks needs (torch)
 #
 # Running it again costs a fraction of a second: the environment is installed anew
-# only when this file, pyproject.toml, constraints.txt or the folder has changed.
+# only when this file, pyproject.toml, constraints.txt, the sources in C or the folder
+# has changed.
 set -eu
 cd "$(dirname "$0")"
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
+C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
 # what the modules with compiled loops import
 COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
@@ -69,6 +71,15 @@ install_system_libraries() {
     fi
 }
 
+can_compile() { echo 'int main(void) { return 0; }' | cc -x c -o /dev/null - 2>/dev/null; }
+
+install_c_compiler() { # for the native engine; without it Mesa filters, 20 times slower
+    if can_compile; then return; fi
+    if command -v dpkg-query >/dev/null && apt_install $C_PACKAGES; then return; fi
+    say "without a C compiler frames go through OpenGL alone, slowly where there is no" \
+        "GPU; to have one:  $(install_command "$C_PACKAGES")"
+}
+
 install_test_packages() { # worth having, but the tests run without
     command -v dpkg-query >/dev/null || return 0
     missing=$(missing_packages $TEST_PACKAGES)
@@ -102,7 +113,8 @@ make_venv() {
 }
 
 install_packages() {
-    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt | cksum)
+    sources=$(echo filter_service/rendering/native/source/*)
+    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
     rm -f $STAMP $TRAINING_STAMP
@@ -136,6 +148,7 @@ install_training_packages() { # on top of the others; the service never needs th
 }
 
 install_system_libraries
+install_c_compiler
 install_packages
 if [ "${1:-}" = training ]; then install_training_packages; fi
 if [ "${1:-}" = test ]; then install_test_packages; fi

@@ -36,6 +36,9 @@ HELD = (
 )
 """Files of the checkout that a wheel holds, and no others."""
 
+COMPILED = "filter_service/rendering/native/_loops"
+"""The native engine's loops, made when the wheel is."""
+
 CLIENT = """
 import json, sys
 import numpy as np
@@ -196,6 +199,9 @@ def test_the_wheel_holds_everything_of_its_packages_and_nothing_else(wheel_names
         expected |= found
     expected = {re.sub("^shaders/", "filter_service/shaders/", n) for n in expected}
     held = {name for name in wheel_names if ".dist-info/" not in name}
+    compiled = {name for name in held if name.endswith(".so")}
+    assert [re.sub(r"\..*", "", name) for name in compiled] == [COMPILED]
+    held -= compiled
     assert sorted(expected - held) == []
     assert sorted(held - expected) == []
     assert {name.split("/")[0] for name in held} == set(PACKAGES)
@@ -230,7 +236,7 @@ def test_doctor_finds_a_machine_that_can_serve(run_json):
     report = run_json("doctor")
     assert report["ok"] and report["works"]["serve"]
     checks = {check["name"]: check["ok"] for check in report["checks"]}
-    assert checks["shaders"] and checks["networks"]
+    assert checks["shaders"] and checks["native"] and checks["networks"]
     fixes = " ".join(report["install"])
     assert "setup.sh" not in fixes and "git" not in fixes
 
@@ -250,7 +256,7 @@ def image(installed):
 
 
 def test_filter_blurs_a_picture(run_json, installed, image):
-    run_json(*image)
+    assert run_json(*image)["engine"] == "native"
     filtered = np.load(installed.cwd / "out.npy")
     assert filtered.shape == (HEIGHT_PX, WIDTH_PX, 3)
     assert np.isfinite(filtered).all()
