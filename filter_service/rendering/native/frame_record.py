@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import MAX_LEVEL, TILE_SIZE_PX
+from filter_service.constants import MAX_LEVEL, MIN_BLUR_RANGE, TILE_SIZE_PX
 from filter_service.psfs.store import FrameLayers
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.image_cells import ImageCells
@@ -61,13 +61,14 @@ class FrameRecord:
     """
 
     c: Frame
+    n_threads: int
     arrays: Arrays
     kept: list[NDArray]
 
     @classmethod
-    def new(cls, threads: int, arrays: Arrays) -> "FrameRecord":
+    def new(cls, threads: int, n_threads: int, arrays: Arrays) -> "FrameRecord":
         """Return an empty record for loops on these threads."""
-        return cls(Frame(threads=threads), arrays, [])
+        return cls(Frame(threads=threads), n_threads, arrays, [])
 
     def _keep(self, array: NDArray) -> int:
         """Keep an array as long as the record; return where it lies."""
@@ -109,11 +110,23 @@ class FrameRecord:
         c.object_low_dpt, c.object_high_dpt = layers.object_range_dpt
         c.object_margin_dpt = CLAMP_MARGIN_RATIO * max(layers.object_range_dpt[1], 1.0)
         c.blur_px_per_dpt = layers.blur_px_per_dpt
-        c.layer_dpt = self._keep(layers.layer_dpt.astype(np.float32))
+        layer_dpt = layers.layer_dpt.astype(np.float32)
+        c.layer_dpt = self._keep(layer_dpt)
+        steps_dpt = np.maximum(np.diff(layer_dpt), MIN_BLUR_RANGE)
+        c.layer_per_dpt = self._keep((1.0 / steps_dpt).astype(np.float32))
         c.layer_count = len(layers.layer_dpt)
         c.interval_count = interval_count(layers)
         c.cell_px, c.cell_columns = image.cell_px, image.grid[0]
         c.corner_dpt = self._keep(np.ascontiguousarray(corner_change_dpt, np.float32))
+        c.row_scratch = self._room(
+            "row_scratch", self.n_threads * (c.cell_columns + 1), np.float32
+        )
+        if image.cell_px:
+            column = np.clip(np.arange(c.width) - c.border_px, 0, c.image_width - 1)
+            cell, place = np.divmod(column, image.cell_px)
+            c.column_cell = self._keep(cell.astype(np.int32))
+            share = (place + np.float32(0.5)) / np.float32(image.cell_px)
+            c.column_share = self._keep(share.astype(np.float32))
         used = np.zeros((image.count, c.interval_count), np.bool_)
         c.used = self._keep(used)
         return used
@@ -162,14 +175,14 @@ class FrameRecord:
             self.c.store_first[r] = self._keep(stored.first_texel)
             self.c.store_reach[r] = self._keep(stored.reach)
 
-    def set_blend_room(self, sizes: BlendSizes, n_threads: int) -> None:
+    def set_blend_room(self, sizes: BlendSizes) -> None:
         """Point to kernels, or room for them."""
         c = self.c
         room = self._room
         c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
         c.kernel_texels = room("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
         c.blend_scratch_floats = sizes.scratch_floats
-        n_floats = n_threads * sizes.scratch_floats
+        n_floats = self.n_threads * sizes.scratch_floats
         c.blend_scratch = room("blend_scratch", n_floats, np.float32)
 
     def set_picture(self, picture: NDArray) -> None:

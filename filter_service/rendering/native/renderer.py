@@ -138,7 +138,7 @@ class NativeRenderer:
     def _render(
         self, timer, view, handle, layers: FrameLayers, image, options: FrameOptions
     ) -> FilteredView:
-        frame = FrameRecord.new(self._threads, self._arrays)
+        frame = FrameRecord.new(self._threads, self._n_threads, self._arrays)
         missing_count, used = self._pixels(timer, frame, view, layers, image)
         with timer.wall("psf_plan_ms"):
             plan = self._planned(handle, layers, image, used)
@@ -213,13 +213,13 @@ class NativeRenderer:
         if self._blended is not None:
             of_plan, made, sizes = self._blended
             if of_plan is plan and not np.any(levels & ~made):
-                frame.set_blend_room(sizes, self._n_threads)
+                frame.set_blend_room(sizes)
                 return
         self._blended = None
         with timer.wall("psf_blend_ms"):
             self._loops.run("place", frame.c)
             sizes = BlendSizes.of(frame.c)
-            frame.set_blend_room(sizes, self._n_threads)
+            frame.set_blend_room(sizes)
             self._loops.run("blend", frame.c)
         self._blended = plan, levels.copy(), sizes
 

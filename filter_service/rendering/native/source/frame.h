@@ -106,10 +106,13 @@ typedef struct {
     float object_low_dpt, object_high_dpt, object_margin_dpt;
     float blur_px_per_dpt;
 
-    const float *layer_dpt;
+    const float *layer_dpt, *layer_per_dpt;  /* ends of intervals, intervals per dpt */
     int32_t layer_count, interval_count;
     int32_t cell_px, cell_columns;  /* cell_px is a power of two, or 0: one cell */
     const float *corner_dpt;  /* change of defocus at the corners of the cells */
+    const int32_t *column_cell;              /* of each column of the frame */
+    const float *column_share;               /* of the way through it */
+    float *row_scratch;                      /* of cell_columns + 1, one a thread */
 
     float *dpt;               /* of each pixel; NOTHING_DPT where nothing is hidden */
     float *position;          /* in layers */

@@ -79,18 +79,13 @@ INLINE void find_edges(block *b) {
     }
 }
 
-INLINE int cell_shift(const frame *f) { return __builtin_ctz((unsigned)f->cell_px); }
-
 INLINE int cell_row(const frame *f, int y) {
     if (f->cell_px == 0) return 0;
     int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
-    return (place >> cell_shift(f)) * f->cell_columns;
+    return (place >> __builtin_ctz((unsigned)f->cell_px)) * f->cell_columns;
 }
 
-INLINE int cell_column(const frame *f, int x) {
-    if (f->cell_px == 0) return 0;
-    return clamped_int(x - f->border_px, 0, f->image_width - 1) >> cell_shift(f);
-}
+INLINE int cell_column(const frame *f, int x) { return f->cell_px ? f->column_cell[x] : 0; }
 
 /* Reads a block's pixels; returns the highest level that any may merge to. */
 INLINE int read_block(block *b) {

@@ -15,36 +15,27 @@ INLINE int clamped_int(int value, int low, int high) {
     return value < low ? low : value > high ? high : value;
 }
 
-/* Layer position of a distance; `low` is where the last one was found. */
-INLINE float layer_position(const frame *f, float dpt, int *low) {
+/* The interval of layers that holds a distance, between the first and the last; looked for
+ * about the one where the last distance was found. */
+INLINE int find_interval(const frame *f, float dpt, int at) {
     const float *layers = f->layer_dpt;
     int last = f->layer_count - 2;
-    int at = *low;
-    if (last < 0) return 0.0f;
-    if (!(layers[at] <= dpt)) {
-        int first = 0;
-        int end = at;      /* the interval lies in first..end */
-        while (first < end) {
-            int middle = (first + end + 1) / 2;
-            if (layers[middle] <= dpt) first = middle;
-            else end = middle - 1;
-        }
-        at = first;
-    } else if (at < last && layers[at + 1] <= dpt) {
-        int first = at + 1;
-        int end = last;
-        while (first < end) {
-            int middle = (first + end + 1) / 2;
-            if (layers[middle] <= dpt) first = middle;
-            else end = middle - 1;
-        }
-        at = first;
+    if (layers[at] <= dpt && (at == last || dpt < layers[at + 1])) return at;
+    int first = 0;
+    while (first < last) {
+        int middle = (first + last + 1) / 2;
+        if (layers[middle] <= dpt) first = middle;
+        else last = middle - 1;
     }
-    *low = at;
-    float span = layers[at + 1] - layers[at];
-    float share = (dpt - layers[at]) / (span > MIN_BLUR_RANGE ? span : MIN_BLUR_RANGE);
-    share = share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share;
-    return (float)at + share;
+    return first;
+}
+
+/* Layer position of a distance; `at` is where the last one was found. */
+INLINE float layer_position(const frame *f, float dpt, int *at) {
+    if (f->layer_count < 2) return 0.0f;
+    int low = *at = find_interval(f, dpt, *at);
+    float share = (dpt - f->layer_dpt[low]) * f->layer_per_dpt[low];
+    return (float)low + smaller_float(larger_float(share, 0.0f), 1.0f);
 }
 
 INLINE int position_interval(const frame *f, float position) {
@@ -80,41 +71,39 @@ INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt
     }
 }
 
-/* Cell of a column or row of the frame, and the share of the way through it. */
-INLINE int cell_place(const frame *f, int at, int size, float *share) {
-    int place = clamped_int(at - f->border_px, 0, size - 1);
-    int cell = place >> __builtin_ctz((unsigned)f->cell_px);
-    *share = ((float)(place - cell * f->cell_px) + 0.5f) / (float)f->cell_px;
-    return cell;
+/* Change of defocus over the field in the middle of a row, at the edges of its cells. */
+INLINE void row_changes(const frame *f, int y, float *change_dpt) {
+    int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
+    int row = place >> __builtin_ctz((unsigned)f->cell_px);
+    float down = ((float)(place - row * f->cell_px) + 0.5f) / (float)f->cell_px;
+    const float *above = f->corner_dpt + row * (f->cell_columns + 1);
+    const float *below = above + f->cell_columns + 1;
+    for (int column = 0; column <= f->cell_columns; ++column)
+        change_dpt[column] = above[column] + down * (below[column] - above[column]);
 }
 
 /* Positions and used pairs of one row of one surface, from its clamped distances. */
-static void row_positions(const frame *f, const float *dpt, int y, float *position) {
-    int low = 0;
+static void row_positions(const frame *f, const float *dpt, int y, float *change_dpt,
+                          float *position) {
+    int found = 0;
     int noted = -1;
-    float down = 0.0f;
-    const float *above = NULL;
     int first_cell = 0;
     if (f->cell_px) {
-        int row = cell_place(f, y, f->image_height, &down);
-        above = f->corner_dpt + row * (f->cell_columns + 1);
-        first_cell = row * f->cell_columns;
+        row_changes(f, y, change_dpt);
+        int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
+        first_cell = (place >> __builtin_ctz((unsigned)f->cell_px)) * f->cell_columns;
     }
     for (int x = 0; x < f->width; ++x) {
         if (dpt[x] < 0.0f) continue;
         float change = 0.0f;
-        int cell = 0;
+        int column = 0;
         if (f->cell_px) {
-            float across;
-            int column = cell_place(f, x, f->image_width, &across);
-            const float *below = above + f->cell_columns + 1;
-            float high = above[column] + across * (above[column + 1] - above[column]);
-            float deep = below[column] + across * (below[column + 1] - below[column]);
-            change = high + down * (deep - high);
-            cell = first_cell + column;
+            column = f->column_cell[x];
+            float left = change_dpt[column];
+            change = left + f->column_share[x] * (change_dpt[column + 1] - left);
         }
-        position[x] = layer_position(f, dpt[x] + change, &low);
-        int pair = cell * f->interval_count + position_interval(f, position[x]);
+        position[x] = layer_position(f, dpt[x] + change, &found);
+        int pair = (first_cell + column) * f->interval_count + position_interval(f, position[x]);
         if (pair != noted) note_use(f->used + pair);
         noted = pair;
     }
@@ -145,7 +134,7 @@ static int64_t bad_colors(const frame *f, int surface, size_t first, const float
 /* One row of all surfaces. */
 static void pixel_row(void *argument, int y, int thread) {
     frame *f = argument;
-    (void)thread;
+    float *change_dpt = f->row_scratch + (size_t)thread * (size_t)(f->cell_columns + 1);
     int64_t clamped = 0;
     int64_t missing = 0;
     int64_t bad = 0;
@@ -176,7 +165,7 @@ static void pixel_row(void *argument, int y, int thread) {
             kept = kept > f->object_high_dpt ? f->object_high_dpt : kept;
             dpt[x] = dpt[x] < 0.0f ? NOTHING_DPT : kept;
         }
-        row_positions(f, dpt, y, f->position + (size_t)s * pixels + first);
+        row_positions(f, dpt, y, change_dpt, f->position + (size_t)s * pixels + first);
     }
     if (clamped) __atomic_fetch_add(&f->clamped_count, clamped, __ATOMIC_RELAXED);
     if (bad) __atomic_fetch_add(&f->bad_color_count, bad, __ATOMIC_RELAXED);

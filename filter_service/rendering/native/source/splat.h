@@ -83,45 +83,118 @@ INLINE meeting meet(const reading *r, const raster *own) {
                      row, smaller_int(own->height - r->top, r->image->height) - row};
 }
 
-/* Adds up light and coverage over rows of `count` pairs. */
-INLINE void add_rows(pixel_pair *to, int stride, const uint32_t *from, int from_stride,
-                     int rows, i32x8 factors, f32x8 color, f32x8 scales, int count) {
-    for (int row = 0; row < rows; ++row, to += stride, from += from_stride) {
-        for (int pair = 0; pair < count; ++pair) {
-            f32x8 weight = __builtin_convertvector(
-                pair_sums(read_pairs(from + 8 * pair), factors), f32x8);
-            to[pair].light += weight * color;
-            to[pair].coverage += weight * scales;
+/* What a fragment adds to: rows of a raster, and what it adds. */
+typedef struct {
+    pixel_pair *to;
+    int to_stride, rows, pairs;
+    const uint32_t *from;
+    int from_stride;
+    i32x8 factors;
+    f32x8 color, scales;
+} addition;
+
+INLINE f32x8 weights_of(const addition *a, const uint32_t *from) {
+    return __builtin_convertvector(pair_sums(read_pairs(from), a->factors), f32x8);
+}
+
+/* Adds one fragment; the compiler makes a loop for each number of pairs. */
+INLINE void add_rows(const addition *a, int pairs) {
+    pixel_pair *to = a->to;
+    const uint32_t *from = a->from;
+    for (int row = 0; row < a->rows; ++row, to += a->to_stride, from += a->from_stride) {
+        for (int pair = 0; pair < pairs; ++pair) {
+            f32x8 weight = weights_of(a, from + 8 * pair);
+            to[pair].light += weight * a->color;
+            to[pair].coverage += weight * a->scales;
         }
     }
 }
 
-/* Adds a fragment's light and coverage to the depth that is open. */
-INLINE void add_fragment(const frame *f, uint32_t index, window *w) {
+/* Adds two fragments to the same rows: sums are read and written once for both. */
+INLINE void add_both_rows(const addition *a, const addition *b, int pairs) {
+    pixel_pair *to = a->to;
+    const uint32_t *from_a = a->from;
+    const uint32_t *from_b = b->from;
+    for (int row = 0; row < a->rows; ++row) {
+        for (int pair = 0; pair < pairs; ++pair) {
+            f32x8 weight_a = weights_of(a, from_a + 8 * pair);
+            f32x8 weight_b = weights_of(b, from_b + 8 * pair);
+            f32x8 light = to[pair].light + weight_a * a->color;
+            f32x8 coverage = to[pair].coverage + weight_a * a->scales;
+            to[pair].light = light + weight_b * b->color;
+            to[pair].coverage = coverage + weight_b * b->scales;
+        }
+        to += a->to_stride;
+        from_a += a->from_stride;
+        from_b += b->from_stride;
+    }
+}
+
+#define FOR_EACH_WIDTH(CASE) CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8)
+
+static void add_one(const addition *a) {
+#define CASE(pairs) case pairs: add_rows(a, pairs); return;
+    switch (a->pairs) { FOR_EACH_WIDTH(CASE) default: return; }
+#undef CASE
+}
+
+static void add_both(const addition *a, const addition *b) {
+#define CASE(pairs) case pairs: add_both_rows(a, b, pairs); return;
+    switch (a->pairs) { FOR_EACH_WIDTH(CASE) default: return; }
+#undef CASE
+}
+
+/* Says what a fragment adds to a window; false where it lights another part of the bin. */
+INLINE int prepare_addition(const frame *f, uint32_t index, window *w, addition *a) {
     const fragment *one = f->fragments + index;
     const float *rgb = f->lights[index].rgb;
     const level_image *image = image_of(f, one);
     raster *own = w->open + image->resolution;
     reading r = start_reading(one, image, own);
     meeting m = meet(&r, own);
+    if (m.pairs <= 0 || m.rows <= 0) return 0;
     float scale = image->scale;
     float red = scale * rgb[0], green = scale * rgb[1], blue = scale * rgb[2];
-    f32x8 color = {red, green, blue, 0.0f, red, green, blue, 0.0f};
-    f32x8 scales = all8(scale);
-    pixel_pair *to = own->pairs + (m.row + r.top) * own->stride + m.pair;
-    const uint32_t *from = row_texels(f, &r, m.row) + 8 * m.pair;
-    int stride = 4 * (image->width + 1);
     own->is_lit = 1;
-    /* The compiler makes a loop without a jump for each width. */
-#define CASE(count)                                                                         \
-    case count:                                                                             \
-        add_rows(to, own->stride, from, stride, m.rows, r.factors, color, scales, count);   \
+    a->to = own->pairs + (m.row + r.top) * own->stride + m.pair;
+    a->to_stride = own->stride;
+    a->rows = m.rows;
+    a->pairs = m.pairs;
+    a->from = row_texels(f, &r, m.row) + 8 * m.pair;
+    a->from_stride = 4 * (image->width + 1);
+    a->factors = r.factors;
+    a->color = (f32x8){red, green, blue, 0.0f, red, green, blue, 0.0f};
+    a->scales = all8(scale);
+    return 1;
+}
+
+/* Additions on their way: one waits for another to the same rows. */
+typedef struct {
+    addition two[2];
+    int waiting;              /* 0 or 1 */
+} additions;
+
+INLINE void flush_additions(additions *all) {
+    if (all->waiting) add_one(all->two);
+    all->waiting = 0;
+}
+
+INLINE void add_fragment(const frame *f, uint32_t index, window *w, additions *all) {
+    addition *newest = all->two + all->waiting;
+    if (!prepare_addition(f, index, w, newest)) return;
+    if (!all->waiting) {
+        all->waiting = 1;
         return;
-    switch (m.pairs) {
-        CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8)
-    default: return; /* it lights another part of the bin */
     }
-#undef CASE
+    const addition *first = all->two;
+    if (first->to == newest->to && first->pairs == newest->pairs
+        && first->rows == newest->rows) {
+        add_both(first, newest);
+        all->waiting = 0;
+        return;
+    }
+    add_one(first);
+    all->two[0] = *newest;
 }
 
 /* The paper's rule: a weight is an opacity; it merges once, four pixels. */
@@ -223,6 +296,7 @@ INLINE int is_beyond(const frame *f, float depth, float open_depth) {
 /* Light of a tile where order matters: one depth after the other. */
 static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, window *w) {
     float open_depth = f->lights[list->entries[0].fragment].depth;
+    additions all = {.waiting = 0};
     for (int i = 0; i < list->count; ++i) {
         if (!(list->entries[i].tiles & tile)) continue;
         uint32_t index = list->entries[i].fragment;
@@ -232,19 +306,22 @@ static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, w
         }
         float depth = f->lights[index].depth;
         if (is_beyond(f, depth, open_depth)) {
+            flush_additions(&all);
             if (!close_depth(w)) return;
             open_depth = depth;
         }
-        add_fragment(f, index, w);
+        add_fragment(f, index, w, &all);
     }
+    flush_additions(&all);
     if (!f->paper_rule) close_depth(w);
 }
 
 static void splat_unordered(const frame *f, const bin_list *list, uint32_t tiles,
                             window *w) {
+    additions all = {.waiting = 0};
     for (int i = 0; i < list->count; ++i)
-        if (list->entries[i].tiles & tiles)
-            add_fragment(f, list->entries[i].fragment, w);
+        if (list->entries[i].tiles & tiles) add_fragment(f, list->entries[i].fragment, w, &all);
+    flush_additions(&all);
     gather_sizes(w);
 }
 
