@@ -28,6 +28,7 @@ class Bench(StrEnum):
     BUILD = "build"
     LAYERS = "layers"
     RENDER = "render"
+    LIVE = "live"
     FIELD = "field"
     OCCLUSION = "occlusion"
     SEQUENCE = "sequence"
@@ -45,6 +46,7 @@ BENCH_MODULES = {
     Bench.BUILD: "tests.benchmarks.bench_psf_build",
     Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
+    Bench.LIVE: "tests.benchmarks.bench_live",
     Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SEQUENCE: "tests.benchmarks.bench_sequence",

@@ -212,11 +212,20 @@ def dense_reference(
     """
     if not kept:
         return _filtered(view, state, bins, accumulation)
-    path = CACHE / f"{_key(view, state, bins, accumulation)}.npy"
+    path = _path(view, state, bins, accumulation)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, _filtered(view, state, bins, accumulation))
     return np.load(path)
+
+
+def has_reference(view: RgbdView, state: EyeState, *, bins: bool) -> bool:
+    """Whether a reference of the usual rule has been computed and kept."""
+    return _path(view, state, bins, "coverage").exists()
+
+
+def _path(view: RgbdView, state: EyeState, bins: bool, accumulation: str) -> Path:
+    return CACHE / f"{_key(view, state, bins, accumulation)}.npy"
 
 
 def _filtered(
