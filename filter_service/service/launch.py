@@ -24,12 +24,17 @@ def serve(
     *,
     workshop: Workshop,
     read_profile: Callable[[dict[str, Any]], EyeProfile],
+    when_ready: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; prints one line when ready.
 
     Must run in the main thread of a process that owns the engine's GL context.
+
+    Parameters
+    ----------
+    when_ready : callable, optional
+        Called once that line is printed; must not take long.
     """
-    from filter_service.filtering.load_ahead import load_ahead
     from filter_service.service.server import FilterServer
 
     server = FilterServer(config, workshop=workshop, read_profile=read_profile)
@@ -39,7 +44,8 @@ def serve(
         signal.set_wakeup_fd(server.wake_file_descriptor, warn_on_full_buffer=False)
     try:
         _announce(config, server.endpoint)
-        load_ahead()
+        if when_ready is not None:
+            when_ready()
         server.run()
     finally:
         if threading.current_thread() is threading.main_thread():
@@ -69,9 +75,15 @@ def run(config: ServiceConfig) -> None:
         closing.callback(worker.close)
         worker.start()  # it imports what takes long while this process does the same
         from filter_service.building.read_profile import read_profile
+        from filter_service.filtering.load_ahead import load_ahead
         from filter_service.filtering.shared_workshop import open_workshop
 
         workshop = open_workshop(
             worker, config.build_limits, closing, engine=config.engine
         )
-        serve(config, workshop=workshop, read_profile=read_profile)
+        serve(
+            config,
+            workshop=workshop,
+            read_profile=read_profile,
+            when_ready=load_ahead,
+        )
