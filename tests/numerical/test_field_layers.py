@@ -124,6 +124,8 @@ def test_larger_cells_serve_where_kernels_take_too_much_memory(
     bench.renderer = engine.new_renderer()
     smaller = bench.render(color, depth_m)
     assert smaller.kernel_count < usual.kernel_count // 3
+    if engine.gpu is not None:  # native limits single kernels, and tells all levels
+        assert smaller.kernel_texel_count <= limit
     assert psnr_db(smaller.color, usual.color) >= 40.0
     # Where cells cannot grow any more, memory decides alone.
     engine.limit_kernels(monkeypatch, 1, width * height)

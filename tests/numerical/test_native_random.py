@@ -95,10 +95,15 @@ def test_threads_and_processors_give_the_same_picture(case):
         Engine("native"), kernel, width_px=width_px, height_px=height_px, spread_px=9.0
     )
     view = random_view(rng, bench, case)
+    name_before = bench.renderer.name
     usual = bench.renderer.render(view, bench.handle, **STATE).color
     other = NativeRenderer(n_threads=case["n_threads"])
     same = other.render(view, other.load(bench.store), **STATE).color
     assert same.tobytes() == usual.tobytes()
     portable = NativeRenderer(Library(library_path(), portable=True))
+    assert "portable" in portable.name
     plain = portable.render(view, portable.load(bench.store), **STATE).color
     assert psnr_db(plain, usual.astype(float)) >= 100.0
+    assert bench.renderer.name == name_before  # the one does not change the other
+    again = bench.renderer.render(view, bench.handle, **STATE).color
+    assert again.tobytes() == usual.tobytes()

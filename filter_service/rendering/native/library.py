@@ -47,12 +47,15 @@ class Library:
             raise RenderFailed(
                 f"{path.name} cannot be loaded ({error}); {REMEDY}"
             ) from error
-        self._c.ocu_start.restype = ctypes.c_char_p
+        self._c.ocu_loops.restype = ctypes.c_void_p
+        self._c.ocu_name.argtypes = (ctypes.c_void_p,)
+        self._c.ocu_name.restype = ctypes.c_char_p
         self._c.ocu_pool_new.restype = ctypes.c_void_p
         self._c.ocu_pool_free.argtypes = (ctypes.c_void_p,)
         self._c.ocu_pool_size.argtypes = (ctypes.c_void_p,)
         self._check_sizes(path)
-        self.variant = self._c.ocu_start(int(portable)).decode()
+        self._own = ctypes.c_void_p(self._c.ocu_loops(int(portable)))
+        self.variant = self._c.ocu_name(self._own).decode()
         self._stages = {name: getattr(self._c, f"ocu_{name}") for name in STAGES}
 
     def _check_sizes(self, path: Path) -> None:
@@ -66,11 +69,11 @@ class Library:
 
     def run(self, stage: str, frame: records.Frame) -> None:
         """Run one of `STAGES` on a frame."""
-        self._stages[stage](ctypes.byref(frame))
+        self._stages[stage](self._own, ctypes.byref(frame))
 
     def shrink(self, job: records.ShrinkJob) -> None:
         """Make kernels of a store coarse."""
-        self._c.ocu_shrink(ctypes.byref(job))
+        self._c.ocu_shrink(self._own, ctypes.byref(job))
 
     def new_threads(self, count: int) -> int:
         """Start threads that loops share, the caller among them; returns a handle."""

@@ -1,4 +1,5 @@
 /* What Python calls. */
+#include <pthread.h>
 #include <stdlib.h>
 
 #include "color.h"
@@ -11,21 +12,22 @@ extern const loops loops_any;
 extern const loops loops_avx2;
 #endif
 
-static const loops *chosen = &loops_any;
-
-/* Makes tables and chooses the loops; `portable` keeps to those for every processor. */
-EXPORT const char *ocu_start(int portable) {
-    make_color_tables();
-    chosen = &loops_any;
+/* Makes tables and chooses the loops of this processor; `portable` takes those for every
+ * one.  The caller hands them to each call: two kinds may be in use in one process. */
+EXPORT const loops *ocu_loops(int portable) {
+    static pthread_once_t once = PTHREAD_ONCE_INIT;
+    pthread_once(&once, make_color_tables);
 #if defined(__x86_64__)
     __builtin_cpu_init();
     if (!portable && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        chosen = &loops_avx2;
+        return &loops_avx2;
 #else
     (void)portable;
 #endif
-    return chosen->name;
+    return &loops_any;
 }
+
+EXPORT const char *ocu_name(const loops *own) { return own->name; }
 
 /* Sizes by which the caller sees that its records are ours. */
 EXPORT void ocu_sizes(int32_t *sizes) {
@@ -43,9 +45,9 @@ EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }
 EXPORT void ocu_pool_free(pool *p) { pool_free(p); }
 EXPORT int ocu_pool_size(const pool *p) { return pool_size(p); }
 
-EXPORT void ocu_pixels(frame *f) { chosen->pixels(f); }
-EXPORT void ocu_merge(frame *f) { chosen->merge(f); }
-EXPORT void ocu_place(frame *f) { chosen->place(f); }
-EXPORT void ocu_blend(frame *f) { chosen->blend(f); }
-EXPORT void ocu_splat(frame *f) { chosen->splat(f); }
-EXPORT void ocu_shrink(shrink_job *job) { chosen->shrink(job); }
+EXPORT void ocu_pixels(const loops *own, frame *f) { own->pixels(f); }
+EXPORT void ocu_merge(const loops *own, frame *f) { own->merge(f); }
+EXPORT void ocu_place(const loops *own, frame *f) { own->place(f); }
+EXPORT void ocu_blend(const loops *own, frame *f) { own->blend(f); }
+EXPORT void ocu_splat(const loops *own, frame *f) { own->splat(f); }
+EXPORT void ocu_shrink(const loops *own, shrink_job *job) { own->shrink(job); }
