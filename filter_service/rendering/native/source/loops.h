@@ -18,9 +18,16 @@ typedef struct {
 
 #include "color.h"
 #include "pixels.h"
-#include "blend.h"
+#include "reach.h"
+#include "recipes.h"
+#include "kernel_ends.h"
+#include "kernels.h"
 #include "merge.h"
 #include "lists.h"
+#include "rasters.h"
+#include "additions.h"
+#include "depths.h"
+#include "picture.h"
 #include "splat.h"
 #include "shrink.h"
 

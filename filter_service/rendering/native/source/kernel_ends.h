@@ -1,0 +1,198 @@
+/* A kernel at one layer: recipes of up to four field nodes, each as it is stored or mapped to
+ * the cell's pixels; and its sums over merged squares.  Twins: blend_cells and merge_psfs of
+ * shaders/passes. */
+
+#include <math.h>
+
+#include "frame.h"
+#include "vectors.h"
+
+/* A kernel at one layer: floats in fours, and the sums over squares that it needs. */
+typedef struct {
+    int recipes[FIELD_CORNERS];    /* that it was made of; -1: nothing yet */
+    double maps[FIELD_CORNERS][4];
+    int64_t cell;
+    reach box;
+    int level_count;               /* made so far */
+    float *texels[MAX_LEVEL + 1];
+    float largest[MAX_LEVEL + 1];
+} kernel_end;
+
+INLINE int is_unmoved(const double *map) {
+    return map[0] == 1.0 && map[1] == 0.0 && map[2] == 0.0 && map[3] == 1.0;
+}
+
+/* Reach in the image's pixels of a kernel stored in others; twin: cell_maps.mapped_reach. */
+static reach mapped_reach(const double *map, reach stored) {
+    double area = map[0] * map[3] - map[1] * map[2];
+    double inverse[2][2] = {{map[3] / area, -map[1] / area}, {-map[2] / area, map[0] / area}};
+    double ends[4];
+    for (int axis = 0; axis < 2; ++axis) {
+        double a = inverse[axis][0];
+        double b = inverse[axis][1];
+        double left = -a * (stored.left + 1.0), right = a * (stored.right + 1.0);
+        double up = -b * (stored.up + 1.0), down = b * (stored.down + 1.0);
+        ends[2 * axis] = -(fmin(left, right) + fmin(up, down));
+        ends[2 * axis + 1] = fmax(left, right) + fmax(up, down);
+    }
+    int sides[4];
+    for (int side = 0; side < 4; ++side) {
+        int whole = (int)ceil(ends[side] - 1e-9) - 1;
+        sides[side] = whole < 0 ? 0 : smaller_int(whole, LONGEST_REACH_PX);
+    }
+    return (reach){sides[0], sides[1], sides[2], sides[3]};
+}
+
+/* Where the pixels of a row read along one axis: first texel, and shares of so many. */
+#define MOST_TAPS 8
+#define LONGEST_ROW (2 * LONGEST_REACH_PX + 1)
+
+typedef struct {
+    int32_t first[LONGEST_ROW];
+    float shares[MOST_TAPS][LONGEST_ROW];
+} row_reads;
+
+/* Shares of stored texels that pixels cover: middles `start + step * n`, half a side. */
+INLINE void find_covered(float start, float step, float half, int count, int n_taps,
+                         int lowest, int highest, row_reads *reads) {
+    for (int n = 0; n < count; ++n) {
+        float middle = start + step * (float)n;
+        float low = middle - half;
+        float high = middle + half;
+        float first = __builtin_floorf(low + 0.5f);
+        first = first < (float)lowest ? (float)lowest : first;
+        first = first > (float)highest ? (float)highest : first;
+        reads->first[n] = (int32_t)first;
+        for (int tap = 0; tap < n_taps; ++tap) {
+            float from = first + ((float)tap - 0.5f);
+            float to = from + 1.0f;
+            from = low > from ? low : from;
+            to = high < to ? high : to;
+            reads->shares[tap][n] = to > from ? to - from : 0.0f;
+        }
+    }
+}
+
+/* Adds a mapped part: each pixel takes the light of the stored ones that its sides
+ * cover.  n_taps is 2 or 3 for nearly all; the compiler makes a loop for each. */
+INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const float *map,
+                            float weight, reach box, int n_taps, float *to) {
+    float half_x = 0.5f * fabsf(map[0]);
+    float half_y = 0.5f * fabsf(map[3]);
+    int width = reach_width(box);
+    row_reads across, along;
+    for (int y = -box.up; y <= box.down; ++y, to += 4 * width) {
+        float x = (float)-box.left;
+        find_covered(map[0] * x + map[1] * (float)y, map[0], half_x, width, n_taps,
+                     -stored.left - n_taps, stored.right + 1, &across);
+        find_covered(map[2] * x + map[3] * (float)y, map[2], half_y, width, n_taps,
+                     -stored.up - n_taps, stored.down + 1, &along);
+        for (int n = 0; n < width; ++n) {
+            const float *from = texels + 4 * ((ptrdiff_t)(along.first[n] + stored.up) * stride
+                                              + across.first[n] + stored.left);
+            f32x4 sum = all4(0.0f);
+            for (int j = 0; j < n_taps; ++j, from += 4 * stride) {
+                f32x4 line = load4(from) * all4(across.shares[0][n]);
+                for (int i = 1; i < n_taps; ++i)
+                    line += load4(from + 4 * i) * all4(across.shares[i][n]);
+                sum += line * all4(along.shares[j][n]);
+            }
+            store4(to + 4 * n, load4(to + 4 * n) + sum * all4(weight));
+        }
+    }
+}
+
+static void add_mapped(const frame *f, const recipe_image *image, const double *map,
+                       float weight, reach box, float *to) {
+    const float *texels = f->recipe_texels + 4 * image->first_texel;
+    reach stored = read_reach(image->reach_px);
+    float own[4] = {(float)map[0], (float)map[1], (float)map[2], (float)map[3]};
+    float side = larger_float(fabsf(own[0]), fabsf(own[3]));
+    int n_taps = (int)floorf(side) + 2;
+    if (side <= 1.0f) n_taps = 2;
+    if (n_taps == 2) add_mapped_taps(texels, image->stride, stored, own, weight, box, 2, to);
+    else if (n_taps == 3)
+        add_mapped_taps(texels, image->stride, stored, own, weight, box, 3, to);
+    else
+        add_mapped_taps(texels, image->stride, stored, own, weight, box,
+                        smaller_int(n_taps, MOST_TAPS), to);
+}
+
+static void add_unmoved(const frame *f, const recipe_image *image, float weight, reach box,
+                        float *to) {
+    reach stored = read_reach(image->reach_px);
+    const float *from = f->recipe_texels + 4 * image->first_texel;
+    int width = reach_width(box);
+    int count = 4 * reach_width(stored);
+    to += 4 * ((box.up - stored.up) * width + box.left - stored.left);
+    for (int y = 0; y < reach_height(stored); ++y, to += 4 * width, from += 4 * image->stride)
+        for (int x = 0; x < count; x += 4)
+            store4(to + x, load4(to + x) + load4(from + x) * all4(weight));
+}
+
+static float largest_of(const float *texels, size_t count) {
+    f32x4 most = all4(0.0f);
+    for (size_t i = 0; i < count; ++i) most = larger4(load4(texels + 4 * i), most);
+    return larger_float(most[0], larger_float(most[1], most[2]));
+}
+
+/* Box of a kernel's end: that of its parts, as they are mapped. */
+static reach end_box(const frame *f, int kernel, const int *recipes, int r) {
+    const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
+    reach box = {0, 0, 0, 0};
+    for (int j = 0; j < FIELD_CORNERS; ++j) {
+        if (recipes[j] < 0) continue;
+        reach own = read_reach(f->recipe_images[RESOLUTIONS * recipes[j] + r].reach_px);
+        box = wider(box, is_unmoved(maps + 4 * j) ? own : mapped_reach(maps + 4 * j, own));
+    }
+    return box;
+}
+
+/* Makes the kernel of a cell at one layer, unless that is what it holds. */
+static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *end) {
+    const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
+    const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
+    int recipes[FIELD_CORNERS];
+    kernel_recipes(f, kernel, is_far, recipes);
+    if (end->cell == f->kernel_cells[kernel]
+        && memcmp(recipes, end->recipes, sizeof recipes) == 0
+        && memcmp(maps, end->maps, sizeof end->maps) == 0)
+        return;
+    end->cell = f->kernel_cells[kernel];
+    memcpy(end->recipes, recipes, sizeof recipes);
+    memcpy(end->maps, maps, sizeof end->maps);
+    reach box = end->box = end_box(f, kernel, recipes, r);
+    size_t count = (size_t)reach_width(box) * (size_t)reach_height(box);
+    memset(end->texels[0], 0, sizeof(float) * 4 * count);
+    for (int j = 0; j < FIELD_CORNERS; ++j) {
+        if (recipes[j] < 0) continue;
+        const recipe_image *image = f->recipe_images + RESOLUTIONS * recipes[j] + r;
+        float weight = (float)weights[j];
+        if (is_unmoved(maps + 4 * j)) add_unmoved(f, image, weight, box, end->texels[0]);
+        else add_mapped(f, image, maps + 4 * j, weight, box, end->texels[0]);
+    }
+    end->largest[0] = largest_of(end->texels[0], count);
+    end->level_count = 1;
+}
+
+/* Sums of the level below over 2 x 2 squares, up to a level. */
+static void make_levels(kernel_end *end, int level) {
+    for (; end->level_count <= level; ++end->level_count) {
+        int step = 1 << (end->level_count - 1);
+        int width = reach_width(end->box) + step - 1;
+        int height = reach_height(end->box) + step - 1;
+        int wide = width + step;
+        const float *from = end->texels[end->level_count - 1];
+        float *to = end->texels[end->level_count];
+        size_t count = (size_t)wide * (size_t)(height + step);
+        memset(to, 0, sizeof(float) * 4 * count);
+        for (int y = 0; y < height; ++y, from += 4 * width) {
+            for (int corner = 0; corner < 4; ++corner) {
+                float *row = to + 4 * ((y + step * (corner >> 1)) * wide + step * (corner & 1));
+                for (int x = 0; x < 4 * width; x += 4)
+                    store4(row + x, load4(row + x) + load4(from + x));
+            }
+        }
+        end->largest[end->level_count] = largest_of(to, count);
+    }
+}

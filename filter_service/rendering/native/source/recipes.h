@@ -1,0 +1,137 @@
+/* Recipes: kernels of field nodes at layers, blended from the cache over pupil,
+ * accommodation and defocus.  Twin: blend_psfs of shaders/passes. */
+
+#include <math.h>
+
+#include "color.h"
+#include "frame.h"
+#include "vectors.h"
+
+#define RECIPE_WORDS (3 * RECIPE_TAPS)
+#define PAD_TEXELS 3          /* zeros between rows, as many as a mapped pixel may read */
+
+/* Resolution in which a level of a kernel is made: what is blurred enough is coarse. */
+INLINE int resolution_of(const frame *f, const kernel_shape *shape, int level) {
+    float spread = smaller_float(shape->spread_px[0], shape->spread_px[1]);
+    for (int r = RESOLUTIONS - 1; r > 0; --r)
+        if (level > r && spread >= f->coarse_spread_px[r]) return r;
+    return 0;
+}
+
+/* Resolutions, a bit each, that the used levels of a kernel need. */
+static int resolutions_used(const frame *f, int kernel) {
+    const kernel_shape *shape = f->shapes + kernel;
+    int bits = 0;
+    for (int level = 0; level <= MAX_LEVEL; ++level)
+        if (shape->levels_used & (1 << level)) bits |= 1 << resolution_of(f, shape, level);
+    return bits;
+}
+
+/* Recipes of a kernel's ends; -1 where a part weighs nothing. */
+INLINE void kernel_recipes(const frame *f, int kernel, int is_far, int *recipes) {
+    const int64_t *parts = f->kernel_parts + FIELD_CORNERS * (size_t)kernel;
+    const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
+    for (int j = 0; j < FIELD_CORNERS; ++j)
+        recipes[j] = weights[j] > 0.0 ? (int)(is_far ? f->node_far : f->node_near)[parts[j]] : -1;
+}
+
+/* Reach of what a recipe is blended from. */
+static reach recipe_reach(const frame *f, int recipe, int r) {
+    reach all = {0, 0, 0, 0};
+    for (int channel = 0; channel < RGB; ++channel) {
+        const uint32_t *words = f->recipes + ((size_t)recipe * RGB + (size_t)channel) * RECIPE_WORDS;
+        for (int tap = 0; tap < RECIPE_TAPS; ++tap)
+            if (float_of(words[2 * RECIPE_TAPS + tap]) > 0.0f)
+                all = wider(all, unpack_reach(f->store_reach[r][words[tap]]));
+    }
+    return all;
+}
+
+/* Places recipes one behind the other, in the resolutions that kernels need. */
+static void place_recipes(frame *f) {
+    memset(f->recipe_images, 0, sizeof(recipe_image) * RESOLUTIONS * (size_t)f->recipe_count);
+    for (int k = 0; k < f->kernel_count; ++k) {
+        int used = resolutions_used(f, k);
+        for (int end = 0; used && end < 2; ++end) {
+            int recipes[FIELD_CORNERS];
+            kernel_recipes(f, k, end, recipes);
+            for (int j = 0; j < FIELD_CORNERS; ++j)
+                for (int r = 0; recipes[j] >= 0 && r < RESOLUTIONS; ++r)
+                    if (used & (1 << r)) f->recipe_images[RESOLUTIONS * recipes[j] + r].stride = 1;
+        }
+    }
+    uint64_t next = PAD_TEXELS;
+    uint64_t largest = 0;
+    for (int i = 0; i < RESOLUTIONS * f->recipe_count; ++i) {
+        recipe_image *image = f->recipe_images + i;
+        if (image->stride == 0) continue;
+        reach box = recipe_reach(f, i / RESOLUTIONS, i % RESOLUTIONS);
+        uint8_t sides[4] = {(uint8_t)box.left, (uint8_t)box.right, (uint8_t)box.up,
+                            (uint8_t)box.down};
+        memcpy(image->reach_px, sides, sizeof sides);
+        image->stride = reach_width(box) + PAD_TEXELS;
+        image->first_texel = next + (uint64_t)PAD_TEXELS * (uint64_t)image->stride;
+        next += (uint64_t)image->stride * (uint64_t)(reach_height(box) + 2 * PAD_TEXELS);
+        uint64_t planes = (uint64_t)(reach_width(box) + 8) * (uint64_t)reach_height(box);
+        largest = planes > largest ? planes : largest;
+    }
+    f->recipe_texel_count = next + PAD_TEXELS;
+    f->blend_scratch_floats = RGB * largest;
+}
+
+/* Adds a weighted row of steps. */
+INLINE void add_row(float *to, const uint16_t *from, int count, float weight) {
+    f32x8 factor = all8(weight);
+    int x = 0;
+    for (; x + 8 <= count; x += 8) {
+        u16x8 words;
+        memcpy(&words, from + x, sizeof words);
+        store8(to + x, load8(to + x) + factor * floats_of(words));
+    }
+    for (; x < count; ++x) to[x] += weight * (float)from[x];
+}
+
+/* Blends one channel of a recipe into a plane of rows of `stride` floats. */
+static void blend_channel(const frame *f, const uint32_t *words, int r, reach box, int stride,
+                          float *plane) {
+    memset(plane, 0, sizeof(float) * (size_t)stride * (size_t)reach_height(box));
+    float pixels = (float)(1 << 2 * r); /* steps of a coarse kernel are means */
+    for (int tap = 0; tap < RECIPE_TAPS; ++tap) {
+        float weight = pixels * float_of(words[2 * RECIPE_TAPS + tap]);
+        if (!(weight > 0.0f)) continue;
+        reach own = unpack_reach(f->store_reach[r][words[tap]]);
+        const uint16_t *from = f->store[r] + f->store_first[r][words[tap]];
+        int width = reach_width(own);
+        float *to = plane + (box.up - own.up) * stride + box.left - own.left;
+        for (int y = 0; y < reach_height(own); ++y)
+            add_row(to + y * stride, from + y * width, width, weight);
+    }
+}
+
+/* Item of the first loop: one recipe in one resolution. */
+static void blend_recipe(void *argument, int item, int thread) {
+    const frame *f = argument;
+    const recipe_image *image = f->recipe_images + item;
+    if (image->stride == 0) return;
+    const uint32_t *words = f->recipes + (size_t)(item / RESOLUTIONS) * RGB * RECIPE_WORDS;
+    reach box = read_reach(image->reach_px);
+    int width = reach_width(box);
+    int height = reach_height(box);
+    int stride = width + 8;
+    size_t plane = (size_t)stride * (size_t)height;
+    float *scratch = f->blend_scratch + (size_t)thread * f->blend_scratch_floats;
+    for (int channel = 0; channel < RGB; ++channel)
+        blend_channel(f, words + channel * RECIPE_WORDS, item % RESOLUTIONS, box, stride,
+                      scratch + (size_t)channel * plane);
+    float *row = f->recipe_texels + 4 * image->first_texel;
+    size_t pad = sizeof(float) * 4 * PAD_TEXELS * (size_t)(image->stride + 1);
+    memset(row - pad / sizeof(float), 0, pad);
+    for (int y = 0; y < height; ++y, row += 4 * image->stride) {
+        const float *red = scratch + (size_t)y * (size_t)stride;
+        for (int x = 0; x < width; ++x)
+            store4(row + 4 * x, (f32x4){red[x], red[plane + (size_t)x],
+                                        red[2 * plane + (size_t)x], 0.0f});
+        memset(row + 4 * width, 0, sizeof(float) * 4 * PAD_TEXELS);
+    }
+    memset(row, 0, sizeof(float) * 4 * PAD_TEXELS * (size_t)image->stride);
+}
