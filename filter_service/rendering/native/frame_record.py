@@ -27,6 +27,7 @@ from filter_service.rgbd_view import RgbdView
 
 COLOR_KINDS = {"uint8": 0, "float32": 1, "float16": 2}
 BLOCK_PIXELS = TILE_SIZE_PX**2
+BOXES_READ_BEYOND = 16
 CLAMP_MARGIN_RATIO = 1e-6
 COARSE_MARGIN_PX = 8.0
 """Light of coarse kernels goes that much farther, see merge.h."""
@@ -142,6 +143,9 @@ class FrameRecord:
         n_blocks = c.surface_count * c.block_columns * c.block_rows
         c.fragments = self._room("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
         c.lights = self._room("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
+        n_places = n_blocks * BLOCK_PIXELS + BOXES_READ_BEYOND
+        for side in range(4):
+            c.boxes[side] = self._room(f"boxes {side}", n_places, np.int16)
         c.blocks = self._room("blocks", n_blocks, BLOCK)
         names = ("kernel_cells", "kernel_parts", "node_near", "node_far")
         for name, array in zip(

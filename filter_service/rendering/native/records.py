@@ -25,20 +25,16 @@ FRAGMENT = np.dtype(
         ("state", "<u4"),
         ("fraction", "<u2"),
         ("radius_px", "<u2"),
-        ("reach_px", "u1", 4),
     ]
 )
 FRAGMENT_LIGHT = np.dtype([("rgb", "<f4", 3), ("depth", "<f4")])
 BLOCK = np.dtype(
     [
-        ("x0", "<i2"),
-        ("y0", "<i2"),
-        ("x1", "<i2"),
-        ("y1", "<i2"),
-        ("count", "u1"),
+        ("first", "<u4"),
+        ("end", "<u4"),
+        ("radius_px", "<u2"),
         ("has_edge", "u1"),
-        ("merged", "<u2"),
-        ("reach_px", "<f4"),
+        ("merged", "u1"),
     ]
 )
 KERNEL_IMAGE_BYTES = 128
@@ -93,9 +89,12 @@ class Frame(c.Structure):
         ("largest_reach_px", c.c_float),
         ("fragments", POINTER),
         ("lights", POINTER),
+        ("boxes", POINTER * 4),
         ("blocks", POINTER),
         ("fragment_count", c.c_int64),
         ("merged_count", c.c_int64),
+        ("farthest_px", c.c_int32),
+        ("spare", c.c_int32),
         ("store", POINTER * RESOLUTIONS),
         ("store_first", POINTER * RESOLUTIONS),
         ("store_reach", POINTER * RESOLUTIONS),

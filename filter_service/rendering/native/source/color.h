@@ -8,15 +8,17 @@
 
 #include "vectors.h"
 
-/* Linear light of each byte, and from which light on each byte is the nearest. */
 extern float linear_of_byte[256];
-extern float first_light_of_byte[257];
 
-/* Bytes at the start of equal steps of a float's bits, 128 steps an octave. */
-#define GUESS_SHIFT 16
-#define GUESS_FIRST (0x38000000u >> GUESS_SHIFT) /* 2^-15, half of the second byte */
-#define GUESS_END (0x3F800000u >> GUESS_SHIFT)   /* 1 */
-extern uint8_t guessed_byte[GUESS_END - GUESS_FIRST + 1];
+/* Bytes at equal steps of a float's bits, 128 an octave: at most one byte ends in each. */
+#define STEP_SHIFT 16
+#define FIRST_STEP (0x38000000u >> STEP_SHIFT) /* 2^-15, half of the second byte */
+#define LAST_STEP (0x3F800000u >> STEP_SHIFT)  /* 1 */
+typedef struct {
+    float next_light;         /* from which the next byte is the nearest */
+    uint32_t byte;            /* at the start of the step */
+} byte_step;
+extern byte_step byte_steps[LAST_STEP - FIRST_STEP + 1];
 
 void make_color_tables(void);
 
@@ -32,12 +34,15 @@ INLINE float float_of(uint32_t bits) {
     return value;
 }
 
-INLINE uint8_t byte_of_linear(float light) {
-    if (!(light >= first_light_of_byte[1])) return 0; /* what is not a number, too */
-    if (light >= 1.0f) return 255;
-    unsigned guess = guessed_byte[(bits_of(light) >> GUESS_SHIFT) - GUESS_FIRST];
-    while (light >= first_light_of_byte[guess + 1]) ++guess;
-    return (uint8_t)guess;
+/* Nearest bytes of eight lights; what is not a number is dark. */
+INLINE void bytes_of_linear(f32x8 light, uint8_t *bytes) {
+    f32x8 dark = all8(float_of(FIRST_STEP << STEP_SHIFT));
+    light = smaller8(larger8(light, dark), all8(1.0f));
+    i32x8 at = ((i32x8)light >> STEP_SHIFT) - (int32_t)FIRST_STEP;
+    for (int i = 0; i < 8; ++i) {
+        const byte_step *step = byte_steps + at[i];
+        bytes[i] = (uint8_t)(step->byte + (light[i] >= step->next_light));
+    }
 }
 
 INLINE float float_of_half(uint16_t half) {

@@ -3,36 +3,69 @@
 #include "frame.h"
 #include "vectors.h"
 
+/* Sums of a row of coarse pixels, each alone. */
+typedef struct {
+    float light[4 * (PAIRS_ACROSS + 2)], coverage[4 * (PAIRS_ACROSS + 2)];
+} coarse_row;
+
+/* The row of coarse pixels that lies `share` of the way from one to the next. */
+INLINE void row_between(const raster *coarse, const pixel_pair *above, float share,
+                        coarse_row *row) {
+    const pixel_pair *below = above + coarse->stride;
+    f32x8 part = all8(share);
+    for (int x = 0; x < coarse->width / 2; ++x) {
+        store8(row->light + 8 * x, above[x].light + part * (below[x].light - above[x].light));
+        store8(row->coverage + 8 * x,
+               above[x].coverage + part * (below[x].coverage - above[x].coverage));
+    }
+}
+
+INLINE f32x8 between(const float *left, const float *right, f32x8 part) {
+    f32x8 first = load8(left);
+    return first + part * (load8(right) - first);
+}
+
+/* The same of the two pixels at one place. */
+INLINE f32x8 between_twice(const float *left, const float *right, f32x8 part) {
+    f32x4 a = load4(left), b = load4(right);
+    f32x8 first = {a[0], a[1], a[2], a[3], a[0], a[1], a[2], a[3]};
+    f32x8 last = {b[0], b[1], b[2], b[3], b[0], b[1], b[2], b[3]};
+    return first + part * (last - first);
+}
+
+/* Adds a row of pixels of 2 px to one of pixels of 1 px: each pair lies between three. */
+INLINE void add_halves(const coarse_row *row, pixel_pair *to, int pairs) {
+    f32x8 part = {0.75f, 0.75f, 0.75f, 0.75f, 0.25f, 0.25f, 0.25f, 0.25f};
+    for (int pair = 0; pair < pairs; ++pair) {
+        int at = 4 * pair;
+        to[pair].light += between(row->light + at, row->light + at + 4, part);
+        to[pair].coverage += between(row->coverage + at, row->coverage + at + 4, part);
+    }
+}
+
+/* Adds a row of pixels of 4 px: two pairs from left of a middle to right of it. */
+INLINE void add_quarters(const coarse_row *row, pixel_pair *to, int pairs) {
+    f32x8 before = {0.625f, 0.625f, 0.625f, 0.625f, 0.875f, 0.875f, 0.875f, 0.875f};
+    f32x8 behind = {0.125f, 0.125f, 0.125f, 0.125f, 0.375f, 0.375f, 0.375f, 0.375f};
+    for (int pair = 0; pair < pairs; ++pair) {
+        int at = 4 * ((pair + 1) / 2);
+        f32x8 part = pair & 1 ? behind : before;
+        to[pair].light += between_twice(row->light + at, row->light + at + 4, part);
+        to[pair].coverage += between_twice(row->coverage + at, row->coverage + at + 4, part);
+    }
+}
+
 /* Adds the light of pixels of 2^r px to those of 1 px, between the middles of four. */
 INLINE void add_coarse(window *w, int r) {
     raster *coarse = w->open + r;
-    raster *fine = w->open;
-    pixel_pair line[PAIRS_ACROSS / 2 + 1];
-    float size = (float)(1 << r);
+    const raster *fine = w->open;
+    coarse_row row;
     for (int y = 0; y < w->height; ++y) {
-        float down = ((float)y + 0.5f) / size + 0.5f;
-        int row = (int)down;
-        f32x8 share = all8(down - (float)row);
-        const pixel_pair *above = coarse->pairs + row * coarse->stride;
-        const pixel_pair *below = above + coarse->stride;
-        for (int x = 0; x < coarse->width / 2; ++x) {
-            line[x].light = above[x].light + share * (below[x].light - above[x].light);
-            line[x].coverage =
-                above[x].coverage + share * (below[x].coverage - above[x].coverage);
-        }
-        pixel_pair *to = fine->pairs + y * fine->stride;
-        for (int x = 0; x < w->width; ++x) {
-            float across = ((float)x + 0.5f) / size + 0.5f;
-            int column = (int)across;
-            f32x4 part = all4(across - (float)column);
-            /* light of a pixel, then its neighbour's; coverage lies behind both */
-            const float *left = (const float *)(line + column / 2) + 4 * (column & 1);
-            const float *right = (const float *)(line + (column + 1) / 2) + 4 * ((column + 1) & 1);
-            float *own = (float *)(to + x / 2) + 4 * (x & 1);
-            f32x4 light = load4(left), cover = load4(left + 8);
-            store4(own, load4(own) + light + part * (load4(right) - light));
-            store4(own + 8, load4(own + 8) + cover + part * (load4(right + 8) - cover));
-        }
+        float down = ((float)y + 0.5f) / (float)(1 << r) + 0.5f;
+        row_between(coarse, coarse->pairs + (int)down * coarse->stride, down - (float)(int)down,
+                    &row);
+        if (r == 1) add_halves(&row, fine->pairs + y * fine->stride, w->width / 2);
+        else add_quarters(&row, fine->pairs + y * fine->stride, w->width / 2);
     }
     clear_raster(coarse);
 }

@@ -48,25 +48,26 @@ typedef struct {
     uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT */
     uint16_t fraction;        /* of the kernel's interval, in parts of 65535 */
     uint16_t radius_px;
-    uint8_t reach_px[4];
 } fragment;
+
 
 typedef struct {
     float rgb[RGB];
     float depth;              /* sort depth, smaller is nearer */
 } fragment_light;
 
+enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
+
 #define LEVEL_SHIFT 28
 #define KERNEL_MASK 0xFFFFFFFu
 #define EDGE_BIT 0x40000000u
 
-/* A block of 8 x 8 pixels and the box that its fragments light. */
+/* A block of 8 x 8 pixels; its fragments follow those of the block to its left. */
 typedef struct {
-    int16_t x0, y0, x1, y1;   /* last ones included */
-    uint8_t count;
+    uint32_t first, end;      /* of its fragments */
+    uint16_t radius_px;       /* of the farthest of them */
     uint8_t has_edge;
-    uint16_t merged;
-    float reach_px;
+    uint8_t merged;           /* pixels that are part of squares */
 } block_info;
 
 /* A node kernel at one resolution: floats in fours (red, green, blue, 0), texels of zeros
@@ -128,10 +129,13 @@ typedef struct {
     float white_level;
     float tolerance;          /* of merging, against the usual */
     float largest_reach_px;
-    fragment *fragments;      /* 64 places a block */
+    fragment *fragments;      /* 64 places a block; without gaps in a row of blocks */
     fragment_light *lights;
+    int16_t *boxes[4];        /* first and last columns, rows that fragments light */
     block_info *blocks;
     int64_t fragment_count, merged_count;
+    int32_t farthest_px;      /* radius of the fragment that reaches farthest */
+    int32_t spare;
 
     /* Kernels. */
     const uint16_t *store[RESOLUTIONS];

@@ -59,52 +59,79 @@ INLINE int gap_between(int first_a, int last_a, int first_b, int last_b) {
     return gap > 0 ? gap : 0;
 }
 
-/* Whether a fragment lights pixels x0..x1, y0..y1: within the box of its kernel, and a
- * disc about one of its pixels. */
-INLINE int lights(const fragment *one, int x0, int y0, int x1, int y1) {
+/* Whether a disc about one of a fragment's pixels meets pixels x0..x1, y0..y1. */
+INLINE int disc_meets(const fragment *one, int x0, int y0, int x1, int y1) {
     int extent = (1 << (one->state >> LEVEL_SHIFT & 3)) - 1;
     int x = one->x, y = one->y;
-    if (x - one->reach_px[0] > x1 || x + one->reach_px[1] + extent < x0
-        || y - one->reach_px[2] > y1 || y + one->reach_px[3] + extent < y0)
-        return 0;
     int gap_x = gap_between(x, x + extent, x0, x1);
     int gap_y = gap_between(y, y + extent, y0, y1);
     int radius = one->radius_px; /* gaps are whole: (r + 0.5)^2 = r^2 + r + 0.25 */
     return gap_x * gap_x + gap_y * gap_y <= radius * radius + radius;
 }
 
+/* Whether a fragment lights them: within the box of its kernel too. */
+INLINE int lights(const frame *f, uint32_t at, int x0, int y0, int x1, int y1) {
+    return f->boxes[BOX_LEFT][at] <= x1 && f->boxes[BOX_RIGHT][at] >= x0
+           && f->boxes[BOX_TOP][at] <= y1 && f->boxes[BOX_BOTTOM][at] >= y0
+           && disc_meets(f->fragments + at, x0, y0, x1, y1);
+}
+
+INLINE i16x16 load_sides(const int16_t *from) {
+    i16x16 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+/* Which of the boxes of sixteen fragments meet the bin, a bit for each. */
+INLINE uint32_t boxes_meet(const frame *f, uint32_t first, const bin_list *list) {
+    i16x16 beside = (load_sides(f->boxes[BOX_LEFT] + first) >= all16(list->x0 + BIN_WIDTH))
+                    | (load_sides(f->boxes[BOX_RIGHT] + first) < all16(list->x0))
+                    | (load_sides(f->boxes[BOX_TOP] + first) >= all16(list->y0 + BIN_HEIGHT))
+                    | (load_sides(f->boxes[BOX_BOTTOM] + first) < all16(list->y0));
+    return bits_of_lanes(~beside);
+}
+
+/* Lists what reaches the bin of fragments that follow each other; there is room for all. */
+INLINE void list_some(const frame *f, bin_list *list, uint32_t first, uint32_t end) {
+    int x0 = list->x0, y0 = list->y0;
+    int x1 = x0 + BIN_WIDTH - 1, y1 = y0 + BIN_HEIGHT - 1;
+    entry *out = list->entries + list->count;
+    uint32_t states = 0;
+    for (; first < end; first += 16) {
+        uint32_t met = boxes_meet(f, first, list);
+        if (end - first < 16) met &= (1u << (end - first)) - 1u;
+        for (; met; met &= met - 1) {
+            uint32_t at = first + (uint32_t)__builtin_ctz(met);
+            const fragment *one = f->fragments + at;
+            uint32_t meets = (uint32_t)disc_meets(one, x0, y0, x1, y1);
+            states |= one->state & (0u - meets);
+            *out = (entry){at, ALL_TILES};
+            out += meets;
+        }
+    }
+    list->count = (int)(out - list->entries);
+    list->any_edge |= (states & EDGE_BIT) != 0;
+}
+
 /* Lists what reaches the bin; false where memory ran out. */
 static int list_fragments(const frame *f, bin_list *list) {
     list->count = 0;
     list->any_edge = 0;
-    int x0 = list->x0, y0 = list->y0;
-    int x1 = x0 + BIN_WIDTH - 1, y1 = y0 + BIN_HEIGHT - 1;
-    int search = (int)f->largest_reach_px + TILE_SIZE_PX;
-    int left = larger_int((x0 - search) / TILE_SIZE_PX, 0);
-    int top = larger_int((y0 - search) / TILE_SIZE_PX, 0);
-    int right = smaller_int((x1 + search) / TILE_SIZE_PX + 1, f->block_columns);
-    int bottom = smaller_int((y1 + search) / TILE_SIZE_PX + 1, f->block_rows);
+    int search = f->farthest_px;
+    int left = larger_int(list->x0 - search, 0) / TILE_SIZE_PX;
+    int top = larger_int(list->y0 - search, 0) / TILE_SIZE_PX;
+    int right = (list->x0 + BIN_WIDTH - 1 + search) / TILE_SIZE_PX;
+    int bottom = (list->y0 + BIN_HEIGHT - 1 + search) / TILE_SIZE_PX;
+    right = smaller_int(right, f->block_columns - 1);
+    bottom = smaller_int(bottom, f->block_rows - 1);
     for (int surface = 0; surface < f->surface_count; ++surface) {
-        for (int row = top; row < bottom; ++row) {
-            int line = (surface * f->block_rows + row) * f->block_columns;
-            for (int column = left; column < right; ++column) {
-                const block_info *info = f->blocks + line + column;
-                if (info->x0 > x1 || info->x1 < x0 || info->y0 > y1 || info->y1 < y0)
-                    continue;
-                while (list->capacity < list->count + info->count)
-                    if (!grow(list)) return 0;
-                uint32_t first = (uint32_t)(line + column) * BLOCK_PIXELS;
-                entry *out = list->entries + list->count;
-                uint32_t edges = 0;
-                for (uint32_t i = first; i < first + info->count; ++i) {
-                    const fragment *one = f->fragments + i;
-                    if (!lights(one, x0, y0, x1, y1)) continue;
-                    edges |= one->state;
-                    *out++ = (entry){i, ALL_TILES};
-                }
-                list->count = (int)(out - list->entries);
-                list->any_edge |= (edges & EDGE_BIT) != 0;
-            }
+        for (int row = top; row <= bottom; ++row) {
+            const block_info *blocks =
+                f->blocks + (surface * f->block_rows + row) * f->block_columns;
+            uint32_t first = blocks[left].first, end = blocks[right].end;
+            while (list->capacity < list->count + (int)(end - first))
+                if (!grow(list)) return 0;
+            list_some(f, list, first, end);
         }
     }
     return 1;
@@ -114,16 +141,16 @@ static int list_fragments(const frame *f, bin_list *list) {
 static void mark_tiles(const frame *f, bin_list *list) {
     list->ordered = 0;
     for (int i = 0; i < list->count; ++i) {
-        const fragment *one = f->fragments + list->entries[i].fragment;
+        uint32_t index = list->entries[i].fragment;
         uint32_t tiles = 0;
         for (int tile = 0; tile < BIN_TILES; ++tile) {
             int x0 = list->x0 + tile % BIN_TILES_X * TILE_SIZE_PX;
             int y0 = list->y0 + tile / BIN_TILES_X * TILE_SIZE_PX;
-            int lit = lights(one, x0, y0, x0 + TILE_SIZE_PX - 1, y0 + TILE_SIZE_PX - 1);
+            int lit = lights(f, index, x0, y0, x0 + TILE_SIZE_PX - 1, y0 + TILE_SIZE_PX - 1);
             tiles |= (uint32_t)lit << tile;
         }
         list->entries[i].tiles = tiles;
-        if (one->state & EDGE_BIT) list->ordered |= tiles;
+        if (f->fragments[index].state & EDGE_BIT) list->ordered |= tiles;
     }
 }
 

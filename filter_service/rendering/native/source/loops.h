@@ -38,6 +38,7 @@ static void all_pixels(frame *f) {
 
 static void all_merges(frame *f) {
     f->fragment_count = f->merged_count = 0;
+    f->farthest_px = 0;
     for (int surface = 0; surface < f->surface_count; ++surface) {
         merge_job job = {f, surface};
         pool_run(f->threads, f->block_rows, merge_row, &job);

@@ -222,14 +222,18 @@ INLINE float sort_depth(const frame *f, int x, int y, float dpt) {
 }
 
 /* Coarse light is spread over half a pixel of its own, and over one between middles. */
-INLINE void widen(fragment *one, int resolution) {
-    int beyond = 2 << resolution;
-    one->radius_px = (uint16_t)(one->radius_px + beyond);
-    for (int side = 0; side < 4; ++side)
-        one->reach_px[side] = (uint8_t)smaller_int(one->reach_px[side] + beyond, 255);
+INLINE int spread_beyond(int resolution) { return resolution ? 2 << resolution : 0; }
+
+INLINE void write_box(const frame *f, uint32_t at, reach r, int beyond, int extent) {
+    int x = f->fragments[at].x, y = f->fragments[at].y;
+    f->boxes[BOX_LEFT][at] = (int16_t)(x - r.left - beyond);
+    f->boxes[BOX_RIGHT][at] = (int16_t)(x + r.right + beyond + extent);
+    f->boxes[BOX_TOP][at] = (int16_t)(y - r.up - beyond);
+    f->boxes[BOX_BOTTOM][at] = (int16_t)(y + r.down + beyond + extent);
 }
 
-INLINE void write_fragment(const block *b, int i, fragment *to, fragment_light *light) {
+/* Writes pixel i of a block, or the square that starts there, as fragment `at`. */
+INLINE void write_fragment(const block *b, int i, uint32_t at) {
     const frame *f = b->f;
     int level = b->level[i];
     const square *s = square_at(b, i);
@@ -241,30 +245,17 @@ INLINE void write_fragment(const block *b, int i, fragment *to, fragment_light *
     int y = b->y0 + i / TILE_SIZE_PX;
     kernel_shape *shape = f->shapes + kernel;
     float fraction = place - (float)position_interval(f, place);
-    for (int c = 0; c < RGB; ++c) light->rgb[c] = color[c];
-    light->depth = sort_depth(f, x, y, color[3]);
-    to->x = (uint16_t)x;
-    to->y = (uint16_t)y;
-    to->state = kernel | (uint32_t)level << LEVEL_SHIFT | (is_edge ? EDGE_BIT : 0u);
-    to->fraction = (uint16_t)(fraction * 65535.0f + 0.5f);
-    to->radius_px = shape->radius_px;
-    memcpy(to->reach_px, shape->reach_px, sizeof to->reach_px);
-    if (level > 1 && resolution_of(f, shape, level)) widen(to, resolution_of(f, shape, level));
+    int beyond = level > 1 ? spread_beyond(resolution_of(f, shape, level)) : 0;
+    float depth = sort_depth(f, x, y, color[3]);
+    uint32_t state = kernel | (uint32_t)level << LEVEL_SHIFT | (is_edge ? EDGE_BIT : 0u);
+    f->lights[at] = (fragment_light){{color[0], color[1], color[2]}, depth};
+    f->fragments[at] = (fragment){(uint16_t)x, (uint16_t)y, state,
+                                  (uint16_t)(fraction * 65535.0f + 0.5f),
+                                  (uint16_t)(shape->radius_px + beyond)};
+    write_box(f, at, read_reach(shape->reach_px), beyond, (1 << level) - 1);
     uint8_t used = (uint8_t)(1 << level);
     if (!(__atomic_load_n(&shape->levels_used, __ATOMIC_RELAXED) & used))
         __atomic_fetch_or(&shape->levels_used, used, __ATOMIC_RELAXED);
-}
-
-INLINE void take_in_box(block_info *info, const fragment *one, int extent) {
-    int x0 = one->x - one->reach_px[0];
-    int x1 = one->x + one->reach_px[1] + extent;
-    int y0 = one->y - one->reach_px[2];
-    int y1 = one->y + one->reach_px[3] + extent;
-    info->x0 = (int16_t)(x0 < info->x0 ? x0 : info->x0);
-    info->y0 = (int16_t)(y0 < info->y0 ? y0 : info->y0);
-    info->x1 = (int16_t)(x1 > info->x1 ? x1 : info->x1);
-    info->y1 = (int16_t)(y1 > info->y1 ? y1 : info->y1);
-    info->reach_px = larger_float(info->reach_px, (float)one->radius_px + 0.5f);
 }
 
 /* Whether an edge of what is seen is so close that light from a hidden block may pass. */
@@ -278,7 +269,7 @@ static int edge_in_reach(const frame *f, int column, int row) {
         for (int x = left; x < right; ++x) {
             const block_info *seen = f->blocks + y * f->block_columns + x;
             if (!seen->has_edge) continue;
-            float farthest = seen->reach_px + f->largest_reach_px;
+            float farthest = (float)seen->radius_px + 0.5f + f->largest_reach_px;
             int gap_x = clamped_int(abs(x - column) * TILE_SIZE_PX - TILE_SIZE_PX + 1, 0, 1 << 15);
             int gap_y = clamped_int(abs(y - row) * TILE_SIZE_PX - TILE_SIZE_PX + 1, 0, 1 << 15);
             if ((float)(gap_x * gap_x + gap_y * gap_y) <= farthest * farthest) return 1;
@@ -288,24 +279,21 @@ static int edge_in_reach(const frame *f, int column, int row) {
 }
 
 /* Writes what is left of a block, in scan order. */
-static void write_block(const block *b, int index, block_info *info) {
-    fragment *out = b->f->fragments + (size_t)index * BLOCK_PIXELS;
-    fragment_light *lights = b->f->lights + (size_t)index * BLOCK_PIXELS;
+static void write_block(const block *b, block_info *info) {
     for (int i = 0; i < BLOCK_PIXELS; ++i) {
         int level = b->level[i];
         if (level < 0) continue;
-        write_fragment(b, i, out, lights++);
-        take_in_box(info, out, (1 << level) - 1);
-        info->has_edge |= (out->state & EDGE_BIT) != 0;
-        if (level > 0) info->merged = (uint16_t)(info->merged + (1 << 2 * level));
-        ++info->count;
-        ++out;
+        write_fragment(b, i, info->end);
+        const fragment *one = b->f->fragments + info->end++;
+        if (one->radius_px > info->radius_px) info->radius_px = one->radius_px;
+        info->has_edge |= (one->state & EDGE_BIT) != 0;
+        if (level > 0) info->merged = (uint8_t)(info->merged + (1 << 2 * level));
     }
 }
 
-static void merge_block(frame *f, int surface, int column, int row) {
-    int index = (surface * f->block_rows + row) * f->block_columns + column;
-    block_info info = {.x0 = INT16_MAX, .y0 = INT16_MAX, .x1 = INT16_MIN, .y1 = INT16_MIN};
+/* Writes the fragments of a block from place `first` on. */
+static block_info merge_block(const frame *f, int surface, int column, int row, uint32_t first) {
+    block_info info = {first, first, 0, 0, 0};
     block b; /* not cleared: 6 KB */
     b.f = f;
     b.surface = surface;
@@ -319,9 +307,9 @@ static void merge_block(frame *f, int surface, int column, int row) {
                     if (level == 1) merge_pixels(&b, y * TILE_SIZE_PX + x);
                     else merge_squares(&b, y * TILE_SIZE_PX + x, level);
                 }
-        write_block(&b, index, &info);
+        write_block(&b, &info);
     }
-    f->blocks[index] = info;
+    return info;
 }
 
 typedef struct {
@@ -334,15 +322,23 @@ static void merge_row(void *argument, int row, int thread) {
     merge_job *job = argument;
     (void)thread;
     frame *f = job->f;
-    int64_t count = 0;
     int64_t merged = 0;
+    int32_t farthest_px = 0;
+    int line = (job->surface * f->block_rows + row) * f->block_columns;
+    uint32_t first = (uint32_t)line * BLOCK_PIXELS;
+    uint32_t at = first;
     for (int column = 0; column < f->block_columns; ++column) {
-        merge_block(f, job->surface, column, row);
-        const block_info *info =
-            f->blocks + (job->surface * f->block_rows + row) * f->block_columns + column;
-        count += info->count;
+        block_info *info = f->blocks + line + column;
+        *info = merge_block(f, job->surface, column, row, at);
+        at = info->end;
         merged += info->merged;
+        farthest_px = larger_int(farthest_px, info->radius_px);
     }
-    __atomic_fetch_add(&f->fragment_count, count, __ATOMIC_RELAXED);
+    int32_t known_px = __atomic_load_n(&f->farthest_px, __ATOMIC_RELAXED);
+    while (farthest_px > known_px)
+        if (__atomic_compare_exchange_n(&f->farthest_px, &known_px, farthest_px, 1,
+                                        __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+            break;
+    __atomic_fetch_add(&f->fragment_count, at - first, __ATOMIC_RELAXED);
     __atomic_fetch_add(&f->merged_count, merged, __ATOMIC_RELAXED);
 }

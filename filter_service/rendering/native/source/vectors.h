@@ -73,6 +73,39 @@ INLINE f32x8 smaller8(f32x8 a, f32x8 b) {
 }
 #endif
 
+/* Whether any lane is true (all bits set). */
+INLINE int any8(i32x8 lanes) {
+#ifdef OCU_AVX2
+    return __builtin_ia32_movmskps256((f32x8)lanes) != 0;
+#else
+    int32_t any = 0;
+    for (int i = 0; i < 8; ++i) any |= lanes[i];
+    return any != 0;
+#endif
+}
+
+INLINE i16x16 all16(int value) {
+    int16_t v = (int16_t)value;
+    return (i16x16){v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v};
+}
+
+/* A bit for each of 16 lanes that is true. */
+INLINE uint32_t bits_of_lanes(i16x16 lanes) {
+    uint32_t bits = 0;
+#ifdef OCU_AVX2
+    typedef char c8x16 __attribute__((vector_size(16)));
+    i16x16 packed = (i16x16)__builtin_ia32_packsswb256(lanes, lanes);
+    c8x16 low, high;
+    memcpy(&low, &packed, sizeof low);
+    memcpy(&high, (char *)&packed + 16, sizeof high);
+    bits = ((uint32_t)__builtin_ia32_pmovmskb128(low) & 255u)
+           | ((uint32_t)__builtin_ia32_pmovmskb128(high) & 255u) << 8;
+#else
+    for (int i = 0; i < 16; ++i) bits |= (uint32_t)(lanes[i] & 1) << i;
+#endif
+    return bits;
+}
+
 /* Eight 16-bit words as floats. */
 INLINE f32x8 floats_of(u16x8 words) {
     return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);
