@@ -48,6 +48,9 @@ DISTANCE_BIN_DPT = 0.005
 BATCH_PSF_COUNT = 9000
 """PSFs held at a time: 250 MB of them at a radius of 40 px."""
 
+WINDOW_REACH_PX = 112
+"""Pixels taken in about a window: no PSF may reach farther."""
+
 BAND_ROWS = 8
 """Rows that one thread adds to; a source reaches few bands, so all stay busy."""
 
@@ -153,6 +156,32 @@ def linear_color(view: RgbdView) -> NDArray[np.float64]:
     return view.color.astype(np.float64)
 
 
+@dataclass(frozen=True)
+class Window:
+    """Part of a picture whose filtered pixels are wanted.
+
+    Attributes
+    ----------
+    x, y, width_px, height_px : int
+        First column and row, and how many.
+    """
+
+    x: int
+    y: int
+    width_px: int
+    height_px: int
+
+    def of(self, picture: NDArray) -> NDArray:
+        """Cut it out of a picture (height, width, ...)."""
+        return picture[self.y :, self.x :][: self.height_px, : self.width_px]
+
+    def distance_px(self, rows: NDArray, columns: NDArray) -> NDArray[np.int64]:
+        """How many columns or rows pixels lie outside, the larger of both; 0 inside."""
+        beside = np.maximum(self.x - columns, columns - (self.x + self.width_px - 1))
+        above = np.maximum(self.y - rows, rows - (self.y + self.height_px - 1))
+        return np.maximum(np.maximum(beside, above), 0)
+
+
 def view_sources(view: RgbdView, spec: GridSpec) -> Sources:
     """Colour, direction and distance of every pixel."""
     depth_m, _ = fill_missing_depth(view.depth_m)
@@ -190,6 +219,7 @@ def dense_reference(
     bins: bool,
     accumulation: str = "coverage",
     kept: bool = True,
+    window: Window | None = None,
 ) -> NDArray[np.float64]:
     """Filter a view with the exact PSF of every pixel.
 
@@ -205,34 +235,61 @@ def dense_reference(
         surface alone.
     kept : bool
         Read and write the files under out/.
+    window : Window, optional
+        Only this part of the picture, from all pixels whose light can reach it: a
+        large picture takes tens of minutes.
 
     Returns
     -------
     linear_rgb : (height, width, 3)
+        Of the window, where one is given.
+
+    Raises
+    ------
+    ValueError
+        A PSF reaches farther than `WINDOW_REACH_PX`.
     """
     if not kept:
-        return _filtered(view, state, bins, accumulation)
-    path = _path(view, state, bins, accumulation)
+        return _filtered(view, state, bins, accumulation, window)
+    path = _path(view, state, bins, accumulation, window)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, _filtered(view, state, bins, accumulation))
+        np.save(path, _filtered(view, state, bins, accumulation, window))
     return np.load(path)
 
 
-def has_reference(view: RgbdView, state: EyeState, *, bins: bool) -> bool:
+def has_reference(
+    view: RgbdView, state: EyeState, *, bins: bool, window: Window | None = None
+) -> bool:
     """Whether a reference of the usual rule has been computed and kept."""
-    return _path(view, state, bins, "coverage").exists()
+    return _path(view, state, bins, "coverage", window).exists()
 
 
-def _path(view: RgbdView, state: EyeState, bins: bool, accumulation: str) -> Path:
-    return CACHE / f"{_key(view, state, bins, accumulation)}.npy"
+def _path(
+    view: RgbdView,
+    state: EyeState,
+    bins: bool,
+    accumulation: str,
+    window: Window | None,
+) -> Path:
+    name = _key(view, state, bins, accumulation)
+    if window is not None:
+        name += f"_{window.x}_{window.y}_{window.width_px}x{window.height_px}"
+    return CACHE / f"{name}.npy"
 
 
 def _filtered(
-    view: RgbdView, state: EyeState, bins: bool, accumulation: str
+    view: RgbdView,
+    state: EyeState,
+    bins: bool,
+    accumulation: str,
+    window: Window | None,
 ) -> NDArray[np.float64]:
     sources = view_sources(view, state.spec)
     order = sources.near_first()
+    if window is not None:
+        away_px = window.distance_px(*np.divmod(order, view.width_px))
+        order = order[away_px <= WINDOW_REACH_PX]
     places = binned(sources) if bins else sources
     # A place is one PSF, however many pixels share it.
     places = np.stack([places.h_deg, places.v_deg, places.distance_dpt], axis=-1)
@@ -244,6 +301,11 @@ def _filtered(
     step_dpt = depth_step_dpt(state)
     for part, found, place_of in _batches(places):
         psfs = state.exact_psfs(*found.T)
+        if window is not None and psfs.radius_px.max() > WINDOW_REACH_PX:
+            raise ValueError(
+                f"a PSF reaches {psfs.radius_px.max()} px; windows take in "
+                f"{WINDOW_REACH_PX} px about them"
+            )
         pixels = order[part]
         add_sources(
             *np.divmod(pixels, view.width_px),
@@ -259,7 +321,8 @@ def _filtered(
             coverage,
         )
     close_depths(depths, light, coverage)
-    return normalised(light, coverage, linear_color(view))
+    picture = normalised(light, coverage, linear_color(view))
+    return picture if window is None else window.of(picture)
 
 
 def depth_step_dpt(state: EyeState) -> float:

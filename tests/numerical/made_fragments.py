@@ -25,21 +25,24 @@ def made_fragments(bench, width_px, height_px, surface_count=1):
     n_slots = n_blocks * constants.THREADS
     if bench.gpu is None:
         arrays = bench.renderer._arrays
-        counts = arrays.get("blocks", n_blocks, BLOCK)[:n_blocks]["count"]
+        blocks = arrays.get("blocks", n_blocks, BLOCK)[:n_blocks]
+        counts = (blocks["end"] - blocks["first"]).astype(int)
+        firsts = blocks["first"].astype(int)
         made = arrays.get("fragments", n_slots, FRAGMENT)[:n_slots]
         x, y, state = made["x"], made["y"], made["state"]
         rgb = arrays.get("lights", n_slots, FRAGMENT_LIGHT)[:n_slots]["rgb"]
     else:
-        counts = _read(bench.gpu, "BLOCKS", (n_blocks, 4), np.uint32)[:, 0]
+        counts = _read(bench.gpu, "BLOCKS", (n_blocks, 4), np.uint32)[:, 0].astype(int)
+        firsts = np.arange(n_blocks) * constants.THREADS
         place = _read(bench.gpu, "FRAGMENT_PLACE", (n_slots, 4), np.uint32)
         x = place[:, 0] & constants.PLACE_MASK
         y = place[:, 0] >> constants.PLACE_BITS
         rgb = _read(bench.gpu, "FRAGMENT_COLOR", (n_slots, 4), np.float32)[:, :3]
         state = place[:, 1]
-    slot = np.arange(n_slots)
-    alive = slot % constants.THREADS < np.repeat(counts, constants.THREADS)
+    before = np.cumsum(counts) - counts
+    alive = np.arange(counts.sum()) + np.repeat(firsts - before, counts)
     level = (state[alive] >> constants.LEVEL_SHIFT) & constants.LEVEL_MASK
-    surface = slot[alive] // (columns * rows * constants.THREADS)
+    surface = np.repeat(np.arange(n_blocks) // (columns * rows), counts)
     return Fragments(
         surface,
         x[alive].astype(int),

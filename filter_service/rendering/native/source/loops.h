@@ -22,6 +22,8 @@ typedef struct {
 #include "recipes.h"
 #include "kernel_ends.h"
 #include "kernels.h"
+#include "block.h"
+#include "squares.h"
 #include "merge.h"
 #include "lists.h"
 #include "rasters.h"

@@ -106,6 +106,49 @@ INLINE uint32_t bits_of_lanes(i16x16 lanes) {
     return bits;
 }
 
+/* A bit for each of eight lanes that is true. */
+INLINE uint32_t bits_of8(i32x8 lanes) {
+#ifdef OCU_AVX2
+    return (uint32_t)__builtin_ia32_movmskps256((f32x8)lanes);
+#else
+    uint32_t bits = 0;
+    for (int i = 0; i < 8; ++i) bits |= (uint32_t)(lanes[i] & 1) << i;
+    return bits;
+#endif
+}
+
+/* Without signs. */
+INLINE f32x8 size8(f32x8 value) {
+    i32x8 sign = {INT32_MIN, INT32_MIN, INT32_MIN, INT32_MIN,
+                  INT32_MIN, INT32_MIN, INT32_MIN, INT32_MIN};
+    return (f32x8)((i32x8)value & ~sign);
+}
+
+INLINE f32x8 root8(f32x8 value) {
+#ifdef OCU_AVX2
+    return __builtin_ia32_sqrtps256(value);
+#else
+    for (int i = 0; i < 8; ++i) value[i] = __builtin_sqrtf(value[i]);
+    return value;
+#endif
+}
+
+/* Whole part of what is not negative. */
+INLINE i32x8 whole8(f32x8 value) { return __builtin_convertvector(value, i32x8); }
+
+/* Lanes changed for their neighbours: one (level 1), two or four (level 3) on. */
+INLINE f32x8 across8(f32x8 value, int level) {
+#if defined(__clang__)
+    if (level == 1) return __builtin_shufflevector(value, value, 1, 0, 3, 2, 5, 4, 7, 6);
+    if (level == 2) return __builtin_shufflevector(value, value, 2, 3, 0, 1, 6, 7, 4, 5);
+    return __builtin_shufflevector(value, value, 4, 5, 6, 7, 0, 1, 2, 3);
+#else
+    if (level == 1) return __builtin_shuffle(value, (i32x8){1, 0, 3, 2, 5, 4, 7, 6});
+    if (level == 2) return __builtin_shuffle(value, (i32x8){2, 3, 0, 1, 6, 7, 4, 5});
+    return __builtin_shuffle(value, (i32x8){4, 5, 6, 7, 0, 1, 2, 3});
+#endif
+}
+
 /* Eight 16-bit words as floats. */
 INLINE f32x8 floats_of(u16x8 words) {
     return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);

@@ -1,0 +1,150 @@
+/* The pixels of a block: light, distance, place between layers, kernel. */
+
+#include <math.h>
+
+#include "color.h"
+#include "frame.h"
+#include "vectors.h"
+
+#define BLOCK_PIXELS (TILE_SIZE_PX * TILE_SIZE_PX)
+
+/* Pixels in scan order; sets of them are bits. */
+typedef struct {
+    const frame *f;
+    int surface, x0, y0;      /* first pixel */
+    float rgb[RGB][BLOCK_PIXELS];    /* linear light */
+    float dpt[BLOCK_PIXELS];
+    float place[BLOCK_PIXELS];       /* in layers */
+    float spread_px[BLOCK_PIXELS];
+    uint32_t kernel[BLOCK_PIXELS];
+    uint64_t held;            /* those that hold something */
+    uint64_t edges;           /* those beside another surface */
+    int highest_level;        /* to which any of their kernels merges */
+} block;
+
+INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
+    size_t first = 3 * pixel;
+    if (f->color_kind == COLOR_SRGB8) {
+        const uint8_t *bytes = (const uint8_t *)f->color[surface] + first;
+        return (f32x4){linear_of_byte[bytes[0]], linear_of_byte[bytes[1]],
+                       linear_of_byte[bytes[2]], 0.0f};
+    }
+    float rgb[RGB];
+    if (f->color_kind == COLOR_LINEAR) {
+        memcpy(rgb, (const float *)f->color[surface] + first, sizeof rgb);
+    } else {
+        const uint16_t *halves = (const uint16_t *)f->color[surface] + first;
+        for (int c = 0; c < RGB; ++c) rgb[c] = float_of_half(halves[c]);
+    }
+    for (int c = 0; c < RGB; ++c)
+        if (!isfinite(rgb[c])) rgb[c] = 0.0f;
+    return (f32x4){rgb[0], rgb[1], rgb[2], 0.0f};
+}
+
+/* Distances of a block with those around it; beyond the frame as at its edge. */
+#define AROUND_PX (TILE_SIZE_PX + 2)
+
+INLINE void copy_around(const block *b, float *dpt) {
+    const frame *f = b->f;
+    for (int y = 0; y < AROUND_PX; ++y) {
+        int row = clamped_int(b->y0 + y - 1, 0, f->height - 1);
+        const float *from = f->dpt + (size_t)row * (size_t)f->width;
+        for (int x = 0; x < AROUND_PX; ++x)
+            dpt[y * AROUND_PX + x] = from[clamped_int(b->x0 + x - 1, 0, f->width - 1)];
+    }
+}
+
+/* Pixels that have a neighbour on another surface, seen through this pupil. */
+INLINE uint64_t find_edges(const block *b) {
+    const frame *f = b->f;
+    float copied[AROUND_PX * AROUND_PX];
+    const float *above_left = copied;
+    ptrdiff_t stride = AROUND_PX;
+    if (b->x0 > 0 && b->x0 + TILE_SIZE_PX < f->width && b->y0 > 0
+        && b->y0 + TILE_SIZE_PX < f->height) {
+        stride = f->width;
+        above_left = f->dpt + (b->y0 - 1) * stride + b->x0 - 1;
+    } else {
+        copy_around(b, copied);
+    }
+    uint64_t edges = 0;
+    for (int y = 0; y < TILE_SIZE_PX; ++y) {
+        const float *left = above_left + (y + 1) * stride;
+        f32x8 own = load8(left + 1);
+        f32x8 across = larger8(size8(load8(left) - own), size8(load8(left + 2) - own));
+        f32x8 along = larger8(size8(load8(left + 1 - stride) - own),
+                              size8(load8(left + 1 + stride) - own));
+        f32x8 most_px = larger8(across, along) * all8(f->blur_px_per_dpt);
+        edges |= (uint64_t)bits_of8(most_px > all8(DISCONTINUITY_PX)) << (y * TILE_SIZE_PX);
+    }
+    return edges;
+}
+
+INLINE int cell_row(const frame *f, int y) {
+    if (f->cell_px == 0) return 0;
+    int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
+    return (place >> __builtin_ctz((unsigned)f->cell_px)) * f->cell_columns;
+}
+
+INLINE int cell_column(const frame *f, int x) { return f->cell_px ? f->column_cell[x] : 0; }
+
+/* Reads a row of a block from pixel i on, whose first pixel in the frame is `first`. */
+INLINE void read_row(block *b, int i, size_t first, int width) {
+    const frame *f = b->f;
+    size_t pixels = (size_t)f->width * (size_t)f->height;
+    const float *dpt = f->dpt + (size_t)b->surface * pixels + first;
+    const float *place = f->position + (size_t)b->surface * pixels + first;
+    int row = cell_row(f, b->y0 + i / TILE_SIZE_PX);
+    int last_pair = -1;
+    uint32_t kernel = 0;
+    const kernel_shape *shape = f->shapes;
+    for (int x = 0; x < width; ++x, ++i) {
+        if (dpt[x] < 0.0f) continue;
+        int interval = position_interval(f, place[x]);
+        int pair = (row + cell_column(f, b->x0 + x)) * f->interval_count + interval;
+        if (pair != last_pair) {
+            last_pair = pair;
+            kernel = f->kernel_of[pair];
+            shape = f->shapes + kernel;
+            b->highest_level = larger_int(b->highest_level, shape->highest_level);
+        }
+        float change_px = shape->spread_px[1] - shape->spread_px[0];
+        f32x4 color = pixel_color(f, b->surface, first + (size_t)x);
+        for (int c = 0; c < RGB; ++c) b->rgb[c][i] = color[c];
+        b->dpt[i] = dpt[x];
+        b->place[i] = place[x];
+        b->spread_px[i] = shape->spread_px[0] + (place[x] - (float)interval) * change_px;
+        b->kernel[i] = kernel;
+        b->held |= (uint64_t)1 << i;
+    }
+}
+
+/* Begins a block; what it does not hold stays dark and sharp. */
+INLINE void read_block(block *b, const frame *f, int surface, int column, int row) {
+    b->f = f;
+    b->surface = surface;
+    b->x0 = column * TILE_SIZE_PX;
+    b->y0 = row * TILE_SIZE_PX;
+    b->held = 0;
+    b->highest_level = 0;
+    b->edges = surface == 0 ? find_edges(b) : ~(uint64_t)0;
+    int width = smaller_int(f->width - b->x0, TILE_SIZE_PX);
+    int height = smaller_int(f->height - b->y0, TILE_SIZE_PX);
+    if (surface > 0 || width < TILE_SIZE_PX || height < TILE_SIZE_PX) {
+        memset(b->rgb, 0, sizeof b->rgb);
+        memset(b->dpt, 0, sizeof b->dpt);
+        memset(b->place, 0, sizeof b->place);
+        memset(b->spread_px, 0, sizeof b->spread_px);
+    }
+    for (int y = 0; y < height; ++y) {
+        size_t first = (size_t)(b->y0 + y) * (size_t)f->width + (size_t)b->x0;
+        read_row(b, y * TILE_SIZE_PX, first, width);
+    }
+}
+
+/* Kernel of a position within the cell of pixel i. */
+INLINE uint32_t kernel_at(const block *b, int i, float place) {
+    const frame *f = b->f;
+    int cell = cell_row(f, b->y0 + i / TILE_SIZE_PX) + cell_column(f, b->x0 + i % TILE_SIZE_PX);
+    return f->kernel_of[cell * f->interval_count + position_interval(f, place)];
+}
