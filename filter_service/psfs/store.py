@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
-from filter_service.planning.grid import GridSpec, layer_distances_dpt
+from filter_service.planning.grid import (
+    LAYER_BLUR_RATIO,
+    GridSpec,
+    layer_distances_dpt,
+)
 from filter_service.planning.nodes import CachePlan, bracket_axis
 from filter_service.psfs.boxes import pack_reach
 from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
@@ -183,7 +187,8 @@ def frame_layers(
         blur_radius_px=lambda at_dpt: layer_blur_px(
             store.tables, reads, layer_zero_dpt, at_dpt
         ),
-        max_blur_step_px=store.spec.max_blur_step_px,
+        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
+        blur_ratio=LAYER_BLUR_RATIO[store.spec.settings.mode],
         step_ratio=step_ratio,
     )
     return FrameLayers(

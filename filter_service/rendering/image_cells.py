@@ -19,7 +19,7 @@ from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, bracket_axis
 from filter_service.rendering.cell_maps import CellMaps
 
-CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
+CELL_DEG = {"quality": 2.0, "dynamic": 6.0}
 """Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
 of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 47.4 dB
 of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""

@@ -16,7 +16,7 @@ from filter_service.constants import (
     RGB,
     WEIGHT_MAX,
 )
-from filter_service.planning.grid import BASE_OBJECT_STEP_DPT, blur_step_px
+from filter_service.planning.grid import BASE_OBJECT_STEP_DPT
 from filter_service.psfs.boxes import box_sizes, pack_reach
 from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, UNMOVED_RATIO
 
@@ -64,21 +64,43 @@ def largest_radius_px(store, reads, zero_dpt, layer_dpt):
 
 
 def layer_distances_dpt(
-    object_range_dpt, *, focused_dpt, blur_radius_px, max_blur_step_px
+    object_range_dpt, *, focused_dpt, blur_radius_px, blur_px_per_dpt, blur_ratio
 ):
+    """Walk from node to node; a layer wherever a whole step has gone by."""
     low_dpt, high_dpt = object_range_dpt
     count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
-    inside = focused_dpt[(focused_dpt > low_dpt) & (focused_dpt < high_dpt)]
-    base = np.unique(np.append(np.linspace(low_dpt, high_dpt, max(count, 1)), inside))
-    blur_px = blur_radius_px(base)
-    layers = [base[:1]]
-    for k in range(len(base) - 1):
-        change_px = float(np.abs(blur_px[k + 1] - blur_px[k]).max())
-        smaller_px = float(np.minimum(blur_px[k + 1], blur_px[k]).min())
-        step_px = blur_step_px(smaller_px, max_blur_step_px)
-        transitional = max(math.ceil(change_px / step_px - 1e-9) - 1, 0)
-        layers.append(np.linspace(base[k], base[k + 1], transitional + 2)[1:])
-    return np.concatenate(layers)
+    inside = [d for d in focused_dpt if low_dpt < d < high_dpt]
+    nodes = sorted({*np.linspace(low_dpt, high_dpt, max(count, 1)), *inside})
+    blur_px = blur_radius_px(np.array(nodes))
+    layers, stretch = [nodes[0]], []
+    for k in range(len(nodes) - 1):
+        steps = []
+        for a, b in zip(blur_px[k], blur_px[k + 1], strict=True):
+            least_px = min(a, b)
+            gap_px = 2.0 * blur_ratio * least_px
+            gap_dpt = max(gap_px / blur_px_per_dpt, BASE_OBJECT_STEP_DPT)
+            steps.append(abs(a - b) / max(blur_ratio * least_px, 0.25))
+            steps.append((nodes[k + 1] - nodes[k]) / gap_dpt)
+        stretch.append((nodes[k], nodes[k + 1], max(steps)))
+        if nodes[k + 1] in inside or k == len(nodes) - 2:
+            layers += _layers_of(stretch)
+            stretch = []
+    return np.array(layers)
+
+
+def _layers_of(stretch):
+    """Ends of equal shares of a stretch's steps; (low, high, steps) of each part."""
+    total = sum(steps for _, _, steps in stretch)
+    count = max(math.ceil(total - 1e-9), 1)
+    layers = []
+    for n in range(1, count):
+        left = n * total / count
+        for low_dpt, high_dpt, steps in stretch:
+            if left <= steps:
+                layers.append(low_dpt + left / steps * (high_dpt - low_dpt))
+                break
+            left -= steps
+    return [*layers, stretch[-1][1]]
 
 
 def map_tables(node_from_cell):

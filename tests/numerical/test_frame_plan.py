@@ -114,9 +114,10 @@ def test_layers_equal_the_plain_statement(case):
         tuple(np.add(layers.object_range_dpt, layers.field.range_dpt)),
         focused_dpt=-zero_dpt[gaze],
         blur_radius_px=lambda d: plan_twin.layer_blur_px(store, reads, zero_dpt, d),
-        max_blur_step_px=store.spec.max_blur_step_px,
+        blur_px_per_dpt=layers.blur_px_per_dpt,
+        blur_ratio=0.1 if store.spec.settings.mode == "dynamic" else 0.05,
     )
-    np.testing.assert_array_equal(layers.layer_dpt, expected_dpt)
+    np.testing.assert_allclose(layers.layer_dpt, expected_dpt, rtol=RTOL, atol=1e-9)
     largest_px = plan_twin.largest_radius_px(store, reads, zero_dpt, at_dpt)
     assert layers.max_radius_px == largest_px
     assert reads.weights.sum() == pytest.approx(1.0, rel=RTOL)

@@ -21,7 +21,7 @@ from filter_service.rendering.image_cells import (
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.native.records import KERNEL_SHAPE
 
-TEXELS_PER_PIXEL = 10
+TEXELS_PER_PIXEL = 4
 """Of the single kernels of a frame, before cells are made larger: beyond that it takes
 longer to make kernels than to use them."""
 
