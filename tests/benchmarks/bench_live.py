@@ -9,8 +9,9 @@ pupil and focus, so that its kernels are blended anew.  Rendering the scene is n
 the times.
 
 The error is that of one frame of the walk, in linear light, against the dense
-reference: the exact PSF of every pixel, in bins of 0.2 degrees and 0.005 dpt.
-References of large frames take minutes; they are kept under out/dense_references, and
+reference: the exact PSF of every pixel, in bins of 0.2 degrees and 0.005 dpt.  Of large
+frames three windows of 256 x 256 are judged (middle, left edge, corner), as a reference
+of the whole takes tens of minutes.  References are kept under out/dense_references;
 without ``--errors`` only what lies there is used.
 """
 
@@ -26,7 +27,12 @@ from clients.pyrender_stream import parse_size, path_settings
 from clients.scenes.paths import PATHS, path_moments
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
-from tests.benchmarks.dense_reference import EyeState, dense_reference, has_reference
+from tests.benchmarks.dense_reference import (
+    EyeState,
+    Window,
+    dense_reference,
+    has_reference,
+)
 from tests.benchmarks.harness import (
     RESULTS,
     Row,
@@ -47,6 +53,11 @@ JUDGED = 0.5
 """Part of the walk after which the frame stands whose error is measured."""
 
 WARM_UP_COUNT = 2
+
+WHOLE_PIXELS = 640 * 360
+"""Largest frame that is judged as a whole."""
+
+WINDOW_PX = 256
 
 
 @dataclass(frozen=True)
@@ -116,10 +127,39 @@ def frame_error_db(
         object_range_dpt=path_settings(SCENE)["object_range_dpt"],
     )
     exact = EyeState(traced_eye(eye, spec), spec, *state.values())
-    if not compute and not has_reference(view, exact, bins=True):
+    windows = judged_windows(walk.size_px)
+    if not compute and not all(
+        has_reference(view, exact, bins=True, window=window) for window in windows
+    ):
         return None
-    truth = dense_reference(view, exact, bins=True)
-    return psnr_db(renderer.render(view, handle, **state).color, truth)
+    seen = renderer.render(view, handle, **state).color
+    pairs = [
+        (
+            seen if window is None else window.of(seen),
+            dense_reference(view, exact, bins=True, window=window),
+        )
+        for window in windows
+    ]
+    return psnr_db(
+        *(
+            np.concatenate([part.reshape(-1, 3) for part in parts])
+            for parts in zip(*pairs, strict=True)
+        )
+    )
+
+
+def judged_windows(size_px: tuple[int, int]) -> list[Window | None]:
+    """Parts of a frame whose error is measured; None is the whole."""
+    width_px, height_px = size_px
+    if width_px * height_px <= WHOLE_PIXELS:
+        return [None]
+    middle_y = (height_px - WINDOW_PX) // 2
+    corners = [
+        ((width_px - WINDOW_PX) // 2, middle_y),
+        (0, middle_y),
+        (width_px - WINDOW_PX, height_px - WINDOW_PX),
+    ]
+    return [Window(x, y, WINDOW_PX, WINDOW_PX) for x, y in corners]
 
 
 @dataclass(frozen=True)
@@ -130,6 +170,7 @@ class Case:
     setting: str
     n: int
     error_db: float | None
+    reference: str
 
     def row(self, method: str, times_ms: list[float]) -> Row:
         """Return a row of a method or stage."""
@@ -144,7 +185,7 @@ class Case:
             memory_mb=memory_mb(),
             error_name="psnr_db",
             error=float("nan") if self.error_db is None else self.error_db,
-            reference="dense, over the field, bins of 0.2 deg and 0.005 dpt",
+            reference=self.reference,
         )
 
 
@@ -154,6 +195,9 @@ def eye_rows(eye: str, walk: Walk, threads: list[int], *, errors: bool) -> list[
     store = build_psf_store(traced_eye(eye, spec), spec)
     rows: list[Row] = []
     error_db = None
+    reference = "dense, over the field, bins of 0.2 deg and 0.005 dpt"
+    if judged_windows(walk.size_px) != [None]:
+        reference += f", three windows of {WINDOW_PX} x {WINDOW_PX} px"
     for n_threads in threads:
         renderer = NativeRenderer(n_threads=n_threads)
         handle = renderer.load(store)
@@ -162,7 +206,7 @@ def eye_rows(eye: str, walk: Walk, threads: list[int], *, errors: bool) -> list[
         times_ms, stages_ms = walk_times(renderer, handle, walk)
         cores = f"{n_threads} core" + "s" * (n_threads > 1)
         setting = f"{walk.size_px[0]}x{walk.size_px[1]} {cores}"
-        case = Case(eye, setting, len(times_ms), error_db)
+        case = Case(eye, setting, len(times_ms), error_db, reference)
         rows.append(case.row("frame", times_ms))
         rows += [
             case.row(f"  {name.removesuffix('_ms')}", [median_ms])

@@ -10,6 +10,7 @@
 #define BIN_TILES_Y 2
 #define BIN_TILES (BIN_TILES_X * BIN_TILES_Y)
 #define ALL_TILES ((1u << BIN_TILES) - 1u)
+_Static_assert(BIN_TILES_X == 2 && BIN_TILES_Y == 2, "box_tiles counts on it");
 #define BIN_WIDTH (BIN_TILES_X * TILE_SIZE_PX)
 #define BIN_HEIGHT (BIN_TILES_Y * TILE_SIZE_PX)
 
@@ -137,20 +138,31 @@ static int list_fragments(const frame *f, bin_list *list) {
     return 1;
 }
 
-/* Notes which tiles each entry lights, and in which order matters. */
+/* Tiles of the bin that the box of a fragment's kernel meets, a bit for each: left and
+ * right above, left and right below. */
+INLINE uint32_t box_tiles(const frame *f, const bin_list *list, uint32_t at) {
+    int middle_x = list->x0 + TILE_SIZE_PX, middle_y = list->y0 + TILE_SIZE_PX;
+    uint32_t columns = (uint32_t)(f->boxes[BOX_LEFT][at] < middle_x)
+                       | (uint32_t)(f->boxes[BOX_RIGHT][at] >= middle_x) << 1;
+    uint32_t above = 0u - (uint32_t)(f->boxes[BOX_TOP][at] < middle_y);
+    uint32_t below = 0u - (uint32_t)(f->boxes[BOX_BOTTOM][at] >= middle_y);
+    return (columns & above) | (columns & below) << BIN_TILES_X;
+}
+
+/* Notes which tiles each entry may light, and in which order matters: where light from
+ * beside an edge arrives. */
 static void mark_tiles(const frame *f, bin_list *list) {
     list->ordered = 0;
     for (int i = 0; i < list->count; ++i) {
-        uint32_t index = list->entries[i].fragment;
-        uint32_t tiles = 0;
+        uint32_t at = list->entries[i].fragment;
+        list->entries[i].tiles = box_tiles(f, list, at);
+        if (!(f->fragments[at].state & EDGE_BIT)) continue;
         for (int tile = 0; tile < BIN_TILES; ++tile) {
             int x0 = list->x0 + tile % BIN_TILES_X * TILE_SIZE_PX;
             int y0 = list->y0 + tile / BIN_TILES_X * TILE_SIZE_PX;
-            int lit = lights(f, index, x0, y0, x0 + TILE_SIZE_PX - 1, y0 + TILE_SIZE_PX - 1);
-            tiles |= (uint32_t)lit << tile;
+            int lit = lights(f, at, x0, y0, x0 + TILE_SIZE_PX - 1, y0 + TILE_SIZE_PX - 1);
+            list->ordered |= (uint32_t)lit << tile;
         }
-        list->entries[i].tiles = tiles;
-        if (f->fragments[index].state & EDGE_BIT) list->ordered |= tiles;
     }
 }
 
