@@ -76,10 +76,11 @@ class Engine:
     def limit_kernels(self, monkeypatch, texel_count, pixel_count):
         """Let a frame's kernels take no more than so many texels."""
         if self.gpu is None:
-            from filter_service.rendering.native import kernel_plan
+            from filter_service.rendering import image_cells
 
             per_pixel = texel_count / pixel_count
-            monkeypatch.setattr(kernel_plan, "TEXELS_PER_PIXEL", per_pixel)
+            limits = dict.fromkeys(image_cells.TEXELS_PER_PIXEL, (per_pixel,) * 2)
+            monkeypatch.setattr(image_cells, "TEXELS_PER_PIXEL", limits)
         else:
             from filter_service.rendering.gl import kernel_passes
 

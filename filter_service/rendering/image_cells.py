@@ -19,10 +19,16 @@ from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, bracket_axis
 from filter_service.rendering.cell_maps import CellMaps
 
-CELL_DEG = {"quality": 2.0, "dynamic": 6.0}
+CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 """Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
 of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 47.4 dB
 of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""
+
+TEXELS_PER_PIXEL = {"quality": (10.0, 10.0), "dynamic": (1.3, 10.0)}
+"""Of the single kernels of a frame, for each pixel: beyond the first, cells are made
+twice as wide; beyond the second, wider still.  At 1280x720 the first halves the time to
+make the kernels of myopia, astigmatism and cataract, for 1 to 2 dB; cells four times as
+wide would cost cataract 4 dB more."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
@@ -98,7 +104,7 @@ def image_cells(
             corner_v_deg=np.zeros((2, 2)),
         )
     gaze_deg = spec.settings.gaze_deg if gaze_deg is None else gaze_deg
-    cell_px = cell_px or _cell_px(spec)
+    cell_px = cell_px or usual_cell_px(spec)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
     x_px, y_px = np.meshgrid(
@@ -143,6 +149,24 @@ def can_coarsen(image: ImageCells) -> bool:
     return 0 < image.cell_px < MAX_CELL_PX
 
 
+def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
+    """See that the single kernels of a frame are not too many for its cells.
+
+    Raises
+    ------
+    KernelsTooLarge
+        Wider cells would have fewer, see `TEXELS_PER_PIXEL`.
+    """
+    if not can_coarsen(image):
+        return
+    first, last = TEXELS_PER_PIXEL[spec.settings.mode]
+    allowed = first if image.cell_px <= usual_cell_px(spec) else last
+    if n_texels > allowed * spec.camera.width_px * spec.camera.height_px:
+        raise KernelsTooLarge(
+            f"the frame's kernels have {n_texels} texels, more than {allowed:g} a pixel"
+        )
+
+
 def stored_scale(spec: GridSpec, plan: CachePlan) -> NDArray[np.float64]:
     """Scale (n_fields, 2, 2) of the pixels that nodes' kernels are stored in."""
     return spec.node_pixel_from_mrad(*plan.field_nodes_deg)
@@ -156,7 +180,8 @@ def _node_from_cell(
     return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
-def _cell_px(spec: GridSpec) -> int:
+def usual_cell_px(spec: GridSpec) -> int:
+    """Edge of cells where kernels are few or small enough."""
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
     power = math.floor(math.log2(max(CELL_DEG[spec.settings.mode] / pixel_deg, 1.0)))
     return min(max(2**power, MIN_CELL_PX), MAX_CELL_PX)

@@ -1,6 +1,6 @@
 """Is it live?  Streams whose pupil and focus change with every frame, eye by eye.
 
-    python -m tests.benchmarks.bench_live [--quick] [--json]
+    python -m tests.benchmarks.bench_live [--quick] [--json] [--gl]
         [--eyes NAME ...] [--sizes WxH ...] [--threads N ...] [--frames N] [--errors]
 
 The demo's walk through *Courtyard*, colour and depth as a client sends them, 8-bit
@@ -13,13 +13,17 @@ reference: the exact PSF of every pixel, in bins of 0.2 degrees and 0.005 dpt.  
 frames three windows of 256 x 256 are judged (middle, left edge, corner), as a reference
 of the whole takes tens of minutes.  References are kept under out/dense_references;
 without ``--errors`` only what lies there is used.
+
+``--gl`` measures the OpenGL engine in the same run, in few frames, and draws the times
+of the stages of both, results/live.png.
 """
 
 import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,7 +37,9 @@ from tests.benchmarks.dense_reference import (
     dense_reference,
     has_reference,
 )
+from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.harness import (
+    OUT,
     RESULTS,
     Row,
     machine_info,
@@ -42,6 +48,7 @@ from tests.benchmarks.harness import (
     report,
     write_report,
 )
+from tests.benchmarks.live_picture import plot_stages
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
@@ -58,6 +65,9 @@ WHOLE_PIXELS = 640 * 360
 """Largest frame that is judged as a whole."""
 
 WINDOW_PX = 256
+
+GL_FRAMES = 3
+"""Of the walk, for a software OpenGL."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +89,10 @@ class Walk:
             for m in path_moments(PATHS[SCENE], count)
         )
         return cls(size_px, views, states)
+
+    def shortened(self, count: int) -> "Walk":
+        """Only the first frames, for what is slow."""
+        return replace(self, views=self.views[:count], states=self.states[:count])
 
     @property
     def judged(self) -> int:
@@ -189,8 +203,13 @@ class Case:
         )
 
 
-def eye_rows(eye: str, walk: Walk, threads: list[int], *, errors: bool) -> list[Row]:
-    """Rows of one eye and size, one for each number of threads, and its stages."""
+def eye_rows(
+    eye: str, walk: Walk, threads: list[int], *, errors: bool, gl=None
+) -> list[Row]:
+    """Rows of one eye and size, one for each number of threads, and its stages.
+
+    ``gl`` is an OpenGL renderer to measure too.
+    """
     spec = grid_spec(**walk.camera, mode="dynamic", **path_settings(SCENE))
     store = build_psf_store(traced_eye(eye, spec), spec)
     rows: list[Row] = []
@@ -198,22 +217,32 @@ def eye_rows(eye: str, walk: Walk, threads: list[int], *, errors: bool) -> list[
     reference = "dense, over the field, bins of 0.2 deg and 0.005 dpt"
     if judged_windows(walk.size_px) != [None]:
         reference += f", three windows of {WINDOW_PX} x {WINDOW_PX} px"
-    for n_threads in threads:
-        renderer = NativeRenderer(n_threads=n_threads)
+    for name, renderer, of_walk in measured_engines(walk, threads, gl=gl):
         handle = renderer.load(store)
-        if error_db is None:
+        if error_db is None or renderer is gl:
             error_db = frame_error_db(renderer, handle, walk, eye, compute=errors)
-        times_ms, stages_ms = walk_times(renderer, handle, walk)
-        cores = f"{n_threads} core" + "s" * (n_threads > 1)
-        setting = f"{walk.size_px[0]}x{walk.size_px[1]} {cores}"
+        times_ms, stages_ms = walk_times(renderer, handle, of_walk)
+        setting = f"{walk.size_px[0]}x{walk.size_px[1]} {name}"
         case = Case(eye, setting, len(times_ms), error_db, reference)
         rows.append(case.row("frame", times_ms))
         rows += [
-            case.row(f"  {name.removesuffix('_ms')}", [median_ms])
-            for name, median_ms in stages_ms.items()
+            case.row(f"  {stage.removesuffix('_ms')}", [median_ms])
+            for stage, median_ms in stages_ms.items()
         ]
-        renderer.close()
+        if renderer is not gl:
+            renderer.close()
+        else:
+            handle.release()
     return rows
+
+
+def measured_engines(walk: Walk, threads: list[int], *, gl) -> Iterator[tuple]:
+    """Name, renderer and walk of each way to filter."""
+    if gl is not None:
+        yield "GL", gl, walk.shortened(GL_FRAMES)
+    for n_threads in threads:
+        cores = f"{n_threads} core" + "s" * (n_threads > 1)
+        yield cores, NativeRenderer(n_threads=n_threads), walk
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -224,7 +253,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--eyes", nargs="+", default=CONDITIONS, choices=CONDITIONS)
     parser.add_argument("--sizes", nargs="+", type=parse_size, metavar="WxH")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], metavar="N")
-    parser.add_argument("--frames", type=int, default=24, metavar="N")
+    parser.add_argument(
+        "--frames", type=int, metavar="N", help="24, of large frames 12"
+    )
+    parser.add_argument("--gl", action="store_true", help="the OpenGL engine too")
     parser.add_argument(
         "--errors", action="store_true", help="compute references that lack"
     )
@@ -234,11 +266,13 @@ def main(argv: list[str] | None = None) -> None:
     if options.quick:
         sizes, eyes = [(192, 108)], eyes[:1]
     rows: list[Row] = []
+    gl = open_renderer("gl") if options.gl else None
     for size_px in sizes:
-        walk = Walk.of(size_px, options.frames)
+        usual = 24 if size_px[0] * size_px[1] <= WHOLE_PIXELS else 12
+        walk = Walk.of(size_px, options.frames or usual)
         for eye in eyes:
             errors = options.errors or options.quick
-            rows += eye_rows(eye, walk, options.threads, errors=errors)
+            rows += eye_rows(eye, walk, options.threads, errors=errors, gl=gl)
             print(f"{size_px} {eye}", file=sys.stderr, flush=True)
     content = report(rows, machine=machine_info())
     for row in content["rows"]:
@@ -249,6 +283,8 @@ def main(argv: list[str] | None = None) -> None:
     print_rows(rows)
     if not options.quick:
         print(write_report("live", content).relative_to(RESULTS.parents[2]))
+    if gl is not None:
+        plot_stages(rows, (OUT if options.quick else RESULTS) / "live.png")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from filter_service.rendering.image_cells import (
     ImageCells,
     KernelsTooLarge,
     can_coarsen,
+    check_texels,
 )
 
 MAX_GROUPS = 65535
@@ -80,6 +81,8 @@ class KernelMaker:
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
             kernels = frame_kernels(store.tables, layers, image, used)
+            widths, heights = box_sizes(kernels.reach_px)
+            check_texels(int((widths * heights).sum()), image, store.spec)
             table, sizes = kernel_table(kernels)
             n_texels = int(sizes.sum())
         if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):

@@ -13,17 +13,9 @@ from filter_service.rendering.frame_kernels import (
     frame_kernels,
     pair_index,
 )
-from filter_service.rendering.image_cells import (
-    ImageCells,
-    KernelsTooLarge,
-    can_coarsen,
-)
+from filter_service.rendering.image_cells import ImageCells, check_texels
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.native.records import KERNEL_SHAPE
-
-TEXELS_PER_PIXEL = 4
-"""Of the single kernels of a frame, before cells are made larger: beyond that it takes
-longer to make kernels than to use them."""
 
 MIN_SPREAD_PX = 1e-9
 
@@ -76,10 +68,7 @@ def plan_kernels(
     """
     kernels = frame_kernels(handle.tables, layers, image, used)
     widths, heights = box_sizes(kernels.reach_px)
-    camera = handle.store.spec.camera
-    limit = TEXELS_PER_PIXEL * camera.width_px * camera.height_px
-    if int((widths * heights).sum()) > limit and can_coarsen(image):
-        raise KernelsTooLarge
+    check_texels(int((widths * heights).sum()), image, handle.store.spec)
     nodes = kernels.nodes
     sources = (kernels.cells, kernels.parts, nodes.near, nodes.far)
     return KernelPlan(
