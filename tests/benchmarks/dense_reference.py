@@ -26,6 +26,7 @@ Csoba & Kunkli 2023, section 7.2: bins of 0.2 degrees and 0.005 dpt
 """
 
 import hashlib
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -485,5 +486,22 @@ def _key(view: RgbdView, state: EyeState, bins: bool, accumulation: str) -> str:
         v_low + (v_high - v_low) * np.array([0.6, 0.0, 1.0]),
         np.array([0.0, 1.0, 0.3]),
     )
-    digest.update(probe.flat_kernels.tobytes())
+    digest.update(repr(_sizes_px(probe)).encode())
     return digest.hexdigest()[:24]
+
+
+def _sizes_px(psfs: PsfBatch) -> list[tuple[float, ...]]:
+    """Radius and standard deviations of PSFs, so rounded that noise does not show.
+
+    An eye that is estimated by many threads is not the same to the last bit.
+    """
+    sizes = []
+    for psf in psfs:
+        weight = psf.kernel / psf.kernel.sum()
+        along = np.arange(-psf.radius_px, psf.radius_px + 1.0)
+        sigma_px = [
+            math.sqrt(max(float(line @ along**2 - (line @ along) ** 2), 0.0))
+            for line in (weight.sum(axis=0), weight.sum(axis=1))
+        ]
+        sizes.append((psf.radius_px, *(round(sigma, 4) for sigma in sigma_px)))
+    return sizes

@@ -5,7 +5,13 @@ import pytest
 from scipy.signal import fftconvolve
 
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.dense_reference import EyeState, dense_reference, view_sources
+from tests.benchmarks import dense_reference as dense_module
+from tests.benchmarks.dense_reference import (
+    EyeState,
+    Window,
+    dense_reference,
+    view_sources,
+)
 from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
 from tests.benchmarks.paper_baselines import (
@@ -208,6 +214,24 @@ def test_bins_cost_little(rng):
         dense_reference(view, state, bins=bins, kept=False) for bins in (False, True)
     )
     assert 55.0 <= psnr_db(in_bins, exact) <= 120.0
+
+
+def test_a_window_is_that_part_of_the_whole(rng, monkeypatch):
+    state = off_axis()
+    color = texture(rng, HEIGHT, WIDTH)
+    view = radial_view(state, color, np.linspace(0.4, 1.4, WIDTH)[None])
+    places = view_sources(view, state.spec)
+    reach_px = state.exact_psfs(
+        places.h_deg[::7], places.v_deg[::7], places.distance_dpt[::7]
+    ).radius_px.max()
+    window = Window(x=WIDTH // 2, y=5, width_px=9, height_px=7)
+    whole = dense_reference(view, state, bins=True, kept=False)
+    monkeypatch.setattr(dense_module, "WINDOW_REACH_PX", int(reach_px) + 1)
+    part = dense_reference(view, state, bins=True, kept=False, window=window)
+    np.testing.assert_allclose(part, window.of(whole), rtol=1e-12)
+    monkeypatch.setattr(dense_module, "WINDOW_REACH_PX", int(reach_px) // 2)
+    with pytest.raises(ValueError, match="windows take in"):
+        dense_reference(view, state, bins=True, kept=False, window=window)
 
 
 def convolved(color, kernels):
