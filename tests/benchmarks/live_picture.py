@@ -11,7 +11,7 @@ STAGES = {  # of the picture: those of the engines
     "fragments": ("prepare", "fragments"),
     "merging": ("merge",),
     "lists and order": ("bin", "sort"),
-    "splat": ("splat", "encode", "readback"),
+    "splat (native: and lists)": ("splat", "encode", "readback"),
 }
 AFTER = "2 cores"
 BEFORE = "GL"

@@ -1,16 +1,18 @@
 """Random small frames through the compiled loops, against the float64 twin."""
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
+from filter_service.rendering.native import frame_record
 from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rgbd_view import RgbdView
 from tests.conftest import Engine
-from tests.numerical.one_kernel import OneKernelBench
-from tests.numerical.synthetic import psnr_db
+from tests.numerical.one_kernel import OneKernelBench, disc
+from tests.numerical.synthetic import psnr_db, texture
 
 STATE = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": 0.0}
 
@@ -107,3 +109,25 @@ def test_threads_and_processors_give_the_same_picture(case):
     assert bench.renderer.name == name_before  # the one does not change the other
     again = bench.renderer.render(view, bench.handle, **STATE).color
     assert again.tobytes() == usual.tobytes()
+
+
+@pytest.mark.parametrize("radius_px", [30, 60])
+def test_coarse_pixels_cost_little(rng, monkeypatch, radius_px):
+    """Squares of 8 under kernels that wide light pixels of 2 px (30) or 4 px (60)."""
+    width_px, height_px = 3 * radius_px, 2 * radius_px + 21
+    bench = OneKernelBench(
+        Engine("native"),
+        disc(radius_px),
+        width_px=width_px,
+        height_px=height_px,
+        spread_px=float(radius_px),
+    )
+    image = texture(rng, height_px, width_px, cell_px=16)
+    coarse = bench.render(image).color
+    never = (0.0, np.inf, np.inf)
+    monkeypatch.setattr(frame_record, "COARSE_SPREAD_PX", never)
+    bench.renderer = Engine("native").new_renderer()  # which keeps no kernels
+    fine = bench.render(image).color
+    assert 55.0 <= psnr_db(coarse, fine) <= 90.0
+    truth = bench.plane_truth(image)
+    assert psnr_db(coarse, truth) >= psnr_db(fine, truth) - 2.5
