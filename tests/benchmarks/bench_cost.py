@@ -32,7 +32,7 @@ from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
-from tests.benchmarks.dense_reference import EyeState, dense_reference, linear_color
+from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.engines import counted_work, open_renderer, working_memory_mb
 from tests.benchmarks.field_pictures import plot_costs
 from tests.benchmarks.frame_runs import timed_frames
@@ -44,6 +44,7 @@ from tests.benchmarks.harness import (
     write_report,
 )
 from tests.benchmarks.image_measures import channel_psnr_db
+from tests.benchmarks.view_sources import EyeState, linear_color
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_view

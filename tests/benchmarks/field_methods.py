@@ -10,7 +10,6 @@ from filter_service.psfs.build_store import build_psf_store
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.engines import counted_work
 from tests.benchmarks.frame_runs import WARM_UPS, timed_frames
 from tests.benchmarks.layered_baselines import barsky, celaya, gonzalez
@@ -21,6 +20,7 @@ from tests.benchmarks.paper_baselines import (
     predecessor,
 )
 from tests.benchmarks.published_figures import OFF_AXIS, ON_AXIS
+from tests.benchmarks.view_sources import EyeState
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 

@@ -23,11 +23,7 @@ from filter_service.constants import MIN_COVERAGE
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
-from tests.benchmarks.dense_reference import (
-    EyeState,
-    linear_color,
-    view_sources,
-)
+from tests.benchmarks.view_sources import EyeState, linear_color, view_sources
 
 BARSKY_SLICE_COUNT = 41
 SURFACE_STEP_DPT = 0.1

@@ -8,12 +8,8 @@ from numpy.typing import NDArray
 
 from clients.pyrender_stream import path_settings
 from clients.scenes.paths import PATHS, path_moments
-from tests.benchmarks.dense_reference import (
-    EyeState,
-    Window,
-    dense_reference,
-    has_reference,
-)
+from tests.benchmarks.dense_reference import dense_reference, has_reference
+from tests.benchmarks.view_sources import EyeState, Window
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_views

@@ -8,8 +8,8 @@ from scipy.ndimage import distance_transform_edt
 
 from filter_service.rendering.frame import object_dpt
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.dense_reference import linear_color
 from tests.benchmarks.lens_reference import NOTHING, STEP_PX, Lens, lens_picture
+from tests.benchmarks.view_sources import linear_color
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import tangents, texture
 

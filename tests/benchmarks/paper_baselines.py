@@ -17,16 +17,12 @@ from numpy.typing import NDArray
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
-from tests.benchmarks.dense_reference import (
+from tests.benchmarks.dense_reference import depth_step_dpt
+from tests.benchmarks.depth_sums import (
     BAND_ROWS,
-    EyeState,
-    Sources,
     add_to_depth,
     close_depths,
-    depth_step_dpt,
-    linear_color,
     normalised,
-    view_sources,
 )
 from tests.benchmarks.paper_layout import (
     BYTES_PER_TEXEL,
@@ -38,6 +34,7 @@ from tests.benchmarks.paper_layout import (
     kept_texture,
 )
 from tests.benchmarks.resized_psfs import full_radius_px, resized
+from tests.benchmarks.view_sources import EyeState, Sources, linear_color, view_sources
 
 RULES = ("coverage", "clamp", "paper")
 """How sources add up: those of one depth share what nearer ones leave free; each takes

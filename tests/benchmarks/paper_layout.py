@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.resized_psfs import (
     ResizedPsfs,
     cut_psfs,
@@ -20,6 +19,7 @@ from tests.benchmarks.resized_psfs import (
     resized,
     squares_below,
 )
+from tests.benchmarks.view_sources import EyeState
 
 BYTES_PER_TEXEL = 4
 """R11F_G11F_B10F, the released code's format; here weights are 32-bit floats."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.peer_problem import NotInstalled, Problem
+from tests.benchmarks.view_sources import EyeState
 
 SCRIPT = Path(__file__).with_name("peer_blender_script.py")
 PROBE_SIZES = (4.0, 12.0)

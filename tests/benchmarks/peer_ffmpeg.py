@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.peer_problem import NotInstalled, Problem
+from tests.benchmarks.view_sources import EyeState
 
 FRAMES = 8
 """Frames of one process: its start is shared among them, as in a stream."""

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from filter_service.constants import MIN_COVERAGE
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.layered_baselines import _bounds, _widened
 from tests.benchmarks.peer_problem import KeptForState, NotInstalled, Problem
+from tests.benchmarks.view_sources import EyeState
 
 N_WORKERS = 2
 EDGE_SAMPLES = 8

@@ -16,7 +16,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.dense_reference import EyeState, linear_color, view_sources
+from tests.benchmarks.view_sources import EyeState, linear_color, view_sources
 from tests.grid_specs import grid_spec
 
 LAYER_COUNT = 41

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
-from tests.benchmarks.dense_reference import EyeState
 from tests.benchmarks.peer_problem import KeptForState, Problem
+from tests.benchmarks.view_sources import EyeState
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
-from tests.benchmarks.dense_reference import EyeState
+from tests.benchmarks.view_sources import EyeState
 
 KEPT_ENERGY_RATIO = 0.99
 SAMPLES_PER_PX = 3

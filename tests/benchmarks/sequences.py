@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from filter_service.planning.grid import GridSpec
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.dense_reference import EyeState, dense_reference
+from tests.benchmarks.dense_reference import dense_reference
+from tests.benchmarks.view_sources import EyeState
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_views

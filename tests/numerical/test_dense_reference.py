@@ -6,12 +6,7 @@ from scipy.signal import fftconvolve
 
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks import dense_reference as dense_module
-from tests.benchmarks.dense_reference import (
-    EyeState,
-    Window,
-    dense_reference,
-    view_sources,
-)
+from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
 from tests.benchmarks.paper_baselines import (
@@ -29,6 +24,7 @@ from tests.benchmarks.paper_layout import (
     interval_count,
     paper_texture,
 )
+from tests.benchmarks.view_sources import EyeState, Window, view_sources
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.synthetic import psnr_db, tangents, texture

@@ -130,4 +130,5 @@ def test_coarse_pixels_cost_little(rng, monkeypatch, radius_px):
     fine = bench.render(image).color
     assert 55.0 <= psnr_db(coarse, fine) <= 90.0
     truth = bench.plane_truth(image)
+    # a disc's rim is the worst there is: 1.9 dB at 60 px, below 1.5 at 30
     assert psnr_db(coarse, truth) >= psnr_db(fine, truth) - 2.5
