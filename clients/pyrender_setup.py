@@ -31,25 +31,22 @@ def release_context(renderer: "pyrender.OffscreenRenderer") -> None:
     pyrender's own hook for this does nothing, and X11 refuses a GLX context while an
     EGL one is current.  The next render takes the context back by itself.
     """
-    _release(_display(renderer))
-
-
-def delete_renderer(renderer: "pyrender.OffscreenRenderer") -> None:
-    """Free an off-screen renderer; afterwards no context is current."""
-    display = _display(renderer)
-    renderer.delete()
-    # pyrender destroys its context while it is current: it lives on until released.
-    _release(display)
-
-
-def _display(renderer: "pyrender.OffscreenRenderer"):
-    return getattr(renderer._platform, "_egl_display", None)
-
-
-def _release(display) -> None:
     from OpenGL import EGL
 
+    display = getattr(renderer._platform, "_egl_display", None)
     if display is not None:
         EGL.eglMakeCurrent(
             display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT
         )
+
+
+def delete_renderer(renderer: "pyrender.OffscreenRenderer") -> None:
+    """Free an off-screen renderer; afterwards no context is current."""
+    platform = renderer._platform
+    platform.make_current()
+    renderer._renderer.delete()
+    # Before the display ends, not after as pyrender has it: NVIDIA's EGL then no longer
+    # knows the display, and Mesa's keeps the context alive.
+    release_context(renderer)
+    platform.delete_context()
+    renderer._renderer = renderer._platform = None

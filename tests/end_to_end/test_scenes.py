@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from clients.hidden_surface import LEAST_GAP_DPT
+from clients.pyrender_setup import delete_renderer, pyrender
 from clients.scene_renderer import (
     SceneRenderer,
     _hidden_pixels,
@@ -19,6 +20,25 @@ from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
 
 UNITS_PER_M = 180.0
+
+
+def test_a_renderer_lets_go_of_its_context_before_its_display_ends(monkeypatch):
+    # NVIDIA's EGL refuses it afterwards
+    from OpenGL import EGL
+
+    released = []
+    make_current = EGL.eglMakeCurrent
+
+    def noted(display, draw, read, context):
+        if not context:
+            released.append(EGL.eglQueryString(display, EGL.EGL_VENDOR))
+        return make_current(display, draw, read, context)
+
+    monkeypatch.setattr(EGL, "eglMakeCurrent", noted)
+    delete_renderer(pyrender.OffscreenRenderer(8, 8))
+    assert len(released) == 1
+    assert released[0]
+    assert not EGL.eglGetCurrentContext()
 
 
 @pytest.fixture(scope="module")
