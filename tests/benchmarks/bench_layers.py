@@ -1,6 +1,6 @@
 """Layers, memory and times of the PSF cache, by eye: the paper's Tables 6 and 9.
 
-Usage: python -m tests.benchmarks.bench_layers [--quick] [--json]
+Usage: python -m tests.benchmarks.bench_layers [--quick] [--json] [--engine NAME]
 
 One row for building the cache of an eye (of one pupil on axis as in Table 6; of pupils
 from 2 to 6 mm and foci from 0 to 4 dpt over the field as in Table 9) and one for making
@@ -16,10 +16,9 @@ import time
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.build_store import build_psf_store
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.harness import (
     Row,
     machine_info,
@@ -115,9 +114,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one eye")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     arguments = parser.parse_args()
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
+    renderer = open_renderer(arguments.engine)
     view = scene_view("courtyard", width_px=1280, height_px=720)
     eyes = ["emmetropia"] if arguments.quick else list(PAPER)
     rows = [
@@ -126,9 +125,7 @@ def main() -> None:
         for mode in GRIDS
         for row in rows_of(renderer, view, name, mode)
     ]
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
     if arguments.json:
         print(json.dumps(content))
         return

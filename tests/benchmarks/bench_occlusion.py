@@ -1,6 +1,6 @@
 """Occlusion: one layer and two, against what a lens sees of the same scene.
 
-Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json]
+Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json] [--engine NAME]
 
 Error: PSNR in linear light against rays through a thin lens (lens_reference), over the
 whole picture, and over the band that light from both sides of an edge reaches.  The eye
@@ -16,9 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.harness import (
     Row,
     machine_info,
@@ -45,7 +44,7 @@ METHODS = {
 }
 
 
-def scene_rows(renderer, gpu, scene: Scene, repeats: int, ray_count: int) -> list[Row]:
+def scene_rows(renderer, scene: Scene, repeats: int, ray_count: int) -> list[Row]:
     """Two rows of each method: the whole picture, and the band around edges."""
     view = scene.view
     setting = f"{view.width_px}x{view.height_px} {scene.pupil_diameter_mm:g} mm"
@@ -93,7 +92,7 @@ def scene_rows(renderer, gpu, scene: Scene, repeats: int, ray_count: int) -> lis
 
         times_ms = time_calls(filtered, repeats=repeats)
         color = results[-1].color.astype(np.float64)
-        found += rows(method, repeats, *times_ms, gpu.memory_mb, color)
+        found += rows(method, repeats, *times_ms, working_memory_mb(renderer), color)
     handle.release()
     return found
 
@@ -118,9 +117,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small synthetic scenes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     arguments = parser.parse_args()
-    gpu = Gpu()
-    renderer = FilterRenderer(gpu)
+    renderer = open_renderer(arguments.engine)
     if arguments.quick:
         scenes = synthetic_scenes(width_px=160, height_px=90)[:4]
     else:
@@ -134,11 +133,9 @@ def main() -> None:
     rows = [
         row
         for scene in scenes
-        for row in scene_rows(renderer, gpu, scene, repeats, ray_count)
+        for row in scene_rows(renderer, scene, repeats, ray_count)
     ]
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+    content = report(rows, machine={**machine_info(), "renderer": renderer.name})
     if arguments.json:
         print(json.dumps(content))
         return

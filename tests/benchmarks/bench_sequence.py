@@ -1,7 +1,7 @@
 """Popping and flicker: how the error changes over paths of 120 frames.
 
     python -m tests.benchmarks.bench_sequence [--quick] [--json] [--plot]
-        [--motions NAME ...] [--modes NAME ...]
+        [--motions NAME ...] [--modes NAME ...] [--engine NAME]
 
 The camera moves, the pupil opens from 2.5 to 6.5 mm, focus goes from 0 to 4 dpt, the
 gaze turns, or nothing moves at all.  A frame's error is its difference to the dense
@@ -19,14 +19,14 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import ENGINES, renderer_maker, working_memory_mb
 from tests.benchmarks.harness import (
     OUT,
     RESULTS,
@@ -128,21 +128,22 @@ class SequenceRow(Row):
 class SequenceBench:
     """Renders paths through one eye in all variants."""
 
-    def __init__(self, gpu: Gpu, mode: str, eye: str):
-        self.gpu, self.mode, self.eye = gpu, mode, eye
+    def __init__(self, new_renderer: Callable, mode: str, eye: str):
+        self.new_renderer, self.mode, self.eye = new_renderer, mode, eye
+        self.renderer = new_renderer()
         self._stores = {}
 
     def frames(self, moments: tuple[Moment, ...], variant: Variant, gaze: bool) -> list:
         """Frames of a path with their times, ms."""
         handle = self._store(moments, variant, gaze)
-        renderer = FilterRenderer(self.gpu)
+        self.renderer = self.new_renderer()
         frames = []
         for moment in moments:
             if variant.is_fresh:
-                renderer = FilterRenderer(self.gpu)
+                self.renderer = self.new_renderer()
             options = {"gaze_deg": moment.gaze_deg} if gaze else {}
             start_s = time.perf_counter()
-            frame = renderer.render(
+            frame = self.renderer.render(
                 moment.view,
                 handle,
                 pupil_diameter_mm=moment.pupil_mm,
@@ -168,7 +169,7 @@ class SequenceBench:
         if key not in self._stores:
             spec = eye_spec(moments[0].view, mode, **settings)
             store = build_psf_store(traced_eye(self.eye, spec), spec)
-            self._stores[key] = FilterRenderer(self.gpu).load(store)
+            self._stores[key] = self.renderer.load(store)
         return self._stores[key]
 
     def release(self) -> None:
@@ -250,7 +251,7 @@ def _row(bench, motion, part, name, found: Flicker, times_ms) -> SequenceRow:
         n=len(times_ms),
         median_ms=float(np.median(times_ms)),
         p95_ms=float(np.percentile(times_ms, 95)),
-        memory_mb=bench.gpu.memory_mb,
+        memory_mb=working_memory_mb(bench.renderer),
         error_name="flicker_db",
         error=found.flicker_db,
         reference=f"dense, {place}",
@@ -297,8 +298,9 @@ def main() -> None:
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS)
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument("--methods", nargs="+", choices=VARIANTS)
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     arguments = parser.parse_args()
-    gpu = Gpu()
+    new_renderer = renderer_maker(arguments.engine)
     part = QUICK_FRAMES if arguments.quick else (0, FRAME_COUNT)
     rows, notes, benches = [], [], {}
     for mode in arguments.modes:
@@ -307,12 +309,10 @@ def main() -> None:
                 continue
             eyes = FOCUSING_EYES if motion == "focus" else EYES
             bench = benches.setdefault(
-                (mode, eyes[mode]), SequenceBench(gpu, mode, eyes[mode])
+                (mode, eyes[mode]), SequenceBench(new_renderer, mode, eyes[mode])
             )
             rows += bench_motion(bench, motion, part, arguments.methods)
-    content = report(
-        rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
-    )
+    content = report(rows, machine={**machine_info(), "renderer": new_renderer().name})
     content["notes"] = notes
     if arguments.json:
         print(json.dumps(content))

@@ -1,5 +1,8 @@
 """The frame engines that benchmarks measure, opened by name; all else takes any."""
 
+from collections.abc import Callable
+from functools import partial
+
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
@@ -18,10 +21,21 @@ def open_renderer(name: str = "native"):
     ValueError
         A name that is not among `ENGINES`.
     """
+    return renderer_maker(name)()
+
+
+def renderer_maker(name: str = "native") -> Callable:
+    """Return what makes renderers of an engine; those of OpenGL share a context.
+
+    Raises
+    ------
+    ValueError
+        A name that is not among `ENGINES`.
+    """
     if name == "native":
-        return NativeRenderer()
+        return NativeRenderer
     if name == "gl":
-        return FilterRenderer(Gpu())
+        return partial(FilterRenderer, Gpu())
     raise ValueError(f"engine '{name}': there are {', '.join(ENGINES)}")
 
 

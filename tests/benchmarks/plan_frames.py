@@ -9,10 +9,9 @@ import time
 
 import numpy as np
 
-from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.build_store import build_psf_store
-from filter_service.rendering.gl.renderer import FilterRenderer
+from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.harness import Row
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
@@ -33,7 +32,7 @@ class _Frames:
 
     def __init__(self):
         self.view = scene_view("courtyard", width_px=480, height_px=270)
-        self.renderer = FilterRenderer(Gpu())
+        self.renderer = open_renderer()
 
     def filtered(self, eye, spec, plan, state):
         """Linear image; time in ms and MB of its cache."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.bench_sequence import (
     EYES,
     FOCUSING_EYES,
@@ -64,12 +65,12 @@ def test_windows_see_what_the_whole_frame_sees():
 
 
 @pytest.fixture
-def sequence_bench(gpu):
+def sequence_bench():
     made = []
 
     def make(mode, motion):
         eyes = FOCUSING_EYES if motion == "focus" else EYES
-        made.append(SequenceBench(gpu, mode, eyes[mode]))
+        made.append(SequenceBench(NativeRenderer, mode, eyes[mode]))
         return made[-1]
 
     yield make
