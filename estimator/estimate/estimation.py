@@ -132,13 +132,25 @@ class EstimatedEye:
         """Return the largest accommodation, by age, addition and lens."""
         return self.accommodating.amplitude_dpt
 
-    def focused(self, focus_dpt: float = 0.0) -> FocusedEye:
-        """Return the eye focused as near to ``focus_dpt`` as it can."""
-        return self.accommodating.focused(focus_dpt)
+    def focused(
+        self, focus_dpt: float = 0.0, *, pupil_diameter_mm: float | None = None
+    ) -> FocusedEye:
+        """Return the eye focused as near to ``focus_dpt`` as it can.
 
-    def surfaces(self, focus_dpt: float = 0.0):
-        """Return the surfaces of the eye focused as near to ``focus_dpt`` as it can."""
-        return self.focused(focus_dpt).surfaces
+        Parameters
+        ----------
+        pupil_diameter_mm : float, optional
+            Through which that distance is sharpest; the measured pupil if not given.
+        """
+        return self.accommodating.focused(
+            focus_dpt, pupil_diameter_mm=pupil_diameter_mm
+        )
+
+    def surfaces(
+        self, focus_dpt: float = 0.0, *, pupil_diameter_mm: float | None = None
+    ):
+        """Return the surfaces of `focused`."""
+        return self.focused(focus_dpt, pupil_diameter_mm=pupil_diameter_mm).surfaces
 
 
 def accommodating_eye(

@@ -7,6 +7,7 @@ assembly        from parameters to surfaces, one eye or many
 explicit        an eye given surface by surface
 tracing         coefficients and refractions of many eyes
 focusing        far point, near point, and what is said where they end
+focus_table     refraction over pupil and accommodation, and back
 accommodation   the lens that focuses an eye at a distance
 """
 

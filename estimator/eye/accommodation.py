@@ -9,12 +9,14 @@ its ray-traced least-squares refraction M, from C(2,0) at the given pupil and 55
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
 from estimator.eye.assembly import eye_surfaces
+from estimator.eye.focus_table import FocusTable, table_pupils_mm
 from estimator.eye.focusing import Focusing
 from estimator.eye.lens_shape import (
     ANTERIOR_THICKNESS_RATIO,
@@ -36,6 +38,9 @@ SMALLEST_AQUEOUS_MM = 1.0
 
 N_TABLE = 10
 """Lens diameters at which the refraction is traced before the root is refined."""
+
+N_FOCUS = 6
+"""Of those that are traced at other pupils as well."""
 
 REFRACTION_TOLERANCE_DPT = 1e-6
 MAX_REFINEMENTS = 6
@@ -117,19 +122,22 @@ class FocusedEye:
 
 
 class AccommodatingEye(Focusing):
-    """An eye that can be asked to focus.
+    """An eye that can be asked to focus, at any pupil.
+
+    *Accommodation* names states of the lens: by how much they change the refraction at
+    ``pupil_diameter_mm``.  Through another pupil the change is another.
 
     Attributes
     ----------
     refraction_dpt : float
         M of the relaxed eye at 555 nm and ``pupil_diameter_mm``, as seen through the
-        worn correction: its far point is at -M.
+        worn correction.
     bare_refraction_dpt : float
         The same without the correction.
     lens_range_dpt : float
         Accommodation that the lens model itself can reach.
     amplitude_dpt : float
-        The smaller of that and the amplitude given (by age).
+        The smaller of that and the amplitude given (by age), at that pupil.
     """
 
     def __init__(
@@ -146,13 +154,78 @@ class AccommodatingEye(Focusing):
         self.pupil_diameter_mm = pupil_diameter_mm
         self._vector = parameters.to_vector()
         diameters_mm, refractions_dpt = self._refraction_table()
-        correction_dpt = rx.power_vector(correction)[0] if correction else 0.0
+        self._correction_dpt = rx.power_vector(correction)[0] if correction else 0.0
         self.bare_refraction_dpt = float(refractions_dpt[0])
-        self.refraction_dpt = self.bare_refraction_dpt - correction_dpt
+        self.refraction_dpt = self.bare_refraction_dpt - self._correction_dpt
         self._diameters_mm = diameters_mm
         self._accommodations_dpt = self.bare_refraction_dpt - refractions_dpt
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
+        self._age_amplitude_dpt = amplitude_dpt
         self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
+
+    @cached_property
+    def _focus_table(self) -> FocusTable:
+        """Refraction without correction over pupil and accommodation.
+
+        Pupils that light does not fill in every state of the lens are left out.
+        """
+        pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
+        some = np.unique(
+            np.linspace(0, self._diameters_mm.size - 1, N_FOCUS).astype(int)
+        )
+        states = accommodated_vectors(
+            self._vector, lens_diameter_mm=self._diameters_mm[some]
+        )
+        found_dpt = refraction_of_vectors(
+            np.tile(states, (pupils_mm.size, 1)),
+            retina=self.retina,
+            pupil_diameter_mm=np.repeat(pupils_mm, len(states)),
+            wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        ).reshape(pupils_mm.size, len(states))
+        usable = np.isfinite(found_dpt).all(axis=1)
+        return FocusTable(
+            pupils_mm[usable], self._accommodations_dpt[some], found_dpt[usable]
+        )
+
+    def accommodation_dpt(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> float:
+        """Accommodation at which a distance is sharpest; through its own pupil."""
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> float:
+        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        if pupil_diameter_mm == self.pupil_diameter_mm:
+            return self.refraction_dpt - accommodation_dpt
+        bare_dpt = self._focus_table.refraction_dpt(
+            pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
+        )
+        return bare_dpt - self._correction_dpt
+
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
+        if pupil_diameter_mm == self.pupil_diameter_mm:
+            wanted_dpt = self.refraction_dpt - refraction_dpt
+            return min(max(wanted_dpt, 0.0), self.amplitude_dpt)
+        relaxed_dpt = self.refraction_at_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
+        )
+        least_dpt = relaxed_dpt - self._age_amplitude_dpt
+        return self._focus_table.accommodation_dpt(
+            pupil_mm=pupil_diameter_mm,
+            refraction_dpt=max(refraction_dpt, least_dpt) + self._correction_dpt,
+        )
+
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Accommodation at which the nearest distance is seen through a pupil."""
+        return self.accommodation_for_dpt(
+            -math.inf, pupil_diameter_mm=pupil_diameter_mm
+        )
 
     def _refraction_table(self):
         """Lens diameters, falling, and the refraction at each, as far as it falls."""
@@ -212,12 +285,21 @@ class AccommodatingEye(Focusing):
         )
         return (vectors - self._vector)[:, [DIAMETER, AQUEOUS]]
 
-    def focused(self, focus_dpt: float) -> FocusedEye:
-        """Eye focused as near to ``focus_dpt`` as it can."""
-        return self.focused_at([focus_dpt])[0]
+    def focused(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> FocusedEye:
+        """Eye focused as near to ``focus_dpt`` as it can, see `focused_at`."""
+        return self.focused_at([focus_dpt], pupil_diameter_mm=pupil_diameter_mm)[0]
 
-    def focused_at(self, focuses_dpt: ArrayLike) -> list[FocusedEye]:
+    def focused_at(
+        self, focuses_dpt: ArrayLike, *, pupil_diameter_mm: float | None = None
+    ) -> list[FocusedEye]:
         """Focus at many distances in one batch of traces.
+
+        Parameters
+        ----------
+        pupil_diameter_mm : float, optional
+            Through which they are sharpest; the eye's own where it is None.
 
         Raises
         ------
@@ -227,20 +309,41 @@ class AccommodatingEye(Focusing):
         focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
         if not np.all(np.isfinite(focuses_dpt)):
             raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
-        used_dpt = np.array([self.accommodation_dpt(f) for f in focuses_dpt.tolist()])
-        diameters_mm = self.lens_diameters_mm(used_dpt)
-        return self.with_diameters(focuses_dpt, used_dpt, diameters_mm)
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        used_dpt = [
+            self.accommodation_dpt(f, pupil_diameter_mm=pupil_mm)
+            for f in focuses_dpt.tolist()
+        ]
+        return [
+            replace(
+                state,
+                focus_dpt=-self.refraction_at_dpt(
+                    pupil_diameter_mm=pupil_mm,
+                    accommodation_dpt=state.accommodation_dpt,
+                ),
+                notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
+            )
+            for focus_dpt, state in zip(
+                focuses_dpt.tolist(), self.states_at(used_dpt), strict=True
+            )
+        ]
+
+    def states_at(self, accommodations_dpt: ArrayLike) -> list[FocusedEye]:
+        """States (P,) at accommodations within the amplitude, in one batch of traces.
+
+        Their ``focus_dpt`` is that of the eye's own pupil.
+        """
+        diameters_mm = self.lens_diameters_mm(accommodations_dpt)
+        return self.with_diameters(accommodations_dpt, diameters_mm)
 
     def with_diameters(
-        self, focuses_dpt: ArrayLike, used_dpt: ArrayLike, diameters_mm: ArrayLike
+        self, accommodations_dpt: ArrayLike, diameters_mm: ArrayLike
     ) -> list[FocusedEye]:
-        """States (P,) with the lens diameters that a focus and accommodation need."""
-        states = zip(*map(np.ravel, (focuses_dpt, used_dpt, diameters_mm)), strict=True)
+        """States (P,) whose lens diameters are known."""
+        states = zip(*map(np.ravel, (accommodations_dpt, diameters_mm)), strict=True)
         return [self._state(*map(float, state)) for state in states]
 
-    def _state(
-        self, focus_dpt: float, accommodation_dpt: float, diameter_mm: float
-    ) -> FocusedEye:
+    def _state(self, accommodation_dpt: float, diameter_mm: float) -> FocusedEye:
         relaxed = self.parameters
         eye = accommodated(relaxed, lens_diameter_mm=diameter_mm)
         return FocusedEye(
@@ -252,5 +355,5 @@ class AccommodatingEye(Focusing):
             aqueous_thickness_change_mm=(
                 eye.aqueous_thickness_mm - relaxed.aqueous_thickness_mm
             ),
-            notes=self.focus_notes(focus_dpt),
+            notes=(),
         )

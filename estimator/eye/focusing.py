@@ -1,17 +1,29 @@
-"""What any eye answers about focus and pupil: its reach, and what it cannot meet."""
+"""What any eye answers about focus and pupil: its reach, and what it cannot meet.
+
+Focus is a matter of the pupil too: spherical aberration moves the sharpest distance as
+the pupil opens, so every question names the pupil that it is asked at.
+"""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
 
 OUT_OF_REACH_DPT = 1e-6
 """A request farther than this from what the eye can do is said to be out of reach."""
 
+RANGE_PUPIL_COUNT = 5
+"""Pupils of a range at which the accommodation for a focus is looked at: it changes
+slowly and smoothly with the pupil."""
 
-class Focusing:
+
+class Focusing(ABC):
     """Accommodation of an eye, whatever its wavefronts come from.
 
     Attributes
     ----------
     refraction_dpt : float
-        Least-squares M at 555 nm of the relaxed eye, through the worn correction: its
-        far point is at -M.
+        Least-squares M at 555 nm of the relaxed eye at the measured pupil, through the
+        worn correction.
     amplitude_dpt : float
         Largest accommodation.
     """
@@ -19,25 +31,75 @@ class Focusing:
     refraction_dpt: float
     amplitude_dpt: float
 
-    def accommodation_dpt(self, focus_dpt: float) -> float:
-        """Accommodation a = clamp(f + M(555 nm), 0, amplitude) for a focus distance."""
-        return min(max(focus_dpt + self.refraction_dpt, 0.0), self.amplitude_dpt)
+    @abstractmethod
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> float:
+        """Least-squares M at 555 nm through a pupil, at an accommodation."""
 
-    def reachable_focus_dpt(self, focus_dpt: float) -> float:
-        """Distance, dpt, that the eye is really focused at when asked for this one."""
-        return self.accommodation_dpt(focus_dpt) - self.refraction_dpt
+    @abstractmethod
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
 
-    def focus_notes(self, focus_dpt: float) -> tuple[str, ...]:
+    @abstractmethod
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Accommodation at which the nearest distance is seen through a pupil."""
+
+    def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
+        """Accommodation at which a distance is sharpest through a pupil, in reach."""
+        return self.accommodation_for_dpt(
+            -focus_dpt, pupil_diameter_mm=pupil_diameter_mm
+        )
+
+    def reachable_focus_dpt(
+        self, focus_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Distance, dpt, that is really sharpest when this one is asked for."""
+        used_dpt = self.accommodation_dpt(
+            focus_dpt, pupil_diameter_mm=pupil_diameter_mm
+        )
+        return -self.refraction_at_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
+        )
+
+    def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
+        """Far point and near point through a pupil, dpt."""
+        far_dpt, near_dpt = (
+            -self.refraction_at_dpt(
+                pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
+            )
+            for used_dpt in (0.0, self.largest_accommodation_dpt(pupil_diameter_mm))
+        )
+        return far_dpt, near_dpt
+
+    def accommodation_range_dpt(
+        self,
+        focus_range_dpt: tuple[float, float],
+        *,
+        pupil_range_mm: tuple[float, float],
+    ) -> tuple[float, float]:
+        """Smallest and largest accommodation for ranges of focus and pupil."""
+        used_dpt = [
+            self.accommodation_dpt(focus_dpt, pupil_diameter_mm=float(pupil_mm))
+            for pupil_mm in np.linspace(*pupil_range_mm, RANGE_PUPIL_COUNT)
+            for focus_dpt in focus_range_dpt
+        ]
+        return min(used_dpt), max(used_dpt)
+
+    def focus_notes(
+        self, focus_dpt: float, *, pupil_diameter_mm: float
+    ) -> tuple[str, ...]:
         """Say in words what of a focus distance this eye cannot meet."""
-        asked_dpt = focus_dpt + self.refraction_dpt
-        if asked_dpt < -OUT_OF_REACH_DPT:
+        far_dpt, near_dpt = self.focus_limits_dpt(pupil_diameter_mm)
+        if focus_dpt < far_dpt - OUT_OF_REACH_DPT:
             return (
                 f"focus {focus_dpt:g} dpt is beyond the far point "
-                f"({-self.refraction_dpt:.3g} dpt): the eye stays relaxed",
+                f"({far_dpt:.3g} dpt): the eye stays relaxed",
             )
-        if asked_dpt <= self.amplitude_dpt + OUT_OF_REACH_DPT:
+        if focus_dpt <= near_dpt + OUT_OF_REACH_DPT:
             return ()
-        near_dpt = self.amplitude_dpt - self.refraction_dpt
         reached = (
             f"is nearer than the near point ({near_dpt:.3g} dpt)"
             if near_dpt >= 0.0
@@ -45,7 +107,7 @@ class Focusing:
         )
         return (
             f"focus {focus_dpt:g} dpt {reached}: "
-            f"accommodation stops at {self.amplitude_dpt:.3g} dpt",
+            f"accommodation stops at {near_dpt - far_dpt:.3g} dpt",
         )
 
 
@@ -69,7 +131,8 @@ class FocusingEye(Focusing):
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
         """Say in words what of the request this eye cannot meet."""
-        notes = self.focus_notes(focus_dpt)
+        usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
+        notes = self.focus_notes(focus_dpt, pupil_diameter_mm=usable_mm)
         if pupil_diameter_mm <= self.max_pupil_diameter_mm + 1e-9:
             return notes
         capped = (

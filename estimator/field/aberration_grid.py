@@ -85,7 +85,7 @@ def aberration_grid(
     fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
     parts, shifts = [], []
     if states is None:
-        states = eye.accommodating.focused_at(used_dpt - eye.refraction_dpt)
+        states = eye.accommodating.states_at(used_dpt)
     for k, state in enumerate(states):
         found = wavefront_grid(
             state.surfaces,

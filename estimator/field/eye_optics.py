@@ -24,17 +24,30 @@ class EyeOptics(Protocol):
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
         """Pupil diameter asked for, mm, capped where the eye knows no more."""
 
-    def accommodation_dpt(self, focus_dpt: float) -> float:
-        """Accommodation for a focus distance, both dpt, within reach."""
+    def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
+        """Accommodation at which a distance, dpt, is sharpest through a pupil."""
 
-    def reachable_focus_dpt(self, focus_dpt: float) -> float:
-        """Distance that the eye is then really focused at, dpt."""
+    def reachable_focus_dpt(
+        self, focus_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Distance that is then really sharpest, dpt: the eye's reach has ends."""
+
+    def accommodation_range_dpt(
+        self,
+        focus_range_dpt: tuple[float, float],
+        *,
+        pupil_range_mm: tuple[float, float],
+    ) -> tuple[float, float]:
+        """Smallest and largest accommodation for ranges of focus and pupil."""
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
         """Say what of a request cannot be met, in sentences; empty where all can."""
 
     def accommodation_nodes_dpt(
-        self, focus_range_dpt: tuple[float, float]
+        self,
+        focus_range_dpt: tuple[float, float],
+        *,
+        pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
         """Accommodations (n,), dpt, ascending, between which wavefronts are blended."""
 

@@ -140,7 +140,7 @@ class GridSource:
             else:
                 self.focus_by_network = bool(np.any(np.greater(used_dpt, 0.0)))
                 return states
-        return eye.accommodating.focused_at(np.asarray(used_dpt) - eye.refraction_dpt)
+        return eye.accommodating.states_at(used_dpt)
 
     def _by_network(self, eye, states, n_nodes: int, n_rays: int, axes: dict):
         """Give the grid by network, or None and the reason where it was wanted."""

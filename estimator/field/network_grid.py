@@ -66,7 +66,7 @@ def network_focused(eye: EstimatedEye, accommodations_dpt: ArrayLike):
             focus_dpt=used_dpt[needed] - lens.bare_refraction_dpt,
         )
         diameters_mm[needed] += np.minimum(changes_mm, 0.0)
-    return lens.with_diameters(used_dpt - eye.refraction_dpt, used_dpt, diameters_mm)
+    return lens.with_diameters(used_dpt, diameters_mm)
 
 
 def network_grid(

@@ -95,6 +95,7 @@ class TracedEye(FocusingEye):
         traced_range_deg: FieldRange = ON_AXIS_DEG,
     ):
         self.grid = axis.grid
+        self._accommodating = eye.accommodating
         self.refraction_dpt = eye.refraction_dpt
         self.amplitude_dpt = eye.amplitude_dpt
         self.max_pupil_diameter_mm = largest_open_pupil_mm(axis.grid)
@@ -139,16 +140,19 @@ class TracedEye(FocusingEye):
             A field range that is not ascending.
         """
         _check_field_range(field_range_deg)
-        used_dpt = [eye.accommodating.accommodation_dpt(f) for f in focus_range_dpt]
+        pupils_mm = np.unique(pupil_diameters_mm)
+        used_dpt = eye.accommodating.accommodation_range_dpt(
+            focus_range_dpt, pupil_range_mm=(pupils_mm[0], pupils_mm[-1])
+        )
         states = {
-            "accommodations_dpt": accommodation_nodes_dpt(min(used_dpt), max(used_dpt)),
+            "accommodations_dpt": accommodation_nodes_dpt(*used_dpt),
             "wavelengths_nm": np.unique(wavelengths_nm),
         }
         on_axis_only = not np.any(field_range_deg)
         axis_share = 1.0 if on_axis_only else AXIS_PROGRESS
         axis_grid = make_grid(
             eye,
-            pupil_diameters_mm=np.unique(pupil_diameters_mm),
+            pupil_diameters_mm=pupils_mm,
             **states,
             progress=_share(progress, 0.0, axis_share),
         )
@@ -174,12 +178,38 @@ class TracedEye(FocusingEye):
             traced_range_deg=traced_range_deg,
         )
 
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> float:
+        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        return self._accommodating.refraction_at_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
+        )
+
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Accommodation whose M at a pupil comes nearest to this, of those traced."""
+        used_dpt = self._accommodating.accommodation_for_dpt(
+            refraction_dpt, pupil_diameter_mm=pupil_diameter_mm
+        )
+        low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]].tolist()
+        return min(max(used_dpt, low_dpt), high_dpt)
+
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Accommodation at which the nearest distance is seen through a pupil."""
+        return self._accommodating.largest_accommodation_dpt(pupil_diameter_mm)
+
     def accommodation_nodes_dpt(
-        self, focus_range_dpt: tuple[float, float]
+        self,
+        focus_range_dpt: tuple[float, float],
+        *,
+        pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
         """Accommodations (n,), ascending, between which PSFs may be blended."""
-        used_dpt = [self.accommodation_dpt(f) for f in focus_range_dpt]
-        low_dpt, high_dpt = min(used_dpt), max(used_dpt)
+        low_dpt, high_dpt = self.accommodation_range_dpt(
+            focus_range_dpt, pupil_range_mm=pupil_range_mm
+        )
         count = 1 + int(np.ceil((high_dpt - low_dpt) / ACCOMMODATION_STEP_DPT - 1e-9))
         return np.linspace(low_dpt, high_dpt, max(count, 1))
 

@@ -63,10 +63,7 @@ class WavefrontState:
 
 
 class MeasuredWavefront(FocusingEye):
-    """Wavefront-only eye: measured coefficients plus defocus by formula.
-
-    Its M is from C(2,0) on the measured pupil.
-    """
+    """Wavefront-only eye: measured coefficients plus defocus by formula."""
 
     pupil_limit = "measured"
 
@@ -84,19 +81,37 @@ class MeasuredWavefront(FocusingEye):
         self.amplitude_dpt = accommodation_amplitude_dpt(
             age_years=profile.age_years, add_dpt=profile.add_dpt
         )
-        self.refraction_dpt = self.refraction_at_dpt(REFERENCE_WAVELENGTH_NM)
+        self.refraction_dpt = self.refraction_at_dpt(pupil_diameter_mm=2.0 * radius_mm)
 
     @classmethod
     def from_profile(cls, profile: EyeProfile) -> "MeasuredWavefront":
         """Build from a parsed profile."""
         return cls(profile)
 
-    def refraction_at_dpt(self, wavelength_nm: float) -> float:
-        """M(lambda) = M(lambda_0) + Rx(lambda) - Rx(lambda_0), dpt."""
-        m_dpt, _, _ = rx.power_vector_from_zernike(
-            self.zernike_um, zernike_radius_mm=self.zernike_radius_mm
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float = 0.0
+    ) -> float:
+        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        radius_mm = pupil_diameter_mm / 2.0
+        relaxed_dpt, _, _ = rx.power_vector_from_zernike(
+            rescale_pupil(
+                self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
+            ),
+            zernike_radius_mm=radius_mm,
         )
-        return m_dpt + self.chromatic_shift_dpt(wavelength_nm)
+        shift_dpt = self.chromatic_shift_dpt(REFERENCE_WAVELENGTH_NM)
+        return relaxed_dpt + shift_dpt - accommodation_dpt
+
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
+        relaxed_dpt = self.refraction_at_dpt(pupil_diameter_mm=pupil_diameter_mm)
+        return min(max(relaxed_dpt - refraction_dpt, 0.0), self.amplitude_dpt)
+
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Accommodation at which the nearest distance is seen: the amplitude."""
+        return self.amplitude_dpt
 
     def chromatic_shift_dpt(self, wavelength_nm: float) -> float:
         """Refraction at this wavelength less that at the measured one, dpt."""
@@ -125,7 +140,10 @@ class MeasuredWavefront(FocusingEye):
     # ----- what the PSF cache asks of any eye (also estimator/field/traced_eye.py)
 
     def accommodation_nodes_dpt(
-        self, focus_range_dpt: tuple[float, float]
+        self,
+        focus_range_dpt: tuple[float, float],
+        *,
+        pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
         """Accommodations whose shape of the wavefront differs: here a single one."""
         return np.zeros(1)
@@ -257,7 +275,7 @@ class MeasuredWavefront(FocusingEye):
         usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
         added_dpt = (
             object_dpt
-            - self.accommodation_dpt(focus_dpt)
+            - self.accommodation_dpt(focus_dpt, pupil_diameter_mm=usable_mm)
             + self.chromatic_shift_dpt(wavelength_nm)
         )
         return WavefrontState(

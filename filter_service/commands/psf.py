@@ -178,7 +178,9 @@ def _traced(source: str, focus_dpt: float | None, **view) -> _State:
     is_explicit = explicit_body(source) is not None
     if focus_dpt is None and not is_explicit:
         focus_dpt = 0.0
-    name, surfaces, notes = load_surfaces(source, focus_dpt)
+    name, surfaces, notes = load_surfaces(
+        source, focus_dpt, pupil_mm=view["pupil_diameter_mm"]
+    )
     found = wavefront_aberrations(surfaces, **view)
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(

@@ -52,7 +52,7 @@ def wavefront(
     v_deg: Annotated[float, typer.Option(help="Source above, deg.")] = 0.0,
     focus_dpt: Annotated[
         float | None,
-        typer.Option(help="Distance focused at, dpt; relaxed if not given."),
+        typer.Option(help="Distance made sharpest, dpt; relaxed if not given."),
     ] = None,
     object_dpt: Annotated[
         float, typer.Option(help="Distance of the source, dpt; 0 is infinity.")
@@ -73,7 +73,9 @@ def wavefront(
 
     from estimator.wavefront.aberrations import wavefront_aberrations
 
-    name, surfaces, notes = load_surfaces(eye, focus_dpt)
+    name, surfaces, notes = load_surfaces(
+        eye, focus_dpt, pupil_mm=pupil_mm, stop_mm=stop_mm
+    )
     found = wavefront_aberrations(
         surfaces,
         wavelength_nm=wavelength_nm,
@@ -137,9 +139,19 @@ def explicit_body(source: str) -> dict | None:
 
 
 def load_surfaces(
-    source: str, focus_dpt: float | None
+    source: str,
+    focus_dpt: float | None,
+    *,
+    pupil_mm: float | None = None,
+    stop_mm: float | None = None,
 ) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
-    """Name, surfaces and notes of what the user named."""
+    """Name, surfaces and notes of what the user named.
+
+    Parameters
+    ----------
+    focus_dpt : float or None
+        Distance that is sharpest through the pupil or stop given; relaxed where None.
+    """
     body = explicit_body(source)
     if body is not None:
         from estimator.eye.explicit import parse_explicit_eye
@@ -154,16 +166,19 @@ def load_surfaces(
     from estimator.estimate.estimation import estimate_eye
     from estimator.eye.assembly import eye_surfaces
     from estimator.profiles.files import load_profile
+    from estimator.wavefront.aberrations import pupil_magnification
 
     profile = load_profile(source)
     found = estimate_eye(profile)
     notes = found.notes
     if profile.correction is not None:
         notes = (*notes, "the worn correction is not in these coefficients")
+    relaxed = eye_surfaces(found.parameters, retina=found.retina)
     if focus_dpt is None:
-        surfaces = eye_surfaces(found.parameters, retina=found.retina)
-        return profile.name, surfaces, notes
-    focused = found.focused(focus_dpt)
+        return profile.name, relaxed, notes
+    if stop_mm is not None:
+        pupil_mm = stop_mm * pupil_magnification(relaxed)
+    focused = found.focused(focus_dpt, pupil_diameter_mm=pupil_mm)
     return profile.name, focused.surfaces, (*notes, *focused.notes)
 
 

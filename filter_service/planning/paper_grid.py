@@ -48,10 +48,17 @@ def paper_axes(
     )
     pupils_mm = np.clip(PUPILS_MM[mode], *settings.pupil_range_mm)
     foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
+    usable_mm = np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
+    used_dpt = [
+        eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+        for focus_dpt in foci_dpt
+        for pupil_mm in usable_mm[[0, -1]]
+    ]
+    count = len(np.unique(foci_dpt))
     return (
         *angles_deg,
-        np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm]),
-        np.unique([eye.accommodation_dpt(focus_dpt) for focus_dpt in foci_dpt]),
+        usable_mm,
+        np.unique(np.linspace(min(used_dpt), max(used_dpt), count)),
     )
 
 

@@ -160,13 +160,23 @@ def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
     return errors | {"defocus": defocus_error(use, plan)}
 
 
+def _usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
+    low_mm, high_mm = spec.settings.pupil_range_mm
+    return eye.usable_pupil_mm(low_mm), eye.usable_pupil_mm(high_mm)
+
+
+def _accommodations_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
+    return eye.accommodation_nodes_dpt(
+        spec.settings.focus_range_dpt, pupil_range_mm=_usable_pupils_mm(eye, spec)
+    )
+
+
 def _central_axes(eye: EyeOptics, spec: GridSpec) -> _Axes:
-    low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
     return _Axes(
         h_deg=np.zeros(1),
         v_deg=np.zeros(1),
-        pupils_mm=pupil_nodes_mm((low_mm, high_mm)),
-        accommodations_dpt=eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt),
+        pupils_mm=pupil_nodes_mm(_usable_pupils_mm(eye, spec)),
+        accommodations_dpt=_accommodations_dpt(eye, spec),
     )
 
 
@@ -176,10 +186,10 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
     Axes with few nodes meet their share with some to spare; it goes to the others.
     """
     eye, spec = use.eye, use.spec
-    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
+    used_dpt = _accommodations_dpt(eye, spec)
     ranges = {
         "accommodation": (used_dpt[0], used_dpt[-1]),
-        "pupil": tuple(eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm),
+        "pupil": _usable_pupils_mm(eye, spec),
         "v": spec.field_range_deg[1],
         "h": spec.field_range_deg[0],
     }
@@ -272,11 +282,10 @@ def _readable_ranges_dpt(
     lows, highs = at_infinity_dpt.min(axis=-1), at_infinity_dpt.max(axis=-1)
     used_dpt = axes.accommodations_dpt
     if len(used_dpt) == 1:  # one shape for all: accommodation is defocus alone
-        beyond = [
-            eye.accommodation_dpt(f) - used_dpt[0]
-            for f in spec.settings.focus_range_dpt
-        ]
-        lows, highs = lows - max(beyond), highs - min(beyond)
+        least_dpt, most_dpt = eye.accommodation_range_dpt(
+            spec.settings.focus_range_dpt, pupil_range_mm=_usable_pupils_mm(eye, spec)
+        )
+        lows, highs = lows - (most_dpt - used_dpt[0]), highs - (least_dpt - used_dpt[0])
     else:
         beside = [_neighbours(j, len(used_dpt)) for j in range(len(used_dpt))]
         lows = np.stack([lows[..., j].min(axis=-1) for j in beside], axis=-1)

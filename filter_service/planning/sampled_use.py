@@ -88,8 +88,16 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
     foci_dpt = (
         spec.settings.focus_range_dpt[0] + np.ptp(spec.settings.focus_range_dpt) * focus
     )
-    used_dpt = np.array([eye.accommodation_dpt(f) for f in foci_dpt])
-    focused_dpt = np.array([eye.reachable_focus_dpt(f) for f in foci_dpt])
+    pupils_mm = low_mm + (high_mm - low_mm) * pupil
+    used_dpt, focused_dpt = (
+        np.array(
+            [
+                answer(focus_dpt, pupil_diameter_mm=pupil_mm)
+                for focus_dpt, pupil_mm in zip(foci_dpt, pupils_mm, strict=True)
+            ]
+        )
+        for answer in (eye.accommodation_dpt, eye.reachable_focus_dpt)
+    )
     low_dpt, high_dpt = spec.settings.object_range_dpt
     object_dpt = np.where(
         distance < 0.5,
@@ -100,7 +108,7 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
     known = {
         "h_deg": h_deg,
         "v_deg": v_deg,
-        "pupil_diameter_mm": low_mm + (high_mm - low_mm) * pupil,
+        "pupil_diameter_mm": pupils_mm,
         "accommodation_dpt": used_dpt,
         "wavelength_nm": wavelengths_nm[(channel * len(wavelengths_nm)).astype(int)],
     }

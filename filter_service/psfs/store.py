@@ -165,7 +165,7 @@ def frame_layers(
     plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
     notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-    accommodation_dpt = eye.accommodation_dpt(focus_dpt)
+    accommodation_dpt = eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
     at_infinity_dpt, change = store.defocus.state(
         pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
     )
@@ -201,7 +201,7 @@ def frame_layers(
             store.tables, reads, layer_zero_dpt, layer_dpt[0], layer_dpt[-1]
         ),
         pupil_diameter_mm=pupil_mm,
-        focus_dpt=eye.reachable_focus_dpt(focus_dpt),
+        focus_dpt=eye.reachable_focus_dpt(focus_dpt, pupil_diameter_mm=pupil_mm),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
     )

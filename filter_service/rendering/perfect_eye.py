@@ -77,9 +77,7 @@ def perfect_store(camera: Camera) -> PsfStore:
             h_deg=np.zeros(1),
             v_deg=np.zeros(1),
             pupils_mm=np.array([PUPIL_MM]),
-            accommodations_dpt=eye.accommodation_nodes_dpt(
-                spec.settings.focus_range_dpt
-            ),
+            accommodations_dpt=np.zeros(1),
             defocus=RaggedNodes.of([np.zeros(1)]),
             channel_shift_dpt=np.zeros((1, RGB)),
             prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),

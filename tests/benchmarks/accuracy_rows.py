@@ -57,7 +57,12 @@ def asked_states(spec: GridSpec, *, max_pupil_mm: float) -> NDArray[np.float64]:
 def answered_um(eye: TracedEye, states: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients (n, 27) of an eye that is asked to focus, on its own circles."""
     h_deg, v_deg, pupils_mm, focuses_dpt, wavelengths_nm = states.T
-    used_dpt = np.array([eye.accommodation_dpt(f) for f in focuses_dpt.tolist()])
+    used_dpt = np.array(
+        [
+            eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+            for focus_dpt, pupil_mm in zip(focuses_dpt, pupils_mm, strict=True)
+        ]
+    )
     state = {
         **{"h_deg": h_deg, "v_deg": v_deg, "pupil_diameter_mm": pupils_mm},
         **{"accommodation_dpt": used_dpt, "wavelength_nm": wavelengths_nm},

@@ -84,11 +84,14 @@ def measured(name, width_px, axis, rng, count, spectrum):
     eye = traced_eye(name, spec)
     use = sample_use(eye, spec, 4096)
     use = use.taken(rng.choice(4096, count, replace=False))
-    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
+    pupils_mm = tuple(eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
+    used_dpt = eye.accommodation_nodes_dpt(
+        spec.settings.focus_range_dpt, pupil_range_mm=pupils_mm
+    )
     limits = {
         "h": spec.field_range_deg[0],
         "v": spec.field_range_deg[1],
-        "pupil": [eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm],
+        "pupil": pupils_mm,
         "accommodation": (used_dpt[0], used_dpt[-1]),
     }
     pair, good = neighbours(use, axis, rng, limits)

@@ -48,7 +48,10 @@ class EyeState:
             "v_deg": v_deg,
             "pupil_diameter_mm": np.full(h_deg.size, self.pupil_diameter_mm),
             "accommodation_dpt": np.full(
-                h_deg.size, self.eye.accommodation_dpt(self.focus_dpt)
+                h_deg.size,
+                self.eye.accommodation_dpt(
+                    self.focus_dpt, pupil_diameter_mm=self.pupil_diameter_mm
+                ),
             ),
             "wavelength_nm": np.tile(self.spec.channel_wavelengths_nm, h_deg.size // 3),
         }

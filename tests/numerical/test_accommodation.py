@@ -54,6 +54,44 @@ def test_focused_eye_has_that_refraction(pupil_mm, focus_dpt):
     assert state.focus_dpt == pytest.approx(focus_dpt, abs=1e-12)
 
 
+@pytest.mark.parametrize("pupil_mm", [1.0, 2.0, 2.6, 3.5, 4.9, 6.0, 7.3])
+@pytest.mark.parametrize("focus_dpt", [0.0, 0.5, 3.125, 5.4])
+def test_an_eye_can_be_focused_through_any_pupil(pupil_mm, focus_dpt):
+    eye = AccommodatingEye(_far_sighted(), pupil_diameter_mm=4.0)
+    state = eye.focused(focus_dpt, pupil_diameter_mm=pupil_mm)
+    assert state.notes == ()
+    assert refraction_dpt(state.parameters, pupil_mm) == pytest.approx(
+        -focus_dpt, abs=3e-3
+    )
+    assert state.focus_dpt == pytest.approx(focus_dpt, abs=1e-3)
+
+
+def test_aberrations_move_the_focus_as_the_pupil_opens():
+    eye = AccommodatingEye(_far_sighted(), pupil_diameter_mm=6.0)
+    small, own = (
+        eye.focused(4.0, pupil_diameter_mm=pupil_mm).lens_diameter_change_mm
+        for pupil_mm in (3.0, 6.0)
+    )
+    state = eye.focused(4.0)  # at 6 mm: what a pupil of 3 mm makes of it
+    assert refraction_dpt(state.parameters, 3.0) < -4.3
+    assert own < 1.1 * small < 0.0
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_reach_through_a_pupil_is_what_is_traced_there(name):
+    eye = estimate_eye(parse_profile({"kind": "preset", "name": name})).accommodating
+    for pupil_mm in (2.0, 3.3, 5.2):
+        far_dpt, near_dpt = eye.focus_limits_dpt(pupil_mm)
+        relaxed = refraction_dpt(eye.parameters, pupil_mm)
+        assert far_dpt == pytest.approx(-relaxed, abs=0.01)
+        nearest = eye.focused(50.0, pupil_diameter_mm=pupil_mm)
+        assert near_dpt == pytest.approx(nearest.focus_dpt, abs=1e-9)
+        traced = refraction_dpt(nearest.parameters, pupil_mm)
+        assert near_dpt == pytest.approx(-traced, abs=0.01)
+        assert near_dpt - far_dpt <= 10.0 + 1e-3  # the amplitude without an age
+        assert "near point" in nearest.notes[0]
+
+
 def _far_sighted():
     return replace(EyeParameters.mean_eye(), eye_length_mm=23.3)
 

@@ -29,7 +29,7 @@ def test_defocus_between_asked_directions_is_the_eyes(rng, name, allowed_dpt):
     eye = traced_eye(name, spec)
     state = {
         "pupil_diameter_mm": 5.0,
-        "accommodation_dpt": eye.accommodation_dpt(0.5),
+        "accommodation_dpt": eye.accommodation_dpt(0.5, pupil_diameter_mm=5.0),
     }
     _, found = EyeDefocus(eye, spec, h_deg=0.0, v_deg=0.0).state(**state)
     h_deg, v_deg = (rng.uniform(*ends, 400) for ends in spec.field_range_deg)
@@ -48,7 +48,8 @@ def test_the_papers_grid_is_read_at_the_distance_of_the_object():
     spec = spec_for(64, 36, mode="dynamic", grid="paper", **STILL)
     eye = traced_eye("emmetropia", spec)
     _, found = EyeDefocus(eye, spec, h_deg=0.0, v_deg=0.0).state(
-        pupil_diameter_mm=5.0, accommodation_dpt=eye.accommodation_dpt(0.5)
+        pupil_diameter_mm=5.0,
+        accommodation_dpt=eye.accommodation_dpt(0.5, pupil_diameter_mm=5.0),
     )
     assert found.range_dpt == (0.0, 0.0)
 
@@ -140,7 +141,7 @@ def test_plans_end_where_kernels_may_not_grow():
         720,
         mode="dynamic",
         object_range_dpt=(0.0, 1.0),
-        focus_range_dpt=(0.0, 6.0),
+        focus_range_dpt=(9.0, 10.0),
         pupil_range_mm=(6.0, 7.0),
     )
     eye = traced_eye("cataract", spec)

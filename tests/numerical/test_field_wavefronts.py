@@ -231,7 +231,7 @@ def test_measured_wavefront_is_the_same_at_every_field():
     expected = eye.state(
         pupil_diameter_mm=3.0,
         object_dpt=2.5,
-        focus_dpt=eye.reachable_focus_dpt(1.0 - eye.refraction_dpt),
+        focus_dpt=1.0 - eye.refraction_at_dpt(pupil_diameter_mm=3.0),
         wavelength_nm=464.0,
     )
     for p in range(2):

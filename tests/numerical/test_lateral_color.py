@@ -223,7 +223,7 @@ def test_red_and_blue_lie_beside_green_by_the_table(engine):
         shift_mrad = eye.chief_ray_shift_mrad(
             h_deg=field[0],
             v_deg=field[1],
-            accommodation_dpt=eye.accommodation_dpt(0.0),
+            accommodation_dpt=eye.accommodation_dpt(0.0, pupil_diameter_mm=3.0),
             wavelength_nm=np.array(RGB_WAVELENGTHS_NM),
         )
         to_green_mrad = shift_mrad - shift_mrad[1]

@@ -89,13 +89,13 @@ def test_myope_sees_clearly_at_the_far_point_only(pupil_mm):
 
 def test_hyperope_accommodates_and_myope_does_not():
     hyperope = wavefront(kind="prescription", sphere_dpt=2.0)
-    assert hyperope.accommodation_dpt(0.0) == pytest.approx(2.0)
+    assert hyperope.accommodation_dpt(0.0, pupil_diameter_mm=5.0) == pytest.approx(2.0)
     assert state(hyperope, d=3.0, f=3.0).zernike_um[C20] == pytest.approx(
         0.0, abs=1e-12
     )
     myope = wavefront(kind="prescription", sphere_dpt=-2.0)
     answer = state(myope, d=1.0, f=1.0)
-    assert myope.accommodation_dpt(1.0) == 0.0
+    assert myope.accommodation_dpt(1.0, pupil_diameter_mm=5.0) == 0.0
     assert answer.zernike_um[C20] == pytest.approx(6.25 / (4 * math.sqrt(3)))
     assert "beyond the far point" in answer.notes[0]
 

@@ -74,7 +74,8 @@ def expected_defocus(eye, spec):
     pupils_mm = pupil_nodes_mm(
         [eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm]
     )
-    used_dpt = eye.accommodation_nodes_dpt(spec.settings.focus_range_dpt)
+    ranges = spec.settings.focus_range_dpt, (pupils_mm[0], pupils_mm[-1])
+    used_dpt = eye.accommodation_nodes_dpt(ranges[0], pupil_range_mm=ranges[1])
     groups = []
     for i, pupil_mm in enumerate(pupils_mm):
         for j in range(len(used_dpt)):
@@ -83,9 +84,9 @@ def expected_defocus(eye, spec):
                 read_dpt = (
                     used_dpt[max(j - 1, 0) : j + 2]
                     if len(used_dpt) > 1
-                    else [
-                        eye.accommodation_dpt(f) for f in spec.settings.focus_range_dpt
-                    ]
+                    else eye.accommodation_range_dpt(
+                        ranges[0], pupil_range_mm=ranges[1]
+                    )
                 )
                 at_infinity_dpt = eye.total_defocus_dpt(
                     pupil_diameter_mm=other_mm,

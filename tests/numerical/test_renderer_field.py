@@ -72,7 +72,9 @@ class FieldBench:
         n_pixels = own["h_deg"].size // 3
         state = {
             "pupil_diameter_mm": PUPIL_MM,
-            "accommodation_dpt": self.eye.accommodation_dpt(FOCUS_DPT),
+            "accommodation_dpt": self.eye.accommodation_dpt(
+                FOCUS_DPT, pupil_diameter_mm=PUPIL_MM
+            ),
             "wavelength_nm": np.tile(self.spec.channel_wavelengths_nm, n_pixels),
         }
         total_dpt = self.eye.total_defocus_dpt(**own, **state) + 1.0 / distance_m

@@ -77,16 +77,18 @@ def test_larger_pupils_are_traced_and_not_extrapolated():
     higher = np.arange(28) > 5
     assert np.abs(ours - scaled)[higher].max() < 1e-9
     assert eye.usable_pupil_mm(6.0) == 6.0
-    assert not eye.notes(pupil_diameter_mm=6.0, focus_dpt=1.5)
+    assert not eye.notes(pupil_diameter_mm=6.0, focus_dpt=5.0)
 
 
+@pytest.mark.parametrize("pupil_mm", [3.0, 4.5, 6.0])
 @pytest.mark.parametrize("focus_dpt", [0.5, 2.0, 4.7])
-def test_an_object_at_the_focus_is_in_focus(focus_dpt):
-    body = {"kind": "prescription", "sphere_dpt": 0.0}
-    _, eye = traced(body, wavelengths_nm=(555.0,), pupils_mm=(5.0, 6.0))
+@pytest.mark.parametrize("sphere_dpt", [0.0, 4.0])
+def test_an_object_at_the_focus_is_in_focus(sphere_dpt, focus_dpt, pupil_mm):
+    body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
+    _, eye = traced(body, wavelengths_nm=(555.0,), pupils_mm=(3.0, 4.5, 6.0))
     total_dpt = focus_dpt + eye.total_defocus_dpt(
-        pupil_diameter_mm=6.0,  # a prescription is written down on a 6 mm circle
-        accommodation_dpt=eye.accommodation_dpt(focus_dpt),
+        pupil_diameter_mm=pupil_mm,
+        accommodation_dpt=eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm),
         wavelength_nm=555.0,
     )
     assert total_dpt == pytest.approx(0.0, abs=0.01)
@@ -132,7 +134,9 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     kernels = frame_kernels(store.tables, layers, image, used)
     blended = reference.kernel_pairs(store, kernels)[0, 0, ..., 1]
     direct = wavefront_aberrations(
-        estimated.surfaces(focus_dpt), wavelength_nm=549.0, pupil_diameter_mm=pupil_mm
+        estimated.surfaces(focus_dpt, pupil_diameter_mm=pupil_mm),
+        wavelength_nm=549.0,
+        pupil_diameter_mm=pupil_mm,
     )
     zernike_um = rescale_pupil(
         direct.zernike_um, radius_ratio=pupil_mm / 2 / direct.zernike_radius_mm

@@ -1,0 +1,94 @@
+"""Refraction of one eye over pupil and accommodation, and back to accommodation.
+
+Along the accommodation a polynomial through traced states of the lens; along the pupil
+one in its square, in which a wavefront's spherical terms are a short series.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+STANDARD_PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+NEAREST_PUPIL_MM = 0.6
+"""Standard pupils nearer than this to the eye's own are left out."""
+
+
+def table_pupils_mm(own_mm: float) -> list[float]:
+    """Pupils of a table, ascending: the eye's own and standard ones."""
+    others = [p for p in STANDARD_PUPILS_MM if abs(p - own_mm) >= NEAREST_PUPIL_MM]
+    return sorted([own_mm, *others])
+
+
+class FocusTable:
+    """Traced refractions, and what lies between.
+
+    Parameters
+    ----------
+    pupils_mm : (n,)
+    accommodations_dpt : (m,)
+        Ascending from 0.
+    refractions_dpt : (n, m)
+        Falling along the accommodations as far as `reach` says.
+    """
+
+    def __init__(
+        self, pupils_mm: NDArray, accommodations_dpt: NDArray, refractions_dpt: NDArray
+    ):
+        self._accommodations_dpt = accommodations_dpt
+        self._refractions_dpt = refractions_dpt
+        self._squares_mm2 = np.square(pupils_mm)
+        self._pupil_shares = _barycentric_shares(self._squares_mm2)
+        self._used_shares = _barycentric_shares(accommodations_dpt)
+
+    def _at_pupil(self, pupil_mm: float) -> NDArray[np.float64]:
+        """Refractions (m,) at a pupil."""
+        return _through(
+            self._squares_mm2, self._refractions_dpt, self._pupil_shares, pupil_mm**2
+        )
+
+    def refraction_dpt(self, *, pupil_mm: float, accommodation_dpt: float) -> float:
+        """Refraction through a pupil at an accommodation."""
+        return float(
+            _through(
+                self._accommodations_dpt,
+                self._at_pupil(pupil_mm),
+                self._used_shares,
+                accommodation_dpt,
+            )
+        )
+
+    def accommodation_dpt(self, *, pupil_mm: float, refraction_dpt: float) -> float:
+        """Accommodation within the table whose refraction is nearest to one."""
+        found_dpt, used_dpt = self._falling(pupil_mm)
+        wanted_dpt = min(max(refraction_dpt, found_dpt[-1]), found_dpt[0])
+        shares = _barycentric_shares(found_dpt)
+        inverse = _through(found_dpt, used_dpt, shares, wanted_dpt)
+        return float(np.clip(inverse, used_dpt[0], used_dpt[-1]))
+
+    def reach_dpt(self, pupil_mm: float) -> float:
+        """Accommodation at which the nearest distance is seen through a pupil."""
+        return float(self._falling(pupil_mm)[1][-1])
+
+    def _falling(self, pupil_mm: float) -> tuple[NDArray, NDArray]:
+        """Refractions at a pupil as far as they fall, and their accommodations."""
+        found_dpt = self._at_pupil(pupil_mm)
+        rises = np.flatnonzero(np.diff(found_dpt) >= 0.0)
+        count = int(rises[0]) + 1 if rises.size else found_dpt.size
+        return found_dpt[:count], self._accommodations_dpt[:count]
+
+
+def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
+    """Weights (n,) of the barycentric formula for nodes (n,)."""
+    span = np.ptp(nodes) or 1.0  # so that many nodes do not overflow
+    away = (nodes[:, None] - nodes[None]) * (4.0 / span)
+    np.fill_diagonal(away, 1.0)
+    return 1.0 / away.prod(axis=1)
+
+
+def _through(nodes: NDArray, values: NDArray, shares: NDArray, at: float):
+    """Value at a place of the polynomial through values (n, ...) at nodes (n,)."""
+    away = at - nodes
+    hit = np.flatnonzero(np.abs(away) < 1e-12)
+    if hit.size:
+        return values[hit[0]]
+    terms = shares / away
+    return terms @ values / terms.sum()
