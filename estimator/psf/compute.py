@@ -31,6 +31,7 @@ from estimator.psf.kernel_types import (
 from estimator.psf.pupil import pupil_frames
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.psf.survey import (
+    PIXEL_CORNER_PX,
     PupilSurvey,
     edge_light_outside,
     needed_radius_px,
@@ -141,11 +142,15 @@ def _choose_radii(
             raise ValueError(f"radius_px {radius_px}: must be 0 or more")
         radii = np.full(survey.blur_radius_px.shape, radius_px, np.int64)
     elif diffraction:
-        radii = needed_radius_px(survey, lost_energy_ratio=1.0 - min_energy_ratio)
+        radii = needed_radius_px(
+            survey,
+            lost_energy_ratio=1.0 - min_energy_ratio,
+            tail_end_px=max_radius_px,
+        )
     else:
         blur = survey.blur_radius_px
-        # Half a pixel's diagonal keeps the corners of the last pixels in the disc.
-        radii = np.where(blur < 1e-6, 0, np.ceil(blur + 0.21)).astype(np.int64)
+        radii = np.where(blur < 1e-6, 0, np.ceil(blur + PIXEL_CORNER_PX))
+        radii = radii.astype(np.int64)
     worst = int(np.argmax(radii)) if radii.size else 0
     if radii.size and radii[worst] > max_radius_px:
         raise PsfTooLarge(
@@ -291,7 +296,8 @@ def compute_psf_batch(
     diffraction : bool
         False: ray optics only, and a perfect eye gives exactly one pixel.
     max_radius_px : int
-        Larger kernels are refused.
+        Blur beyond it is refused.  Light that diffraction alone sends farther is left
+        out and counted (`lost_energy_ratio`), whatever ``min_energy_ratio`` asks for.
     min_energy_ratio : float
         Share of the light that a chosen radius must hold.
     workers : int, optional
@@ -304,7 +310,7 @@ def compute_psf_batch(
     Raises
     ------
     PsfTooLarge
-        A PSF needs more than ``max_radius_px``.
+        A PSF blurs farther than ``max_radius_px``.
     EnzOutsideDomain
         The ENZ series of this degree does not hold a wavefront.
     ValueError

@@ -53,7 +53,8 @@ class PsfTooLarge(ValueError):
     def __init__(self, *, radius_px: int, max_radius_px: int, index: int):
         super().__init__(
             f"PSF {index} needs a radius of {radius_px} px; "
-            f"allowed are at most {max_radius_px} px"
+            f"allowed are at most {max_radius_px} px: "
+            "fewer pixels per degree, a smaller pupil or less defocus need less"
         )
         self.radius_px = radius_px
         self.max_radius_px = max_radius_px

@@ -19,6 +19,9 @@ _RING_RADII = (0.2, 0.35, 0.5, 0.65, 0.8, 0.9)
 _N_RING = 24
 RADIUS_LIMIT_PX = 1 << 14
 
+PIXEL_CORNER_PX = 0.21
+"""With half a pixel's diagonal the corners of the last pixels lie in a disc."""
+
 
 @dataclass(frozen=True)
 class PupilSurvey:
@@ -258,9 +261,15 @@ def edge_light_outside(
 
 
 def needed_radius_px(
-    survey: PupilSurvey, *, lost_energy_ratio: float
+    survey: PupilSurvey, *, lost_energy_ratio: float, tail_end_px: int | None = None
 ) -> NDArray[np.int64]:
     """Smallest kernel radius (P,) px that keeps all but a share of the light.
+
+    Parameters
+    ----------
+    tail_end_px : int, optional
+        Where rays land within this radius, diffraction does not need more: its light
+        falls so slowly that a share of it always lies farther out.
 
     Notes
     -----
@@ -271,9 +280,13 @@ def needed_radius_px(
     a circle this is the mean Airy tail, 2 lambda / (pi² D theta) outside theta; for
     defocus lambda / (pi² D) [1/(theta-g) + 1/(theta+g)].
     """
-    return _smallest_radii(
+    radii = _smallest_radii(
         *_edge_geometry(survey),
         survey.blur_radius_px,
         float(lost_energy_ratio),
         RADIUS_LIMIT_PX,
     )
+    if tail_end_px is None:
+        return radii
+    lands_within = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX) <= tail_end_px
+    return np.where(lands_within, np.minimum(radii, tail_end_px), radii)

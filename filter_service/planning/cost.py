@@ -7,7 +7,12 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.machine_speed import relative_core_time
 from estimator.psf.compute import ACCURACY
 from estimator.psf.fourier import plan_grids
-from estimator.psf.survey import PupilSurvey, needed_radius_px, survey_pupils
+from estimator.psf.survey import (
+    PIXEL_CORNER_PX,
+    PupilSurvey,
+    needed_radius_px,
+    survey_pupils,
+)
 from estimator.psf.switch import geometric_shares
 from estimator.threads import thread_count
 from filter_service.constants import RGB
@@ -72,9 +77,11 @@ def kernel_radius_px(
 ) -> NDArray[np.int64]:
     """Radii (P,) that hold all but a share of the light that a cache may drop."""
     if not spec.settings.diffraction:
-        return np.ceil(survey.blur_radius_px + 0.21).astype(np.int64)
+        return np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX).astype(np.int64)
     return needed_radius_px(
-        survey, lost_energy_ratio=share * (1.0 - spec.kept_energy_ratio)
+        survey,
+        lost_energy_ratio=share * (1.0 - spec.kept_energy_ratio),
+        tail_end_px=spec.max_blur_radius_px,
     )
 
 
@@ -86,7 +93,7 @@ def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
     """
     beyond_px = np.maximum(
         kernel_radius_px(spec, survey, share=1.0)
-        - np.ceil(survey.blur_radius_px + 0.21),
+        - np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX),
         0,
     )
     sides_px = np.concatenate([-survey.slope_low_px, survey.slope_high_px], axis=1)

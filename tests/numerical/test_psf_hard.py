@@ -208,6 +208,60 @@ def test_a_window_without_light_is_refused_by_name():
         compute_psfs(tilt[None], pupil_diameter_mm=4.0, max_radius_px=20, **COMMON)
 
 
+SHARP_PIXEL_MRAD = 0.2909
+"""A minute of arc: a pixel that the sharpest eye just sees."""
+
+TAIL = {"wavelength_nm": 555.0, "min_energy_ratio": 0.9996}
+"""What a single picture asks for: its kernels keep 99.8 %, a fifth of the rest left."""
+
+
+@pytest.mark.parametrize("pupil_mm", [1.0, 2.0, 3.0, 5.0, 7.0])
+def test_a_sharp_eye_is_not_refused_for_its_tail(pupil_mm):
+    (psf,) = compute_psfs(
+        np.zeros((1, 28)),
+        pupil_diameter_mm=pupil_mm,
+        pixel_pitch_mrad=SHARP_PIXEL_MRAD,
+        **TAIL,
+    )
+    assert psf.radius_px <= 255
+    # encircled energy of an Airy pattern: 1 - J0² - J1²
+    theta_mrad = (psf.radius_px + 0.5) * SHARP_PIXEL_MRAD
+    v = np.pi * pupil_mm * theta_mrad / (TAIL["wavelength_nm"] / 1e3)
+    outside = j0(v) ** 2 + j1(v) ** 2
+    assert psf.lost_energy_ratio == pytest.approx(outside, rel=0.2)
+    assert psf.lost_energy_ratio < 2.5e-3
+
+
+def test_a_tail_that_is_cut_costs_a_picture_little():
+    """An edge from black to white, where a tail shows most: beyond it all is dark."""
+    cut, whole = (
+        compute_psfs(
+            np.zeros((1, 28)),
+            pupil_diameter_mm=1.0,
+            pixel_pitch_mrad=SHARP_PIXEL_MRAD,
+            max_radius_px=radius_px,
+            **TAIL,
+        )[0].kernel
+        for radius_px in (255, 2000)
+    )
+    assert whole.shape[0] > 1500 > 511 == cut.shape[0]
+    seen = [np.cumsum(k.sum(axis=0) / k.sum()) for k in (cut, whole)]
+    margin = (seen[1].size - seen[0].size) // 2
+    spread = np.pad(seen[0], (margin, margin), constant_values=(0.0, 1.0))
+    error = spread - seen[1]
+    # the 400 pixels about the edge
+    near = error[error.size // 2 - 200 : error.size // 2 + 200]
+    assert 10.0 * np.log10(1.0 / np.mean(near**2)) > 60.0
+
+
+def test_blur_beyond_the_largest_kernel_is_refused_with_what_helps():
+    blurred = zernike_from_terms({"2,0": 3.0})
+    with pytest.raises(PsfTooLarge, match="smaller pupil or less defocus"):
+        compute_psfs(
+            blurred[None], pupil_diameter_mm=3.0, pixel_pitch_mrad=0.02, **TAIL
+        )
+
+
 @pytest.mark.parametrize("name", ["-12 dpt", "5 dpt of astigmatism", "keratoconus"])
 def test_float32_of_the_wave_method_is_nothing_beside_its_sampling(name):
     """The pupil's field and its transform against the same samples in float64.
