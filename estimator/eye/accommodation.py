@@ -190,7 +190,7 @@ class AccommodatingEye(Focusing):
     def accommodation_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
     ) -> float:
-        """Accommodation at which a distance is sharpest; through its own pupil."""
+        """Accommodation for the sharpest distance, by default at its own pupil."""
         pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
         return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
 

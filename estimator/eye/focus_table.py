@@ -27,7 +27,7 @@ class FocusTable:
     accommodations_dpt : (m,)
         Ascending from 0.
     refractions_dpt : (n, m)
-        Falling along the accommodations as far as `reach` says.
+        Least-squares M at 555 nm; where it no longer falls, the reach of a pupil ends.
     """
 
     def __init__(
@@ -63,10 +63,6 @@ class FocusTable:
         shares = _barycentric_shares(found_dpt)
         inverse = _through(found_dpt, used_dpt, shares, wanted_dpt)
         return float(np.clip(inverse, used_dpt[0], used_dpt[-1]))
-
-    def reach_dpt(self, pupil_mm: float) -> float:
-        """Accommodation at which the nearest distance is seen through a pupil."""
-        return float(self._falling(pupil_mm)[1][-1])
 
     def _falling(self, pupil_mm: float) -> tuple[NDArray, NDArray]:
         """Refractions at a pupil as far as they fall, and their accommodations."""

@@ -7,7 +7,7 @@ the projected pupil fills, and the set is rescaled from that circle to the measu
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.eye.assembly import pack_eyes
 from estimator.eye.parameters import EyeParameters, RetinaShape
@@ -33,7 +33,7 @@ def eye_indices(wavelength_nm: float) -> NDArray[np.float64]:
 def zernike_of_vectors(
     vectors: NDArray[np.float64],
     *,
-    pupil_diameter_mm: float,
+    pupil_diameter_mm: ArrayLike,
     wavelength_nm: float,
     retina: RetinaShape | None = None,
     h_deg: float = 0.0,
@@ -41,12 +41,15 @@ def zernike_of_vectors(
 ) -> NDArray[np.float64]:
     """Coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
 
-    They are on the circle of ``pupil_diameter_mm`` about the chief ray; object at
-    infinity; a row is nan where light does not pass.
+    They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray;
+    object at infinity; a row is nan where light does not pass.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(wavelength_nm)
-    radius_mm = pupil_diameter_mm / 2.0
+    pupils_mm = np.broadcast_to(
+        np.asarray(pupil_diameter_mm, dtype=np.float64), (len(vectors),)
+    )
+    radius_mm = pupils_mm / 2.0
     if h_deg == 0.0 and v_deg == 0.0:
         zernike_um, _ = on_axis_zernike(packed, indices, zernike_radius_mm=radius_mm)
         return zernike_um
@@ -57,7 +60,7 @@ def zernike_of_vectors(
     found = eyes_aberrations(
         packed[usable],
         indices,
-        stop_diameters_mm=pupil_diameter_mm / ratios[usable],
+        stop_diameters_mm=pupils_mm[usable] / ratios[usable],
         h_deg=h_deg,
         v_deg=v_deg,
     )
@@ -65,7 +68,7 @@ def zernike_of_vectors(
     rows = np.flatnonzero(usable)[traced]
     zernike_um[rows] = rescale_pupil(
         found.zernike_um[traced],
-        radius_ratio=radius_mm / found.zernike_radius_mm[traced],
+        radius_ratio=radius_mm[rows] / found.zernike_radius_mm[traced],
     )
     zernike_um[:, 0] = np.where(np.isnan(zernike_um[:, 1]), np.nan, 0.0)
     return zernike_um
@@ -74,7 +77,7 @@ def zernike_of_vectors(
 def refraction_of_vectors(
     vectors: NDArray[np.float64],
     *,
-    pupil_diameter_mm: float,
+    pupil_diameter_mm: ArrayLike,
     wavelength_nm: float = REFERENCE_WAVELENGTH_NM,
     retina: RetinaShape | None = None,
 ) -> NDArray[np.float64]:
@@ -85,7 +88,8 @@ def refraction_of_vectors(
         wavelength_nm=wavelength_nm,
         retina=retina,
     )
-    return -SPHERE_PER_C20 * zernike_um[:, C20] / (pupil_diameter_mm / 2.0) ** 2
+    radius_mm = np.asarray(pupil_diameter_mm, dtype=np.float64) / 2.0
+    return -SPHERE_PER_C20 * zernike_um[:, C20] / radius_mm**2
 
 
 def on_axis_zernike_um(

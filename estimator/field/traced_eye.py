@@ -51,6 +51,9 @@ FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
 TRACED_ERROR_UM = 1e-3
 """What a reply states of them."""
 
+PREPARED_MARGIN_DPT = 0.02
+"""A focus that was not traced is met to this, or its reply says so."""
+
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
 """Step by which the traced field is made smaller until light passes all of it."""
@@ -199,6 +202,18 @@ class TracedEye(FocusingEye):
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
         """Accommodation at which the nearest distance is seen through a pupil."""
         return self._accommodating.largest_accommodation_dpt(pupil_diameter_mm)
+
+    def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
+        """Say in words what of the request this eye cannot meet, or was not traced."""
+        notes = super().notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
+        pupil_mm = self.usable_pupil_mm(pupil_diameter_mm)
+        if self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm):
+            return notes  # the eye itself ends there
+        used_dpt = self.reachable_focus_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+        if abs(used_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
+            return notes
+        said = f"focus {focus_dpt:g} dpt is outside what was prepared: {used_dpt:.3g}"
+        return (*notes, f"{said} dpt used")
 
     def accommodation_nodes_dpt(
         self,

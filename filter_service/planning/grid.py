@@ -73,7 +73,7 @@ class GridSpec:
     max_blur_step_px : float
         Blur difference between neighbouring nodes.
     max_blur_radius_px : int
-        A kernel larger than this is refused.
+        More blur than this is refused; diffraction's tail ends there.
     kept_energy_ratio : float
         Light within a kernel's box; the rest is spread over it again.  0.99 keeps
         filtered images at 60 dB or more of the uncut kernel's, 0.995 at 65 dB, 0.998

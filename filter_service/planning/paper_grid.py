@@ -49,17 +49,16 @@ def paper_axes(
     pupils_mm = np.clip(PUPILS_MM[mode], *settings.pupil_range_mm)
     foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
     usable_mm = np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
-    used_dpt = [
-        eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
-        for focus_dpt in foci_dpt
-        for pupil_mm in usable_mm[[0, -1]]
-    ]
-    count = len(np.unique(foci_dpt))
-    return (
-        *angles_deg,
-        usable_mm,
-        np.unique(np.linspace(min(used_dpt), max(used_dpt), count)),
+    widest_mm = float(usable_mm[-1])
+    used_dpt = np.unique(
+        [eye.accommodation_dpt(f, pupil_diameter_mm=widest_mm) for f in foci_dpt]
     )
+    # Through smaller pupils the ends are met with other accommodations.
+    low_dpt, high_dpt = eye.accommodation_range_dpt(
+        (float(foci_dpt[0]), float(foci_dpt[-1])),
+        pupil_range_mm=(float(usable_mm[0]), widest_mm),
+    )
+    return *angles_deg, usable_mm, np.unique([low_dpt, *used_dpt[1:-1], high_dpt])
 
 
 def paper_defocus(

@@ -39,8 +39,12 @@ def close_depth(at, depths, light, coverage):
 
 
 @njit(cache=True)
-def add_to_depth(at, weight, color, distance_dpt, step_dpt, depths, light, coverage):
-    """Add a source to the depth that a pixel is at, or begin the next one with it."""
+def add_to_depth(at, weight, color, distance_dpt, step_dpt, sums):
+    """Add a source to the depth that a pixel is at, or begin the next one with it.
+
+    ``sums``: arrays of depths, light and coverage, see `add_sources`.
+    """
+    depths, light, coverage = sums
     if depths[0][at] - distance_dpt > step_dpt:
         close_depth(at, depths, light, coverage)
     if depths[2][at] == 0.0:
@@ -82,6 +86,7 @@ def add_sources(
         Added to.
     """
     height, width = light.shape[1:]
+    sums = (depths, light, coverage)
     for band in prange(-(-height // BAND_ROWS)):
         top = band * BAND_ROWS
         bottom = min(height, top + BAND_ROWS)
@@ -98,16 +103,8 @@ def add_sources(
                             continue
                         if rule == 0:
                             at = (c, to_y, to_x)
-                            add_to_depth(
-                                at,
-                                weight,
-                                color[n, c],
-                                distance_dpt[n],
-                                step_dpt,
-                                depths,
-                                light,
-                                coverage,
-                            )
+                            source = (color[n, c], distance_dpt[n])
+                            add_to_depth(at, weight, *source, step_dpt, sums)
                             continue
                         if rule == 1:
                             weight = weight * (1.0 - coverage[c, to_y, to_x])

@@ -312,6 +312,7 @@ def _add_layers(
     height, width = light.shape[1:]
     full = texture.shape[2] // 2
     n_taps = layers.shape[2]
+    sums = (depths, light, coverage)
     for band in prange(-(-height // BAND_ROWS)):
         top = band * BAND_ROWS
         bottom = min(height, top + BAND_ROWS)
@@ -336,16 +337,8 @@ def _add_layers(
                             continue
                         at = (c, to_y, left + k)
                         if rule == 0:
-                            add_to_depth(
-                                at,
-                                weight,
-                                color[n, c],
-                                distance_dpt[n],
-                                step_dpt,
-                                depths,
-                                light,
-                                coverage,
-                            )
+                            source = (color[n, c], distance_dpt[n])
+                            add_to_depth(at, weight, *source, step_dpt, sums)
                             continue
                         room = 1.0 - coverage[at]
                         weight = weight * room if rule == 2 else min(weight, room)

@@ -94,6 +94,22 @@ def test_an_object_at_the_focus_is_in_focus(sphere_dpt, focus_dpt, pupil_mm):
     assert total_dpt == pytest.approx(0.0, abs=0.01)
 
 
+def test_a_focus_that_was_not_traced_is_said():
+    estimated = estimate_eye(parse_profile({"kind": "prescription", "sphere_dpt": 0.0}))
+    eye = TracedEye.trace(
+        estimated,
+        pupil_diameters_mm=PUPILS_MM,
+        focus_range_dpt=(0.0, 2.0),
+        wavelengths_nm=(555.0,),
+    )
+    for pupil_mm in PUPILS_MM:
+        assert eye.notes(pupil_diameter_mm=pupil_mm, focus_dpt=1.9) == ()
+        (note,) = eye.notes(pupil_diameter_mm=pupil_mm, focus_dpt=4.0)
+        assert "outside what was prepared" in note
+        used_dpt = eye.reachable_focus_dpt(4.0, pupil_diameter_mm=pupil_mm)
+        assert 1.98 < used_dpt < 3.0
+
+
 def test_worn_correction_moves_the_far_point():
     body = {"kind": "prescription", "sphere_dpt": -4.0}
     _, bare = traced(body)
