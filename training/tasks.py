@@ -175,8 +175,8 @@ def _focus_of_one(
         )
     except TraceFailed:
         return np.full((len(focuses_dpt), 2), np.nan)
-    used_dpt = [eye.accommodation_dpt(focus) for focus in focuses_dpt.tolist()]
-    return eye.changes_mm(used_dpt)
+    # The network speaks of the refraction at the cornea.
+    return eye.changes_mm(eye.accommodations_at_cornea_dpt(-focuses_dpt))
 
 
 def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ its ray-traced least-squares refraction M, from C(2,0) at the given pupil and 55
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,10 +24,21 @@ from estimator.eye.lens_shape import (
     lens_shape,
 )
 from estimator.eye.parameters import EyeParameters, RetinaShape, column
-from estimator.eye.tracing import TraceFailed, refraction_of_vectors
+from estimator.eye.tracing import (
+    TraceFailed,
+    refraction_of_vectors,
+    seen_refraction_of_vectors,
+)
 from estimator.optics import prescription as rx
+from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.surfaces import EyeSurfaces
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.vergence import ObjectVergence, refraction_at_cornea_dpt
+from estimator.optics.zernike import N_TERMS
+from estimator.wavefront.field_wavefronts import (
+    total_defocus_dpt,
+    zernike_from_polynomial,
+)
 
 SMALLEST_DIAMETER_RATIO = 0.84
 """Smallest lens diameter over the relaxed one.  The earlier search stopped at 0.91, on
@@ -121,6 +132,13 @@ class FocusedEye:
     notes: tuple[str, ...]
 
 
+class Rest(Protocol):
+    """Phase beside that of the traced eye, see `estimate.measured_rest`."""
+
+    def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+        """Monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
+
+
 class AccommodatingEye(Focusing):
     """An eye that can be asked to focus, at any pupil.
 
@@ -130,14 +148,21 @@ class AccommodatingEye(Focusing):
     Attributes
     ----------
     refraction_dpt : float
-        M of the relaxed eye at 555 nm and ``pupil_diameter_mm``, as seen through the
-        worn correction.
+        M of the relaxed eye at the cornea, 555 nm and ``pupil_diameter_mm``, as seen
+        through the worn correction.
     bare_refraction_dpt : float
         The same without the correction.
+    entrance_pupil_mm : float
+        Of the relaxed eye, behind the corneal apex.
     lens_range_dpt : float
         Accommodation that the lens model itself can reach.
     amplitude_dpt : float
         The smaller of that and the amplitude given (by age), at that pupil.
+
+    Parameters
+    ----------
+    rest : Rest, optional
+        What is seen beside the traced eye.
     """
 
     def __init__(
@@ -148,27 +173,61 @@ class AccommodatingEye(Focusing):
         pupil_diameter_mm: float = 4.0,
         amplitude_dpt: float = math.inf,
         correction: rx.Prescription | None = None,
+        rest: Rest | None = None,
     ):
         self.parameters = parameters
         self.retina = retina
         self.pupil_diameter_mm = pupil_diameter_mm
         self._vector = parameters.to_vector()
+        self.entrance_pupil_mm = entrance_pupil_mm(
+            eye_surfaces(parameters, retina=retina),
+            wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        )
+        self.vergence = ObjectVergence.seen_through(
+            correction, entrance_pupil_mm=self.entrance_pupil_mm
+        )
         diameters_mm, refractions_dpt = self._refraction_table()
-        self._correction_dpt = rx.power_vector(correction)[0] if correction else 0.0
-        self.bare_refraction_dpt = float(refractions_dpt[0])
-        self.refraction_dpt = self.bare_refraction_dpt - self._correction_dpt
+        self._bare_dpt = float(refractions_dpt[0])
+        self._rest = rest
+        self._table: FocusTable | None = None
+        self._correction_dpt, at_cornea_dpt = 0.0, 0.0
+        if correction is not None:
+            at_cornea_dpt, *_ = rx.power_vector(correction)
+            self._correction_dpt, *_ = rx.power_vector(
+                correction, depth_mm=self.entrance_pupil_mm
+            )
+        self.bare_refraction_dpt = refraction_at_cornea_dpt(
+            self._bare_dpt + float(self._rest_dpt(pupil_diameter_mm)),
+            entrance_pupil_mm=self.entrance_pupil_mm,
+        )
+        self.refraction_dpt = self.bare_refraction_dpt - at_cornea_dpt
         self._diameters_mm = diameters_mm
-        self._accommodations_dpt = self.bare_refraction_dpt - refractions_dpt
+        self._accommodations_dpt = self._bare_dpt - refractions_dpt
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
         self._age_amplitude_dpt = amplitude_dpt
         self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
 
-    @cached_property
-    def _focus_table(self) -> FocusTable:
-        """Refraction without correction over pupil and accommodation.
+    def _rest_dpt(self, pupil_diameter_mm: float) -> NDArray[np.float64]:
+        """M of the rest on a round pupil."""
+        if self._rest is None:
+            return np.zeros(())
+        radius_mm = pupil_diameter_mm / 2.0
+        rest_um = self._rest.on_axis_um(pupil_diameter_mm)
+        zernike_um = zernike_from_polynomial(rest_um, radius_mm)
+        return total_defocus_dpt(zernike_um, radius_mm)[0]
 
-        Pupils that light does not fill in every state of the lens are left out.
+    @property
+    def _focus_table(self) -> FocusTable:
+        """Refraction without correction over pupil and accommodation, made when asked.
+
+        No cached property: whoever stores the eye stores the table with it.
         """
+        if self._table is None:
+            self._table = self._new_focus_table()
+        return self._table
+
+    def _new_focus_table(self) -> FocusTable:
+        """Trace it; pupils that light does not fill in every state are left out."""
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
         some = np.unique(
             np.linspace(0, self._diameters_mm.size - 1, N_FOCUS).astype(int)
@@ -176,11 +235,14 @@ class AccommodatingEye(Focusing):
         states = accommodated_vectors(
             self._vector, lens_diameter_mm=self._diameters_mm[some]
         )
-        found_dpt = refraction_of_vectors(
+        rest_um = np.zeros((pupils_mm.size, N_TERMS))
+        if self._rest is not None:
+            rest_um = self._rest.on_axis_um(pupils_mm)
+        found_dpt = seen_refraction_of_vectors(
             np.tile(states, (pupils_mm.size, 1)),
             retina=self.retina,
             pupil_diameter_mm=np.repeat(pupils_mm, len(states)),
-            wavelength_nm=REFERENCE_WAVELENGTH_NM,
+            added_um=np.repeat(rest_um, len(states), axis=0),
         ).reshape(pupils_mm.size, len(states))
         usable = np.isfinite(found_dpt).all(axis=1)
         return FocusTable(
@@ -198,8 +260,6 @@ class AccommodatingEye(Focusing):
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> float:
         """Least-squares M at 555 nm through a pupil, at an accommodation."""
-        if pupil_diameter_mm == self.pupil_diameter_mm:
-            return self.refraction_dpt - accommodation_dpt
         bare_dpt = self._focus_table.refraction_dpt(
             pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
         )
@@ -209,9 +269,6 @@ class AccommodatingEye(Focusing):
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
         """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
-        if pupil_diameter_mm == self.pupil_diameter_mm:
-            wanted_dpt = self.refraction_dpt - refraction_dpt
-            return min(max(wanted_dpt, 0.0), self.amplitude_dpt)
         relaxed_dpt = self.refraction_at_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
         )
@@ -226,6 +283,38 @@ class AccommodatingEye(Focusing):
         return self.accommodation_for_dpt(
             -math.inf, pupil_diameter_mm=pupil_diameter_mm
         )
+
+    def _cornea_refractions_dpt(self) -> NDArray[np.float64]:
+        """M at the cornea of the traced eye alone, at the lens diameters of the table.
+
+        Through its own pupil: what the networks know.
+        """
+        return refraction_of_vectors(
+            accommodated_vectors(self._vector, lens_diameter_mm=self._diameters_mm),
+            retina=self.retina,
+            pupil_diameter_mm=self.pupil_diameter_mm,
+        )
+
+    def at_cornea_dpt(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
+        """M at the cornea (n,) of the traced eye alone, at accommodations (n,)."""
+        used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
+        refractions_dpt = self._cornea_refractions_dpt()
+        return BarycentricInterpolator(self._accommodations_dpt, refractions_dpt)(
+            used_dpt
+        )
+
+    def accommodations_at_cornea_dpt(
+        self, refractions_dpt: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Accommodations (n,) within the amplitude for M at the cornea (n,)."""
+        known_dpt = self._cornea_refractions_dpt()
+        if known_dpt.size == 1:
+            return np.zeros(np.shape(refractions_dpt))
+        wanted_dpt = np.clip(refractions_dpt, known_dpt[-1], known_dpt[0])
+        used_dpt = BarycentricInterpolator(known_dpt, self._accommodations_dpt)(
+            wanted_dpt
+        )
+        return np.clip(used_dpt, 0.0, self.amplitude_dpt)
 
     def _refraction_table(self):
         """Lens diameters, falling, and the refraction at each, as far as it falls."""
@@ -250,6 +339,7 @@ class AccommodatingEye(Focusing):
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
             wavelength_nm=REFERENCE_WAVELENGTH_NM,
+            at_pupil=True,
         )
 
     def lens_diameters_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
@@ -270,7 +360,7 @@ class AccommodatingEye(Focusing):
         slope_mm_dpt = np.interp(wanted_dpt, known_dpt, slopes)
         for _ in range(MAX_REFINEMENTS):
             vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
-            reached_dpt = self.bare_refraction_dpt - self._refractions_dpt(vectors)
+            reached_dpt = self._bare_dpt - self._refractions_dpt(vectors)
             error_dpt = wanted_dpt - reached_dpt
             if np.max(np.abs(error_dpt)) < REFRACTION_TOLERANCE_DPT:
                 break
@@ -317,10 +407,7 @@ class AccommodatingEye(Focusing):
         return [
             replace(
                 state,
-                focus_dpt=-self.refraction_at_dpt(
-                    pupil_diameter_mm=pupil_mm,
-                    accommodation_dpt=state.accommodation_dpt,
-                ),
+                focus_dpt=self._sharpest_dpt(state.accommodation_dpt, pupil_mm),
                 notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
             )
             for focus_dpt, state in zip(
@@ -349,7 +436,7 @@ class AccommodatingEye(Focusing):
         return FocusedEye(
             parameters=eye,
             surfaces=eye_surfaces(eye, retina=self.retina),
-            focus_dpt=accommodation_dpt - self.refraction_dpt,
+            focus_dpt=self._sharpest_dpt(accommodation_dpt, self.pupil_diameter_mm),
             accommodation_dpt=accommodation_dpt,
             lens_diameter_change_mm=diameter_mm - relaxed.lens_diameter_mm,
             aqueous_thickness_change_mm=(

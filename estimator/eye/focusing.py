@@ -1,12 +1,15 @@
 """What any eye answers about focus and pupil: its reach, and what it cannot meet.
 
-Focus is a matter of the pupil too: spherical aberration moves the sharpest distance as
-the pupil opens, so every question names the pupil that it is asked at.
+Distances and refraction are counted in the plane of the entrance pupil.  Focus is a
+matter of the pupil too: spherical aberration moves the sharpest distance as the pupil
+opens, so every question names the pupil that it is asked at.
 """
 
 from abc import ABC, abstractmethod
 
 import numpy as np
+
+from estimator.optics.vergence import ObjectVergence
 
 OUT_OF_REACH_DPT = 1e-6
 """A request farther than this from what the eye can do is said to be out of reach."""
@@ -22,20 +25,23 @@ class Focusing(ABC):
     Attributes
     ----------
     refraction_dpt : float
-        Least-squares M at 555 nm of the relaxed eye at the measured pupil, through the
-        worn correction.
+        Least-squares M at the cornea and 555 nm of the relaxed eye at the measured
+        pupil, through the worn correction: what one tells a person.
     amplitude_dpt : float
         Largest accommodation.
+    vergence : ObjectVergence
+        From distances to vergences, through the worn correction.
     """
 
     refraction_dpt: float
     amplitude_dpt: float
+    vergence: ObjectVergence
 
     @abstractmethod
     def refraction_at_dpt(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> float:
-        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        """Least-squares M at 555 nm in the plane of a pupil, at an accommodation."""
 
     @abstractmethod
     def accommodation_for_dpt(
@@ -50,7 +56,16 @@ class Focusing(ABC):
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
         """Accommodation at which a distance is sharpest through a pupil, in reach."""
         return self.accommodation_for_dpt(
-            -focus_dpt, pupil_diameter_mm=pupil_diameter_mm
+            -self.vergence.vergence_dpt(focus_dpt),
+            pupil_diameter_mm=pupil_diameter_mm,
+        )
+
+    def _sharpest_dpt(self, used_dpt: float, pupil_diameter_mm: float) -> float:
+        """Distance that is sharpest at an accommodation, through a pupil."""
+        return self.vergence.object_dpt(
+            -self.refraction_at_dpt(
+                pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
+            )
         )
 
     def reachable_focus_dpt(
@@ -60,17 +75,14 @@ class Focusing(ABC):
         used_dpt = self.accommodation_dpt(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
-        return -self.refraction_at_dpt(
-            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
-        )
+        return self._sharpest_dpt(used_dpt, pupil_diameter_mm)
 
     def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
         """Far point and near point through a pupil, dpt."""
+        largest_dpt = self.largest_accommodation_dpt(pupil_diameter_mm)
         far_dpt, near_dpt = (
-            -self.refraction_at_dpt(
-                pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
-            )
-            for used_dpt in (0.0, self.largest_accommodation_dpt(pupil_diameter_mm))
+            self._sharpest_dpt(used_dpt, pupil_diameter_mm)
+            for used_dpt in (0.0, largest_dpt)
         )
         return far_dpt, near_dpt
 
@@ -105,9 +117,12 @@ class Focusing(ABC):
             if near_dpt >= 0.0
             else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
         )
+        added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(
+            far_dpt
+        )
         return (
             f"focus {focus_dpt:g} dpt {reached}: "
-            f"accommodation stops at {near_dpt - far_dpt:.3g} dpt",
+            f"accommodation stops at {added_dpt:.3g} dpt",
         )
 
 

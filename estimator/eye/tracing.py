@@ -12,11 +12,21 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.eye.assembly import pack_eyes
 from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.optics.media import refractive_index
+from estimator.optics.paraxial import entrance_pupils_mm
 from estimator.optics.prescription import C20
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, rescale_pupil
 from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
+from estimator.wavefront.field_wavefronts import (
+    circumscribed_radius_mm,
+    polynomial_in_mm,
+    rim_from_ellipse,
+)
 from estimator.wavefront.kernels import magnifications
+from estimator.wavefront.pupil_refraction import pupil_refraction_dpt
+
+OPEN_RATIO = 0.999
+"""Share of the stop from which a pupil counts as open."""
 
 MEDIA_INWARDS = ("air", "cornea", "aqueous", "lens", "vitreous")
 
@@ -38,22 +48,25 @@ def zernike_of_vectors(
     retina: RetinaShape | None = None,
     h_deg: float = 0.0,
     v_deg: float = 0.0,
+    at_pupil: bool = False,
 ) -> NDArray[np.float64]:
     """Coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
 
     They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray;
-    object at infinity; a row is nan where light does not pass.
+    object at infinity; a row is nan where light does not pass.  The circle lies at the
+    cornea, or, on axis, in the plane of each eye's own entrance pupil.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(wavelength_nm)
     pupils_mm = np.broadcast_to(
         np.asarray(pupil_diameter_mm, dtype=np.float64), (len(vectors),)
     )
-    radius_mm = pupils_mm / 2.0
+    radius_mm, reference = pupils_mm / 2.0, eye_indices(REFERENCE_WAVELENGTH_NM)
     if h_deg == 0.0 and v_deg == 0.0:
-        zernike_um, _ = on_axis_zernike(packed, indices, zernike_radius_mm=radius_mm)
-        return zernike_um
-    reference = eye_indices(REFERENCE_WAVELENGTH_NM)
+        pupil_z_mm = entrance_pupils_mm(packed, reference) if at_pupil else np.nan
+        return on_axis_zernike(
+            packed, indices, zernike_radius_mm=radius_mm, pupil_z_mm=pupil_z_mm
+        )[0]
     ratios = magnifications(packed, reference)
     zernike_um = np.full((len(vectors), N_TERMS), np.nan)
     usable = ratios > 0.0
@@ -80,6 +93,7 @@ def refraction_of_vectors(
     pupil_diameter_mm: ArrayLike,
     wavelength_nm: float = REFERENCE_WAVELENGTH_NM,
     retina: RetinaShape | None = None,
+    at_pupil: bool = False,
 ) -> NDArray[np.float64]:
     """Least-squares M (P,), dpt, from C(2,0) on the pupil's circle; nan as above."""
     zernike_um = zernike_of_vectors(
@@ -87,9 +101,45 @@ def refraction_of_vectors(
         pupil_diameter_mm=pupil_diameter_mm,
         wavelength_nm=wavelength_nm,
         retina=retina,
+        at_pupil=at_pupil,
     )
     radius_mm = np.asarray(pupil_diameter_mm, dtype=np.float64) / 2.0
     return -SPHERE_PER_C20 * zernike_um[:, C20] / radius_mm**2
+
+
+def seen_refraction_of_vectors(
+    vectors: NDArray[np.float64],
+    *,
+    pupil_diameter_mm: ArrayLike,
+    added_um: NDArray[np.float64] | float = 0.0,
+    retina: RetinaShape | None = None,
+) -> NDArray[np.float64]:
+    """M (P,), dpt, on axis and at 555 nm over the light in each eye's entrance pupil.
+
+    The circle of ``pupil_diameter_mm``, one or (P,), is circumscribed about the pupil;
+    nan where light does not pass all of that.
+
+    Parameters
+    ----------
+    added_um : (P, 28), um/mm^degree
+        Wavefront beside that of the eye.
+    """
+    packed = pack_eyes(vectors, retina=retina)
+    indices = eye_indices(REFERENCE_WAVELENGTH_NM)
+    pupils_mm = np.broadcast_to(
+        np.asarray(pupil_diameter_mm, dtype=np.float64), (len(vectors),)
+    )
+    found = eyes_aberrations(
+        packed,
+        indices,
+        stop_diameters_mm=pupils_mm / magnifications(packed, indices),
+        pupil_z_mm=entrance_pupils_mm(packed, indices),
+    )
+    polynomial_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm)
+    rim_mm = rim_from_ellipse(found.ellipse_mm)
+    scale = pupils_mm / 2.0 / circumscribed_radius_mm(rim_mm)
+    seen_dpt = pupil_refraction_dpt(polynomial_um + added_um, rim_mm * scale[:, None])
+    return np.where(found.open_ratio > OPEN_RATIO, seen_dpt, np.nan)
 
 
 def on_axis_zernike_um(

@@ -92,6 +92,7 @@ def aberration_grid(
             fields_deg=fields_deg.reshape(-1, 2),
             wavelengths_nm=wavelengths_nm,
             pupil_diameters_mm=pupils_mm,
+            plane="pupil",
             n_rings=n_rings,
             n_azimuths=n_azimuths,
         )

@@ -6,20 +6,29 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.optics.vergence import ObjectVergence
 from estimator.wavefront.field_wavefronts import FieldWavefronts
 
 
 class EyeOptics(Protocol):
     """Wavefronts over field, pupil, accommodation, wavelength and defocus.
 
-    Object distance adds its vergence to the total defocus, so a PSF depends on it
-    through that sum alone.
+    Wavefronts are those in the plane of the entrance pupil.  There object distance adds
+    its vergence to the total defocus, so a PSF depends on it through that sum alone.
 
     Every array of states may have any shape that broadcasts with the others: fields
     ``h_deg`` and ``v_deg``, the entrance pupil's diameter in mm, accommodation in dpt,
     the wavelength in nm.  An eye that was traced for a range raises ValueError where a
     state lies outside of it.
     """
+
+    @property
+    def eye_side(self) -> str:
+        """OD or OS, which decides where cones see the pupil brightest."""
+
+    @property
+    def vergence(self) -> ObjectVergence:
+        """From object distances to vergences, through the worn correction."""
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
         """Pupil diameter asked for, mm, capped where the eye knows no more."""

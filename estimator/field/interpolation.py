@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.field_wavefronts import (
@@ -22,9 +23,6 @@ from estimator.wavefront.field_wavefronts import (
     polynomial_in_mm,
     rim_from_ellipse,
 )
-
-OPEN_RATIO = 0.999
-"""Share of the stop from which a pupil counts as open."""
 
 NODES_PER_EXTENT = 7.7
 """Field nodes per half extent in stretched angle: 10 for 40 deg, 8 for 25 deg; fewer
@@ -43,7 +41,7 @@ _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
 """A rim's centre goes with the square of the pupil, its axes with the pupil."""
 
-_POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.6)])
+_POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
 """How coefficients change with the pupil A: a term of order 8 (7 for the odd) that a
 fit of order 6 leaves out adds a share that goes with A^(8 - degree) to a coefficient of
 its parity; a rim departs from its paraxial form with A² and a little A⁴."""

@@ -3,7 +3,8 @@
 The network knows no vignetting and no retina but the sphere.  So a grid is only made
 where the corners of its field pass the largest pupil, which is traced; those nodes show
 its error in this eye, too, and where that is far above the stated one the grid is
-refused.  Lateral colour is traced: chief rays cost a fortieth of whole bundles.
+refused.  Lateral colour is traced: chief rays cost a fortieth of whole bundles.  The
+network was trained on wavefronts at the cornea; they are carried to the entrance pupil.
 """
 
 from dataclasses import dataclass
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.accommodation import FocusedEye, accommodated_vectors
+from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
-from estimator.field.interpolation import OPEN_RATIO
 from estimator.networks.card import NetworkUnfit
 from estimator.networks.inference import (
     load_network,
@@ -24,10 +25,20 @@ from estimator.networks.inference import (
 )
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.chief_rays import chief_shift_mrad
-from estimator.wavefront.field_wavefronts import ellipse_from_rim
+from estimator.wavefront.field_wavefronts import (
+    circumscribed_radius_mm,
+    ellipse_from_rim,
+    polynomial_in_mm,
+    zernike_from_polynomial,
+)
+from estimator.wavefront.moved_plane import moved_polynomial, moved_rim
 
 CHECK_RINGS, CHECK_AZIMUTHS = 5, 14
 """Rays of a check, as over the field of a traced grid: far below the error sought."""
+
+CORNEA_RADIUS_MM = 7.8
+"""Of the sphere that stands for the cornea where its distance from the entrance pupil
+is asked for: 0.05 mm off at 45 deg."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +74,7 @@ def network_focused(eye: EstimatedEye, accommodations_dpt: ArrayLike):
         changes_mm, _ = network_focus(
             eye.parameters.to_vector(),
             pupil_diameter_mm=lens.pupil_diameter_mm,
-            focus_dpt=used_dpt[needed] - lens.bare_refraction_dpt,
+            focus_dpt=-lens.at_cornea_dpt(used_dpt[needed]),
         )
         diameters_mm[needed] += np.minimum(changes_mm, 0.0)
     return lens.with_diameters(used_dpt, diameters_mm)
@@ -114,17 +125,23 @@ def network_grid(
         v_deg=v_deg[:, None, None, None],
     )
     shape = found.zernike_radius_mm.shape
+    polynomial_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm)
+    depth_mm = _depths_mm(eye, h_deg, v_deg)[..., None, None, None]
+    rim_mm = moved_rim(found.rim_mm, polynomial_um, depth_mm=depth_mm)
+    radius_mm = circumscribed_radius_mm(rim_mm)
     grid = AberrationGrid(
         h_deg=h_deg,
         v_deg=v_deg,
         pupil_diameters_mm=pupils_mm,
         accommodations_dpt=used_dpt,
         wavelengths_nm=wavelengths_nm,
-        zernike_um=found.zernike_um,
-        zernike_radius_mm=found.zernike_radius_mm,
+        zernike_um=zernike_from_polynomial(
+            moved_polynomial(polynomial_um, depth_mm=depth_mm), radius_mm
+        ),
+        zernike_radius_mm=radius_mm,
         rms_residual_um=np.full(shape, np.nan),
         open_ratio=np.ones(shape),
-        ellipse_mm=ellipse_from_rim(found.rim_mm),
+        ellipse_mm=ellipse_from_rim(rim_mm),
         chief_shift_mrad=_chief_shifts_mrad(states, h_deg, v_deg, wavelengths_nm),
     )
     errors_um = _corner_errors_um(grid, states)
@@ -138,6 +155,18 @@ def _vectors(eye: EstimatedEye, states: list[FocusedEye]) -> NDArray[np.float64]
     diameters_mm = [state.parameters.lens_diameter_mm for state in states]
     return accommodated_vectors(
         eye.parameters.to_vector(), lens_diameter_mm=diameters_mm
+    )
+
+
+def _depths_mm(
+    eye: EstimatedEye, h_deg: NDArray, v_deg: NDArray
+) -> NDArray[np.float64]:
+    """From cornea to entrance pupil along chief rays (n_h, n_v)."""
+    cosine = np.cos(np.radians(h_deg))[:, None] * np.cos(np.radians(v_deg))
+    behind_mm = CORNEA_RADIUS_MM - eye.accommodating.entrance_pupil_mm
+    sine_squared = 1.0 - cosine**2
+    return np.sqrt(CORNEA_RADIUS_MM**2 - behind_mm**2 * sine_squared) - (
+        behind_mm * cosine
     )
 
 
@@ -180,6 +209,7 @@ def _corner_errors_um(
             fields_deg=fields_deg,
             wavelengths_nm=grid.wavelengths_nm[:1],
             pupil_diameters_mm=grid.pupil_diameters_mm[-1:],
+            plane="pupil",
             n_rings=CHECK_RINGS,
             n_azimuths=CHECK_AZIMUTHS,
         )

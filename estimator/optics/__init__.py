@@ -10,6 +10,7 @@ surfaces          one surface, a stack of them, and both packed for compiled loo
 raytrace          rays through a stack of surfaces, each with its status
 raytrace_kernels  its compiled loops
 paraxial          vergences and pupils near the axis
+vergence          the plane of the entrance pupil: distances, spectacles
 pinhole           directions and local scale of a pinhole image
 """
 

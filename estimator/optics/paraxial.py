@@ -16,6 +16,7 @@ from estimator.optics.surfaces import (
     FORM,
     N_BEFORE_STOP,
     OFFSET,
+    STOP_Z,
     VERTEX,
     WITH_OFFSET,
     EyeSurfaces,
@@ -109,6 +110,34 @@ def _entrance_pupil(
     # Object plane at z: height at the stop must not depend on the slope there.
     back_mm = -indices[0] * to_stop[0, 1] / to_stop[0, 0]
     return float(z_mm[0] - back_mm), float(1.0 / to_stop[0, 0])
+
+
+def entrance_pupils_mm(
+    packed: NDArray[np.float64], indices: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Entrance pupils (n_eyes,) on the axis of eyes that have the same surfaces.
+
+    Parameters
+    ----------
+    packed : (n_eyes, n_surfaces + 1, 48)
+        Stacked `surfaces.pack_eye`.
+    indices : (n_surfaces + 1,)
+        From `surfaces.media_indices`.
+    """
+    rows = packed.reshape(-1, packed.shape[-1])
+    curvature, vertex_mm = (
+        column.reshape(packed.shape[:2])
+        for column in (_mean_curvatures(rows), _vertices_mm(rows))
+    )
+    n_before = int(packed[0, -1, N_BEFORE_STOP])
+    z_mm, height = packed[:, -1, STOP_Z], np.zeros(len(packed))
+    slope = np.full(len(packed), 1.0 / indices[n_before])
+    for i in range(n_before - 1, -1, -1):
+        height = height + slope * (vertex_mm[:, i] - z_mm)
+        z_mm = vertex_mm[:, i]
+        power = (indices[i + 1] - indices[i]) * curvature[:, i]
+        slope = (indices[i + 1] * slope + power * height) / indices[i]
+    return z_mm - height / slope
 
 
 def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints:

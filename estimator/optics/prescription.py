@@ -33,13 +33,16 @@ def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
     return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
 
 
-def power_vector(prescription: Prescription) -> tuple[float, float, float]:
+def power_vector(
+    prescription: Prescription, *, depth_mm: float = 0.0
+) -> tuple[float, float, float]:
     """M, J0 and J45 in dpt at the cornea, in the eye frame (x to the person's right).
 
     The examiner sees the eye mirrored, so the axis A becomes 180 - A (DESIGN 3),
-    which changes the sign of J45 alone.  Thibos, Wheeler & Horner 1997.
+    which changes the sign of J45 alone.  Thibos, Wheeler & Horner 1997.  With
+    ``depth_mm`` they are those so far behind the cornea.
     """
-    vertex_mm = prescription.vertex_mm
+    vertex_mm = prescription.vertex_mm + depth_mm
     sphere = power_at_cornea_dpt(prescription.sphere_dpt, vertex_mm=vertex_mm)
     other = prescription.sphere_dpt + prescription.cylinder_dpt
     cylinder = power_at_cornea_dpt(other, vertex_mm=vertex_mm) - sphere

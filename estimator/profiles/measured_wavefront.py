@@ -17,6 +17,11 @@ from estimator.eye.focusing import FocusingEye
 from estimator.optics import prescription as rx
 from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.optics.vergence import (
+    TYPICAL_ENTRANCE_PUPIL_MM,
+    ObjectVergence,
+    refraction_at_cornea_dpt,
+)
 from estimator.optics.zernike import remove_central_tilt, rescale_pupil
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import (
@@ -27,6 +32,7 @@ from estimator.wavefront.field_wavefronts import (
     with_defocus,
     zernike_from_polynomial,
 )
+from estimator.wavefront.moved_plane import moved_polynomial
 
 DEFAULT_AMPLITUDE_DPT = 10.0
 """Amplitude of accommodation of an eye whose age is not given."""
@@ -63,17 +69,39 @@ class WavefrontState:
 
 
 class MeasuredWavefront(FocusingEye):
-    """Wavefront-only eye: measured coefficients plus defocus by formula."""
+    """Wavefront-only eye: measured coefficients plus defocus by formula.
+
+    Attributes
+    ----------
+    eye_side : str
+        OD or OS.
+    zernike_um : (28,)
+        In the plane of a typical entrance pupil, worn correction taken off.
+    refraction_dpt : float
+        M at the cornea and 555 nm at the measured pupil, through the correction.
+    """
 
     pupil_limit = "measured"
 
     def __init__(self, profile: EyeProfile):
         radius_mm = profile.pupil_diameter_mm / 2.0
-        zernike_um = remove_central_tilt(profile.zernike_um)
+        depth_mm = TYPICAL_ENTRANCE_PUPIL_MM
+        at_cornea_um = remove_central_tilt(profile.zernike_um)
+        zernike_um = zernike_from_polynomial(
+            moved_polynomial(
+                polynomial_in_mm(at_cornea_um, radius_mm), depth_mm=depth_mm
+            ),
+            radius_mm,
+        )
         if profile.correction is not None:
             zernike_um = zernike_um - rx.zernike_from_power_vector(
-                *rx.power_vector(profile.correction), zernike_radius_mm=radius_mm
+                *rx.power_vector(profile.correction, depth_mm=depth_mm),
+                zernike_radius_mm=radius_mm,
             )
+        self.vergence = ObjectVergence.seen_through(
+            profile.correction, entrance_pupil_mm=depth_mm
+        )
+        self.eye_side = profile.eye_side
         self.zernike_um = zernike_um
         self.zernike_radius_mm = radius_mm
         self.wavelength_nm = profile.wavelength_nm
@@ -81,7 +109,10 @@ class MeasuredWavefront(FocusingEye):
         self.amplitude_dpt = accommodation_amplitude_dpt(
             age_years=profile.age_years, add_dpt=profile.add_dpt
         )
-        self.refraction_dpt = self.refraction_at_dpt(pupil_diameter_mm=2.0 * radius_mm)
+        self.refraction_dpt = refraction_at_cornea_dpt(
+            self.refraction_at_dpt(pupil_diameter_mm=2.0 * radius_mm),
+            entrance_pupil_mm=depth_mm,
+        )
 
     @classmethod
     def from_profile(cls, profile: EyeProfile) -> "MeasuredWavefront":
@@ -274,7 +305,7 @@ class MeasuredWavefront(FocusingEye):
             raise ValueError(f"eye state {values}: needs a positive pupil, all finite")
         usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
         added_dpt = (
-            object_dpt
+            self.vergence.vergence_dpt(object_dpt)
             - self.accommodation_dpt(focus_dpt, pupil_diameter_mm=usable_mm)
             + self.chromatic_shift_dpt(wavelength_nm)
         )

@@ -9,6 +9,8 @@ fit                coefficients and the pupil's rim from rays
 chief_rays         where chief rays of other colours end: lateral colour
 chief_ray_kernels  its compiled loops
 field_wavefronts   sets of wavefronts with their pupils, as PSFs are made of
+moved_plane        coefficients carried from the cornea to the entrance pupil
+pupil_refraction   least-squares refraction over the light that passes
 """
 
 import lazy_loader

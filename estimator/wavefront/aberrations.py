@@ -31,6 +31,7 @@ from estimator.wavefront.kernels import magnification
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS, circle_nodes, stop_nodes
 
 FITS = ("opd", "slope")
+PLANES = ("cornea", "pupil")
 TRACED_FIELD_LIMIT_DEG = 75.0
 
 
@@ -74,7 +75,8 @@ class FieldResults:
     retinal_point_mm : (..., 3)
         Where the chief ray meets the retina.
     pupil_point_mm : (..., 3)
-        Where it meets the cornea: origin of the pupil plane.
+        Where it meets the cornea, or the plane of the entrance pupil: origin of the
+        plane of the wavefront.
     """
 
     zernike_um: NDArray[np.float64]
@@ -172,6 +174,12 @@ def _check_view(fields_deg: NDArray, object_dpt: float, fit: str) -> None:
         raise ValueError(f"object_dpt {object_dpt}: allowed is -50 to 50")
 
 
+def _is_at_pupil(plane: str) -> bool:
+    if plane not in PLANES:
+        raise ValueError(f"plane '{plane}': allowed are {', '.join(PLANES)}")
+    return plane == "pupil"
+
+
 def _in_threads(n: int, n_threads: int | None, work: Callable[[slice], None]) -> None:
     """Share ``n`` items among threads; the compiled work releases the lock."""
     n_threads = max(1, min(n_threads or thread_count(), n))
@@ -193,6 +201,7 @@ def wavefront_grid(
     stop_diameters_mm: ArrayLike | None = None,
     pupil_diameters_mm: ArrayLike | None = None,
     object_dpt: float = 0.0,
+    plane: str = "cornea",
     fit: str = "opd",
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
@@ -210,7 +219,11 @@ def wavefront_grid(
         The iris, or the entrance pupil at 555 nm; give one.
     object_dpt : float
         Vergence of the source, from the entrance pupil along the chief ray; the
-        wavefront is taken against its spherical wave on the pupil plane.
+        wavefront is taken against its spherical wave on the plane.
+    plane : {"cornea", "pupil"}
+        Of the wavefront, normal to the chief ray: where that meets the cornea, as
+        instruments and prescriptions have it, or crosses the plane of the paraxial
+        entrance pupil, where pupils and distances are counted.
     fit : {"opd", "slope"}
         Least squares of W, or of its slopes (Algorithm 1).
     n_rings, n_azimuths : int
@@ -232,13 +245,14 @@ def wavefront_grid(
     check_eye(eye)
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
     _check_view(fields_deg, object_dpt, fit)
+    at_pupil = _is_at_pupil(plane)
     stops_mm = _stop_diameters_mm(eye, stop_diameters_mm, pupil_diameters_mm)
     packed, nodes = pack_eye(eye), stop_nodes(n_rings, n_azimuths)
     indices = media_indices(eye, np.atleast_1d(wavelengths_nm))
     pupil_z = entrance_pupil_mm(eye, wavelength_nm=REFERENCE_WAVELENGTH_NM)
     shape = (len(fields_deg), len(indices), len(stops_mm), bundle.N_RESULT)
     rows, fields_rad = np.empty(shape), np.radians(fields_deg)
-    viewed = (float(object_dpt), pupil_z, fit == "slope")
+    viewed = (float(object_dpt), pupil_z, at_pupil, fit == "slope")
 
     def work(part: slice) -> None:
         bundle.analyse_fields(
@@ -331,6 +345,7 @@ def eyes_aberrations(
     stop_diameters_mm: ArrayLike,
     h_deg: ArrayLike = 0.0,
     v_deg: ArrayLike = 0.0,
+    pupil_z_mm: ArrayLike = math.nan,
     fit: str = "opd",
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
@@ -345,6 +360,9 @@ def eyes_aberrations(
     indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
         From `surfaces.media_indices`, at the wavelength of the wavefront.
     stop_diameters_mm, h_deg, v_deg : scalar or (n_eyes,)
+    pupil_z_mm : scalar or (n_eyes,)
+        Where the chief ray crosses the plane of the wavefront, as the entrance pupil;
+        at the cornea where it is nan.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
     """
@@ -357,7 +375,8 @@ def eyes_aberrations(
     _check_view(fields_deg, 0.0, fit)
     rows, stop_radii = np.empty((n_eyes, bundle.N_RESULT)), stops_mm / 2.0
     fields_rad = np.radians(fields_deg)
-    viewed, nodes = (0.0, 0.0, fit == "slope"), stop_nodes(n_rings, n_azimuths)
+    planes_z_mm, nodes = np.empty(n_eyes), stop_nodes(n_rings, n_azimuths)
+    planes_z_mm[:] = pupil_z_mm
 
     def work(part: slice) -> None:
         bundle.analyse_eyes(
@@ -365,7 +384,8 @@ def eyes_aberrations(
             indices[part],
             fields_rad[part],
             stop_radii[part],
-            viewed,
+            planes_z_mm[part],
+            fit == "slope",
             nodes,
             rows[part],
         )
@@ -381,6 +401,7 @@ def on_axis_zernike(
     zernike_radius_mm: ArrayLike,
     h_deg: float = 0.0,
     v_deg: float = 0.0,
+    pupil_z_mm: ArrayLike = math.nan,
     n_threads: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Coefficients of many eyes on given circles outside the eye.
@@ -397,6 +418,9 @@ def on_axis_zernike(
     zernike_radius_mm : scalar or (n_eyes,)
     h_deg, v_deg : float
         Field; off axis a real pupil fills its circle only in part.
+    pupil_z_mm : scalar or (n_eyes,)
+        Where the chief ray crosses the plane of the circle, as the entrance pupil;
+        at the cornea where it is nan.
     n_threads : int, optional
         As many as the machine gives us where it is None.
 
@@ -414,6 +438,8 @@ def on_axis_zernike(
     field_rad = (math.radians(h_deg), math.radians(v_deg))
     radii_mm = np.empty(n_eyes)
     radii_mm[:] = zernike_radius_mm
+    planes_z_mm = np.empty(n_eyes)
+    planes_z_mm[:] = pupil_z_mm
     nodes = circle_nodes()
 
     def work(part: slice) -> None:
@@ -422,6 +448,7 @@ def on_axis_zernike(
             indices[part],
             field_rad,
             radii_mm[part],
+            planes_z_mm[part],
             nodes,
             zernike_um[part],
             status[part],

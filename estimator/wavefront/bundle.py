@@ -25,7 +25,9 @@ from estimator.wavefront.kernels import (
     aim,
     back_to_stop,
     chief_ray,
+    depth_along,
     leave_eye,
+    sink_plane,
     stop_response,
 )
 
@@ -243,11 +245,11 @@ def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
     ----------
     field_rad : (h, v)
     stop_radii : (n_stops,) mm
-    viewed : (object_dpt, entrance pupil z in mm, use_slopes)
+    viewed : (object_dpt, entrance pupil z in mm, at_pupil, use_slopes)
     nodes : (rings (n_rings,), their weights, azimuths (n_azimuths, 2))
     results : (n_stops, N_RESULT) out
     """
-    object_dpt, pupil_z, use_slopes = viewed
+    object_dpt, pupil_z, at_pupil, use_slopes = viewed
     rings, ring_weights, azimuths = nodes
     chief, frame, axes = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     response, sag = np.empty((2, 2)), np.empty(3)
@@ -260,11 +262,12 @@ def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
     results[:, WORST_STATUS] = status
     if status != TRACED:
         return
-    distance_mm = math.inf
-    if object_dpt != 0.0:
+    along, distance_mm = depth_along(chief, axes, pupil_z), math.inf
+    if at_pupil:
+        sink_plane(chief, axes, along)
+        path -= along * indices[0]
         along = 0.0
-        for i in range(3):
-            along += (chief[1, i] - (pupil_z if i == 2 else 0.0)) * axes[2, i]
+    if object_dpt != 0.0:
         distance_mm = UM_PER_MM / object_dpt - along
     samples = np.empty((azimuths.shape[0], rings.shape[0], N_SAMPLE))
     edge = np.empty(azimuths.shape[0])
@@ -294,13 +297,17 @@ def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, resul
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyse_eyes(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+def analyse_eyes(
+    packed, indices, fields_rad, stop_radii, pupil_z_mm, use_slopes, nodes, results
+):
     """`analyse_field` over eyes, each with a field and a stop of its own.
 
     ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
-    (E, 2), ``stop_radii`` (E,), ``results`` (E, N_RESULT).
+    (E, 2), ``stop_radii`` and ``pupil_z_mm`` (E,), nan for the plane at the cornea,
+    ``results`` (E, N_RESULT).
     """
     for e in range(packed.shape[0]):
         field_rad = (fields_rad[e, 0], fields_rad[e, 1])
         stop, result = stop_radii[e : e + 1], results[e : e + 1]
+        viewed = (0.0, pupil_z_mm[e], not math.isnan(pupil_z_mm[e]), use_slopes)
         analyse_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)

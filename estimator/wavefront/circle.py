@@ -22,7 +22,9 @@ from estimator.wavefront.kernels import (
     X,
     Y,
     back_to_stop,
+    depth_along,
     leave_eye,
+    sink_plane,
     update_inverse,
 )
 
@@ -133,7 +135,9 @@ def _count_used(weights):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, status):
+def circle_zernike(
+    packed, indices, field_rad, radii_mm, pupil_z_mm, nodes, zernike_um, status
+):
     """Coefficients of many eyes, each on its circle about the chief ray of one field.
 
     Parameters
@@ -142,6 +146,8 @@ def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, stat
     indices : (n_eyes, n_surfaces + 1)
     field_rad : (h, v)
     radii_mm : (n_eyes,)
+    pupil_z_mm : (n_eyes,)
+        Where the chief ray crosses the plane of the circle; nan: at the cornea.
     nodes : (rings (n_rings,), weights (n_rings,), azimuths (n_azimuths, 2),
         projection (28, n_azimuths * n_rings))
     zernike_um : (n_eyes, 28) out
@@ -172,6 +178,10 @@ def circle_zernike(packed, indices, field_rad, radii_mm, nodes, zernike_um, stat
         status[e] = code
         if code != TRACED:
             continue
+        if not math.isnan(pupil_z_mm[e]):
+            along = depth_along(chief, axes, pupil_z_mm[e])
+            sink_plane(chief, axes, along)
+            path -= along * indices[e, 0]
         for k in range(n_azimuths):
             for ring in range(n_rings):
                 weights[k, ring] = ring_weights[ring] / n_azimuths

@@ -112,16 +112,19 @@ def zernike_from_polynomial(
     return zernike_um
 
 
-def correction_polynomial(correction: rx.Prescription | None) -> NDArray[np.float64]:
+def correction_polynomial(
+    correction: rx.Prescription | None, *, entrance_pupil_mm: float
+) -> NDArray[np.float64]:
     """Monomial coefficients (28,), um/mm^degree, that a worn correction takes off.
 
-    The same dioptres at every field, in the pupil plane of the field: a lens that is
-    turned to the source.  What a real lens adds off its axis depends on its shape.
+    The same dioptres at every field, in the plane of the entrance pupil so far behind
+    the cornea: a lens that is turned to the source.  What a real lens adds off its axis
+    depends on its shape.
     """
     if correction is None:
         return np.zeros(DEGREE.size)
     zernike_um = rx.zernike_from_power_vector(
-        *rx.power_vector(correction), zernike_radius_mm=1.0
+        *rx.power_vector(correction, depth_mm=entrance_pupil_mm), zernike_radius_mm=1.0
     )
     return polynomial_in_mm(zernike_um, 1.0)
 

@@ -209,6 +209,22 @@ def across(direction, frame):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def depth_along(chief, axes, pupil_z):
+    """From the plane's point to where the chief ray crosses z = ``pupil_z``, mm."""
+    along = 0.0
+    for i in range(3):
+        along += (chief[1, i] - (pupil_z if i == 2 else 0.0)) * axes[2, i]
+    return along
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sink_plane(chief, axes, along):
+    """Move the plane's point inwards along the chief ray, as if all were air."""
+    for i in range(3):
+        chief[1, i] -= along * axes[2, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def launch(chief, frame, a, b, ray):
     """Ray from the retinal point at direction cosines (a, b) from the chief ray."""
     squared = 1.0 - a * a - b * b

@@ -75,6 +75,7 @@ def paper_defocus(
     ).reshape(-1, 3)
     green_dpt = at_infinity_dpt[:, GREEN, None]
     count = DISTANCE_COUNTS[spec.settings.mode]
-    values = green_dpt + np.linspace(*DISTANCES_DPT, count)
+    distances_dpt = np.linspace(*DISTANCES_DPT, count)
+    values = green_dpt + eye.vergence.vergence_dpt(distances_dpt)
     starts = count * np.arange(len(values) + 1)
     return RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt

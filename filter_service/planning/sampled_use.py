@@ -34,7 +34,8 @@ class Use:
     Attributes
     ----------
     states : PupilStates
-    object_dpt : (P,)
+    vergence_dpt : (P,)
+        Of the object, at the cornea.
     pixel_from_mrad : (P, 2, 2) or None
         Scale of the image there, where frames map stored kernels to it.  None without
         a range of gaze: between the nodes around a pixel the scale changes so little
@@ -46,7 +47,7 @@ class Use:
     eye: EyeOptics
     spec: GridSpec
     states: PupilStates
-    object_dpt: NDArray[np.float64]
+    vergence_dpt: NDArray[np.float64]
     pixel_from_mrad: NDArray[np.float64] | None
     exact_px: NDArray[np.float64]
 
@@ -60,7 +61,7 @@ class Use:
         return replace(
             self,
             states=self.states.taken(index),
-            object_dpt=self.object_dpt[index],
+            vergence_dpt=self.vergence_dpt[index],
             pixel_from_mrad=(
                 None if self.pixel_from_mrad is None else self.pixel_from_mrad[index]
             ),
@@ -99,10 +100,12 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
         for answer in (eye.accommodation_dpt, eye.reachable_focus_dpt)
     )
     low_dpt, high_dpt = spec.settings.object_range_dpt
-    object_dpt = np.where(
-        distance < 0.5,
-        np.clip(focused_dpt, low_dpt, high_dpt),
-        low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
+    vergence_dpt = eye.vergence.vergence_dpt(
+        np.where(
+            distance < 0.5,
+            np.clip(focused_dpt, low_dpt, high_dpt),
+            low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
+        )
     )
     wavelengths_nm = spec.channel_wavelengths_nm
     known = {
@@ -113,12 +116,12 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
         "wavelength_nm": wavelengths_nm[(channel * len(wavelengths_nm)).astype(int)],
     }
     states = PupilStates(
-        **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + object_dpt
+        **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + vergence_dpt
     )
     if not any(spec.settings.gaze_range_deg):
         scale = None
     exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
-    return Use(eye, spec, states, object_dpt, scale, exact_px)
+    return Use(eye, spec, states, vergence_dpt, scale, exact_px)
 
 
 def _seen_directions(
@@ -160,7 +163,7 @@ def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
     if axis == "pupil":
         total_dpt = total_dpt * use.states.pupil_diameter_mm / to
     elif axis in ("h", "v") and not use.spec.blends_at_equal_blur:
-        total_dpt = use.eye.total_defocus_dpt(**columns) + use.object_dpt
+        total_dpt = use.eye.total_defocus_dpt(**columns) + use.vergence_dpt
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
 
 
@@ -194,7 +197,7 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
             **vars(states)
             | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
         )
-        own_dpt += use.object_dpt - states.total_defocus_dpt
+        own_dpt += use.vergence_dpt - states.total_defocus_dpt
         own_dpt += _at_infinity_dpt(use, node)
     channel = np.argmin(
         np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.optics.vergence import ObjectVergence
 from filter_service.planning.grid import (
     LAYER_BLUR_RATIO,
     GridSpec,
@@ -110,12 +111,15 @@ class FrameLayers:
     Attributes
     ----------
     layer_dpt : (n_layers,)
-        Ascending: object distance plus the change of defocus over the field, so that
-        at one layer field nodes have the same defocus and are blended at equal blur.
+        Ascending: an object's vergence plus the change of defocus over the field, so
+        that at one layer field nodes have the same defocus and are blended at equal
+        blur.
+    vergence : ObjectVergence
+        From distances of objects to vergences.
     field : FieldDefocus
         That change; none in the paper's grids, whose nodes are object distances.
-    object_range_dpt : (low, high)
-        Object distances that the layers are for.
+    vergence_range_dpt : (low, high)
+        Vergences that the layers are for.
     layer_zero_dpt : (n_fields, 3)
         Total defocus at layer 0 dpt, per field node and channel.
     reads : StateReads
@@ -125,7 +129,8 @@ class FrameLayers:
     """
 
     layer_dpt: NDArray[np.float64]
-    object_range_dpt: tuple[float, float]
+    vergence: ObjectVergence
+    vergence_range_dpt: tuple[float, float]
     field: FieldDefocus
     layer_zero_dpt: NDArray[np.float64]
     reads: StateReads
@@ -180,9 +185,13 @@ def frame_layers(
     notes += _limit_notes(store, corners)
     reads = _state_reads(plan, pupil_mm, corners)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
-    near_far_dpt = object_range_dpt or store.spec.settings.object_range_dpt
+    far_dpt, near_dpt = object_range_dpt or store.spec.settings.object_range_dpt
+    far_near_dpt = (
+        eye.vergence.vergence_dpt(far_dpt),
+        eye.vergence.vergence_dpt(near_dpt),
+    )
     layer_dpt = layer_distances_dpt(
-        tuple(np.add(near_far_dpt, change.range_dpt)),
+        tuple(np.add(far_near_dpt, change.range_dpt)),
         focused_dpt=-layer_zero_dpt[gaze],
         blur_radius_px=lambda at_dpt: layer_blur_px(
             store.tables, reads, layer_zero_dpt, at_dpt
@@ -193,7 +202,8 @@ def frame_layers(
     )
     return FrameLayers(
         layer_dpt=layer_dpt,
-        object_range_dpt=near_far_dpt,
+        vergence=eye.vergence,
+        vergence_range_dpt=far_near_dpt,
         field=change,
         layer_zero_dpt=layer_zero_dpt,
         reads=reads,

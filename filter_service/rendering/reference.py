@@ -178,7 +178,7 @@ def gather(
     filled_m, _ = fill_missing_depth(view.depth_m)
     border_px = layers.max_radius_px + 2 if view.surface_count > 1 else 0
     view = extended(replace(view, depth_m=filled_m), border_px)
-    distances_dpt = surface_distances_dpt(view, layers)
+    distances_dpt = surface_vergences_dpt(view, layers)
     holds = ~np.isnan(distances_dpt)
     linear = np.stack([_linear_color(color) for color in view.surface_colors])
     n_intervals = interval_count(layers)
@@ -212,17 +212,19 @@ def gather(
     return out[rows, columns]
 
 
-def surface_distances_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:
-    """Object distance (surfaces, height, width); NaN where nothing is hidden.
+def surface_vergences_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:
+    """Vergence (surfaces, height, width) at the cornea; NaN where nothing is hidden.
 
     Nothing that blurs like the surface before it counts as hidden.
     """
-    distances = [object_dpt(view, view.depth_m)]
+    seen_dpt = layers.vergence.vergence_dpt(object_dpt(view, view.depth_m))
+    vergences = [seen_dpt]
     for hidden_m in view.surface_depths_m[1:]:
-        hidden_dpt = object_dpt(view, np.where(hidden_m > 0.0, hidden_m, np.nan))
-        behind_px = (distances[0] - hidden_dpt) * layers.blur_px_per_dpt
-        distances.append(np.where(behind_px > DISCONTINUITY_PX, hidden_dpt, np.nan))
-    return np.clip(distances, *layers.object_range_dpt)
+        distance_dpt = object_dpt(view, np.where(hidden_m > 0.0, hidden_m, np.nan))
+        hidden_dpt = layers.vergence.vergence_dpt(distance_dpt)
+        behind_px = (seen_dpt - hidden_dpt) * layers.blur_px_per_dpt
+        vergences.append(np.where(behind_px > DISCONTINUITY_PX, hidden_dpt, np.nan))
+    return np.clip(vergences, *layers.vergence_range_dpt)
 
 
 def _linear_color(color: NDArray) -> NDArray[np.float64]:

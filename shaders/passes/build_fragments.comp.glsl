@@ -1,11 +1,11 @@
-// Turns colour and depth of the input frame into linear light, dioptres and layer
+// Turns colour and depth of the input frame into linear light, vergences and layer
 // positions, and notes which kernels the frame needs.  Surface after surface: what is
 // seen, and what it hides.
 // In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
 //      COLOR_IS_HALF),
 //      DEPTH_IN (f32 metres; all valid in what is seen, 0 where nothing is hidden),
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
-// Out: PIXELS (linear RGB, object distance dpt; negative where nothing is hidden),
+// Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
 //      PIXEL_LAYER (position), USED (a bit per cell and interval).
 // Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
@@ -30,7 +30,9 @@ uniform int layer_count;
 uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
-uniform vec2 object_range_dpt;    // beyond which distances are taken as its ends
+uniform vec2 vergence_range_dpt;  // beyond which vergences are taken as its ends
+uniform float vergence_scale;     // over distance and offset: vergence at the cornea
+uniform float vergence_offset_m;
 
 bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; }
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
@@ -61,11 +63,12 @@ vec3 read_linear_rgb(uint pixel) {
 }
 
 // Planar view depth to distance from the eye: the ray through a pixel has length
-// sqrt(1 + tan_x^2 + tan_y^2) per unit of depth.
-float object_dpt(float depth_m, vec2 position) {
+// sqrt(1 + tan_x^2 + tan_y^2) per unit of depth.  Distance to vergence at the cornea.
+float vergence_dpt(float depth_m, vec2 position) {
     vec2 tangent = mix(tangents.xz, tangents.yw, (position + 0.5) / vec2(frame_size_px));
     float stretch = depth_is_planar != 0 ? sqrt(1.0 + dot(tangent, tangent)) : 1.0;
-    return isinf(depth_m) ? 0.0 : 1.0 / (depth_m * stretch);
+    float distance_m = max(depth_m * stretch, NEAREST_M) + vergence_offset_m;
+    return isinf(depth_m) ? 0.0 : vergence_scale / distance_m;
 }
 
 // Change of defocus over the field, between the corners of a pixel's cell.
@@ -96,10 +99,10 @@ float layer_position(float dpt) {
 // Object distance, or NOTHING_DPT where a hidden pixel is empty, or as good as on the
 // surface before it: the two would blur alike.
 float distance_of(uint pixel, uint seen, vec2 at) {
-    if (pixel == seen) return object_dpt(depth_in[pixel], at);
+    if (pixel == seen) return vergence_dpt(depth_in[pixel], at);
     if (depth_in[pixel] == 0.0) return NOTHING_DPT;
-    float dpt = object_dpt(depth_in[pixel], at);
-    float behind = object_dpt(depth_in[seen], at) - dpt;
+    float dpt = vergence_dpt(depth_in[pixel], at);
+    float behind = vergence_dpt(depth_in[seen], at) - dpt;
     return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
 }
 
@@ -125,7 +128,7 @@ void main() {
         uint pixel = seen + gl_WorkGroupID.z * uint(frame_size_px.x * frame_size_px.y);
         float dpt = distance_of(pixel, seen, vec2(at));
         if (dpt >= 0.0) {
-            dpt = clamp(dpt, object_range_dpt.x, object_range_dpt.y);
+            dpt = clamp(dpt, vergence_range_dpt.x, vergence_range_dpt.y);
             float place = layer_position(dpt + field_defocus_dpt(at));
             position[pixel] = place;
             note_use(at, position_interval(place, layer_count));

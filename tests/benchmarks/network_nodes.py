@@ -93,7 +93,7 @@ def traced_focus(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     parameters = EyeParameters.from_vector(nodes[0, :N_PARAMETERS])
     for pupil_mm, rows in _pupil_groups(nodes):
         eye = AccommodatingEye(parameters, pupil_diameter_mm=pupil_mm)
-        used_dpt = [eye.accommodation_dpt(f) for f in nodes[rows, -1].tolist()]
+        used_dpt = eye.accommodations_at_cornea_dpt(-nodes[rows, -1])
         changes_mm[rows] = eye.changes_mm(used_dpt)
     return changes_mm
 

@@ -59,7 +59,7 @@ def frame_spectrum(image, side_px=512):
 
 def neighbours(use, axis, rng, limits):
     """Lower and upper neighbours of states, and which of them stay in the limits."""
-    count = use.object_dpt.size
+    count = use.vergence_dpt.size
     low, high = STEPS[axis]
     step = np.exp(rng.uniform(math.log(low), math.log(high), count))
     if axis == "defocus":

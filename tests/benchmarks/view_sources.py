@@ -56,7 +56,8 @@ class EyeState:
             "wavelength_nm": np.tile(self.spec.channel_wavelengths_nm, h_deg.size // 3),
         }
         at_infinity_dpt = self.eye.total_defocus_dpt(**state)
-        return state | {"total_defocus_dpt": at_infinity_dpt + distance_dpt}
+        added_dpt = self.eye.vergence.vergence_dpt(distance_dpt)
+        return state | {"total_defocus_dpt": at_infinity_dpt + added_dpt}
 
     def exact_psfs(
         self,

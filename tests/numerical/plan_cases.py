@@ -204,7 +204,7 @@ def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=No
     chosen = np.random.default_rng(seed).choice(4096, count, replace=False)
     use = use.taken(chosen)
     return state_errors(
-        eye, spec, plan, use.states, use.object_dpt, axes=axes, spectrum=spectrum
+        eye, spec, plan, use.states, use.vergence_dpt, axes=axes, spectrum=spectrum
     )
 
 

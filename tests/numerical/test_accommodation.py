@@ -15,7 +15,10 @@ from estimator.eye.accommodation import (
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.lens_shape import lens_shape
 from estimator.eye.parameters import EyeParameters, RetinaShape
-from estimator.eye.tracing import refraction_of_vectors
+from estimator.eye.tracing import (
+    refraction_of_vectors,
+    seen_refraction_of_vectors,
+)
 from estimator.optics.prescription import C20, Prescription
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile, preset_names
@@ -34,11 +37,13 @@ def myope():
     return estimate_eye(parse_profile({"kind": "preset", "name": "myopia"})).parameters
 
 
-def refraction_dpt(parameters, pupil_diameter_mm, retina=None):
-    return refraction_of_vectors(
+def refraction_dpt(parameters, pupil_diameter_mm, retina=None, added_um=0.0):
+    """Traced in the plane of the entrance pupil, over what of it light fills."""
+    return seen_refraction_of_vectors(
         parameters.to_vector()[None],
         pupil_diameter_mm=pupil_diameter_mm,
         retina=retina,
+        added_um=added_um,
     )[0]
 
 
@@ -49,9 +54,9 @@ def test_focused_eye_has_that_refraction(pupil_mm, focus_dpt):
     state = eye.focused(focus_dpt)
     assert state.notes == ()
     assert refraction_dpt(state.parameters, pupil_mm) == pytest.approx(
-        -focus_dpt, abs=1e-5
+        -focus_dpt, abs=3e-3
     )
-    assert state.focus_dpt == pytest.approx(focus_dpt, abs=1e-12)
+    assert state.focus_dpt == pytest.approx(focus_dpt, abs=1e-3)
 
 
 @pytest.mark.parametrize("pupil_mm", [1.0, 2.0, 2.6, 3.5, 4.9, 6.0, 7.3])
@@ -79,15 +84,18 @@ def test_aberrations_move_the_focus_as_the_pupil_opens():
 
 @pytest.mark.parametrize("name", preset_names())
 def test_reach_through_a_pupil_is_what_is_traced_there(name):
-    eye = estimate_eye(parse_profile({"kind": "preset", "name": name})).accommodating
+    estimated = estimate_eye(parse_profile({"kind": "preset", "name": name}))
+    eye = estimated.accommodating
+    limit_dpt = 0.1 if name == "cataract" else 0.01
     for pupil_mm in (2.0, 3.3, 5.2):
         far_dpt, near_dpt = eye.focus_limits_dpt(pupil_mm)
-        relaxed = refraction_dpt(eye.parameters, pupil_mm)
-        assert far_dpt == pytest.approx(-relaxed, abs=0.01)
+        rest_um = estimated.rest(555.0).on_axis_um(pupil_mm)
+        relaxed = refraction_dpt(eye.parameters, pupil_mm, added_um=rest_um)
+        assert far_dpt == pytest.approx(-relaxed, abs=limit_dpt)
         nearest = eye.focused(50.0, pupil_diameter_mm=pupil_mm)
         assert near_dpt == pytest.approx(nearest.focus_dpt, abs=1e-9)
-        traced = refraction_dpt(nearest.parameters, pupil_mm)
-        assert near_dpt == pytest.approx(-traced, abs=0.01)
+        traced = refraction_dpt(nearest.parameters, pupil_mm, added_um=rest_um)
+        assert near_dpt == pytest.approx(-traced, abs=limit_dpt)
         assert near_dpt - far_dpt <= 10.0 + 1e-3  # the amplitude without an age
         assert "near point" in nearest.notes[0]
 
@@ -103,9 +111,7 @@ def test_object_at_the_focus_is_seen_without_defocus():
     )
     radius_mm = seen.zernike_radius_mm
     defocus_dpt = 4.0 * math.sqrt(3.0) * seen.zernike_um[C20] / radius_mm**2
-    # the object's distance counts from the entrance pupil 3 mm behind the cornea and
-    # the pupil is a little smaller than its paraxial size
-    assert abs(defocus_dpt) < 0.08
+    assert abs(defocus_dpt) < 0.01
 
 
 def test_many_focuses_in_one_batch_equal_each_alone(myope):
@@ -139,11 +145,14 @@ def test_lens_shrinks_thickens_and_moves_its_pole_forward(myope):
 def test_reach_is_the_one_of_the_wavefront_only_eye(name):
     profile = parse_profile({"kind": "preset", "name": name, "age_years": 40})
     traced, measured = estimate_eye(profile), MeasuredWavefront(profile)
-    # the model's own dispersion against the Indiana eye's, from the measured
-    # wavelength to 555 nm: 0.09 dpt at 460 nm for Navarro's eye (optics.md 2.2), and
-    # these are eyes of other lengths and powers
-    assert traced.refraction_dpt == pytest.approx(measured.refraction_dpt, abs=0.15)
+    assert traced.refraction_dpt == pytest.approx(measured.refraction_dpt, abs=0.01)
     assert traced.amplitude_dpt == pytest.approx(measured.amplitude_dpt)
+    # An astigmatic cornea shows its iris as an ellipse, of which a measurement does not
+    # know; all others agree to 0.03 dpt.
+    limit_dpt = 0.05 if name == "astigmatism" else 0.03
+    far_dpt, _ = traced.accommodating.focus_limits_dpt(profile.pupil_diameter_mm)
+    other_dpt, _ = measured.focus_limits_dpt(profile.pupil_diameter_mm)
+    assert far_dpt == pytest.approx(other_dpt, abs=limit_dpt)
 
 
 def test_out_of_reach_is_said_and_stops_at_the_end_of_the_range(myope):
@@ -153,10 +162,12 @@ def test_out_of_reach_is_said_and_stops_at_the_end_of_the_range(myope):
     assert "beyond the far point" in far.notes[0]
     assert far.parameters.lens_diameter_mm == pytest.approx(myope.lens_diameter_mm)
     near = eye.focused(20.0)
-    assert near.accommodation_dpt == pytest.approx(3.0)
+    assert near.accommodation_dpt == pytest.approx(3.0, abs=1e-3)
     assert "nearer than the near point" in near.notes[0]
-    assert near.focus_dpt == pytest.approx(3.0 - eye.refraction_dpt)
-    assert refraction_dpt(near.parameters, 4.0) == pytest.approx(-near.focus_dpt, 1e-5)
+    far_dpt, near_dpt = eye.focus_limits_dpt(4.0)
+    assert near_dpt - far_dpt == pytest.approx(3.0, abs=1e-3)
+    assert near.focus_dpt == pytest.approx(near_dpt, abs=1e-9)
+    assert refraction_dpt(near.parameters, 4.0) == pytest.approx(-near_dpt, abs=3e-3)
 
 
 def test_the_lens_itself_limits_a_young_eye():
@@ -183,9 +194,15 @@ def test_worn_correction_moves_the_far_point(myope):
     bare = AccommodatingEye(myope)
     corrected = AccommodatingEye(myope, correction=glasses)
     assert corrected.refraction_dpt == pytest.approx(bare.refraction_dpt + 6.0)
+    # -6 dpt at the cornea are so many in the entrance pupil
+    at_pupil_dpt = 1.0 / (1.0 / 6.0 + bare.entrance_pupil_mm / 1000.0)
+    (bare_dpt, _), (far_dpt, _) = (e.focus_limits_dpt(4.0) for e in (bare, corrected))
+    left_dpt = corrected.vergence.vergence_dpt(far_dpt)
+    assert left_dpt == pytest.approx(bare_dpt - at_pupil_dpt, abs=2e-3)
+    demand_dpt = corrected.vergence.vergence_dpt(3.0)
+    assert demand_dpt == pytest.approx(3.0 * (1.0 - 2.0 * 0.0029 * 6.0), abs=0.02)
     state = corrected.focused(3.0)
-    wanted_dpt = 3.0 + corrected.refraction_dpt
-    assert state.accommodation_dpt == pytest.approx(wanted_dpt)
+    assert state.accommodation_dpt == pytest.approx(demand_dpt - left_dpt, abs=5e-3)
 
 
 def test_a_retina_of_its_own_is_kept():
@@ -193,7 +210,9 @@ def test_a_retina_of_its_own_is_kept():
     eye = AccommodatingEye(_far_sighted(), retina=retina)
     state = eye.focused(2.0)
     assert state.surfaces.retina.conic_constant == -0.2
-    assert refraction_dpt(state.parameters, 4.0, retina) == pytest.approx(-2.0, 1e-5)
+    assert refraction_dpt(state.parameters, 4.0, retina) == pytest.approx(
+        -2.0, abs=3e-3
+    )
 
 
 @pytest.mark.parametrize("focus_dpt", [math.nan, math.inf])

@@ -111,7 +111,7 @@ def test_layers_equal_the_plain_statement(case):
     h_deg, v_deg = store.plan.field_nodes_deg
     gaze = np.argmin(np.hypot(h_deg, v_deg))
     expected_dpt = plan_twin.layer_distances_dpt(
-        tuple(np.add(layers.object_range_dpt, layers.field.range_dpt)),
+        tuple(np.add(layers.vergence_range_dpt, layers.field.range_dpt)),
         focused_dpt=-zero_dpt[gaze],
         blur_radius_px=lambda d: plan_twin.layer_blur_px(store, reads, zero_dpt, d),
         blur_px_per_dpt=layers.blur_px_per_dpt,

@@ -18,6 +18,7 @@ from estimator.optics.prescription import (
     power_vector_from_zernike,
     prescription_from_power_vector,
 )
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.optics.zernike import rescale_pupil, zernike_gradient
 from estimator.profiles.measured_wavefront import (
     MeasuredWavefront,
@@ -26,6 +27,7 @@ from estimator.profiles.measured_wavefront import (
 from estimator.profiles.parse import parse_profile, preset_names
 
 DATA = Path(__file__).parents[1] / "data"
+BEHIND_CORNEA_M = TYPICAL_ENTRANCE_PUPIL_MM / 1000.0
 
 
 def wavefront(**fields):
@@ -40,10 +42,15 @@ def state(eye, *, pupil=5.0, d=0.0, f=0.0, wavelength=555.0):
 
 def test_published_prescription_example():
     """-6/-3x102 at 5 mm, the paper's astigmatism, in the examiner's frame."""
-    eye = wavefront(
-        kind="prescription", sphere_dpt=-6.0, cylinder_dpt=-3.0, axis_deg=102.0
+    profile = parse_profile(
+        {
+            "kind": "prescription",
+            "sphere_dpt": -6.0,
+            "cylinder_dpt": -3.0,
+            "axis_deg": 102.0,
+        }
     )
-    zernike_um = state(eye).zernike_um
+    zernike_um = rescale_pupil(profile.zernike_um, radius_ratio=2.5 / 3.0)
     assert zernike_um[C20] == pytest.approx(6.76582, abs=5e-6)
     assert zernike_um[C22] == pytest.approx(1.74822, abs=5e-6)
     # the examiner's +0.77836 mirrors to the eye frame
@@ -82,21 +89,30 @@ def test_presets_carry_the_published_mean_coefficients():
 @pytest.mark.parametrize("pupil_mm", [2.0, 3.5, 5.0])
 def test_myope_sees_clearly_at_the_far_point_only(pupil_mm):
     eye = wavefront(kind="prescription", sphere_dpt=-4.0)
-    assert state(eye, pupil=pupil_mm, d=4.0).zernike_um == pytest.approx(0.0, abs=1e-12)
+    # 0.25 m before the cornea, and that from the entrance pupil behind it
+    far_dpt = 1.0 / (0.25 + BEHIND_CORNEA_M)
+    assert state(eye, pupil=pupil_mm, d=far_dpt).zernike_um == pytest.approx(
+        0.0, abs=1e-9
+    )
     far = state(eye, pupil=pupil_mm, d=0.0).zernike_um[C20]
-    assert far == pytest.approx(4.0 * (pupil_mm / 2) ** 2 / (4 * math.sqrt(3)))
+    assert far == pytest.approx(far_dpt * (pupil_mm / 2) ** 2 / (4 * math.sqrt(3)))
+    assert eye.focus_limits_dpt(pupil_mm)[0] == pytest.approx(far_dpt)
 
 
 def test_hyperope_accommodates_and_myope_does_not():
     hyperope = wavefront(kind="prescription", sphere_dpt=2.0)
-    assert hyperope.accommodation_dpt(0.0, pupil_diameter_mm=5.0) == pytest.approx(2.0)
+    at_pupil_dpt = 1.0 / (0.5 - BEHIND_CORNEA_M)
+    assert hyperope.accommodation_dpt(0.0, pupil_diameter_mm=5.0) == pytest.approx(
+        at_pupil_dpt
+    )
     assert state(hyperope, d=3.0, f=3.0).zernike_um[C20] == pytest.approx(
         0.0, abs=1e-12
     )
     myope = wavefront(kind="prescription", sphere_dpt=-2.0)
     answer = state(myope, d=1.0, f=1.0)
     assert myope.accommodation_dpt(1.0, pupil_diameter_mm=5.0) == 0.0
-    assert answer.zernike_um[C20] == pytest.approx(6.25 / (4 * math.sqrt(3)))
+    left_dpt = 1.0 / (0.5 + BEHIND_CORNEA_M) - 1.0
+    assert answer.zernike_um[C20] == pytest.approx(left_dpt * 6.25 / (4 * math.sqrt(3)))
     assert "beyond the far point" in answer.notes[0]
 
 
@@ -119,8 +135,43 @@ def test_full_correction_leaves_no_refraction():
         axis_deg=102.0,
         correction={"sphere_dpt": -6.0, "cylinder_dpt": -3.0, "axis_deg": 102.0},
     )
-    assert np.abs(state(eye).zernike_um).max() < 1e-12
-    assert state(eye, d=2.0, f=2.0).zernike_um == pytest.approx(0.0, abs=1e-12)
+    assert np.abs(state(eye).zernike_um).max() < 1e-6
+    assert state(eye, d=2.0, f=2.0).zernike_um == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("vertex_mm", [0.0, 12.0, 15.0])
+@pytest.mark.parametrize("sphere_dpt", [-12.0, -6.0, 3.0, 10.0])
+def test_spectacles_ask_for_what_a_thin_lens_makes_of_the_distance(
+    sphere_dpt, vertex_mm
+):
+    glasses = {"sphere_dpt": sphere_dpt, "vertex_mm": vertex_mm}
+    eye = wavefront(kind="prescription", **glasses, correction=glasses)
+    assert eye.focus_limits_dpt(4.0)[0] == pytest.approx(0.0, abs=1e-4)
+    lens_m = vertex_mm / 1000.0 + BEHIND_CORNEA_M
+    for object_dpt in (0.5, 3.0, 8.0):
+        # the lens images the object at an image distance before or behind it; the eye
+        # looks at that image instead
+        power_dpt = sphere_dpt - 1.0 / (1.0 / object_dpt - lens_m)
+        seen_dpt = -1.0 / (1.0 / power_dpt - lens_m)
+        bare = wavefront(kind="prescription", **glasses)
+        demand_dpt = seen_dpt - bare.focus_limits_dpt(4.0)[0]
+        assert eye.vergence.vergence_dpt(object_dpt) == pytest.approx(
+            demand_dpt, abs=1e-4
+        )
+        assert eye.vergence.object_dpt(demand_dpt) == pytest.approx(
+            object_dpt, abs=1e-3
+        )
+        used_dpt = eye.accommodation_dpt(object_dpt, pupil_diameter_mm=4.0)
+        assert used_dpt == pytest.approx(min(demand_dpt, eye.amplitude_dpt), abs=1e-4)
+
+
+def test_glasses_of_a_myope_spare_accommodation():
+    """-6 dpt at 12 mm, an object at 3 dpt: 2.6 dpt and not 3."""
+    glasses = {"sphere_dpt": -6.0, "vertex_mm": 12.0}
+    eye = wavefront(kind="prescription", **glasses, correction=glasses)
+    assert eye.accommodation_dpt(3.0, pupil_diameter_mm=4.0) == pytest.approx(
+        2.53, abs=0.02
+    )
 
 
 def test_measured_wavefront_is_capped_at_its_pupil_and_says_so():

@@ -121,9 +121,10 @@ def test_the_focus_network_has_its_stated_error(rng, rows):
         except TraceFailed:
             continue
         focus_dpt = draw(card, "focus_dpt", rng)
-        if not 0.0 < focus_dpt + eye.refraction_dpt < eye.lens_range_dpt:
+        used_dpt = eye.accommodations_at_cornea_dpt(np.array([-focus_dpt]))
+        if not 0.0 < used_dpt[0] < eye.lens_range_dpt:
             continue
-        state = eye.focused(focus_dpt)
+        (state,) = eye.states_at(used_dpt)
         inputs.append([*vector, pupil_mm, focus_dpt])
         traced_mm.append(
             [state.lens_diameter_change_mm, state.aqueous_thickness_change_mm]

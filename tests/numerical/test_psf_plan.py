@@ -140,7 +140,7 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
     states = use.states
     for v in bracket_axis(plan.v_deg, states.v_deg)[:2]:
         for h in bracket_axis(plan.h_deg, states.h_deg)[:2]:
-            total_dpt = use.object_dpt + eye.total_defocus_dpt(
+            total_dpt = use.vergence_dpt + eye.total_defocus_dpt(
                 h_deg=plan.h_deg[h],
                 v_deg=plan.v_deg[v],
                 pupil_diameter_mm=states.pupil_diameter_mm,

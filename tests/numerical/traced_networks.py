@@ -35,7 +35,7 @@ def trace_focus(row):
     eye = AccommodatingEye(
         EyeParameters.from_vector(row[:45]), pupil_diameter_mm=row[45]
     )
-    state = eye.focused(row[46])
+    (state,) = eye.states_at(eye.accommodations_at_cornea_dpt(np.array([-row[46]])))
     return [state.lens_diameter_change_mm, state.aqueous_thickness_change_mm]
 
 

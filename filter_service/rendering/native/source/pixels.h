@@ -1,4 +1,4 @@
-/* Depth of every pixel to object distance and layer position, and which pairs of cell
+/* Depth of every pixel to vergence at the cornea and layer position, and which pairs of cell
  * and layer interval the frame uses.  Twin: build_fragments.comp.glsl. */
 
 #include <math.h>
@@ -43,11 +43,16 @@ INLINE int position_interval(const frame *f, float position) {
     return interval < f->interval_count - 1 ? interval : f->interval_count - 1;
 }
 
-/* Object distance of a row of pixels, not clamped; missing depth gives what it gives. */
-INLINE void row_distances(const frame *f, const float *depth_m, int y, float *dpt) {
+INLINE float vergence_dpt(const frame *f, float distance_m) {
+    float kept_m = larger_float(distance_m, NEAREST_M);
+    return f->vergence_scale / (kept_m + f->vergence_offset_m);
+}
+
+/* Vergences of a row of pixels, not clamped; missing depth gives what it gives. */
+INLINE void row_vergences(const frame *f, const float *depth_m, int y, float *dpt) {
     int width = f->width;
     if (!f->depth_is_planar) {
-        for (int x = 0; x < width; ++x) dpt[x] = 1.0f / depth_m[x];
+        for (int x = 0; x < width; ++x) dpt[x] = vergence_dpt(f, depth_m[x]);
         return;
     }
     float across = (f->tangents[1] - f->tangents[0]) / (float)width;
@@ -56,7 +61,7 @@ INLINE void row_distances(const frame *f, const float *depth_m, int y, float *dp
     float along = 1.0f + ty * ty;
     for (int x = 0; x < width; ++x) {
         float tx = f->tangents[0] + ((float)x + 0.5f) * across;
-        dpt[x] = 1.0f / (depth_m[x] * __builtin_sqrtf(along + tx * tx));
+        dpt[x] = vergence_dpt(f, depth_m[x] * __builtin_sqrtf(along + tx * tx));
     }
 }
 
@@ -82,7 +87,7 @@ INLINE void row_changes(const frame *f, int y, float *change_dpt) {
         change_dpt[column] = above[column] + down * (below[column] - above[column]);
 }
 
-/* Positions and used pairs of one row of one surface, from its clamped distances. */
+/* Positions and used pairs of one row of one surface, from its clamped vergences. */
 static void row_positions(const frame *f, const float *dpt, int y, float *change_dpt,
                           float *position) {
     int found = 0;
@@ -144,9 +149,9 @@ static void pixel_row(void *argument, int y, int thread) {
     for (int s = f->surface_count - 1; s >= 0; --s) {
         const float *depth_m = f->depth_m[s] + first;
         float *dpt = f->dpt + (size_t)s * pixels + first;
-        row_distances(f, depth_m, y, dpt);
-        float low = f->object_low_dpt - f->object_margin_dpt;
-        float high = f->object_high_dpt + f->object_margin_dpt;
+        row_vergences(f, depth_m, y, dpt);
+        float low = f->vergence_low_dpt - f->vergence_margin_dpt;
+        float high = f->vergence_high_dpt + f->vergence_margin_dpt;
         int last = f->border_px + f->image_width;
         for (int x = f->border_px; x < last; ++x) {
             int holds = depth_m[x] > 0.0f;
@@ -161,8 +166,8 @@ static void pixel_row(void *argument, int y, int thread) {
     for (int s = 0; s < f->surface_count; ++s) {
         float *dpt = f->dpt + (size_t)s * pixels + first;
         for (int x = 0; x < f->width; ++x) {
-            float kept = dpt[x] < f->object_low_dpt ? f->object_low_dpt : dpt[x];
-            kept = kept > f->object_high_dpt ? f->object_high_dpt : kept;
+            float kept = dpt[x] < f->vergence_low_dpt ? f->vergence_low_dpt : dpt[x];
+            kept = kept > f->vergence_high_dpt ? f->vergence_high_dpt : kept;
             dpt[x] = dpt[x] < 0.0f ? NOTHING_DPT : kept;
         }
         row_positions(f, dpt, y, change_dpt, f->position + (size_t)s * pixels + first);

@@ -1,0 +1,102 @@
+"""Wavefronts carried to another plane along the chief ray, by their coefficients alone.
+
+Instruments and networks give them at the cornea; images are made in the entrance
+pupil.  Light that leaves the eye obeys the eikonal equation; for slopes of a few
+mrad/mm dW/ddepth = -|grad W|² / 2, which the terms up to the sixth order fulfil among
+themselves where the chief ray has no slope.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics.units import UM_PER_MM
+from estimator.optics.zernike import EXPONENTS, N_TERMS
+
+_ANGLES = 2.0 * np.pi * np.arange(16) / 16
+_RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
+
+@cache
+def _slope_products() -> NDArray[np.float64]:
+    """Matrix (28, 28 * 28) that takes p to q -> grad p . grad q, in monomials."""
+    place = {tuple(e): k for k, e in enumerate(EXPONENTS.tolist())}
+    products = np.zeros((N_TERMS, N_TERMS, N_TERMS))
+    for i, (a, b) in enumerate(EXPONENTS.tolist()):
+        for j, (c, d) in enumerate(EXPONENTS.tolist()):
+            for factor, term in (
+                (a * c, (a + c - 2, b + d)),
+                (b * d, (a + c, b + d - 2)),
+            ):
+                if factor and term in place:
+                    products[i, j, place[term]] += factor
+    return products.reshape(N_TERMS, -1)
+
+
+def _squared_slopes(polynomial_um: NDArray) -> NDArray[np.float64]:
+    by_factor = polynomial_um @ _slope_products()
+    by_factor = by_factor.reshape(*polynomial_um.shape, N_TERMS)
+    return (polynomial_um[..., None, :] @ by_factor)[..., 0, :]
+
+
+def moved_polynomial(
+    polynomial_um: NDArray[np.float64], *, depth_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Wavefronts (..., 28) in planes that lie (...) mm deeper, towards the eye.
+
+    Monomials in mm, as `field_wavefronts.polynomial_in_mm` has them.  One step of
+    Runge and Kutta's fourth order: 30 dpt moved by 3 mm are 1e-5 dpt off.
+    """
+    step = np.asarray(depth_mm, dtype=np.float64)[..., None] / (-2.0 * UM_PER_MM)
+    start = polynomial_um.copy()
+    start[..., 1:3] = 0.0  # of the fit: the chief ray itself has no slope
+    k1 = _squared_slopes(start)
+    k2 = _squared_slopes(start + step / 2.0 * k1)
+    k3 = _squared_slopes(start + step / 2.0 * k2)
+    k4 = _squared_slopes(start + step * k3)
+    return polynomial_um + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+def moved_rim(
+    rim_mm: NDArray[np.float64],
+    polynomial_um: NDArray[np.float64],
+    *,
+    depth_mm: ArrayLike,
+) -> NDArray[np.float64]:
+    """Rims (..., 5), centre and matrix, there, where their rays meet those planes.
+
+    Parameters
+    ----------
+    polynomial_um : (..., 28)
+        Before the move.
+    """
+    x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)[..., None]
+    cosine, sine = _RIM.T
+    px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
+    slopes = np.zeros((2, *px.shape))
+    for k in range(3, N_TERMS):
+        (a, b), factor = EXPONENTS[k], polynomial_um[..., k, None]
+        if a:
+            slopes[0] += factor * a * px ** (a - 1) * py**b
+        if b:
+            slopes[1] += factor * b * px**a * py ** (b - 1)
+    moved = np.stack([px, py], axis=-1) + np.asarray(depth_mm)[..., None, None] * (
+        np.moveaxis(slopes, 0, -1) / UM_PER_MM
+    )
+    centre = moved.mean(axis=-2)
+    matrix = 2.0 * np.swapaxes(moved, -1, -2) @ _RIM / len(_RIM)
+    square = matrix @ np.swapaxes(matrix, -1, -2)
+    root = np.sqrt(np.linalg.det(square))
+    trace = square[..., 0, 0] + square[..., 1, 1]
+    scale = 1.0 / np.sqrt(trace + 2.0 * root)
+    return np.stack(
+        [
+            centre[..., 0],
+            centre[..., 1],
+            scale * (square[..., 0, 0] + root),
+            scale * square[..., 0, 1],
+            scale * (square[..., 1, 1] + root),
+        ],
+        axis=-1,
+    )

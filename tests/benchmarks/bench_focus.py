@@ -1,0 +1,177 @@
+"""Where eyes are sharpest against the focus they were asked for, by forward rays.
+
+    python -m tests.benchmarks.bench_focus [--quick] [--json]
+
+<<<<<<< HEAD
+Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to 7
+mm.  Rays from points at many distances then run inwards to the retina: error is how far
+the distance of the smallest RMS wavefront lies from the focus that the eye reported.
+Beside it stands the distance of the largest visual Strehl ratio, the criterion not
+taken.  Far points are those of both eye models.  Writes results/focus.json.
+=======
+Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to
+7 mm.  Rays from points at many distances then run inwards to the retina: error is how
+far the distance of the smallest RMS wavefront lies from the focus that the eye
+reported.  Beside it stands the distance of the largest visual Strehl ratio, the
+criterion not taken.  Far points are those of both eye models.  Writes
+results/focus.json.
+>>>>>>> hoa
+"""
+
+import argparse
+import json
+import time
+
+import numpy as np
+
+from estimator.estimate.estimation import EstimatedEye, estimate_eye
+from estimator.field.traced_eye import TracedEye
+from estimator.optics.units import RGB_WAVELENGTHS_NM
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import EyeProfile, parse_profile, preset_names
+from tests.benchmarks.forward_rays import WAVELENGTH_NM, ForwardEye
+from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
+
+PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+FOCI_DPT = (0.0, 1.5, 3.0, 4.5, 6.0)
+SPHERES_DPT = (-6.0, 0.0, 4.0)
+REFERENCE = "smallest RMS wavefront of rays from the object to the retina"
+REACH_MARGIN_DPT = 1e-3
+
+
+def profiles() -> dict[str, EyeProfile]:
+    """Eyes by name: three prescriptions and every preset."""
+    found = {
+        f"{sphere_dpt:+g} dpt": parse_profile(
+            {
+                "kind": "prescription",
+                "sphere_dpt": sphere_dpt,
+                "higher_order": "none",
+            }
+        )
+        for sphere_dpt in SPHERES_DPT
+    }
+    for name in preset_names():
+        found[name] = parse_profile({"kind": "preset", "name": name})
+    return found
+
+
+def _row(method, case, setting, n, time_ms, name, error) -> Row:
+    return Row(
+        *("focus", method, case, setting, n, time_ms, time_ms, memory_mb()),
+        *(name, float(error), REFERENCE),
+    )
+
+
+def prepared(eye: EstimatedEye) -> TracedEye:
+    """Return the eye as a service prepares it for all these frames, on its axis."""
+    return TracedEye.trace(
+        eye,
+        pupil_diameters_mm=PUPILS_MM,
+        focus_range_dpt=(FOCI_DPT[0], FOCI_DPT[-1]),
+        wavelengths_nm=RGB_WAVELENGTHS_NM,
+    )
+
+
+def focus_rows(name: str, profile: EyeProfile, *, with_visual: bool) -> list[Row]:
+    """A row for each pupil and focus."""
+    estimated = estimate_eye(profile)
+    eye, rows = prepared(estimated), []
+    rest = estimated.rest(WAVELENGTH_NM)
+    for pupil_mm in PUPILS_MM:
+        for focus_dpt in FOCI_DPT:
+            asked = {"focus_dpt": focus_dpt, "pupil_diameter_mm": pupil_mm}
+            started_s = time.perf_counter()
+            used_dpt = eye.accommodation_dpt(**asked)
+            said_dpt = eye.reachable_focus_dpt(**asked)
+            time_ms = 1e3 * (time.perf_counter() - started_s)
+            (state,) = estimated.accommodating.states_at([used_dpt])
+            forward = ForwardEye.of(
+                state.surfaces,
+                pupil_diameter_mm=pupil_mm,
+                rest_um=rest.on_axis_um(pupil_mm)[0],
+            )
+            error_dpt = forward.sharpest_dpt(said_dpt) - said_dpt
+            setting = f"{pupil_mm:g} mm, asked {focus_dpt:g}, reached {said_dpt:.3f}"
+            reaches = abs(said_dpt - focus_dpt) <= REACH_MARGIN_DPT
+            method = "in reach" if reaches else "end of reach"
+            rows.append(
+                _row(method, name, setting, 1, time_ms, "best focus, dpt", error_dpt)
+            )
+            if with_visual:
+                visual_dpt = forward.visually_sharpest_dpt(said_dpt) - said_dpt
+                rows.append(
+                    _row(
+                        *("visual Strehl", name, setting, 1, time_ms),
+                        *("best focus, dpt", visual_dpt),
+                    )
+                )
+    return rows
+
+
+def far_point_rows(name: str, profile: EyeProfile) -> list[Row]:
+    """Far points of both models and by forward rays, at 3 mm and the measured pupil."""
+    estimated, measured = estimate_eye(profile), MeasuredWavefront(profile)
+    rows = []
+    for pupil_mm in sorted({3.0, profile.pupil_diameter_mm}):
+        far_dpt, _ = estimated.accommodating.focus_limits_dpt(pupil_mm)
+        other_dpt, _ = measured.focus_limits_dpt(pupil_mm)
+        surfaces = estimated.accommodating.states_at([0.0])[0].surfaces
+        forward = ForwardEye.of(
+            surfaces,
+            pupil_diameter_mm=pupil_mm,
+            rest_um=estimated.rest(WAVELENGTH_NM).on_axis_um(pupil_mm)[0],
+        )
+        setting = f"far point {far_dpt:.3f} dpt at {pupil_mm:g} mm"
+        for method, against_dpt in (
+            ("measured wavefront", other_dpt),
+            ("forward rays", forward.sharpest_dpt(far_dpt)),
+        ):
+            rows.append(
+                _row(
+                    *(method, name, setting, 1, 0.0),
+                    *("far point, dpt", against_dpt - far_dpt),
+                )
+            )
+    return rows
+
+
+def summary_rows(rows: list[Row]) -> list[Row]:
+    """Largest and median error of each method over all eyes."""
+    found = []
+    for method in dict.fromkeys(row.method for row in rows):
+        own = [row for row in rows if row.method == method]
+        errors = np.abs([row.error for row in own])
+        times_ms = float(np.median([row.median_ms for row in own]))
+        for label, value in (("median", np.median(errors)), ("largest", errors.max())):
+            found.append(
+                _row(
+                    *(method, "all eyes", label, len(own), times_ms),
+                    *(own[0].error_name, value),
+                )
+            )
+    return found
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="no visual Strehl ratio")
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    rows = []
+    for name, profile in profiles().items():
+        rows += focus_rows(name, profile, with_visual=not options.quick)
+        rows += far_point_rows(name, profile)
+    rows = summary_rows(rows) + rows
+    content = report(rows)
+    if not options.quick:
+        write_report("focus", content)
+    if options.json:
+        print(json.dumps(content))
+    else:
+        print_rows(rows)
+
+
+if __name__ == "__main__":
+    main()
