@@ -4,6 +4,8 @@ estimation      the entry: refined, by network, or searched
 problem         what is compared, and the model that answers
 prior           eyes as people have them, by their refraction
 bounded_fit     least squares within bounds
+plausible       what of the eye would be unusual in a person
+measured_rest   what the eye leaves of its measurement: a phase
 table           eyes at which fits start
 make_table      the program that makes them
 eye_table.json  what it wrote

@@ -23,9 +23,9 @@ FIRST_REACH, SMALLEST_REACH, LARGEST_REACH = 8.0, 1e-4, 20.0
 SMALLEST_DECREASE = 0.1
 """Relative decrease of the cost by one Jacobian below which the fit has ended."""
 
-MET_UM = 1e-4
-"""Misfit of every coefficient at which the fit has ended: a hundredth of what
-instruments repeat to."""
+MET_UM = 1e-3
+"""Misfit of every coefficient at which the fit has ended: a tenth of what instruments
+repeat to."""
 
 BOX_TOLERANCE = 1e-10
 """Of the linear problem in a box, in prior deviations."""

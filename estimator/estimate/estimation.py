@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.bounded_fit import BoundedFit
+from estimator.estimate.measured_rest import MeasuredRest
 from estimator.estimate.network_guess import network_guess
 from estimator.estimate.pattern_search import pattern_search
+from estimator.estimate.plausible import unusual
 from estimator.estimate.problem import EstimationProblem
 from estimator.estimate.table import table_vectors
 from estimator.eye.accommodation import AccommodatingEye, FocusedEye
@@ -31,9 +33,14 @@ from estimator.networks.card import (
     NetworkUnfit,
     WeightsMissing,
 )
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, remove_central_tilt
 from estimator.profiles.measured_wavefront import accommodation_amplitude_dpt
 from estimator.profiles.parse import EyeProfile
+from estimator.profiles.typical_aberrations import (
+    typical_note,
+    with_typical_aberrations,
+)
 
 METHODS = ("network", "refined", "search")
 STARTS = ("table", "network")
@@ -61,7 +68,7 @@ class EstimatedEye:
     parameters : EyeParameters
         The relaxed eye.
     profile : EyeProfile
-        What it was estimated from.
+        What it was estimated from, typical aberrations included.
     zernike_um, residual_um : (28,), um
         Of the eye, and of the eye less the measurement, on the measured circle
         (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements, the
@@ -117,6 +124,12 @@ class EstimatedEye:
         problem = EstimationProblem(self.profile)
         return problem.determined_ratio(self.parameters.to_vector())
 
+    def rest(self, wavelengths_nm: ArrayLike) -> MeasuredRest:
+        """Return what of the measurement this eye does not show, at wavelengths."""
+        return MeasuredRest.of(
+            self.parameters, self.profile, wavelengths_nm=wavelengths_nm
+        )
+
     @cached_property
     def accommodating(self) -> AccommodatingEye:
         """Return the eye as one that can be asked to focus, correction worn."""
@@ -165,6 +178,9 @@ def accommodating_eye(
             age_years=profile.age_years, add_dpt=profile.add_dpt
         ),
         correction=profile.correction,
+        rest=MeasuredRest.of(
+            parameters, profile, wavelengths_nm=REFERENCE_WAVELENGTH_NM
+        ),
     )
 
 
@@ -182,6 +198,8 @@ def estimate_eye(
     ----------
     profile : EyeProfile
         A profile that is an eye already is returned as it is, with method ``given``.
+        A prescription gets typical higher-order aberrations first, with a note, unless
+        its ``higher_order`` is ``none``.
     method : {"network", "refined", "search"}
         Where the wavefront is out of the network's training ranges, or light does not
         pass its eye, ``network`` becomes ``refined`` from the table, with a note.
@@ -205,6 +223,15 @@ def estimate_eye(
         raise ValueError(f"method '{method}': allowed are {', '.join(METHODS)}")
     if not starts or not set(starts) <= set(STARTS):
         raise ValueError(f"starts {starts}: allowed are {', '.join(STARTS)}")
+    if profile.higher_order != "none":
+        found = estimate_eye(
+            with_typical_aberrations(profile),
+            method=method,
+            max_time_s=max_time_s,
+            starts=starts,
+            start_vectors=start_vectors,
+        )
+        return replace(found, notes=(typical_note(profile), *found.notes))
     start_s = time.perf_counter()
     if profile.eye is not None:
         return _given(profile, start_s)
@@ -248,11 +275,12 @@ def _answer(
     zernike_um[0] = 0.0
     measured_um = remove_central_tilt(problem.profile.zernike_um)
     residual_um = zernike_um - measured_um
+    parameters = EyeParameters.from_vector(vector)
     residual_um[0] = 0.0
     return EstimatedEye(
         name=problem.profile.name,
         method=method,
-        parameters=EyeParameters.from_vector(vector),
+        parameters=parameters,
         profile=problem.profile,
         zernike_um=zernike_um,
         residual_um=residual_um,
@@ -263,7 +291,7 @@ def _answer(
         n_iterations=counts[0],
         n_evaluations=counts[1],
         on_bound=on_bound,
-        notes=_notes(error_um, method),
+        notes=(*_notes(error_um, method), *_unusual(parameters, problem.profile)),
         start=start,
         network_reason=network_reason,
     )
@@ -273,7 +301,15 @@ def _notes(error_um: float, method: str) -> tuple[str, ...]:
     if error_um <= POOR_FIT_UM:
         return ()
     which = "network's eye" if method == "network" else "eye model"
-    return (f"the {which} reaches this wavefront only to {error_um:.2g} um on average",)
+    return (
+        f"the {which} reaches this wavefront only to {error_um:.2g} um on average: the "
+        "rest is added to it near the axis",
+    )
+
+
+def _unusual(parameters: EyeParameters, profile: EyeProfile) -> tuple[str, ...]:
+    named = unusual(parameters, retina=profile.retina)
+    return (f"unusual for a person: {'; '.join(named)}",) if named else ()
 
 
 def _start_vectors(

@@ -68,8 +68,9 @@ class TracedEye(FocusingEye):
 
     On axis the circle circumscribed about the pupil is the pupil asked for: the traced
     rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
-    and at other fields by the same factor.  The worn correction is taken off at every
-    field alike, see `field_wavefronts.correction_polynomial`.
+    and at other fields by the same factor.  What the eye leaves of its measurement is
+    added to its wavefronts, see `measured_rest`.  The worn correction is taken off at
+    every field alike, see `field_wavefronts.correction_polynomial`.
 
     Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
     the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
@@ -80,6 +81,8 @@ class TracedEye(FocusingEye):
     ----------
     grid : AberrationGrid
         On axis.
+    eye_side : str
+        OD or OS.
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Fields that may be asked for.
     traced_range_deg : the same
@@ -98,16 +101,22 @@ class TracedEye(FocusingEye):
         traced_range_deg: FieldRange = ON_AXIS_DEG,
     ):
         self.grid = axis.grid
+        self.eye_side = eye.profile.eye_side
         self._accommodating = eye.accommodating
         self.refraction_dpt = eye.refraction_dpt
         self.amplitude_dpt = eye.amplitude_dpt
+        self.vergence = eye.accommodating.vergence
         self.max_pupil_diameter_mm = largest_open_pupil_mm(axis.grid)
         self.field_range_deg = field_range_deg
         self.traced_range_deg = traced_range_deg
         self._field = field or axis
         has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
         self._on_axis = self._field if has_axis else axis
-        self._correction = correction_polynomial(eye.profile.correction)
+        self._correction = correction_polynomial(
+            eye.profile.correction,
+            entrance_pupil_mm=eye.accommodating.entrance_pupil_mm,
+        )
+        self._rest = eye.rest(axis.grid.wavelengths_nm)
 
     @classmethod
     def trace(
@@ -351,6 +360,7 @@ class TracedEye(FocusingEye):
             self._field,
             self._on_axis,
             self._correction,
+            self._rest,
             h_deg=h_deg,
             v_deg=v_deg,
             wavelength_nm=wavelength_nm,

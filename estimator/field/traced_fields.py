@@ -7,6 +7,7 @@ stream of frames asks for the same fields again and again.
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.estimate.measured_rest import MeasuredRest
 from estimator.field.interpolation import FieldInterpolation
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
@@ -43,6 +44,8 @@ class TracedFields:
         That of the states, and one that holds the axis.
     correction_um : (28,), um/mm^degree
         What a worn correction takes off.
+    rest : MeasuredRest
+        What is added.
     h_deg, v_deg, wavelength_nm : (n,)
         Within what was traced.
     pupil_diameter_mm : (n,), optional
@@ -54,6 +57,7 @@ class TracedFields:
         field: FieldInterpolation,
         on_axis: FieldInterpolation,
         correction_um: NDArray[np.float64],
+        rest: MeasuredRest,
         *,
         h_deg: NDArray[np.float64],
         v_deg: NDArray[np.float64],
@@ -61,7 +65,6 @@ class TracedFields:
         pupil_diameter_mm: NDArray[np.float64] | None = None,
     ):
         self._field, self._on_axis = field, on_axis
-        self._correction_um = correction_um
         self._open_mm = field.open_pupils_mm(h_deg, v_deg)
         pupils = {}
         if pupil_diameter_mm is not None:
@@ -69,6 +72,9 @@ class TracedFields:
         self._states = field.values(
             h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm, **pupils
         )
+        self._rest = rest
+        self._left_share = rest.left_share(h_deg, v_deg)
+        self._added_um = rest.color_um(wavelength_nm) - correction_um
         zeros = np.zeros(h_deg.size)
         self._axis_states = on_axis.values(
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
@@ -97,8 +103,9 @@ class TracedFields:
         )
         rim_mm = rim_mm * self._rim_scale(pupil_mm, used_dpt)[:, None]
         radius_mm = circumscribed_radius_mm(rim_mm)
+        residue_um = self._rest.residues_um(pupil_mm / 2.0, self._left_share)
         zernike_um = zernike_from_polynomial(
-            polynomial_um - self._correction_um, radius_mm
+            polynomial_um + self._added_um + residue_um, radius_mm
         )
         return zernike_um, rim_mm, radius_mm
 

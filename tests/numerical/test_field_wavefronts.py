@@ -26,7 +26,8 @@ from estimator.wavefront.field_wavefronts import (
 WIDE_DEG = ((-45.0, 45.0), (-25.0, 25.0))
 BLUE_NM = 464.0
 WORST_WAVES, WORST_RATIO = 0.02, 0.01
-WORST_RIM_RATIO = 0.005
+WORST_RIM_RATIO = 0.012
+"""Keratoconus at 2 mm, in the corners of the field; 0.005 for a healthy eye."""
 
 
 def estimated(**body):
@@ -69,6 +70,15 @@ def rms_um(zernike_um, radius_mm, rim_mm):
     return (values * zernike_um[..., None, :]).sum(axis=-1).std(axis=-1)
 
 
+def rest_um(source, fields_deg, pupils_mm):
+    """What is added to traced wavefronts (fields, pupils, 28)."""
+    rest = source.rest(BLUE_NM)
+    share = rest.left_share(*fields_deg.T)[:, None]
+    radius_mm = np.broadcast_to(pupils_mm / 2.0, (len(share), len(pupils_mm)))
+    residues_um = rest.residues_um(radius_mm, np.broadcast_to(share, radius_mm.shape))
+    return residues_um + rest.color_um(np.array(BLUE_NM))
+
+
 @pytest.mark.parametrize("name", preset_names())
 def test_interpolated_wavefronts_equal_direct_traces(name):
     rng = np.random.default_rng(len(name))
@@ -81,16 +91,17 @@ def test_interpolated_wavefronts_equal_direct_traces(name):
     pupils_mm = np.array([2.0, 3.1, 4.7, 6.0, 7.0])
     low_dpt, high_dpt = eye.grid.accommodations_dpt[[0, -1]]
     for used_dpt in np.unique([low_dpt, low_dpt + 0.37 * (high_dpt - low_dpt)]):
-        state = source.accommodating.focused_at([used_dpt - source.refraction_dpt])[0]
+        state = source.accommodating.states_at([used_dpt])[0]
         direct = wavefront_grid(
             state.surfaces,
             fields_deg=fields_deg,
             wavelengths_nm=[BLUE_NM],
             pupil_diameters_mm=pupils_mm,
+            plane="pupil",
         )
         radius_mm = direct.zernike_radius_mm[:, 0]
         rim_mm = rim_from_ellipse(direct.ellipse_mm[:, 0])
-        polynomial_um, our_rim_mm = unscaled(
+        seen_um, our_rim_mm = unscaled(
             eye,
             h_deg=fields_deg[:, :1],
             v_deg=fields_deg[:, 1:],
@@ -98,6 +109,7 @@ def test_interpolated_wavefronts_equal_direct_traces(name):
             accommodation_dpt=used_dpt,
             wavelength_nm=BLUE_NM,
         )
+        polynomial_um = seen_um - rest_um(source, fields_deg, pupils_mm)
         truth_um = direct.zernike_um[:, 0]
         difference_um = zernike_from_polynomial(polynomial_um, radius_mm) - truth_um
         error_um = rms_um(difference_um, radius_mm, rim_mm)
@@ -127,7 +139,7 @@ def test_a_field_range_leaves_the_axis_as_it_is():
 
 
 def test_a_symmetric_eye_is_mirror_symmetric():
-    eye = traced(estimated(kind="prescription", sphere_dpt=-3.0))
+    eye = traced(estimated(kind="prescription", sphere_dpt=-3.0, higher_order="none"))
     rest = {
         **{"v_deg": np.array([-18.0, 0.0, 7.0]), "pupil_diameter_mm": 5.0},
         **{"accommodation_dpt": 0.5, "wavelength_nm": BLUE_NM},
@@ -160,7 +172,7 @@ def test_a_far_field_sees_a_narrow_pupil():
 
 def test_a_worn_correction_is_taken_off_alike_at_all_fields():
     worn = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 30.0}
-    body = {"kind": "prescription", **worn}
+    body = {"kind": "prescription", **worn, "higher_order": "none"}
     bare_eye = traced(estimated(**body), foci_dpt=(-4.0, 0.0))
     worn_profile = parse_profile({**body, "correction": worn})
     worn_eye = traced(estimate_eye(worn_profile), foci_dpt=(-4.0, 0.0))
@@ -174,7 +186,7 @@ def test_a_worn_correction_is_taken_off_alike_at_all_fields():
     }
     difference = unscaled(bare_eye, **state)[0] - unscaled(worn_eye, **state)[0]
     expected_um = zernike_from_power_vector(
-        *power_vector(worn_profile.correction), zernike_radius_mm=2.2
+        *power_vector(worn_profile.correction, depth_mm=2.89), zernike_radius_mm=2.2
     )
     for polynomial_um in difference:
         on_circle_um = zernike_from_polynomial(polynomial_um, 2.2)

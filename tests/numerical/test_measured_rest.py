@@ -1,0 +1,162 @@
+"""What an estimated eye leaves of its measurement: on the axis nothing is lost."""
+
+import numpy as np
+import pytest
+
+from estimator.estimate.estimation import estimate_eye
+from estimator.estimate.measured_rest import FADE_DEG, MeasuredRest
+from estimator.field.traced_eye import TracedEye
+from estimator.optics.chromatic import chromatic_refraction_dpt
+from estimator.optics.zernike import remove_central_tilt
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile, preset_names
+from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.field_wavefronts import (
+    polynomial_in_mm,
+    zernike_from_polynomial,
+)
+from estimator.wavefront.moved_plane import moved_polynomial
+from tests.numerical.eye_cases import population_profiles, random_eye_profiles
+
+WILD = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 5.0,
+    "wavelength_nm": 555.0,
+    "zernike_um": {"2,0": 1.0, "3,3": 0.6, "4,-4": 0.5, "5,1": -0.3, "6,6": 0.25},
+}
+"""Farther from any eye than the 45 parameters reach."""
+
+
+def axis_error_um(profile):
+    """RMS, um, of what the traced eye has on its axis less what was measured."""
+    estimated = estimate_eye(profile)
+    pupil_mm, wavelength_nm = profile.pupil_diameter_mm, profile.wavelength_nm
+    eye = TracedEye.trace(
+        estimated,
+        pupil_diameters_mm=[pupil_mm],
+        focus_range_dpt=(-30.0, -30.0),  # relaxed, hyperopes too
+        wavelengths_nm=[wavelength_nm],
+    )
+    state = {
+        **{"h_deg": 0.0, "v_deg": 0.0, "pupil_diameter_mm": pupil_mm},
+        **{"accommodation_dpt": 0.0, "wavelength_nm": wavelength_nm},
+    }
+    total_dpt = eye.total_defocus_dpt(**state)
+    ours_um = eye.wavefronts(**state, total_defocus_dpt=total_dpt).zernike_um[0]
+    radius_mm = pupil_mm / 2.0
+    at_cornea_um = polynomial_in_mm(remove_central_tilt(profile.zernike_um), radius_mm)
+    in_pupil_um = moved_polynomial(
+        at_cornea_um, depth_mm=estimated.accommodating.entrance_pupil_mm
+    )
+    error_um = ours_um - zernike_from_polynomial(in_pupil_um, radius_mm)
+    return float(np.sqrt(np.sum(error_um[1:] ** 2)))
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_presets_are_exact_on_their_axis(name):
+    assert axis_error_um(parse_profile({"kind": "preset", "name": name})) < 1e-9
+
+
+def test_a_wavefront_that_no_eye_has_is_exact_too_and_said():
+    profile = parse_profile(WILD)
+    estimated = estimate_eye(profile)
+    assert estimated.rest(555.0).rms_um > 0.05
+    assert any("the rest is added" in note for note in estimated.notes)
+    assert axis_error_um(profile) < 1e-9
+
+
+def test_random_eyes_are_exact_on_their_axis(rng):
+    profiles = [p for p, _ in random_eye_profiles(8, rng)] + population_profiles(8, rng)
+    assert max(map(axis_error_um, profiles)) < 1e-4
+
+
+@pytest.mark.slow
+def test_1000_random_eyes_are_exact_on_their_axis(rng):
+    profiles = [p for p, _ in random_eye_profiles(500, rng)]
+    profiles += population_profiles(500, rng)
+    assert max(map(axis_error_um, profiles)) < 1e-4
+
+
+def test_the_rest_fades_and_does_not_run_away_in_wide_pupils():
+    rest = estimate_eye(parse_profile(WILD)).rest(555.0)
+    share = rest.left_share([0.0, FADE_DEG, 0.0, 45.0], [0.0, 0.0, -FADE_DEG, 25.0])
+    assert share == pytest.approx([1.0, np.exp(-1), np.exp(-1), 0.0], abs=1e-4)
+    for radius_mm in (2.5, 3.0, 4.5):
+        wide_um = rest.residues_um(np.array([radius_mm]), np.ones(1))[0]
+        zernike_um = zernike_from_polynomial(wide_um, radius_mm)
+        rms_um = np.sqrt(np.sum(zernike_um[3:] ** 2))
+        assert rms_um == pytest.approx(rest.rms_um, rel=1e-9)
+
+
+def test_colour_is_that_of_measured_eyes():
+    profile = parse_profile({"kind": "preset", "name": "post_lasik"})
+    wavelengths_nm = np.array([464.0, 549.0, 612.0])
+    traced = TracedEye.trace(
+        estimate_eye(profile),
+        pupil_diameters_mm=[3.0],
+        focus_range_dpt=(0.0, 2.0),
+        wavelengths_nm=wavelengths_nm,
+    )
+    for eye in (traced, MeasuredWavefront(profile)):
+        found_dpt = eye.total_defocus_dpt(
+            pupil_diameter_mm=3.0,
+            accommodation_dpt=0.0,
+            wavelength_nm=wavelengths_nm,
+        )
+        published_dpt = chromatic_refraction_dpt(wavelengths_nm)
+        assert np.diff(found_dpt) == pytest.approx(np.diff(published_dpt), abs=5e-3)
+
+
+def test_a_given_eye_is_traced_as_it_is():
+    estimated = estimate_eye(parse_profile({"kind": "preset", "name": "cataract"}))
+    body = {"kind": "eye", "parameters": estimated.parameters.to_mapping()}
+    given = estimate_eye(parse_profile(body))
+    none = given.rest([464.0, 612.0])
+    assert not none.residue_um.any() and not none.color_dpt.any()
+
+
+@pytest.mark.parametrize(
+    ("sphere_dpt", "named"),
+    [(0.0, ()), (-4.0, ()), (18.0, ("corneal power",)), (-20.0, ("eye length",))],
+)
+def test_what_is_unusual_in_a_person_is_named(sphere_dpt, named):
+    body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
+    notes = " ".join(estimate_eye(parse_profile(body)).notes)
+    assert ("unusual for a person" in notes) == bool(named)
+    for word in named:
+        assert word in notes
+
+
+@pytest.mark.parametrize("depth_mm", [1.0, 3.0])
+def test_a_wavefront_is_carried_to_another_plane_as_rays_go(depth_mm):
+    """Against the same eye traced in both planes, where six orders hold all of it."""
+    estimated = estimate_eye(
+        parse_profile({"kind": "prescription", "sphere_dpt": -12.0})
+    )
+    (state,) = estimated.accommodating.states_at([0.0])
+    at = {
+        "fields_deg": [[0.0, 0.0]],
+        "wavelengths_nm": [555.0],
+        "pupil_diameters_mm": [4.0],
+    }
+    outer, inner = (
+        wavefront_grid(state.surfaces, **at, plane=plane)
+        for plane in ("cornea", "pupil")
+    )
+    whole_mm = float(
+        np.linalg.norm(outer.pupil_point_mm - inner.pupil_point_mm, axis=-1).squeeze()
+    )
+    polynomial_um = polynomial_in_mm(outer.zernike_um, outer.zernike_radius_mm)
+    for step_mm in (depth_mm, whole_mm - depth_mm):
+        polynomial_um = moved_polynomial(polynomial_um, depth_mm=step_mm)
+    ours_um = zernike_from_polynomial(polynomial_um, inner.zernike_radius_mm)
+    assert np.abs(ours_um - inner.zernike_um)[..., 1:].max() < 1e-4
+
+
+def test_the_rest_of_a_narrow_pupil_is_the_measurement_there():
+    profile = parse_profile(WILD)
+    rest = MeasuredRest.of(
+        estimate_eye(profile).parameters, profile, wavelengths_nm=[555.0]
+    )
+    narrow_um = rest.residues_um(np.array([1.5]), np.ones(1))[0]
+    assert narrow_um == pytest.approx(rest.residue_um)
