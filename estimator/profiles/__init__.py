@@ -1,9 +1,10 @@
 """What is known of one eye: a prescription, a measurement, an eye.
 
-parse               a profile's object, checked, as an `EyeProfile`
-files               .json, .abp and .csv profiles, and presets by name
-presets.json        the six presets
-measured_wavefront  a profile as the measurement by formula, without a model eye
+parse                a profile's object, checked, as an `EyeProfile`
+files                .json, .abp and .csv profiles, and presets by name
+presets.json         the six presets
+measured_wavefront   a profile as the measurement by formula, without a model eye
+typical_aberrations  what people have beside their prescription, by age
 """
 
 import lazy_loader

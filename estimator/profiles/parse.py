@@ -48,7 +48,11 @@ PRESCRIPTION_FIELDS = (
     "axis_deg",
     "vertex_mm",
     "add_dpt",
+    "higher_order",
 )
+HIGHER_ORDERS = ("typical", "none")
+"""What a traced eye has beside its prescription: aberrations of its age, or none."""
+
 ZERNIKE_FIELDS = ("frame", "pupil_diameter_mm", "wavelength_nm", "zernike_um")
 SET_FIELDS = ("frame", "measurements")
 MEASURED_FIELD_LIMIT_DEG = 50.0
@@ -111,6 +115,9 @@ class EyeProfile:
         The eye itself, for kind ``eye``.
     retina : RetinaShape or None
         Instead of the sphere of radius eye length / 2.
+    higher_order : {"typical", "none"}
+        Aberrations to be added where an eye is traced (`typical_aberrations`); a
+        prescription alone asks for any.
     """
 
     name: str
@@ -125,6 +132,7 @@ class EyeProfile:
     measurements: tuple[Measurement, ...] = ()
     eye: EyeParameters | None = None
     retina: RetinaShape | None = None
+    higher_order: str = "none"
 
     @cached_property
     def zernike_um(self) -> NDArray[np.float64]:
@@ -230,6 +238,9 @@ def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
         ),
         max_pupil_diameter_mm=math.inf,
         add_dpt=fields.number(data, "add_dpt", 0.0, 4.0, default=0.0),
+        higher_order=fields.choice(
+            data, "higher_order", HIGHER_ORDERS, default="typical"
+        ),
         **_common(data),
     )
 

@@ -37,7 +37,7 @@ from tests.numerical.scene_frames import scene_view
 
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
 EYES = {
-    "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0},
+    "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0, "higher_order": "none"},
     "emmetropia": {"kind": "preset", "name": "emmetropia"},
 }
 SIZE, QUICK_SIZE = (1280, 720), (320, 180)

@@ -53,7 +53,7 @@ PUPILS_MM = np.array([3.0, 5.0])
 def vector():
     """Give a myope of 1.5 dpt on average."""
     body = {"kind": "prescription", "sphere_dpt": -1.0, "cylinder_dpt": -1.0}
-    profile = parse_profile(body | {"axis_deg": 30})
+    profile = parse_profile(body | {"axis_deg": 30, "higher_order": "none"})
     return estimate_eye(profile, starts=("table",)).parameters.to_vector()
 
 
@@ -268,7 +268,7 @@ def test_a_refinement_that_ends_badly_or_not_at_all_has_failed():
 
 
 def traced(sphere_dpt, spec):
-    body = {"kind": "prescription", "sphere_dpt": sphere_dpt}
+    body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "higher_order": "none"}
     return TracedEye.trace(
         estimate_eye(parse_profile(body), starts=("table",)),
         pupil_diameters_mm=pupil_nodes_mm(spec.settings.pupil_range_mm),

@@ -1,0 +1,214 @@
+"""Typical higher-order aberrations: published figures, prescription, mirrors, notes.
+
+Figures that the code is not made from: Wang & Koch 2003 (J Cataract Refract Surg
+29:1896, 532 eyes, 41 years on average), Salmon & van de Pol 2006 (the same journal,
+32:2064, 2560 eyes), Mathur, Atchison & Charman 2010 (Opt Express 18:5840), Seo et al.
+2025 (J Clin Med 14:6981).
+"""
+
+import numpy as np
+import pytest
+
+from estimator.estimate.estimation import METHODS, estimate_eye
+from estimator.field.prepare import prepare_eye
+from estimator.optics import prescription as rx
+from estimator.optics.zernike import flip_horizontal, index_from_nm, rescale_pupil
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import ProfileError, parse_profile, preset_names
+from estimator.profiles.typical_aberrations import (
+    typical_note,
+    typical_zernike_um,
+    with_typical_aberrations,
+)
+
+CYLINDER = {"sphere_dpt": -6.0, "cylinder_dpt": -3.0, "axis_deg": 102.0}
+COMA = [index_from_nm(3, -1), index_from_nm(3, 1)]
+SPHERICAL = index_from_nm(4, 0)
+MEAN_AGE_YEARS = 41.0
+"""Of the eyes of Wang & Koch."""
+
+NOTE = "higher-order aberrations typical of"
+
+
+def profile(**body):
+    return parse_profile({"kind": "prescription", "sphere_dpt": 0.0} | body)
+
+
+def term_um(n, m, age_years=None, eye_side="OD"):
+    return typical_zernike_um(age_years, eye_side=eye_side)[index_from_nm(n, m)]
+
+
+def rms_um(age_years, terms=slice(None)):
+    zernike_um = typical_zernike_um(age_years, eye_side="OD")[terms]
+    return float(np.sqrt(np.sum(zernike_um**2)))
+
+
+def test_a_young_adult_s_spherical_aberration_is_the_population_s_mean():
+    assert term_um(4, 0) == pytest.approx(0.094, abs=5e-4)  # Thibos et al. 2002
+    assert term_um(4, 0, 25.0) == term_um(4, 0)
+
+
+def test_sizes_of_coma_and_trefoil_are_those_of_other_people_too():
+    # mean absolute values of Salmon & van de Pol, adults of all ages; two decimals
+    assert abs(term_um(3, -1)) == pytest.approx(0.14, abs=5e-3)
+    assert abs(term_um(3, -3)) == pytest.approx(0.11, abs=0.02)
+    assert term_um(4, 0, MEAN_AGE_YEARS) == pytest.approx(0.13, abs=5e-3)
+    # means and standard deviations of Wang & Koch; theirs hold more terms
+    assert rms_um(MEAN_AGE_YEARS, COMA) == pytest.approx(0.170, abs=0.02)
+    assert rms_um(MEAN_AGE_YEARS, SPHERICAL) == pytest.approx(0.128, abs=0.005)
+    assert rms_um(MEAN_AGE_YEARS) == pytest.approx(0.305, abs=0.095)
+    assert 0.8 * 0.305 < rms_um(MEAN_AGE_YEARS) < 0.305
+
+
+def test_signs_are_those_of_the_population_in_the_eye_frame():
+    # right eyes, examiner's frame: -, -, +, - (Thibos et al. 2002); x is mirrored here
+    terms = [(3, -3), (3, -1), (3, 1), (3, 3)]
+    signs = [np.sign(term_um(*term)) for term in terms]
+    assert signs == [-1.0, -1.0, -1.0, 1.0]
+
+
+def test_left_eyes_mirror_right_ones():
+    for age_years in (None, 60.0):
+        right, left = (
+            typical_zernike_um(age_years, eye_side=side) for side in ("OD", "OS")
+        )
+        assert np.array_equal(left, flip_horizontal(right))
+        assert not np.array_equal(left, right)
+    right, left = (
+        with_typical_aberrations(profile(eye_side=side)).zernike_um
+        for side in ("OD", "OS")
+    )
+    assert np.array_equal(left, flip_horizontal(right))
+
+
+def test_aberrations_grow_with_age_as_published():
+    # Berrio et al. 2010 through 5 mm, um a year
+    old, young = (
+        rescale_pupil(typical_zernike_um(a, eye_side="OS"), radius_ratio=5 / 6)
+        for a in (70.0, 20.0)
+    )
+    yearly_um = (old - young) / 50.0
+    assert yearly_um[SPHERICAL] == pytest.approx(0.0011, abs=1e-12)
+    assert yearly_um[COMA] == pytest.approx([0.0, 0.0017], abs=1e-12)
+    # older emmetropes of Mathur et al. through 5 mm
+    assert old[SPHERICAL] == pytest.approx(0.08, abs=0.02)
+    # all of it at 6 mm, Seo et al.: 0.003 um a year
+    assert (rms_um(77.0) - rms_um(20.0)) / 57.0 == pytest.approx(0.003, abs=5e-4)
+    ages = [20.0, 30.0, 45.0, 60.0, 77.0]
+    assert np.all(np.diff([term_um(4, 0, age) for age in ages]) > 0.01)
+
+
+def test_ages_without_figures_are_as_those_at_the_ends():
+    assert term_um(4, 0, 8.0) == term_um(4, 0, 20.0)
+    assert term_um(4, 0, 95.0) == term_um(4, 0, 77.0)
+
+
+@pytest.mark.parametrize("age_years", [20.0, 77.0])
+@pytest.mark.parametrize("body", [{}, CYLINDER, CYLINDER | {"vertex_mm": 12.0}])
+def test_through_4_mm_the_refraction_is_the_prescription(body, age_years):
+    given = profile(**body, age_years=age_years)
+    typical = with_typical_aberrations(given)
+    assert typical.pupil_diameter_mm == 6.0 and typical.wavelength_nm == 555.0
+    ours, theirs = (
+        rx.power_vector_from_zernike(
+            rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm),
+            zernike_radius_mm=2.0,
+        )
+        for eye in (typical, given)
+    )
+    assert ours == pytest.approx(theirs, abs=1e-9)
+    wide_dpt, *_ = rx.power_vector_from_zernike(
+        typical.zernike_um, zernike_radius_mm=3.0
+    )
+    assert theirs[0] - 0.5 < wide_dpt < theirs[0] - 0.1
+    higher_um = typical_zernike_um(age_years, eye_side="OD")
+    assert np.array_equal(typical.zernike_um[6:], higher_um[6:])
+
+
+def test_aberrations_are_added_once():
+    typical = with_typical_aberrations(profile())
+    assert with_typical_aberrations(typical) is typical
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_finds_the_eye_with_them(method):
+    found = estimate_eye(profile(age_years=40), method=method, max_time_s=0.5)
+    assert found.profile.zernike_um[SPHERICAL] == pytest.approx(0.128, abs=5e-4)
+    assert [NOTE in note for note in found.notes] == [True] + [False] * (
+        len(found.notes) - 1
+    )
+    if method != "search":  # it has no time here to come near
+        assert found.mean_abs_error_um < 5e-3
+        assert found.zernike_um[SPHERICAL] == pytest.approx(0.128, abs=0.02)
+
+
+def test_none_is_the_prescription_alone():
+    given = profile(**CYLINDER, higher_order="none")
+    assert with_typical_aberrations(given) is given
+    second_order = rx.zernike_from_power_vector(
+        *rx.power_vector(rx.Prescription(**CYLINDER)), zernike_radius_mm=3.0
+    )
+    assert np.array_equal(given.zernike_um, second_order)
+    found = estimate_eye(given)
+    assert found.profile is given
+    assert found.notes == ()
+    assert found.refraction_dpt == pytest.approx(-7.5, abs=0.01)
+
+
+def test_the_wavefront_model_is_the_prescription_alone():
+    bare, typical = (
+        MeasuredWavefront.from_profile(profile(**CYLINDER, higher_order=which))
+        for which in ("none", "typical")
+    )
+    assert np.array_equal(bare.zernike_um, typical.zernike_um)
+    _, notes = prepare_eye(profile(), eye_model="wavefront")
+    assert notes == ()
+
+
+def test_the_reply_says_it_with_its_size_and_how_to_switch_it_off():
+    few = {"pupil_diameters_mm": (4.0,), "wavelengths_nm": (555.0,)}
+    _, said = prepare_eye(profile(age_years=60), **few)
+    (note,) = [note for note in said if NOTE in note]
+    assert "60 years of age" in note and "RMS 0.31 um at 6 mm" in note
+    assert '"higher_order": "none"' in note
+    assert "young adult" in typical_note(profile())
+    assert len(typical_note(profile(age_years=33.25))) < 200  # a part of a header
+    _, said = prepare_eye(profile(age_years=60, higher_order="none"), **few)
+    assert not any(NOTE in note for note in said)
+
+
+def test_a_worn_correction_has_none():
+    worn = {"correction": {"sphere_dpt": -4.0}}
+    bare, corrected = (
+        with_typical_aberrations(profile(sphere_dpt=-4.0, **more))
+        for more in ({}, worn)
+    )
+    assert np.array_equal(bare.zernike_um, corrected.zernike_um)
+    assert corrected.correction == profile(**worn).correction
+
+
+def test_measured_eyes_and_presets_ask_for_none():
+    for name in preset_names():
+        preset = parse_profile({"kind": "preset", "name": name})
+        assert preset.higher_order == "none"
+        assert with_typical_aberrations(preset) is preset
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({"higher_order": "some"}, "higher_order"),
+        ({"higher_order": True}, "higher_order"),
+        (
+            {"correction": {"sphere_dpt": 0, "higher_order": "none"}},
+            "correction.higher_order",
+        ),
+    ],
+)
+def test_a_bad_value_is_refused_by_name(body, field):
+    with pytest.raises(ProfileError) as caught:
+        profile(**body)
+    assert caught.value.field == field
+    preset = {"kind": "preset", "name": "myopia", "higher_order": "none"}
+    with pytest.raises(ProfileError, match="higher_order"):
+        parse_profile(preset)
