@@ -10,8 +10,9 @@ MRAD_PER_RAD = 1000.0
 REFERENCE_WAVELENGTH_NM = 555.0
 """Wavelength at which accommodation and pupil sizes are defined (DESIGN 3, 4)."""
 
-RGB_WAVELENGTHS_NM = (612.0, 549.0, 464.0)
-"""One wavelength per sRGB primary (Csoba & Kunkli 2023, released settings)."""
+RGB_WAVELENGTHS_NM = (618.0, 536.0, 453.0)
+"""The single wavelengths that stand best for the primaries of common displays, see
+`filter_service.displays`."""
 
 SPHERE_PER_C20 = 4.0 * math.sqrt(3.0)
 """M [dpt] = -4 sqrt(3) C(2,0) [um] / radius² [mm²] (Thibos 2002)."""

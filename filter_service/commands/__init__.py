@@ -2,6 +2,7 @@
 
 console          output, errors, progress
 setting_options  options made from `FilterSettings`
+display_file     a display's measured spectra
 programs         demo and bench: programs of the clients and the checkout
 serve            the service
 prepare          loops compiled ahead

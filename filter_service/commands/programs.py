@@ -22,6 +22,8 @@ class Bench(StrEnum):
     """Benchmarks by what they time."""
 
     ESTIMATE = "estimate"
+    FOCUS = "focus"
+    DISPLAYS = "displays"
     NETWORKS = "networks"
     PLAN = "plan"
     PSF = "psf"
@@ -29,6 +31,7 @@ class Bench(StrEnum):
     LAYERS = "layers"
     RENDER = "render"
     LIVE = "live"
+    FOLLOW = "follow"
     FIELD = "field"
     OCCLUSION = "occlusion"
     SEQUENCE = "sequence"
@@ -40,6 +43,8 @@ class Bench(StrEnum):
 
 BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
+    Bench.FOCUS: "tests.benchmarks.bench_focus",
+    Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",
     Bench.PSF: "tests.benchmarks.bench_psf",
@@ -47,6 +52,7 @@ BENCH_MODULES = {
     Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
     Bench.LIVE: "tests.benchmarks.bench_live",
+    Bench.FOLLOW: "tests.benchmarks.bench_follow",
     Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SEQUENCE: "tests.benchmarks.bench_sequence",

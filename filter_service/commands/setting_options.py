@@ -13,6 +13,7 @@ from typing import Annotated, Any, get_args
 import typer
 
 from filter_service.checked import checked
+from filter_service.commands.display_file import display_of_file
 from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 
@@ -116,6 +117,8 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
             value, names = tuple(given[side] for side in sides), sides
         else:
             continue
+        if name == "display" and str(value).endswith(".csv"):
+            value = display_of_file(value)
         try:
             found[name] = checked(value, kind, name)
         except BadMessage as error:

@@ -1,0 +1,170 @@
+"""One wavelength for each primary of a display, against its whole spectrum.
+
+    python -m tests.benchmarks.bench_displays [--json]
+
+A white point, seen by an eye without other aberrations than the colour of people's
+(Indiana eye), in focus at 555 nm.  The truth has 31 wavelengths, each with its own PSF,
+seen with the colour-matching functions of CIE 1931 and shown in the display's own
+primaries.  Errors are those of the picture around the point, over its brightest pixel:
+in linear light, and encoded as sRGB.  ``ms`` is what the PSFs of one state cost: a
+display of one wavelength a primary costs no more whatever the wavelengths, two cost
+twice as much.  Writes results/displays.json.
+"""
+
+import argparse
+import json
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.optics.chromatic import chromatic_refraction_dpt
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.psf.compute import compute_psfs
+from filter_service.displays import (
+    DISPLAYS,
+    primary_shares,
+    wavelengths_of_spectra,
+)
+from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
+
+SPECTRA = Path(__file__).parents[1] / "data" / "display_spectra.json"
+PITCH_MRAD = 0.29
+HALF_WIDTH_MRAD = 12.0
+PUPIL_MM = 5.0
+DEFOCUS_DPT = (0.0, 1.0)
+REFERENCE = "31 wavelengths, CIE 1931 matching functions"
+
+
+def measured_displays() -> dict[str, tuple[NDArray, NDArray]]:
+    """Wavelengths (31,), nm, and power (31, 3) of measured displays by name."""
+    content = json.loads(SPECTRA.read_text(encoding="utf-8"))
+    at_nm = np.array(content["wavelengths_nm"], dtype=np.float64)
+    displays = content["displays"].items()
+    return {name: (at_nm, np.array(power)) for name, power in displays}
+
+
+@cache
+def psf(wavelength_nm: float, defocus_dpt: float) -> NDArray[np.float64]:
+    """Kernel [y, x] of one wavelength; the defocus is that at 555 nm."""
+    refraction_dpt = chromatic_refraction_dpt(wavelength_nm)
+    shift_dpt = refraction_dpt - chromatic_refraction_dpt(REFERENCE_WAVELENGTH_NM)
+    zernike_um = np.zeros((1, 28))
+    radius_mm = PUPIL_MM / 2.0
+    total_dpt = shift_dpt + defocus_dpt
+    zernike_um[0, 4] = -total_dpt * radius_mm**2 / (4.0 * np.sqrt(3.0))
+    return compute_psfs(
+        zernike_um,
+        pupil_diameter_mm=PUPIL_MM,
+        wavelength_nm=wavelength_nm,
+        pixel_pitch_mrad=PITCH_MRAD,
+        radius_px=round(HALF_WIDTH_MRAD / PITCH_MRAD),
+    )[0].kernel
+
+
+def true_picture(at_nm: NDArray, power: NDArray, defocus_dpt: float) -> NDArray:
+    """White point (3, y, x) in the display's primaries."""
+    shares = primary_shares(at_nm, power).sum(axis=1)
+    kernels = np.stack([psf(nm, defocus_dpt) for nm in at_nm.tolist()])
+    return np.tensordot(shares, kernels, axes=1)
+
+
+def single_picture(wavelengths_nm, defocus_dpt: float) -> NDArray:
+    """The same with one wavelength for each primary."""
+    return np.stack([psf(nm, defocus_dpt) for nm in wavelengths_nm])
+
+
+def pairs_of(at_nm: NDArray, power: NDArray) -> list[tuple[NDArray, NDArray]]:
+    """Two wavelengths and their shares for each primary: a Gauss rule of it."""
+    shares, pairs = primary_shares(at_nm, power), []
+    for k in range(3):
+        own = shares[k, k] / shares[k, k].sum()
+        middle_nm = float(own @ at_nm)
+        moments = [float(own @ (at_nm - middle_nm) ** n) for n in range(4)]
+        nodes = np.roots([1.0, -moments[3] / moments[2], -moments[2]]).real
+        first = nodes[1] / (nodes[1] - nodes[0])
+        pairs.append((middle_nm + nodes, np.array([first, 1.0 - first])))
+    return pairs
+
+
+def paired_picture(pairs, defocus_dpt: float) -> NDArray:
+    """The same with two wavelengths for each primary."""
+    return np.stack(
+        [
+            sum(w * psf(float(nm), defocus_dpt) for nm, w in zip(*pair, strict=True))
+            for pair in pairs
+        ]
+    )
+
+
+def encoded(light: NDArray) -> NDArray:
+    """SRGB values, 0 to 1."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055
+    )
+
+
+def errors_db(ours: NDArray, truth: NDArray) -> tuple[float, float]:
+    """PSNR in linear light and encoded, over the brightest pixel."""
+    scale = truth.max()
+    linear = np.mean((ours / scale - truth / scale) ** 2)
+    coded = np.mean((encoded(ours / scale) - encoded(truth / scale)) ** 2)
+    return float(-10.0 * np.log10(linear)), float(-10.0 * np.log10(coded))
+
+
+def rows() -> list[Row]:
+    """Every display by every choice of wavelengths."""
+    found = []
+    for name, (at_nm, power) in measured_displays().items():
+        own = wavelengths_of_spectra(at_nm, power)
+        for defocus_dpt in DEFOCUS_DPT:
+            truth = true_picture(at_nm, power, defocus_dpt)
+            choices = {display: DISPLAYS[display] for display in DISPLAYS}
+            choices["its own spectra"] = tuple(round(nm, 1) for nm in own)
+            for method, wavelengths_nm in choices.items():
+                psf.cache_clear()
+                started_s = time.perf_counter()
+                ours = single_picture(wavelengths_nm, defocus_dpt)
+                time_ms = 1e3 * (time.perf_counter() - started_s)
+                setting = ", ".join(f"{nm:g}" for nm in wavelengths_nm)
+                found += _rows(method, name, setting, defocus_dpt, time_ms, ours, truth)
+            psf.cache_clear()
+            started_s = time.perf_counter()
+            ours = paired_picture(pairs_of(at_nm, power), defocus_dpt)
+            time_ms = 1e3 * (time.perf_counter() - started_s)
+            found += _rows("two each", name, "", defocus_dpt, time_ms, ours, truth)
+    return found
+
+
+def _rows(method, name, setting, defocus_dpt, time_ms, ours, truth) -> list[Row]:
+    where = f"{setting} nm, {defocus_dpt:g} dpt"
+    return [
+        Row(
+            *("displays", method, name, where, 1, time_ms, time_ms, memory_mb()),
+            *(error_name, error_db, REFERENCE),
+        )
+        for error_name, error_db in zip(
+            ("linear, dB", "sRGB, dB"), errors_db(ours, truth), strict=True
+        )
+    ]
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    found = rows()
+    content = report(found)
+    write_report("displays", content)
+    if options.json:
+        print(json.dumps(content))
+    else:
+        print_rows(found)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""The wavelengths that stand for the primaries of displays."""
+
+import numpy as np
+import pytest
+
+from estimator.optics.units import RGB_WAVELENGTHS_NM
+from filter_service.commands.display_file import display_of_file
+from filter_service.displays import (
+    DISPLAYS,
+    display_wavelengths_nm,
+    matching_functions,
+    primary_shares,
+    wavelengths_of_spectra,
+)
+from filter_service.errors import BadMessage
+from filter_service.settings import FilterSettings
+from tests.benchmarks.bench_displays import (
+    errors_db,
+    measured_displays,
+    single_picture,
+    true_picture,
+)
+from tests.grid_specs import grid_spec
+
+AT_NM = np.arange(400.0, 701.0, 5.0)
+
+
+def lines(*centres_nm, width_nm=4.0):
+    """Narrow primaries (n, 3)."""
+    away = (AT_NM[:, None] - np.array(centres_nm)) / width_nm
+    return np.exp(-0.5 * away**2)
+
+
+def test_matching_functions_are_those_of_cie_1931():
+    # x, y, z of the 1931 observer at four wavelengths, and where y is highest
+    published = {
+        450.0: (0.3362, 0.0380, 1.7721),
+        500.0: (0.0049, 0.3230, 0.2720),
+        550.0: (0.4334, 0.9950, 0.0087),
+        600.0: (1.0622, 0.6310, 0.0008),
+    }
+    ours = matching_functions(np.array(list(published)))
+    assert ours == pytest.approx(np.array(list(published.values())), abs=0.04)
+    assert AT_NM[matching_functions(AT_NM)[:, 1].argmax()] == pytest.approx(555, abs=5)
+
+
+def test_all_light_of_a_primary_is_seen_as_that_primary():
+    shares = primary_shares(AT_NM, lines(620, 530, 455, width_nm=20.0))
+    assert shares.sum(axis=2) == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_narrow_primaries_are_found_where_they_are():
+    found = wavelengths_of_spectra(AT_NM, lines(638, 521, 459))
+    assert found == pytest.approx((638, 521, 459), abs=1.0)
+
+
+@pytest.mark.parametrize("spectra", [np.ones((61, 2)), np.ones((61, 3))])
+def test_spectra_that_are_no_three_colours_are_refused(spectra):
+    with pytest.raises(ValueError, match="spectra"):
+        wavelengths_of_spectra(AT_NM, spectra)
+
+
+def test_both_packages_mean_the_same_by_default():
+    assert DISPLAYS["common"] == RGB_WAVELENGTHS_NM
+
+
+def test_a_display_is_a_name_or_three_wavelengths():
+    assert display_wavelengths_nm("oled") == DISPLAYS["oled"]
+    assert display_wavelengths_nm("640, 525.5,450") == (640.0, 525.5, 450.0)
+    spec = grid_spec(
+        width_px=8, height_px=8, tangents=(-0.1, 0.1, 0.1, -0.1), display="638,521,459"
+    )
+    assert spec.channel_wavelengths_nm == pytest.approx([638, 521, 459])
+
+
+@pytest.mark.parametrize(
+    "display", ["plasma", "", "620,530", "620,530,200", "620,530,nan", "a,b,c"]
+)
+def test_what_is_no_display_is_refused_by_name(display):
+    with pytest.raises(BadMessage, match="display") as caught:
+        FilterSettings(display=display)
+    assert caught.value.field == "display" and "oled" in caught.value.allowed
+
+
+@pytest.mark.parametrize("name", list(measured_displays()))
+def test_one_wavelength_a_primary_stands_for_a_measured_display(name):
+    at_nm, power = measured_displays()[name]
+    truth = true_picture(at_nm, power, 0.0)
+    own, common, paper = (
+        errors_db(single_picture(wavelengths_nm, 0.0), truth)
+        for wavelengths_nm in (
+            wavelengths_of_spectra(at_nm, power),
+            DISPLAYS["common"],
+            DISPLAYS["paper"],
+        )
+    )
+    assert own[0] > 51.0 and own[1] > 48.0
+    assert common[0] > 50.5 and common[1] > 47.5
+    assert common[1] > paper[1] + 1.0
+
+
+def test_a_command_takes_spectra_from_a_file(tmp_path):
+    at_nm, power = measured_displays()["OLED (Sony)"]
+    path = tmp_path / "oled.csv"
+    rows = (f"{nm:g},{r},{g},{b}" for nm, (r, g, b) in zip(at_nm, power, strict=True))
+    path.write_text("nm,red,green,blue\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    found = display_wavelengths_nm(display_of_file(str(path)))
+    assert found == pytest.approx(wavelengths_of_spectra(at_nm, power), abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("400,1,2\n410,1,2\n", "spectra"),
+        ("400,a,2,3\n", "four numbers"),
+        ("400,1,2,3\n420,1,2,3\n430,1,3,3\n", "even steps"),
+        ("", "four numbers"),
+    ],
+)
+def test_a_file_that_holds_no_spectra_is_refused_by_name(tmp_path, text, said):
+    path = tmp_path / "bad.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=said):
+        display_of_file(str(path))
