@@ -143,22 +143,38 @@ def _survey(disc, half, shear, tables, low, high, edge, normal, blur, narrow):
 _N_RADIAL = 8
 
 
+def _passed_points() -> tuple[NDArray, NDArray]:
+    """Powers (6, n) of the unit disc's points, ring by ring; weights (8,) of rings.
+
+    The last ring is the edge, and has no weight.
+    """
+    node, weight = np.polynomial.legendre.leggauss(_N_RADIAL)
+    rings = np.append(np.sqrt((node + 1.0) / 2.0), 1.0)
+    angle = 2.0 * math.pi * np.arange(_N_RING) / _N_RING
+    x, y = (np.outer(rings, f(angle)).ravel() for f in (np.cos, np.sin))
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), weight / 2.0
+
+
+_PASSED_POWERS, _RING_WEIGHTS = _passed_points()
+
+
+def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
+    """Apodisation (P, 6) over the unit disc instead of the box."""
+    one, x, y, xx, xy, yy = frames.log_amplitude.T
+    r = frames.shear_ratio
+    s = np.sqrt(1.0 - r * r)
+    columns = one, x + r * y, s * y, xx + r * xy + r * r * yy, s * xy + 2 * r * s * yy
+    return np.stack([*columns, s * s * yy], axis=1)
+
+
 def _passed_light(frames: PupilFrames) -> tuple[NDArray, NDArray]:
     """Mean of the intensity (P,) over each apodised pupil, and over its edge."""
     count = frames.shear_ratio.size
     if not frames.log_amplitude.any():
         return np.ones(count), np.ones(count)
-    node, weight = np.polynomial.legendre.leggauss(_N_RADIAL)
-    rings = np.append(np.sqrt((node + 1.0) / 2.0), 1.0)
-    angle = 2.0 * math.pi * np.arange(_N_RING) / _N_RING
-    x, y = rings[:, None] * np.cos(angle), rings[:, None] * np.sin(angle)
-    r = frames.shear_ratio[:, None, None]
-    y = r * x + np.sqrt(1.0 - r * r) * y
-    x = np.broadcast_to(x, y.shape)
-    powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    exponent = np.einsum("prak,pk->pra", powers, frames.log_amplitude)
-    intensity = np.exp(2.0 * exponent).mean(axis=2)
-    return intensity[:, :-1] @ (weight / 2.0), intensity[:, -1]
+    intensity = np.exp(2.0 * _disc_log_amplitude(frames) @ _PASSED_POWERS)
+    rings = intensity.reshape(count, -1, _N_RING).mean(axis=2)
+    return rings[:, :-1] @ _RING_WEIGHTS, rings[:, -1]
 
 
 def survey_pupils(frames: PupilFrames) -> PupilSurvey:

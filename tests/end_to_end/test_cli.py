@@ -193,6 +193,16 @@ def test_a_traced_eye_is_as_accurate_as_asked(scene):
     assert "fast" in refusal(*traced, "--accuracy", "high")
 
 
+def test_cones_weigh_the_pupil_where_that_is_asked_for(scene):
+    folder, _ = scene
+    pupil = ("--pupil-mm", 5)
+    images = []
+    for extra in ((), ("--stiles-crawford",)):
+        run_json(*filter_arguments(folder, *pupil, *extra, profile="astigmatism"))
+        images.append(np.load(folder / "out.npy"))
+    assert 30.0 < psnr_db(*images) < 60.0
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [

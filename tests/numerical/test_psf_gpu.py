@@ -414,7 +414,8 @@ def test_a_hardware_gpu_computes_what_the_cpu_does(gpu):
         assert distances(batch, expected).max() < 3e-2
 
 
-def test_a_store_is_the_same_from_either_engine():
+@pytest.mark.parametrize("stiles_crawford", [False, True])
+def test_a_store_is_the_same_from_either_engine(stiles_crawford):
     spec = grid_spec(
         width_px=160,
         height_px=120,
@@ -424,6 +425,7 @@ def test_a_store_is_the_same_from_either_engine():
         object_range_dpt=(0.0, 1.0),
         mode="dynamic",
         tolerance="loose",
+        stiles_crawford=stiles_crawford,
     )
     profile = parse_profile({"kind": "preset", "name": "astigmatism"})
     stores = [

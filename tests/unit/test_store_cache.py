@@ -257,6 +257,8 @@ def test_the_key_tells_apart_what_changes_a_store():
         key(spec=field, gaze_deg=(1.0, 0.0)),
         key(spec=field, gaze_range_deg=(1.0, 0.0)),
         key(spec=field, lateral_color=True),
+        key(stiles_crawford=True),
+        key(stiles_crawford=True, profile=replace(PROFILE, eye_side="OS")),
         key(age_years=50.0),
     ]
     assert len({key(), *others}) == 1 + len(others)
