@@ -51,6 +51,9 @@ SORT_CAPACITIES = (512, 2048)
 """Size classes of the sort: lists up to these lengths are sorted in shared memory, 4
 and 16 KiB, as words of depth and place in the list; longer ones through memory."""
 
+NEAREST_M = 0.02
+"""Distances below count as this: 50 dpt, more than may be prepared."""
+
 DISCONTINUITY_PX = 0.25
 """Blur change between neighbours above which they count as two surfaces.  Continuous
 tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %
@@ -72,6 +75,12 @@ area), so the image error stays the same at every blur: 55 dB on textured scenes
 square of the next level under twice the spread is the same picture, twice as large."""
 
 MERGE_CONTRAST_POWER = 1.5
+
+MERGE_MIDTONE = 0.2
+MERGE_DARKEST = 0.0155
+"""In a picture that is encoded for a screen, dark parts are seen finer: below a fifth
+of white the difference falls as the root of the light (the encoding's own power is
+0.58), and stays where sRGB is straight, at 1.55 % of that fifth."""
 
 MERGE_MAX_BLUR_STEP_PX = 0.25
 """Largest blur difference within a merged quad; more where the blur is wide."""

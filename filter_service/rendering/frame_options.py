@@ -40,6 +40,11 @@ class FrameOptions:
     gaze_deg: tuple[float, float]
     gaze_notes: tuple[str, ...]
 
+    @property
+    def is_encoded(self) -> bool:
+        """Whether the picture is encoded for a screen."""
+        return self.output == "srgb8"
+
 
 def frame_options(
     view: RgbdView,

@@ -30,6 +30,7 @@ uniform ivec2 frame_size_px;
 uniform int layer_count;
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 uniform float white_level;
+uniform int is_encoded;           // the picture is for a screen: dark parts are seen finer
 uniform float tolerance;          // of merging, against the usual
 uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
@@ -106,11 +107,19 @@ void find_edge(ivec2 block, ivec2 grid, uint thread) {
     }
 }
 
+// Difference of light: where the picture will be encoded, as much as it would be in a
+// midtone.
+vec3 seen_contrast(vec3 least, vec3 most) {
+    if (is_encoded == 0) return most - least;
+    vec3 light = 0.5 * (least + most) / (MERGE_MIDTONE * white_level);
+    return (most - least) / sqrt(clamp(light, MERGE_DARKEST, 1.0));
+}
+
 // Whether a square of four of the level below may be one fragment.  Seen from a blur of
 // half the size, a square of the next level looks the same: so does its error.
 bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
     float spread = place.w / float(1 << (level - 1));
-    vec3 contrast = most.rgb - least.rgb;
+    vec3 contrast = seen_contrast(least.rgb, most.rgb);
     float largest = max(contrast.r, max(contrast.g, contrast.b));
     float fraction;
     uint kernel = kernel_at(at, place.x, fraction);

@@ -47,6 +47,8 @@ class FragmentPasses:
         Columns and rows around the image.
     white_level : float
         Light against which the contrast of a merged quad counts.
+    is_encoded : bool
+        The picture is for a screen: dark parts are seen finer.
 
     Attributes
     ----------
@@ -66,6 +68,7 @@ class FragmentPasses:
         image_size_px: tuple[int, int] | None = None,
         border_px: int = 0,
         white_level: float = 1.0,
+        is_encoded: bool = False,
     ):
         self.strip = strip
         self.image = image
@@ -79,6 +82,7 @@ class FragmentPasses:
         self.image_size_px = image_size_px or strip.size
         self.border_px = border_px
         self.white_level = white_level
+        self.is_encoded = is_encoded and white_level > 0.0
         self.search_blocks = 0
         self.kernel_count = 0
         self.kernel_texel_count = 0
@@ -120,7 +124,9 @@ class FragmentPasses:
                 **self._common,
                 words_per_cell=n_words,
                 tangents=self.strip.view.tangents,
-                object_range_dpt=self.strip.layers.object_range_dpt,
+                vergence_range_dpt=self.strip.layers.vergence_range_dpt,
+                vergence_scale=self.strip.layers.vergence.scale_ratio,
+                vergence_offset_m=self.strip.layers.vergence.offset_m,
                 depth_is_planar=int(self.strip.view.depth_kind == "planar"),
                 blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                 defines=COLOR_VARIANTS[self.strip.view.color.dtype.name],
@@ -166,6 +172,7 @@ class FragmentPasses:
                     blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                     max_level=self._max_level,
                     white_level=self.white_level,
+                    is_encoded=int(self.is_encoded),
                     tolerance=self.tolerance,
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,

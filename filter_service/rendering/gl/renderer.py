@@ -217,6 +217,7 @@ class FilterRenderer:
                 image_size_px=(view.width_px, view.height_px),
                 border_px=border_px,
                 white_level=white_level(view.color),
+                is_encoded=options.is_encoded,
             )
             passes = FramePasses(shared, fragments)
             passes.run(

@@ -108,8 +108,11 @@ class FrameRecord:
     ) -> NDArray[np.bool_]:
         """Point to layers and cells; returns where used pairs will be noted."""
         c = self.c
-        c.object_low_dpt, c.object_high_dpt = layers.object_range_dpt
-        c.object_margin_dpt = CLAMP_MARGIN_RATIO * max(layers.object_range_dpt[1], 1.0)
+        far_dpt, near_dpt = layers.vergence_range_dpt
+        c.vergence_low_dpt, c.vergence_high_dpt = far_dpt, near_dpt
+        c.vergence_margin_dpt = CLAMP_MARGIN_RATIO * max(near_dpt, 1.0)
+        c.vergence_scale = layers.vergence.scale_ratio
+        c.vergence_offset_m = layers.vergence.offset_m
         c.blur_px_per_dpt = layers.blur_px_per_dpt
         layer_dpt = layers.layer_dpt.astype(np.float32)
         c.layer_dpt = self._keep(layer_dpt)
@@ -158,11 +161,17 @@ class FrameRecord:
         c.kernels = self._room("kernels", c.kernel_count * KERNEL_IMAGE_BYTES)
 
     def set_merging(
-        self, *, tolerance: float, paper_rule: bool, white_level: float
+        self,
+        *,
+        tolerance: float,
+        paper_rule: bool,
+        white_level: float,
+        is_encoded: bool,
     ) -> None:
         """Say how pixels become fragments, and those light; the paper merges once."""
         c = self.c
         c.paper_rule, c.white_level = paper_rule, white_level
+        c.is_encoded = is_encoded and white_level > 0.0
         most = 1 if paper_rule else MAX_LEVEL
         if c.cell_px:
             most = min(most, c.cell_px.bit_length() - 1)

@@ -149,6 +149,7 @@ class NativeRenderer:
                 tolerance=options.tolerance if options.merge else 0.0,
                 paper_rule=options.paper_rule,
                 white_level=white_level(view.color),
+                is_encoded=options.is_encoded,
             )
             self._loops.run("merge", frame.c)
         self._blend(timer, frame, plan)

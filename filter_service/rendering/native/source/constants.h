@@ -5,6 +5,9 @@
 #define TILE_SIZE_PX 8
 #define MAX_LEVEL 3
 #define DISCONTINUITY_PX 0.25f
+#define NEAREST_M 0.02f
+#define MERGE_MIDTONE 0.2f
+#define MERGE_DARKEST 0.0155f
 #define NOTHING_DPT -1.0f
 #define MERGE_MIN_SPREAD_PX 1.5f
 #define MERGE_CONTRAST 0.03f

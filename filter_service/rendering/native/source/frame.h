@@ -104,7 +104,8 @@ typedef struct {
     int32_t depth_is_planar;
     const float *depth_m[2];
     float tangents[4];        /* left, right, up, down */
-    float object_low_dpt, object_high_dpt, object_margin_dpt;
+    float vergence_scale, vergence_offset_m;   /* scale / (distance + offset), at the cornea */
+    float vergence_low_dpt, vergence_high_dpt, vergence_margin_dpt;
     float blur_px_per_dpt;
 
     const float *layer_dpt, *layer_per_dpt;  /* ends of intervals, intervals per dpt */
@@ -135,7 +136,7 @@ typedef struct {
     block_info *blocks;
     int64_t fragment_count, merged_count;
     int32_t farthest_px;      /* radius of the fragment that reaches farthest */
-    int32_t spare;
+    int32_t is_encoded;       /* for a screen: dark parts are seen finer */
 
     /* Kernels. */
     const uint16_t *store[RESOLUTIONS];

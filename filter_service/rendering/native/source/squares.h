@@ -61,12 +61,21 @@ INLINE void join_rows(const square_row *a, const square_row *b, int level, squar
     to->spread_px = least_of(a->spread_px, b->spread_px, level);
 }
 
+/* Difference of light in one colour: where the picture will be encoded for a screen, as
+ * much as it would be in a midtone. */
+INLINE f32x8 seen_contrast(const frame *f, const square_row *s, int c) {
+    f32x8 contrast = s->high[c] - s->low[c];
+    if (!f->is_encoded) return contrast;
+    f32x8 light = (s->high[c] + s->low[c]) * all8(0.5f / (MERGE_MIDTONE * f->white_level));
+    return contrast / root8(smaller8(larger8(light, all8(MERGE_DARKEST)), all8(1.0f)));
+}
+
 /* Which squares the blur lets be one fragment, a bit for each lane.  Seen from a blur of
  * half the size, a square of the next level looks the same: so does its error. */
 INLINE uint32_t similar_lanes(const frame *f, const square_row *s, int level) {
     f32x8 spread = s->spread_px * all8(1.0f / (float)(1 << (level - 1)));
-    f32x8 contrast = s->high[0] - s->low[0];
-    for (int c = 1; c < RGB; ++c) contrast = larger8(contrast, s->high[c] - s->low[c]);
+    f32x8 contrast = seen_contrast(f, s, 0);
+    for (int c = 1; c < RGB; ++c) contrast = larger8(contrast, seen_contrast(f, s, c));
     f32x8 most = all8(f->tolerance * f->white_level * MERGE_CONTRAST) * spread * root8(spread);
     f32x8 step = larger8(all8(MERGE_MAX_BLUR_STEP_PX), all8(MERGE_MAX_BLUR_RATIO) * s->spread_px);
     f32x8 blur_px = (s->most_dpt - s->least_dpt) * all8(f->blur_px_per_dpt);
