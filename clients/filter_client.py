@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from clients.connection import SendBufferPool
 from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
-from filter_service.errors import FilterError
+from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
     FORMATS,
@@ -63,6 +63,10 @@ DEFAULT_SETTINGS = FilterSettings()
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
     """Return numpy's numbers as Python's; the service refuses what is no pair."""
     return cast("tuple[float, float]", tuple(map(float, pair)))
+
+
+EXTENDING_S = 0.03
+"""Between two tries of a frame whose state is being prepared."""
 
 
 class FilterClient:
@@ -253,8 +257,8 @@ class FilterClient:
     ) -> FilteredFrame:
         """Send one frame and return it filtered; `submit` explains the arguments.
 
-        Where the service is still preparing the eye for this camera, or has just been
-        restarted, the frame is sent again until the time is over.
+        Where the service is still preparing the eye for this camera or this state of
+        it, or has just been restarted, the frame is sent again until the time is over.
 
         Raises
         ------
@@ -273,6 +277,7 @@ class FilterClient:
                 accumulation=accumulation,
                 merge=merge,
                 render_tolerance=render_tolerance,
+                prepared_only=True,
             )
             answer = self._await_frame(frame_id, deadline_s)
             if isinstance(answer, FilteredFrame):
@@ -281,6 +286,10 @@ class FilterClient:
                 raise answer.exception()
             if answer.reason == "preparing":
                 self._await_ready(deadline_s)
+            elif answer.reason == "extending":
+                if time.monotonic() > deadline_s:
+                    raise ServiceTimeout("waited in vain for PSFs of this state")
+                self._link.pump(EXTENDING_S)
 
     def _await_frame(
         self, frame_id: int, deadline_s: float
@@ -321,6 +330,7 @@ class FilterClient:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
         render_tolerance: float = 1.0,
+        prepared_only: bool = False,
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
 
@@ -343,6 +353,9 @@ class FilterClient:
         render_tolerance : float, 0 to 8
             Errors of rendering against the usual, which leaves no visible difference;
             0 is exact, more is faster.
+        prepared_only : bool
+            Dropped with the reason ``extending`` where PSFs for this pupil, focus and
+            scene are not there yet, instead of seen through the nearest that are.
         """
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
@@ -360,7 +373,9 @@ class FilterClient:
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
-            options=FrameOptions(accumulation, merge, float(render_tolerance)),
+            options=FrameOptions(
+                accumulation, merge, float(render_tolerance), prepared_only
+            ),
             images=tuple(images),
         )
         self._next_frame_id += 1

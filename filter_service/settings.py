@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 from msgspec import Meta
 
 from filter_service.checked import RISING, Record, check_rising, checked
+from filter_service.displays import display_wavelengths_nm
 
 MIN_PUPIL_MM = 0.5
 MAX_PUPIL_MM = 9.0
@@ -29,6 +30,7 @@ Years = Annotated[float, Meta(ge=3.0, le=120.0)]
 
 Mode = Literal["on-axis", "quality", "dynamic"]
 Grid = Literal["planned", "paper"]
+Prepare = Literal["stream", "ranges"]
 Tolerance = Literal["loose", "normal", "fine"]
 EyeModel = Literal["traced", "wavefront"]
 Accuracy = Literal["fast", "balanced", "exact"]
@@ -72,6 +74,13 @@ class FilterSettings(Record):
     tolerance: Annotated[
         Tolerance, _doc("Interpolation of a planned grid at about 43, 49 or 55 dB.")
     ] = "normal"
+    prepare: Annotated[
+        Prepare,
+        _doc(
+            "stream: PSFs for what the frames of a stream use and are about to use, "
+            "within the ranges; ranges: all of them at once."
+        ),
+    ] = "stream"
     pupil_range_mm: Annotated[
         tuple[PupilMm, PupilMm],
         _doc("Entrance pupils that frames may ask for, mm.", extra=RISING),
@@ -92,11 +101,26 @@ class FilterSettings(Record):
         tuple[TurnDeg, TurnDeg],
         _doc("How far frames may turn the gaze from there, to either side, deg."),
     ] = (0.0, 0.0)
+    display: Annotated[
+        str,
+        _doc(
+            "What shows the picture: common, lcd, oled, crt, paper, or wavelengths of "
+            "red, green and blue in nm as 620,530,455.  A command also takes a .csv of "
+            "spectra: nm, red, green, blue."
+        ),
+    ] = "common"
     diffraction: Annotated[bool, _doc("Off: geometrical optics only.")] = True
     chromatic: Annotated[bool, _doc("Off: all colours are focused alike.")] = True
     lateral_color: Annotated[
         bool,
         _doc("Displace red and blue against green off the axis; a traced eye only."),
+    ] = False
+    stiles_crawford: Annotated[
+        bool,
+        _doc(
+            "Dim light towards the pupil's rim as cones see it, about the centre usual "
+            "for the eye's side."
+        ),
     ] = False
     eye_model: Annotated[
         EyeModel,
@@ -114,7 +138,11 @@ class FilterSettings(Record):
         ),
     ] = "exact"
     age_years: Annotated[
-        Years | None, _doc("Instead of the profile's; limits accommodation.")
+        Years | None,
+        _doc(
+            "Instead of the profile's; limits accommodation, and typical aberrations "
+            "grow with it."
+        ),
     ] = None
 
     def __post_init__(self) -> None:
@@ -123,11 +151,17 @@ class FilterSettings(Record):
             value = checked(getattr(self, name), kind, name)
             check_rising(value, kind, name)
             object.__setattr__(self, name, value)
+        display_wavelengths_nm(self.display)
 
     @property
     def follows_field(self) -> bool:
         """Return whether PSFs differ over the visual field."""
         return self.mode != "on-axis"
+
+    @property
+    def follows_stream(self) -> bool:
+        """Return whether only what a stream uses is prepared."""
+        return self.prepare == "stream" and self.grid == "planned"
 
     def changed(self, **changes: Any) -> FilterSettings:
         """Return settings of which some are others."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from estimator.profiles.parse import EyeProfile
+from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera
 from filter_service.settings import FilterSettings
 
@@ -49,6 +50,7 @@ class BuildJob:
     """One eye for one camera.
 
     ``look_at`` is what the preview is for: the state of the last frame, if any.
+    ``ranges`` are the part of the settings' that is prepared; all where it is None.
     """
 
     profile: EyeProfile
@@ -56,6 +58,8 @@ class BuildJob:
     camera: Camera
     limits: BuildLimits = BuildLimits()
     look_at: LookAt | None = None
+    ranges: UsedRanges | None = None
+    with_preview: bool = True
 
 
 class Store(Protocol):

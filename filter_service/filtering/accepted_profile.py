@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from estimator.profiles.parse import EyeProfile
+from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError
 from filter_service.rendering.engine import LoadedStore
@@ -17,11 +18,16 @@ class PreparedStore:
     """A loaded store and the camera it was built for.
 
     ``is_complete`` is false for a preview, which a complete store will replace.
+    ``ranges`` are those of a stream that it was built for, None for all that the
+    settings allow; ``failed`` are such that could not be built, with the reason.
     """
 
     camera: Camera
     store: LoadedStore
     is_complete: bool = True
+    ranges: UsedRanges | None = None
+    build_s: float = 0.0
+    failed: dict[UsedRanges, str] = field(default_factory=dict)
 
 
 @dataclass(eq=False)

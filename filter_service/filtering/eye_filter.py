@@ -23,10 +23,11 @@ from filter_service.building.jobs import LookAt
 from filter_service.camera import Camera
 from filter_service.checked import checked
 from filter_service.errors import BadMessage, ServiceTimeout
-from filter_service.filtering.accepted_profile import AcceptedProfile
+from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
 from filter_service.filtering.shared_workshop import shared
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.view_use import frame_use
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
@@ -116,6 +117,7 @@ class EyeFilter:
         self._workshop.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
+        self.is_extending = False  # whether the last frame waits for its state alone
         self.ready: EyeReady | None = None
         if first is not None:
             try:
@@ -153,6 +155,11 @@ class EyeFilter:
         if self._workshop is None:
             raise ValueError("this EyeFilter is closed")
         return self._workshop
+
+    @property
+    def prepared_stores(self) -> tuple[PreparedStore, ...]:
+        """Return what is prepared of the newest eye, the store used last at the end."""
+        return tuple(self._newest.stores) if self._newest is not None else ()
 
     # The eye
 
@@ -259,7 +266,7 @@ class EyeFilter:
         render_tolerance: float = 1.0,
         timeout_s: float = 120.0,
     ) -> Filtered:
-        """Filter one frame; waits where its eye is not ready for its camera yet.
+        """Filter one frame; waits where its camera or its state is not prepared yet.
 
         Parameters
         ----------
@@ -303,7 +310,6 @@ class EyeFilter:
         views = as_views(color, depth_m, next(iter(self.cameras), None))
         deadline_s = time.monotonic() + timeout_s
         while True:
-            self.workshop.advance()
             seen = self.try_filter(
                 views,
                 pupil_diameter_mm=pupil_diameter_mm,
@@ -313,7 +319,9 @@ class EyeFilter:
                 accumulation=accumulation,
                 merge=merge,
                 render_tolerance=render_tolerance,
+                prepared_only=True,
             )
+            self.workshop.advance()  # by now it knows what this frame asks for
             if seen is not None:
                 return seen
             self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
@@ -329,8 +337,15 @@ class EyeFilter:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
         render_tolerance: float = 1.0,
+        prepared_only: bool = False,
     ) -> Filtered | None:
         """Filter one frame like `filter`; None while its eye is being prepared.
+
+        Parameters
+        ----------
+        prepared_only : bool
+            None as well, and `is_extending`, while only the state of this frame is not
+            prepared; else it is seen through the nearest that is.
 
         Raises
         ------
@@ -346,9 +361,11 @@ class EyeFilter:
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         look_at = LookAt(pupil_diameter_mm, focus_dpt)
+        self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
         plan = self._eyes.plan([view.camera for view in views], look_at)
         self.workshop.free_retired(self._eyes)
-        if plan is None:
+        self.is_extending = plan is not None and prepared_only and not plan.is_prepared
+        if plan is None or self.is_extending:
             return None
         started_s = time.monotonic()
         rendered = [
@@ -387,6 +404,10 @@ def _filtered(plan: RenderPlan, rendered: list[Rendered]) -> Filtered:
         missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
         clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
         overflow_count=sum(int(v.overflow_count) for v in rendered),
-        notes=tuple(dict.fromkeys(note for view in rendered for note in view.notes)),
+        notes=tuple(
+            dict.fromkeys(
+                [*plan.notes, *(note for view in rendered for note in view.notes)]
+            )
+        ),
         stage_times_ms=stages_ms,
     )

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.building.jobs import LookAt
+from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent
+from filter_service.filtering.stream_use import StreamUse
 from filter_service.rendering.engine import LoadedStore
 from filter_service.settings import FilterSettings
 
@@ -22,12 +25,26 @@ from filter_service.settings import FilterSettings
 class RenderPlan:
     """Through which eye a frame is seen, with one store for each view.
 
-    ``is_complete`` is false where one of the stores is a preview.
+    ``is_complete`` is false where one of the stores is a preview, or does not hold the
+    state of the frame yet: then ``is_prepared`` is, too, unless that stays so, as
+    ``notes`` say.
     """
 
     eye: AcceptedProfile
     stores: tuple[LoadedStore, ...]
     is_complete: bool = True
+    is_prepared: bool = True
+    notes: tuple[str, ...] = ()
+
+
+class Wanted(NamedTuple):
+    """A store to be built; ``extends`` says that another serves its camera so far."""
+
+    eye: AcceptedProfile
+    camera: Camera
+    ranges: UsedRanges | None = None
+    extends: bool = False
+    with_preview: bool = True
 
 
 @dataclass(eq=False)
@@ -48,11 +65,12 @@ class StreamEyes:
     max_cameras: int = 4
     first_cameras: tuple[Camera, ...] = ()
     ticket: int | None = None
-    building: tuple[AcceptedProfile, Camera] | None = None
+    building: Wanted | None = None
     look_at: LookAt | None = None  # of the last frame
     eyes: list[AcceptedProfile] = field(default_factory=list)  # newest first, two
     retired: list[LoadedStore] = field(default_factory=list)  # stores to be freed
     _n_generations: int = 0
+    use: StreamUse = field(default_factory=StreamUse)
     _last_cameras: tuple[Camera, ...] = ()
 
     def plan(self, cameras: Sequence[Camera], look_at: LookAt) -> RenderPlan | None:
@@ -81,8 +99,14 @@ class StreamEyes:
             is_complete = all(prepared.is_complete for prepared in found)
             if eye is newest and is_complete:
                 self._keep_only_newest()
+            holds = all(self._holds(eye, one) for one in found)
+            failures = self._failures_now(eye, found)
             return RenderPlan(
-                eye, tuple(prepared.store for prepared in found), is_complete
+                eye,
+                tuple(prepared.store for prepared in found),
+                is_complete=is_complete and holds,
+                is_prepared=holds or bool(failures) or eye is not newest,
+                notes=failures,
             )
         for camera in cameras:
             failure = newest.failure_for(camera)
@@ -127,11 +151,77 @@ class StreamEyes:
         newest = self.eyes[0]
         return newest if newest.wanted or not newest.failures else None
 
-    def next_build(self) -> tuple[AcceptedProfile, Camera] | None:
-        """Return what should be built next, if anything."""
-        if not self.eyes or not self.eyes[0].wanted:
+    def next_build(self) -> Wanted | None:
+        """Return what should be built next, if anything.
+
+        First what has nothing yet, then more of what frames are about to leave.
+        """
+        if not self.eyes:
             return None
-        return self.eyes[0], self.eyes[0].wanted[0]
+        eye = self.eyes[0]
+        if eye.wanted:
+            camera = eye.wanted[0]
+            ranges = None
+            if eye.settings.follows_stream:
+                ranges = self.use.wanted(0.0, eye.settings)
+            return Wanted(eye, camera, ranges)
+        used = [eye.store_for(camera) for camera in self._last_cameras]
+        return next(
+            (
+                extension
+                for prepared in used
+                if prepared is not None
+                and (extension := self._extension(eye, prepared)) is not None
+            ),
+            None,
+        )
+
+    @property
+    def builds_in_vain(self) -> bool:
+        """Return whether frames left what is being built as the first of an eye.
+
+        It was begun before the first of them came, for states that they do not have.
+        """
+        wanted, now = self.building, self.use.now
+        if wanted is None or wanted.extends or wanted.ranges is None or now is None:
+            return False
+        return not wanted.ranges.holds(now.within(wanted.eye.settings))
+
+    def _extension(
+        self, eye: AcceptedProfile, prepared: PreparedStore
+    ) -> Wanted | None:
+        """Return more of a store where frames leave it."""
+        if prepared.ranges is None:
+            return None
+        build_s, settings = prepared.build_s, eye.settings
+        if not self.use.leaves(prepared.ranges, build_s, settings):
+            return None
+        ranges = self.use.wanted(build_s, settings)
+        if ranges in prepared.failed or prepared.ranges.holds(ranges):
+            return None
+        # Where frames are within what there is, a preview would only show less.
+        outside = not self._holds(eye, prepared)
+        return Wanted(eye, prepared.camera, ranges, extends=True, with_preview=outside)
+
+    def _holds(self, eye: AcceptedProfile, prepared: PreparedStore) -> bool:
+        """Return whether a store was prepared for the state of the last frame."""
+        now = self.use.now
+        if prepared.ranges is None or now is None:
+            return True
+        return prepared.ranges.holds(now.within(eye.settings))
+
+    def _failures_now(
+        self, eye: AcceptedProfile, used: list[PreparedStore]
+    ) -> tuple[str, ...]:
+        """Say why the state of the last frame could not be prepared for."""
+        return tuple(
+            dict.fromkeys(
+                f"what this frame asks for could not be prepared: {reason}"
+                for prepared in used
+                if not self._holds(eye, prepared)
+                for reason in prepared.failed.values()
+            )
+        )
 
     def put_in_place(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
         """Let frames use a loaded store; forget the camera unused for longest.
@@ -147,6 +237,12 @@ class StreamEyes:
         eye.stores.append(prepared)
         while len(eye.stores) > self.max_cameras:
             self.retired.append(eye.stores.pop(0).store)
+
+    def fail_extension(self, wanted: Wanted, error: FilterError) -> None:
+        """Note why more of a store could not be built; what there is goes on."""
+        prepared = wanted.eye.store_for(wanted.camera)
+        if prepared is not None and wanted.ranges is not None:
+            prepared.failed[wanted.ranges] = str(error)
 
     def fail_build(
         self, eye: AcceptedProfile, camera: Camera, error: FilterError

@@ -26,10 +26,12 @@ from filter_service.camera import Camera
 from filter_service.errors import BuildCancelled, FilterError, RenderFailed
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
-from filter_service.filtering.stream_eyes import StreamEyes
+from filter_service.filtering.stream_eyes import StreamEyes, Wanted
 from filter_service.filtering.upload import Upload
 from filter_service.rendering.engine import FrameEngine, LoadedStore
 from filter_service.settings import FilterSettings
+
+MS_PER_S = 1e3
 
 LOAD_RANGE_S = (0.004, 0.03)  # for copying a new store to the engine between two frames
 LOAD_SHARE = 0.5  # of a frame's time: the stream is never late by a whole frame
@@ -42,8 +44,7 @@ class _Loading:
     """A store that is built and not yet with the engine."""
 
     stream: StreamEyes
-    eye: AcceptedProfile
-    camera: Camera
+    wanted: Wanted
     built: BuiltStore
     upload: Upload
 
@@ -96,7 +97,9 @@ class Workshop:
         """Take a profile in; a build of an older one that still runs is cancelled."""
         # Accepted in the same pass counts as well: its build has not begun, but its
         # sender awaits an ending too.
-        replaced = [stream.building[0]] if stream.building is not None else []
+        building = stream.building
+        begun = building is not None and not building.extends
+        replaced = [building.eye] if building is not None and begun else []
         unfinished = stream.unfinished_eye()
         if unfinished is not None and unfinished not in replaced:
             replaced.append(unfinished)
@@ -168,35 +171,39 @@ class Workshop:
         load_s = min(max(LOAD_SHARE * self.frame_s, low_s), high_s)
         self._advance_loads(time.monotonic() + load_s)
         for stream in list(self.streams):
+            if stream.builds_in_vain:
+                self.cancel(stream)
             following = stream.next_build()
             if stream.building is None and following is not None:
                 stream.building = following
-                stream.ticket = self.worker.submit(self._job(stream, *following))
+                stream.ticket = self.worker.submit(self._job(stream, following))
 
-    def _job(
-        self, stream: StreamEyes, eye: AcceptedProfile, camera: Camera
-    ) -> BuildJob:
+    def _job(self, stream: StreamEyes, wanted: Wanted) -> BuildJob:
         return BuildJob(
-            profile=eye.profile,
-            settings=eye.settings,
-            camera=camera,
+            profile=wanted.eye.profile,
+            settings=wanted.eye.settings,
+            camera=wanted.camera,
             limits=self._limits,
             look_at=stream.look_at,
+            ranges=wanted.ranges,
+            with_preview=wanted.with_preview,
         )
 
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
         if stream.building is None:
             return  # its last word, after it was given up
-        eye, camera = stream.building
+        wanted = stream.building
         if isinstance(event, BuildProgress):
-            stream.on_event(BuildingEye(eye, event.fraction, event.stage))
+            if not wanted.extends:
+                stage, eye = event.stage, wanted.eye
+                stream.on_event(BuildingEye(eye, event.fraction, stage))
         elif isinstance(event, BuildDone):
             if event.built.is_complete:
                 stream.ticket = None
             upload = Upload(self.engine.load_steps(event.built.store))
-            self._loads.append(_Loading(stream, eye, camera, event.built, upload))
+            self._loads.append(_Loading(stream, wanted, event.built, upload))
         elif isinstance(event, BuildError):
-            self._fail(stream, eye, camera, event.error)
+            self._fail(stream, wanted, event.error)
 
     def _loads_of(self, stream: StreamEyes) -> list[_Loading]:
         return [loading for loading in self._loads if loading.stream is stream]
@@ -205,7 +212,7 @@ class Workshop:
         """Go on with the oldest load: a stream's preview before the rest."""
         while self._loads:
             loading = self._loads[0]
-            stream, eye, camera = loading.stream, loading.eye, loading.camera
+            stream = loading.stream
             try:
                 loaded = loading.upload.advance(deadline_s)
                 if loaded is None:
@@ -216,24 +223,33 @@ class Workshop:
                     error = RenderFailed(f"{type(error).__name__}: {error}")
                 if stream.ticket is not None:
                     self.worker.cancel(stream.ticket)
-                self._fail(stream, eye, camera, error)
+                self._fail(stream, loading.wanted, error)
             else:
                 self._loads.pop(0)
                 self._released.append(loading.built)
                 self._put_in_place(loading, loaded)
 
     def _put_in_place(self, loading: _Loading, loaded: LoadedStore) -> None:
-        stream, eye, built = loading.stream, loading.eye, loading.built
+        stream, wanted, built = loading.stream, loading.wanted, loading.built
         if built.is_complete:
             stream.building = None
         stream.put_in_place(
-            eye, PreparedStore(loading.camera, loaded, built.is_complete)
+            wanted.eye,
+            PreparedStore(
+                wanted.camera,
+                loaded,
+                built.is_complete,
+                wanted.ranges if built.is_complete else None,
+                built.build_ms / MS_PER_S,
+            ),
         )
         self.free_retired(stream)
+        if wanted.extends:
+            return  # its sender knows that the eye is ready
         stream.on_event(
             EyeReady(
-                eye,
-                loading.camera,
+                wanted.eye,
+                wanted.camera,
                 build_ms=built.build_ms,
                 psf_count=built.psf_count,
                 memory_mb=built.memory_mb,
@@ -245,13 +261,16 @@ class Workshop:
     def _fail(
         self,
         stream: StreamEyes,
-        eye: AcceptedProfile,
-        camera: Camera,
+        wanted: Wanted,
         error: FilterError,
     ) -> None:
         """End the building of a store, whether it failed there or at being loaded."""
         stream.ticket = None
         self.cancel(stream)
-        stream.fail_build(eye, camera, error)
+        if wanted.extends:
+            log.warning("no more PSFs for a stream: %s", error)
+            stream.fail_extension(wanted, error)
+            return
+        stream.fail_build(wanted.eye, wanted.camera, error)
         self.free_retired(stream)
-        stream.on_event(EyeFailed(eye, error))
+        stream.on_event(EyeFailed(wanted.eye, error))

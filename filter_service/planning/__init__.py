@@ -10,6 +10,7 @@ nodes             a plan, and reading between its nodes
 paper_grid        the paper's fixed grids as plans
 cost              memory and time of a plan
 plan              the entry
+part_of_plan      the part that some frames read
 """
 
 import lazy_loader

@@ -38,14 +38,15 @@ _LADDER = 33
 _STATES_ON_LADDER = 16
 _DEFOCUS_LADDER = 49
 
-_LARGEST_RATIO = 0.9
+_LARGEST_RATIO = 0.86
 """Of the largest kernel: how far rays may land; diffraction and the rim lie beyond."""
 
 
 def target_error(spec: GridSpec) -> float:
     """Mean square error that interpolation may make in all."""
     gain_db = QUALITY_GAIN_DB if spec.settings.mode == "quality" else 0.0
-    return 10.0 ** (-(TOLERANCE_DB[spec.settings.tolerance] + gain_db) / 10.0)
+    wanted_db = TOLERANCE_DB[spec.settings.tolerance] + gain_db
+    return 10.0 ** (-wanted_db / 10.0)
 
 
 def axis_nodes(
@@ -84,7 +85,7 @@ def _needed_over_ladder(
     use: Use, axis: str, ladder: NDArray, allowed_error: float
 ) -> NDArray[np.float64]:
     """Intervals needed up to each step of a ladder along an axis."""
-    count = min(_STATES_ON_LADDER, use.object_dpt.size)
+    count = min(_STATES_ON_LADDER, use.vergence_dpt.size)
     some = use.taken(np.arange(count))
     repeated = use.taken(np.tile(np.arange(count), ladder.size))
     states = moved(repeated, axis, np.repeat(ladder, count))
@@ -106,11 +107,12 @@ def _needed_over_ladder(
 
 def limited_ranges_dpt(
     eye: EyeOptics, spec: GridSpec, groups: PupilStates, ranges_dpt: NDArray[np.float64]
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Ranges (P, 2) without the defocus whose kernels would be too large.
 
-    A range that holds no kernel small enough stays as it is, to be refused with
-    numbers when it is computed.
+    A range that holds no kernel small enough becomes the defocus of its smallest, with
+    the ratio (P,) by which that has to shrink.  On the axis it stays as it is, to be
+    refused with numbers when it is computed: what the eye looks at is never drawn so.
     """
     lows, highs = ranges_dpt.T
     columns = vars(groups.taken(np.tile(np.arange(lows.size), 2)))
@@ -130,11 +132,24 @@ def limited_ranges_dpt(
     fits = (room > 0.0).all(axis=1) & (
         np.maximum(first_dpt, lows) <= np.minimum(last_dpt, highs)
     )
-    return np.where(
+    limited_dpt = np.where(
         fits[:, None],
         np.stack([np.maximum(first_dpt, lows), np.minimum(last_dpt, highs)], axis=-1),
         ranges_dpt,
     )
+    away_deg = np.hypot(groups.h_deg, groups.v_deg)
+    shrunk = np.flatnonzero(~fits & (away_deg > away_deg.min() + 1e-9))
+    ratio = np.ones(lows.size)
+    if shrunk.size:
+        steps = np.linspace(0.0, 1.0, _DEFOCUS_LADDER)[:, None, None, None]
+        at_dpt = steps * (highs - lows)[shrunk, None, None]
+        slopes = low_px[shrunk] + at_dpt * per_dpt[shrunk]
+        largest_px = np.sqrt((slopes**2).sum(axis=-1)).max(axis=-1)
+        best = largest_px.argmin(axis=0)
+        at = np.arange(shrunk.size)
+        limited_dpt[shrunk] = (lows[shrunk] + at_dpt[best, at, 0, 0])[:, None]
+        ratio[shrunk] = limit_px / largest_px[best, at]
+    return limited_dpt, ratio
 
 
 def defocus_groups(

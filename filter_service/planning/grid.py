@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.units import (
-    REFERENCE_WAVELENGTH_NM,
-    RGB_WAVELENGTHS_NM,
-)
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.camera import Camera, is_same_camera
+from filter_service.displays import display_wavelengths_nm
 from filter_service.planning.field_directions import (
     MAX_FIELD_DEG,
     field_range_deg,
@@ -66,8 +64,6 @@ class GridSpec:
         Image size and tangents; the on-axis mode uses no more than its pixel pitch.
     settings : FilterSettings
         Pupils, distances, field, and how fine.
-    wavelengths_nm : (float, float, float)
-        For red, green, blue.
     memory_budget_mb : float
         A larger plan is refused.
     max_blur_step_px : float
@@ -87,7 +83,6 @@ class GridSpec:
 
     camera: Camera
     settings: FilterSettings = DEFAULTS
-    wavelengths_nm: tuple[float, float, float] = RGB_WAVELENGTHS_NM
     memory_budget_mb: float = 2000.0
     max_blur_step_px: float = 0.5
     max_blur_radius_px: int = 255
@@ -163,6 +158,11 @@ class GridSpec:
         paper's hold nine object distances of their own.
         """
         return self.settings.grid == "planned"
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, float, float]:
+        """Wavelengths of red, green and blue."""
+        return display_wavelengths_nm(self.settings.display)
 
     @property
     def channel_wavelengths_nm(self) -> NDArray[np.float64]:
@@ -256,7 +256,7 @@ def defocus_nodes_dpt(
 
 
 def layer_distances_dpt(
-    object_range_dpt: tuple[float, float],
+    range_dpt: tuple[float, float],
     *,
     focused_dpt: NDArray[np.float64],
     blur_radius_px,
@@ -264,15 +264,15 @@ def layer_distances_dpt(
     blur_ratio: float,
     step_ratio: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Object distances of a frame's layers, ascending.
+    """Vergences of a frame's layers, ascending, over a range of them.
 
     Parameters
     ----------
     focused_dpt : (n,)
-        Distances in focus for some channel; each becomes a layer, so that the blur is
+        Those in focus for some channel; each becomes a layer, so that the blur is
         monotone between layers.
     blur_radius_px : callable
-        (n,) distances in dpt to blur radii (n, m) in px, of field nodes and channels.
+        (n,) vergences in dpt to blur radii (n, m) in px, of field nodes and channels.
     blur_px_per_dpt : float
         Of a perfect eye.
     blur_ratio : float
@@ -285,7 +285,7 @@ def layer_distances_dpt(
     Csoba & Kunkli 2023, Eq. 8: L = ceil(|R(k+1) - R(k)|) - 1 transitional layers, here
     with steps in proportion to R, and none where R stays.
     """
-    low_dpt, high_dpt = object_range_dpt
+    low_dpt, high_dpt = range_dpt
     count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
     inside = focused_dpt[(focused_dpt > low_dpt) & (focused_dpt < high_dpt)]
     at_dpt = np.unique(

@@ -137,6 +137,9 @@ class CachePlan:
     prediction : PlanPrediction
     is_limited : (n_groups,)
         Groups that end where the blur is as large as kernels may be.
+    shrink_ratio : (n_groups,), optional
+        By how much wavefronts are made flatter where even the sharpest blur of a group
+        is larger; one elsewhere, and everywhere where it is None.
     """
 
     h_deg: NDArray[np.float64]
@@ -147,6 +150,7 @@ class CachePlan:
     channel_shift_dpt: NDArray[np.float64]
     prediction: PlanPrediction
     is_limited: NDArray[np.bool_]
+    shrink_ratio: NDArray[np.float64] | None = None
 
     @property
     def field_nodes_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

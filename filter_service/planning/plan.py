@@ -80,7 +80,9 @@ class PlanTooLarge(ValueError):
 
 
 @dataclass(frozen=True)
-class _Axes:
+class PlanAxes:
+    """Nodes of a plan but those of defocus."""
+
     h_deg: NDArray[np.float64]
     v_deg: NDArray[np.float64]
     pupils_mm: NDArray[np.float64]
@@ -97,9 +99,19 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
         to change.
     """
     plan = unchecked_plan(eye, spec)
+    check_budget(eye, spec, plan)
+    return plan
+
+
+def check_budget(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> None:
+    """Refuse a plan whose kernels would exceed ``spec.memory_budget_mb``.
+
+    Raises
+    ------
+    PlanTooLarge
+    """
     if plan.prediction.memory_mb > spec.memory_budget_mb:
         raise PlanTooLarge(spec, plan.prediction, _advice(eye, spec))
-    return plan
 
 
 def unchecked_plan(
@@ -116,14 +128,14 @@ def unchecked_plan(
     if target_db is not None:
         allowed_error = 10.0 ** (-target_db / 10.0)
     use = sample_use(eye, spec, USE_SAMPLES)
-    is_limited = None
+    is_limited, shrink_ratio = None, None
     if spec.settings.grid == "paper":
-        axes = _Axes(*paper_axes(eye, spec))
+        axes = PlanAxes(*paper_axes(eye, spec))
         defocus, shift_dpt = paper_defocus(eye, spec, tuple(vars(axes).values()))
     else:
         if spec.follows_field:
             axes, left = _field_axes(use, allowed_error)
-            defocus, is_limited = _field_defocus(eye, spec, axes, left)
+            defocus, is_limited, shrink_ratio = _field_defocus(eye, spec, axes, left)
         else:
             axes = _central_axes(eye, spec)
             defocus = _central_defocus(eye, spec, axes)
@@ -136,6 +148,7 @@ def unchecked_plan(
         channel_shift_dpt=shift_dpt,
         prediction=PlanPrediction(0, 0.0, 0.0, 0, 0.0, {}),
         is_limited=is_limited,
+        shrink_ratio=shrink_ratio,
     )
     errors = _errors(use, plan)
     prediction = PlanPrediction(
@@ -160,27 +173,28 @@ def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
     return errors | {"defocus": defocus_error(use, plan)}
 
 
-def _usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
+def usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
+    """Smallest and largest pupil of a spec that the eye knows."""
     low_mm, high_mm = spec.settings.pupil_range_mm
     return eye.usable_pupil_mm(low_mm), eye.usable_pupil_mm(high_mm)
 
 
 def _accommodations_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
     return eye.accommodation_nodes_dpt(
-        spec.settings.focus_range_dpt, pupil_range_mm=_usable_pupils_mm(eye, spec)
+        spec.settings.focus_range_dpt, pupil_range_mm=usable_pupils_mm(eye, spec)
     )
 
 
-def _central_axes(eye: EyeOptics, spec: GridSpec) -> _Axes:
-    return _Axes(
+def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
+    return PlanAxes(
         h_deg=np.zeros(1),
         v_deg=np.zeros(1),
-        pupils_mm=pupil_nodes_mm(_usable_pupils_mm(eye, spec)),
+        pupils_mm=pupil_nodes_mm(usable_pupils_mm(eye, spec)),
         accommodations_dpt=_accommodations_dpt(eye, spec),
     )
 
 
-def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
+def _field_axes(use: Use, allowed_error: float) -> tuple[PlanAxes, float]:
     """Nodes but those of defocus, and the mean square error left to defocus.
 
     Axes with few nodes meet their share with some to spare; it goes to the others.
@@ -189,7 +203,7 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
     used_dpt = _accommodations_dpt(eye, spec)
     ranges = {
         "accommodation": (used_dpt[0], used_dpt[-1]),
-        "pupil": _usable_pupils_mm(eye, spec),
+        "pupil": usable_pupils_mm(eye, spec),
         "v": spec.field_range_deg[1],
         "h": spec.field_range_deg[0],
     }
@@ -205,12 +219,12 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[_Axes, float]:
         nodes[axis], error = axis_nodes(use, axis, range_, allowed_error=share)
         spent.append(error)
     left = equal_share(allowed_error, spent=spent, count=1)
-    return _Axes(*(nodes[axis] for axis in AXES[:-1])), left
+    return PlanAxes(*(nodes[axis] for axis in AXES[:-1])), left
 
 
-def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: _Axes) -> RaggedNodes:
+def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> RaggedNodes:
     """Nodes on axis: by blur radius alone, far closer than any tolerance asks for."""
-    ranges_dpt = _readable_ranges_dpt(eye, spec, axes)
+    ranges_dpt = readable_ranges_dpt(eye, spec, axes)
     of_group = np.broadcast_to(axes.pupils_mm[:, None], ranges_dpt.shape[:-1])
     return RaggedNodes.of(
         [
@@ -228,9 +242,9 @@ def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: _Axes) -> RaggedNodes
 
 
 def _field_defocus(
-    eye: EyeOptics, spec: GridSpec, axes: _Axes, allowed_error: float
-) -> tuple[RaggedNodes, NDArray[np.bool_]]:
-    """Nodes, and which groups of them end where kernels are as large as they may be."""
+    eye: EyeOptics, spec: GridSpec, axes: PlanAxes, allowed_error: float
+) -> tuple[RaggedNodes, NDArray[np.bool_], NDArray[np.float64]]:
+    """Nodes, which groups end where kernels may not grow, and which have to shrink."""
     groups = PupilStates.of(
         h_deg=axes.h_deg[:, None, None],
         v_deg=axes.v_deg[:, None, None, None],
@@ -239,8 +253,8 @@ def _field_defocus(
         wavelength_nm=spec.channel_wavelengths_nm[GREEN],
         total_defocus_dpt=0.0,
     )
-    ranges_dpt = _readable_ranges_dpt(eye, spec, axes).reshape(-1, 2)
-    limited_dpt = limited_ranges_dpt(eye, spec, groups, ranges_dpt)
+    ranges_dpt = readable_ranges_dpt(eye, spec, axes).reshape(-1, 2)
+    limited_dpt, shrink_ratio = limited_ranges_dpt(eye, spec, groups, ranges_dpt)
     nodes = defocus_groups(
         eye,
         spec,
@@ -249,7 +263,7 @@ def _field_defocus(
         allowed_error=allowed_error,
         unit_px=unit_px(spec, groups),
     )
-    return nodes, np.any(limited_dpt != ranges_dpt, axis=1)
+    return nodes, np.any(limited_dpt != ranges_dpt, axis=1), shrink_ratio
 
 
 def _neighbours(index: int, count: int) -> list[int]:
@@ -265,8 +279,8 @@ def _over_neighbours(values: NDArray, axis: int, extreme) -> NDArray:
     )
 
 
-def _readable_ranges_dpt(
-    eye: EyeOptics, spec: GridSpec, axes: _Axes
+def readable_ranges_dpt(
+    eye: EyeOptics, spec: GridSpec, axes: PlanAxes
 ) -> NDArray[np.float64]:
     """Smallest and largest total defocus (n_v, n_h, n_pupils, n_accommodations, 2).
 
@@ -283,7 +297,7 @@ def _readable_ranges_dpt(
     used_dpt = axes.accommodations_dpt
     if len(used_dpt) == 1:  # one shape for all: accommodation is defocus alone
         least_dpt, most_dpt = eye.accommodation_range_dpt(
-            spec.settings.focus_range_dpt, pupil_range_mm=_usable_pupils_mm(eye, spec)
+            spec.settings.focus_range_dpt, pupil_range_mm=usable_pupils_mm(eye, spec)
         )
         lows, highs = lows - (most_dpt - used_dpt[0]), highs - (least_dpt - used_dpt[0])
     else:
@@ -297,13 +311,8 @@ def _readable_ranges_dpt(
             highs = _over_neighbours(highs, axis, np.max)
         lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
-    near_far = np.stack(
-        [
-            lows + spec.settings.object_range_dpt[0],
-            highs + spec.settings.object_range_dpt[1],
-        ],
-        axis=-1,
-    )
+    far_dpt, near_dpt = map(eye.vergence.vergence_dpt, spec.settings.object_range_dpt)
+    near_far = np.stack([lows + far_dpt, highs + near_dpt], axis=-1)
     # A pupil between two nodes reads both at equal blur, up to the other's own.
     scaled = near_far * axes.pupils_mm[:, None, None]
     ranges = np.empty_like(near_far)

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from filter_service.errors import BuildCancelled
 from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GREEN, GridSpec
 from filter_service.planning.plan import CachePlan, plan_cache
-from filter_service.planning.slopes import PupilStates
+from filter_service.planning.slopes import PupilStates, apodisation
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import CPU, PsfEngine
 from filter_service.psfs.store import PsfStore
@@ -59,9 +60,45 @@ def build_psf_store(
     if isinstance(eye, EyeProfile):
         eye = MeasuredWavefront.from_profile(eye)
     plan = plan or plan_cache(eye, spec)
+    every = np.arange(len(plan.defocus.values_dpt))
+    kernels = compute_kernels(
+        eye,
+        spec,
+        plan,
+        every,
+        engine=engine,
+        progress=progress,
+        cancelled=cancelled,
+    )
+    build_ms = 1e3 * (time.perf_counter() - started_s)
+    return store_of(spec, eye, plan, kernels, build_ms=build_ms)
+
+
+@dataclass(frozen=True)
+class ComputedKernels:
+    """Kernels of some nodes, channel fastest, in pieces one after the other."""
+
+    packed: list[PackedKernels]
+    blur_px: NDArray[np.float64]
+    methods: Counter[str]
+
+
+def compute_kernels(
+    eye: EyeOptics,
+    spec: GridSpec,
+    plan: CachePlan,
+    nodes: NDArray[np.int64],
+    *,
+    engine: PsfEngine = CPU,
+    progress: Callable[[float, str], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> ComputedKernels:
+    """Compute the kernels of some nodes (n,) of a plan; see `build_psf_store`."""
     channels = RGB if spec.settings.chromatic else 1
-    states = _states(spec, plan, channels)
+    psfs = (channels * nodes[:, None] + np.arange(channels)).ravel()
+    states = _states(spec, plan, channels).taken(psfs)
     count = states.h_deg.size
+    shrink = _shrink_ratios(plan, channels)[psfs]
     methods: Counter[str] = Counter()
     packed, blur_px = [], []
     with ThreadPoolExecutor(thread_count()) as pool:
@@ -69,7 +106,8 @@ def build_psf_store(
             if cancelled is not None and cancelled():
                 raise BuildCancelled("a newer profile took over")
             end = first + engine.batch_count
-            batch = _computed(engine, eye, spec, states.taken(slice(first, end)))
+            part = slice(first, end)
+            batch = _computed(engine, eye, spec, states.taken(part), shrink[part])
             packed.append(
                 pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool)
             )
@@ -77,8 +115,7 @@ def build_psf_store(
             methods += _methods(batch)
             if progress is not None:
                 progress(min(1.0, end / count), "psfs")
-    build_ms = 1e3 * (time.perf_counter() - started_s)
-    return _store(spec, eye, plan, packed, np.concatenate(blur_px), methods, build_ms)
+    return ComputedKernels(packed, np.concatenate(blur_px), methods)
 
 
 def _states(spec: GridSpec, plan: CachePlan, channels: int) -> PupilStates:
@@ -107,11 +144,23 @@ def _states(spec: GridSpec, plan: CachePlan, channels: int) -> PupilStates:
     )
 
 
+def _shrink_ratios(plan: CachePlan, channels: int) -> NDArray[np.float64]:
+    """Ratios of the states' wavefronts, in the order of `_states`."""
+    counts = channels * np.diff(plan.defocus.starts)
+    if plan.shrink_ratio is None:
+        return np.ones(int(counts.sum()))
+    return np.repeat(plan.shrink_ratio, counts)
+
+
 def _computed(
-    engine: PsfEngine, eye: EyeOptics, spec: GridSpec, states: PupilStates
+    engine: PsfEngine,
+    eye: EyeOptics,
+    spec: GridSpec,
+    states: PupilStates,
+    shrink_ratio: NDArray[np.float64],
 ) -> PsfBatch:
     found = eye.wavefronts(**vars(states))
-    zernike_um = found.zernike_um
+    zernike_um = found.zernike_um * shrink_ratio[:, None]
     if spec.settings.lateral_color and spec.settings.chromatic:
         shift_mrad = lateral_shift_mrad(eye, spec, states)
         zernike_um = with_tilt(zernike_um, found.circle_diameter_mm / 2.0, shift_mrad)
@@ -119,6 +168,7 @@ def _computed(
         zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
+        stiles_crawford=apodisation(eye, spec),
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.settings.diffraction,
@@ -150,15 +200,17 @@ def _methods(batch: PsfBatch) -> Counter[str]:
     return Counter({name: number for name, number in counts.items() if number})
 
 
-def _store(
+def store_of(
     spec: GridSpec,
     eye: EyeOptics,
     plan: CachePlan,
-    packed: list[PackedKernels],
-    blur_px: NDArray,
-    methods: Counter,
+    kernels: ComputedKernels,
+    *,
     build_ms: float,
 ) -> PsfStore:
+    """Return the store of the kernels of all nodes of a plan."""
+    packed, blur_px = kernels.packed, kernels.blur_px
+
     def joined(name: str) -> NDArray:
         return np.concatenate([getattr(part, name) for part in packed])
 
@@ -181,7 +233,7 @@ def _store(
         blur_px=np.repeat(blur_px, copies),
         spread_px=np.repeat(joined("spread_px"), copies),
         peak_ratio=np.repeat(joined("peak_ratio"), copies),
-        methods=dict(methods),
+        methods=dict(kernels.methods),
         max_lost_energy_ratio=float(joined("lost_energy_ratio").max()),
         build_ms=build_ms,
     )

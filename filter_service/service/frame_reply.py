@@ -36,6 +36,7 @@ def frame_reply(
             accumulation=frame.options.accumulation,
             merge=frame.options.merge,
             render_tolerance=frame.options.render_tolerance,
+            prepared_only=frame.options.prepared_only,
         )
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)
@@ -45,7 +46,8 @@ def frame_reply(
         failure = RenderFailed(f"{type(error).__name__}: {error}")
         return ErrorReply.from_exception(failure, frame_id=frame.frame_id)
     if seen is None:
-        return Dropped(frame.frame_id, "preparing")
+        reason = "extending" if eye_filter.is_extending else "preparing"
+        return Dropped(frame.frame_id, reason)
     stages_ms = {
         "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
         "queue_ms": MS_PER_S * (started_s - waiting.decoded_s),

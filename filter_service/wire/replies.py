@@ -35,7 +35,13 @@ from filter_service.wire.message import (
     expect_parts,
 )
 
-DROP_REASONS = ("superseded", "preparing", "slow_consumer", "connection_lost")
+DROP_REASONS = (
+    "superseded",
+    "preparing",
+    "extending",
+    "slow_consumer",
+    "connection_lost",
+)
 
 MAX_TEXT_BYTES = 1600
 MAX_ALLOWED_BYTES = 1000

@@ -85,6 +85,7 @@ class FrameOptions(Record):
     accumulation: Accumulation = "coverage"
     merge: bool = True
     render_tolerance: RenderTolerance = 1.0
+    prepared_only: bool = False
 
 
 @dataclass(frozen=True)

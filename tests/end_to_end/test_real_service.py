@@ -202,7 +202,11 @@ def test_a_blur_beyond_the_cap_is_an_error_and_not_a_wrong_image(real_client):
 def test_a_plan_beyond_the_memory_budget_is_refused_with_the_numbers(real_client):
     telescope = Camera(2000, 10, (-0.05, 0.05, 0.00025, -0.00025))
     with pytest.raises(errors.GridTooLarge, match=r"MB for \d+ PSFs") as caught:
-        real_client.set_profile(MYOPIA, settings={"mode": "on-axis"}, views=[telescope])
+        real_client.set_profile(
+            MYOPIA,
+            settings={"mode": "on-axis", "prepare": "ranges"},
+            views=[telescope],
+        )
     assert caught.value.allowed == "2000 MB"
 
 
@@ -365,6 +369,38 @@ def test_lateral_color_is_asked_of_a_traced_eye(real_client):
         assert holds_none == (eye_model == "wavefront")
         images[eye_model, lateral] = real_client.filter(view, **SEE).color
     assert np.abs(images["traced", True] - images["traced", False]).max() > 0.005
+
+
+@pytest.mark.parametrize("eye_model", ["traced", "wavefront"])
+def test_cones_weigh_the_pupil_where_that_is_asked_for(real_client, eye_model):
+    view = edge_view()
+    settings = {
+        **NARROW,
+        "focus_range_dpt": (0, 0),
+        "tolerance": "loose",
+        "eye_model": eye_model,
+    }
+    images = {}
+    for eye_side, stiles_crawford in (
+        ("OD", False),
+        ("OS", False),
+        ("OD", True),
+        ("OS", True),
+    ):
+        real_client.set_profile(
+            {
+                "kind": "prescription",
+                "eye_side": eye_side,
+                "sphere_dpt": -2,
+                "higher_order": "none",  # which are of one side
+            },
+            settings=settings | {"stiles_crawford": stiles_crawford},
+            views=[view],
+        )
+        images[eye_side, stiles_crawford] = real_client.filter(view, **SEE).color
+    np.testing.assert_array_equal(images["OD", False], images["OS", False])
+    assert np.abs(images["OD", True] - images["OD", False]).max() > 0.005
+    assert np.abs(images["OD", True] - images["OS", True]).max() > 0.005
 
 
 def test_the_light_option_is_the_measured_wavefront_up_to_its_pupil(real_client):

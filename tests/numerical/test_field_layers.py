@@ -157,7 +157,13 @@ def test_plans_end_where_kernels_may_not_grow():
         total_defocus_dpt=plan.defocus.values_dpt,
     )
     survey = survey_pupils(state_frames(eye, spec, states))
-    assert survey.blur_radius_px.max() <= spec.max_blur_radius_px
+    shrunk = plan.shrink_ratio[plan.defocus.group_of_node]
+    assert (shrunk * survey.blur_radius_px).max() <= spec.max_blur_radius_px
+    # only where even the sharpest blur is too large, and never on the axis
+    is_whole = (plan.shrink_ratio == 1.0).reshape(plan.group_shape)
+    assert 0.9 < is_whole.mean() < 1.0
+    axis = np.abs(plan.v_deg).argmin(), np.abs(plan.h_deg).argmin()
+    assert is_whole[axis].all()
 
 
 def test_a_frame_says_where_its_blur_is_limited():

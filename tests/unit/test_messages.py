@@ -241,6 +241,7 @@ def test_the_limits_stated_are_those_of_the_service():
         ({"object_range_dpt": [-1, 3]}, "settings.object_range_dpt[0]"),
         ({"diffraction": "no"}, "settings.diffraction"),
         ({"lateral_color": 1}, "settings.lateral_color"),
+        ({"stiles_crawford": "OD"}, "settings.stiles_crawford"),
         ({"accuracy": "high"}, "settings.accuracy"),
         ({"gaze_deg": [61, 0]}, "settings.gaze_deg[0]"),
         ({"gaze_range_deg": [5, -1]}, "settings.gaze_range_deg[1]"),
