@@ -3,6 +3,7 @@
 Importing this loads nothing but names: clients stay light.
 
     settings         every setting of a filter, once
+    displays         the wavelengths of red, green and blue
     camera           a pinhole, and which cameras share PSFs
     rgbd_view        colour, depth and camera of one view
     messages         the wire protocol's types (PROTOCOL.md)

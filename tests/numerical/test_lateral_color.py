@@ -228,7 +228,7 @@ def test_red_and_blue_lie_beside_green_by_the_table(engine):
         )
         to_green_mrad = shift_mrad - shift_mrad[1]
         expected_px = to_green_mrad @ spec.pixel_from_mrad(*field).T
-        assert np.abs(moved_px - expected_px).max() <= 0.05, (moved_px, expected_px)
+        assert np.abs(moved_px - expected_px).max() <= 0.1, (moved_px, expected_px)
         assert np.abs(moved_px[1]).max() <= 1e-3  # green
         lateral_px[h_deg] = moved_px[:, 0]
     red, _, blue = lateral_px[20.0]
