@@ -158,9 +158,9 @@ def test_lens_labels_are_what_the_accommodating_eye_finds():
         eye = AccommodatingEye(
             EyeParameters.from_vector(row[:45]), pupil_diameter_mm=float(row[45])
         )
-        used_dpt = eye.accommodation_dpt(found[0])
-        assert used_dpt == pytest.approx(found[0] + eye.refraction_dpt, abs=1e-9)
-        np.testing.assert_allclose(eye.changes_mm([used_dpt])[0], found[1:], atol=1e-6)
+        used_dpt = eye.accommodations_at_cornea_dpt(np.array([-found[0]]))
+        np.testing.assert_allclose(eye.at_cornea_dpt(used_dpt), -found[0], atol=1e-4)
+        np.testing.assert_allclose(eye.changes_mm(used_dpt)[0], found[1:], atol=1e-6)
 
 
 def test_field_labels_are_single_traces():
@@ -197,9 +197,8 @@ def test_focus_labels_are_those_of_the_accommodating_eye():
         eye = AccommodatingEye(
             EyeParameters.from_vector(rows[k, :45]), pupil_diameter_mm=rows[k, 45]
         )
-        state = eye.focused(rows[k, 46])
-        wanted = (state.lens_diameter_change_mm, state.aqueous_thickness_change_mm)
-        np.testing.assert_allclose(found[k], wanted, atol=1e-6)
+        used_dpt = eye.accommodations_at_cornea_dpt(-rows[k, 46:47])
+        np.testing.assert_allclose(found[k], eye.changes_mm(used_dpt)[0], atol=1e-6)
 
 
 def test_the_split_is_a_partition():

@@ -33,10 +33,10 @@ def test_focuses_are_those_of_the_accommodating_eye(rng):
         eye = AccommodatingEye(
             EyeParameters.from_vector(vector), pupil_diameter_mm=pupil_mm[i]
         )
-        for k, state in enumerate(eye.focused_at(focus_dpt[i])):
-            truth_mm[i, k, 0] = state.lens_diameter_change_mm
-            truth_mm[i, k, 1] = state.aqueous_thickness_change_mm
-            share.append(state.accommodation_dpt / eye.amplitude_dpt)
+        # The networks speak of refraction at the cornea.
+        used_dpt = eye.accommodations_at_cornea_dpt(-focus_dpt[i])
+        truth_mm[i] = eye.changes_mm(used_dpt)
+        share.extend(used_dpt / eye.amplitude_dpt)
     # The eyes drawn stay relaxed, reach their focus, and come to their end.
     assert min(share) == 0.0
     assert max(share) == 1.0
