@@ -98,6 +98,13 @@ class Camera(Record):
         return cls(width_px, height_px, tangents)
 
     @property
+    def corner_stretch(self) -> float:
+        """Distance from the eye to the farthest corner, per unit of planar depth."""
+        left, right, up, down = self.tangents
+        across, along = max(abs(left), abs(right)), max(abs(up), abs(down))
+        return math.sqrt(1.0 + across**2 + along**2)
+
+    @property
     def pixel_pitch_mrad(self) -> tuple[float, float]:
         """Return the angle of one pixel on the axis, (x, y), in mrad."""
         left, right, up, down = self.tangents

@@ -2,8 +2,8 @@
 
 `msgspec` does the checking; here its refusal becomes a `BadMessage` that names the
 field's path, the offending value and what is allowed.  Types are dataclasses and
-``Annotated[float, Meta(ge=..., le=...)]``; a range of two numbers that must not fall is
-marked ``Meta(extra=RISING)``.
+``Annotated[float, Meta(ge=..., le=...)]``; numbers that must not fall are marked
+``Meta(extra=RISING)``.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from functools import cache
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import msgspec
@@ -179,7 +180,9 @@ def _allowed(described: kinds.Type | None) -> str | None:
             is_rising = any(extra == RISING for extra in _extras(described))
             return f"{words}, lowest first" if is_rising else words
         case kinds.ListType() | kinds.VarTupleType():
-            return f"a list of {kind.min_length or 0} to {kind.max_length} items"
+            words = f"a list of {kind.min_length or 0} to {kind.max_length} items"
+            is_rising = any(extra == RISING for extra in _extras(described))
+            return f"{words}, lowest first" if is_rising else words
     return "a map"
 
 
@@ -189,10 +192,9 @@ def _is_rising(kind: Any) -> bool:
 
 
 def check_rising(value: Any, kind: Any, path: str) -> None:
-    """Refuse a pair that falls, where its type is marked as `RISING`."""
+    """Refuse numbers that fall, where their type is marked as `RISING`."""
     if not _is_rising(kind):
         return
-    first, last = value
-    if first > last:
+    if any(first > last for first, last in pairwise(value)):
         allowed = _allowed(_described(kind))
         raise BadMessage(f"it is {show(value)}", field=path, allowed=allowed)

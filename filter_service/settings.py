@@ -19,6 +19,7 @@ MIN_PUPIL_MM = 0.5
 MAX_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
 MAX_RENDER_TOLERANCE = 8.0
+MAX_PLANES = 4
 MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 
 PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]
@@ -93,6 +94,15 @@ class FilterSettings(Record):
         tuple[VergenceDpt, VergenceDpt],
         _doc("Object distances in the scene, dpt; 0 is infinity.", extra=RISING),
     ] = (0.0, 10.0)
+    object_planes_dpt: Annotated[
+        tuple[VergenceDpt, ...],
+        _doc(
+            "Flat surfaces that face the camera, dpt, where a scene has nothing else, "
+            "as screens have: PSFs for these alone instead of the range.",
+            max_length=MAX_PLANES,
+            extra=RISING,
+        ),
+    ] = ()
     gaze_deg: Annotated[
         tuple[GazeDeg, GazeDeg],
         _doc("Gaze from the image's axis to the right and upwards, deg."),

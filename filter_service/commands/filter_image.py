@@ -258,7 +258,7 @@ def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict
         "profile": eye.name,
         "pupil_diameter_mm": rendered.pupil_diameter_mm,
         "focus_dpt": rendered.focus_dpt,
-        "object_range_dpt": list(filtered.spec.settings.object_range_dpt),
+        "object_range_dpt": list(filtered.spec.object_range_dpt),
         "missing_depth_count": int(rendered.missing_depth_count),
         "clamped_depth_count": int(rendered.clamped_depth_count),
         "bad_color_count": int(rendered.bad_color_count),

@@ -1,8 +1,8 @@
 """Command-line options made from `FilterSettings`: a new setting is an option at once.
 
 Choices become ``--mode``, angles ``--gaze-h-deg`` and ``--gaze-v-deg``, switches that
-are on ``--no-chromatic`` and those that are off ``--lateral-color``.  Ranges have no
-option: a command takes them from its image.
+are on ``--no-chromatic`` and those that are off ``--lateral-color``.  Ranges and
+planes have no option: a command takes them from its image.
 """
 
 import functools
@@ -34,7 +34,7 @@ def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
         options = [
             option
             for name in setting_types()
-            if "_range_" not in name
+            if "_range_" not in name and name != "object_planes_dpt"
             for option in _options(name, defaults.get(name, getattr(DEFAULTS, name)))
         ]
 

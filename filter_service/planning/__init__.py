@@ -5,12 +5,13 @@ field_directions  directions of an image's pixels
 sampled_use       what frames will ask for, sampled
 slopes            ray slopes over a pupil, which PSFs differ by
 error_law         what blending two PSFs costs
+readable          defocus that frames read at a node
 axis_nodes        nodes along one axis
+defocus_nodes     nodes of defocus, group by group
 nodes             a plan, and reading between its nodes
 paper_grid        the paper's fixed grids as plans
 cost              memory and time of a plan
 plan              the entry
-part_of_plan      the part that some frames read
 """
 
 import lazy_loader

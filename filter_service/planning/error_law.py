@@ -123,6 +123,11 @@ def allowed_difference_px(
     return np.sqrt(difference_px2)
 
 
+def half_way_error(axis: str, allowed_error: float) -> float:
+    """RMS error by the law half-way between nodes that makes a mean square error."""
+    return float(np.sqrt(allowed_error / MEAN_OF_HALF_WAY / AXIS_FACTOR[axis]))
+
+
 def combined_error(errors: list[float]) -> float:
     """Mean square error of several interpolations at once, from those of each."""
     amplitude = float(np.sum(np.sqrt(errors)))

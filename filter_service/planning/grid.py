@@ -175,6 +175,24 @@ class GridSpec:
         """Radius of the geometric blur disc on axis per dioptre of defocus, px."""
         return pupil_diameter_mm / 2.0 / min(self.pixel_pitch_mrad)
 
+    @property
+    def object_ranges_dpt(self) -> list[tuple[float, float]]:
+        """Where objects are, dpt: one range, or one for each plane.
+
+        Towards the corners of the image a plane is farther than on the axis.
+        """
+        planes_dpt = self.settings.object_planes_dpt
+        if not planes_dpt:
+            return [self.settings.object_range_dpt]
+        ratio = 1.0 / self.camera.corner_stretch
+        return [(ratio * plane_dpt, plane_dpt) for plane_dpt in planes_dpt]
+
+    @property
+    def object_range_dpt(self) -> tuple[float, float]:
+        """Farthest and nearest object, dpt."""
+        ranges = self.object_ranges_dpt
+        return min(low for low, _ in ranges), max(high for _, high in ranges)
+
     def gaze_samples_deg(self) -> list[tuple[float, float]]:
         """Directions of gaze over the range: its middle, edges and corners."""
         steps = [
@@ -258,7 +276,7 @@ def defocus_nodes_dpt(
 def layer_distances_dpt(
     range_dpt: tuple[float, float],
     *,
-    focused_dpt: NDArray[np.float64],
+    ends_dpt: NDArray[np.float64],
     blur_radius_px,
     blur_px_per_dpt: float,
     blur_ratio: float,
@@ -268,9 +286,9 @@ def layer_distances_dpt(
 
     Parameters
     ----------
-    focused_dpt : (n,)
-        Those in focus for some channel; each becomes a layer, so that the blur is
-        monotone between layers.
+    ends_dpt : (n,)
+        Those that become layers themselves: where some channel is in focus, so that
+        the blur is monotone between layers, and where distances begin or end.
     blur_radius_px : callable
         (n,) vergences in dpt to blur radii (n, m) in px, of field nodes and channels.
     blur_px_per_dpt : float
@@ -287,7 +305,7 @@ def layer_distances_dpt(
     """
     low_dpt, high_dpt = range_dpt
     count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
-    inside = focused_dpt[(focused_dpt > low_dpt) & (focused_dpt < high_dpt)]
+    inside = ends_dpt[(ends_dpt > low_dpt) & (ends_dpt < high_dpt)]
     at_dpt = np.unique(
         np.concatenate([np.linspace(low_dpt, high_dpt, max(count, 1)), inside])
     )

@@ -131,9 +131,10 @@ class CachePlan:
     defocus : RaggedNodes
         Total defocus in dpt; groups in C order [v, h, pupil, accommodation].
     channel_shift_dpt : (n_groups, 3)
-        Channel c of a node at t is the kernel of total defocus t + shift: zero, so that
-        a node is one defocus for all channels, but in the paper's grids, where it is
-        one object distance.
+        Channel c of a node at t is the kernel of total defocus t + shift: zero where a
+        node is one defocus for all channels; the chromatic difference where it is what
+        they see of one object, as where few distances are read and in the paper's
+        grids.
     prediction : PlanPrediction
     is_limited : (n_groups,)
         Groups that end where the blur is as large as kernels may be.

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from filter_service.planning.defocus_nodes import DefocusNodes
 from filter_service.planning.grid import GREEN, PAPER_REACH_DEG, GridSpec
 from filter_service.planning.nodes import RaggedNodes
 
@@ -63,8 +64,8 @@ def paper_axes(
 
 def paper_defocus(
     eye: EyeOptics, spec: GridSpec, axes: tuple[NDArray, NDArray, NDArray, NDArray]
-) -> tuple[RaggedNodes, NDArray[np.float64]]:
-    """Nodes of total defocus, and the channels' shifts (n_groups, 3) against them."""
+) -> DefocusNodes:
+    """Nodes of total defocus, and the channels' shifts against them."""
     h_deg, v_deg, pupils_mm, used_dpt = axes
     at_infinity_dpt = eye.total_defocus_dpt(
         h_deg=h_deg[:, None, None, None],
@@ -78,4 +79,6 @@ def paper_defocus(
     distances_dpt = np.linspace(*DISTANCES_DPT, count)
     values = green_dpt + eye.vergence.vergence_dpt(distances_dpt)
     starts = count * np.arange(len(values) + 1)
-    return RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt
+    return DefocusNodes.unlimited(
+        RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt
+    )

@@ -99,12 +99,11 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
         )
         for answer in (eye.accommodation_dpt, eye.reachable_focus_dpt)
     )
-    low_dpt, high_dpt = spec.settings.object_range_dpt
     vergence_dpt = eye.vergence.vergence_dpt(
         np.where(
             distance < 0.5,
-            np.clip(focused_dpt, low_dpt, high_dpt),
-            low_dpt + (high_dpt - low_dpt) * (2.0 * distance - 1.0),
+            _nearest_object_dpt(spec, focused_dpt),
+            _objects_dpt(spec, np.maximum(2.0 * distance - 1.0, 0.0)),
         )
     )
     wavelengths_nm = spec.channel_wavelengths_nm
@@ -122,6 +121,23 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
         scale = None
     exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
     return Use(eye, spec, states, vergence_dpt, scale, exact_px)
+
+
+def _nearest_object_dpt(spec: GridSpec, focused_dpt: NDArray) -> NDArray[np.float64]:
+    """Objects (P,) nearest to where the eye focuses."""
+    ranges_dpt = np.array(spec.object_ranges_dpt)
+    found = np.clip(focused_dpt[:, None], ranges_dpt[:, 0], ranges_dpt[:, 1])
+    best = np.abs(found - focused_dpt[:, None]).argmin(axis=1)
+    return found[np.arange(best.size), best]
+
+
+def _objects_dpt(spec: GridSpec, share: NDArray) -> NDArray[np.float64]:
+    """Objects (P,) at shares of the way through the ranges, one after the other."""
+    ranges_dpt = np.array(spec.object_ranges_dpt)
+    steps = share * len(ranges_dpt)
+    number = np.minimum(steps.astype(int), len(ranges_dpt) - 1)
+    low_dpt, high_dpt = ranges_dpt[number].T
+    return low_dpt + (high_dpt - low_dpt) * (steps - number)
 
 
 def _seen_directions(

@@ -2,7 +2,6 @@
 
 eye_for_spec         the eye of a profile, for what a cache covers
 build_store          every PSF of a plan, in chunks
-kernel_shelf         kernels computed before, for other parts of a plan
 psf_engine           on the CPU or the GPU
 gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers

@@ -17,6 +17,7 @@ from filter_service.planning.grid import (
     layer_distances_dpt,
 )
 from filter_service.planning.nodes import CachePlan, bracket_axis
+from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.boxes import pack_reach
 from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
 from filter_service.psfs.read_kernels import StateReads, StoreTables
@@ -185,14 +186,14 @@ def frame_layers(
     notes += _limit_notes(store, corners)
     reads = _state_reads(plan, pupil_mm, corners)
     gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
-    far_dpt, near_dpt = object_range_dpt or store.spec.settings.object_range_dpt
+    far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
     far_near_dpt = (
         eye.vergence.vergence_dpt(far_dpt),
         eye.vergence.vergence_dpt(near_dpt),
     )
     layer_dpt = layer_distances_dpt(
         tuple(np.add(far_near_dpt, change.range_dpt)),
-        focused_dpt=-layer_zero_dpt[gaze],
+        ends_dpt=np.append(-layer_zero_dpt[gaze], _plane_ends_dpt(store, change)),
         blur_radius_px=lambda at_dpt: layer_blur_px(
             store.tables, reads, layer_zero_dpt, at_dpt
         ),
@@ -217,6 +218,15 @@ def frame_layers(
     )
 
 
+def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64]:
+    """Return where layers of several planes end: in the gaps are no PSFs."""
+    ranges_dpt = store.spec.object_ranges_dpt
+    if len(ranges_dpt) == 1:
+        return np.zeros(0)
+    vergences_dpt = store.eye.vergence.vergence_dpt(np.array(ranges_dpt))
+    return (vergences_dpt + change.range_dpt).ravel()
+
+
 def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
     limited = store.plan.is_limited.reshape(store.plan.group_shape)
     if not any(limited[:, :, pupil, used].any() for pupil, used, _ in corners):
@@ -230,6 +240,8 @@ def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
 def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
     usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
     low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
+    if low_mm == high_mm:  # one node for a range
+        low_mm, high_mm = usable_pupils_mm(store.eye, store.spec)
     clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
     if abs(clamped_mm - usable_mm) <= 1e-9:
         return clamped_mm, ()

@@ -64,12 +64,12 @@ def largest_radius_px(store, reads, zero_dpt, layer_dpt):
 
 
 def layer_distances_dpt(
-    object_range_dpt, *, focused_dpt, blur_radius_px, blur_px_per_dpt, blur_ratio
+    object_range_dpt, *, ends_dpt, blur_radius_px, blur_px_per_dpt, blur_ratio
 ):
     """Walk from node to node; a layer wherever a whole step has gone by."""
     low_dpt, high_dpt = object_range_dpt
     count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
-    inside = [d for d in focused_dpt if low_dpt < d < high_dpt]
+    inside = [d for d in ends_dpt if low_dpt < d < high_dpt]
     nodes = sorted({*np.linspace(low_dpt, high_dpt, max(count, 1)), *inside})
     blur_px = blur_radius_px(np.array(nodes))
     layers, stretch = [nodes[0]], []

@@ -21,7 +21,8 @@ RTOL = 1e-12
 """Sums of up to eight numbers in another order."""
 
 FIELD = {"mode": "dynamic", "tolerance": "loose", "object_range_dpt": (0.0, 4.0)}
-MOVING = {"pupil_range_mm": (3.0, 5.0), "focus_range_dpt": (0.0, 3.0)}
+MOVING = {"pupil_range_mm": (3.0, 5.0), "focus_range_dpt": (0.0, 6.0)}
+BREATHING = {"pupil_range_mm": (4.0, 4.4), "focus_range_dpt": (0.0, 0.5)}
 STILL = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (1.0, 1.0)}
 AXIS = {"mode": "on-axis", "object_range_dpt": (0.0, 4.0)}
 
@@ -56,9 +57,14 @@ CASES = {
     "between all nodes": (("keratoconus", FIELD | MOVING), 3.7, 1.3, 0.3, None),
     "pupil on a node": (("keratoconus", FIELD | MOVING), 5.0, 1.3, 0.3, None),
     "lowest end": (("keratoconus", FIELD | MOVING), 3.0, 0.0, 0.3, None),
-    "highest end": (("emmetropia", FIELD | MOVING), 9.0, 3.0, 0.3, None),
+    "highest end": (("emmetropia", FIELD | MOVING), 9.0, 6.0, 0.3, None),
     "several accommodations": (("emmetropia", FIELD | MOVING), 3.7, 1.3, 0.3, None),
     "accommodation on a node": (("emmetropia", FIELD | MOVING), 3.7, 0.0, 0.3, None),
+    "beside single nodes": (("emmetropia", FIELD | BREATHING), 4.0, 0.5, 0.3, None),
+    "two planes": (
+        ("emmetropia", FIELD | BREATHING | {"object_planes_dpt": (0.0, 3.0)}),
+        *(4.4, 0.2, 0.3, None),
+    ),
     "gaze turned": (
         ("emmetropia", FIELD | STILL | {"gaze_range_deg": (12.0, 6.0)}),
         *(4.0, 1.0, 0.3, (-12.0, 5.0)),
@@ -110,9 +116,14 @@ def test_layers_equal_the_plain_statement(case):
     )
     h_deg, v_deg = store.plan.field_nodes_deg
     gaze = np.argmin(np.hypot(h_deg, v_deg))
+    ends_dpt = [
+        store.eye.vergence.vergence_dpt(end) + change_dpt
+        for range_dpt in store.spec.object_ranges_dpt
+        for end, change_dpt in zip(range_dpt, layers.field.range_dpt, strict=True)
+    ]
     expected_dpt = plan_twin.layer_distances_dpt(
         tuple(np.add(layers.vergence_range_dpt, layers.field.range_dpt)),
-        focused_dpt=-zero_dpt[gaze],
+        ends_dpt=np.append(-zero_dpt[gaze], ends_dpt),
         blur_radius_px=lambda d: plan_twin.layer_blur_px(store, reads, zero_dpt, d),
         blur_px_per_dpt=layers.blur_px_per_dpt,
         blur_ratio=0.1 if store.spec.settings.mode == "dynamic" else 0.05,

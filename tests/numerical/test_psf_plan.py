@@ -33,6 +33,7 @@ from tests.numerical.plan_cases import (
 
 FACTOR_TWO_DB = 20.0 * math.log10(2.0)
 ONE_STATE = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (0.5, 0.5)}
+BREATHING = {"pupil_range_mm": (4.0, 4.4), "focus_range_dpt": (0.0, 0.5)}
 GAZE_CAMERA = {"tangents": (-0.5, 1.1, 0.7, -0.4)}
 
 
@@ -120,6 +121,22 @@ def test_on_axis_nodes_follow_the_blur_alone(name, model):
     )
 
 
+@pytest.mark.parametrize("model", ["wavefront", "traced"])
+def test_one_distance_in_one_state_is_one_exact_psf_a_channel(model):
+    spec = spec_for(**ONE_STATE, object_range_dpt=(1.5, 1.5))
+    eye = measured_eye("myopia") if model == "wavefront" else traced_eye("myopia", spec)
+    plan = plan_cache(eye, spec)
+    assert plan.prediction.psf_count == 3
+    expected_dpt = eye.vergence.vergence_dpt(1.5) + eye.total_defocus_dpt(
+        pupil_diameter_mm=4.0,
+        accommodation_dpt=plan.accommodations_dpt[0],
+        wavelength_nm=spec.channel_wavelengths_nm,
+    )
+    np.testing.assert_allclose(
+        plan.defocus.values_dpt + plan.channel_shift_dpt[0], expected_dpt, atol=1e-9
+    )
+
+
 # ----- whatever frames read is there
 
 
@@ -130,6 +147,12 @@ def test_on_axis_nodes_follow_the_blur_alone(name, model):
         ("keratoconus", "traced", {"mode": "dynamic"}),
         ("emmetropia", "traced", {"mode": "dynamic", "gaze_deg": (12.0, -8.0)}),
         ("emmetropia", "wavefront", {"mode": "dynamic"}),
+        ("emmetropia", "traced", {"mode": "dynamic"} | BREATHING),
+        (
+            "keratoconus",
+            "traced",
+            {"mode": "dynamic", "object_planes_dpt": (0.0, 3.0)} | BREATHING,
+        ),
     ],
 )
 def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings):
@@ -138,6 +161,9 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
     plan = plan_cache(eye, spec)
     use = sample_use(eye, spec, 400)
     states = use.states
+    channel = (states.wavelength_nm[:, None] == spec.channel_wavelengths_nm).argmax(
+        axis=1
+    )
     for v in bracket_axis(plan.v_deg, states.v_deg)[:2]:
         for h in bracket_axis(plan.h_deg, states.h_deg)[:2]:
             total_dpt = use.vergence_dpt + eye.total_defocus_dpt(
@@ -153,6 +179,7 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
                 )[:2]:
                     group = np.ravel_multi_index((v, h, i, j), plan.group_shape)
                     read = total_dpt * states.pupil_diameter_mm / plan.pupils_mm[i]
+                    read = read - plan.channel_shift_dpt[group, channel]
                     low = plan.defocus.values_dpt[plan.defocus.starts[group]]
                     high = plan.defocus.values_dpt[plan.defocus.starts[group + 1] - 1]
                     # Pupils and accommodations between nodes bend their defocus.
@@ -198,6 +225,8 @@ def test_finer_tolerances_take_more_psfs_and_err_less_as_predicted():
         ("myopia", {"mode": "dynamic", "vertical_fov_deg": 20.0}),
         ("emmetropia", {"mode": "quality", "grid": "paper", **ONE_STATE}),
         ("astigmatism", {"mode": "dynamic", "model": "wavefront"}),
+        ("emmetropia", {"mode": "dynamic"} | BREATHING),
+        ("myopia", {"mode": "dynamic", "object_planes_dpt": (0.0, 4.0)} | BREATHING),
     ],
 )
 def test_errors_are_predicted_within_a_factor_of_two(name, settings):
@@ -208,6 +237,32 @@ def test_errors_are_predicted_within_a_factor_of_two(name, settings):
     plan = plan_cache(eye, spec)
     measured_db = mean_db(sampled_errors(eye, spec, plan, count=64, seed=3))
     assert abs(measured_db - plan.prediction.interpolation_db) < FACTOR_TWO_DB
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+def test_a_part_of_all_ranges_is_planned_as_well_with_a_tenth_of_the_psfs(name):
+    whole = spec_for(mode="dynamic", width_px=1280, height_px=720)
+    part = whole.with_settings(**BREATHING, object_range_dpt=(0.0, 3.0))
+    eye = traced_eye(name, whole)
+    plans = [unchecked_plan(eye, spec) for spec in (whole, part)]
+    measured_db = mean_db(sampled_errors(eye, part, plans[1], count=64))
+    assert measured_db > mean_db(sampled_errors(eye, part, plans[0], count=64)) - 3.0
+    counts = [plan.prediction.psf_count for plan in plans]
+    assert counts[1] < 0.1 * counts[0]
+
+
+def test_two_planes_take_fewer_psfs_than_all_between_them():
+    state = {"pupil_range_mm": (3.5, 4.5), "focus_range_dpt": (1.0, 1.5)}
+    size = {"width_px": 1280, "height_px": 720, "vertical_fov_deg": 20.0}
+    spec = spec_for(mode="dynamic", **size, **state, object_range_dpt=(0.0, 5.0))
+    planes = spec.with_settings(object_planes_dpt=(0.0, 5.0))
+    eye = traced_eye("emmetropia", spec)
+    wide, split = (unchecked_plan(eye, own) for own in (spec, planes))
+    assert split.prediction.psf_count < 0.4 * wide.prediction.psf_count
+    measured_db = [
+        mean_db(sampled_errors(eye, planes, plan, count=64)) for plan in (wide, split)
+    ]
+    assert measured_db[1] > measured_db[0] - 3.0
 
 
 def test_memory_is_predicted_for_the_cache_that_is_built():

@@ -94,14 +94,18 @@ def test_nested_values_are_named_by_their_path():
     assert RISING == {"is_rising": True}
 
 
-def test_the_filter_command_has_an_option_for_every_setting_but_ranges():
+def has_option(name):
+    return "_range_" not in name and "_planes_" not in name
+
+
+def test_the_filter_command_has_an_option_for_every_setting_but_distances():
     text = CliRunner().invoke(app, ["filter", "--help"]).output
     options = set(re.findall(r"--[a-z-]+", text))
     for name in setting_types():
         words = name.replace("_", "-")
         stem, _, unit = words.rpartition("-")
         forms = {f"--{words}", f"--no-{words}", f"--{stem}-h-{unit}"}
-        assert ("_range_" in name) != bool(forms & options), name
+        assert has_option(name) == bool(forms & options), name
 
 
 def test_options_become_settings():
@@ -117,10 +121,9 @@ def test_options_become_settings():
             for name, parameter in command.__signature__.parameters.items()
         }
     )
-    ranges = {name for name in setting_types() if "_range_" in name}
     expected = DEFAULTS.changed(mode="on-axis")
     assert seen == {
-        name: getattr(expected, name) for name in setting_types() if name not in ranges
+        name: getattr(expected, name) for name in setting_types() if has_option(name)
     }
 
 

@@ -240,7 +240,7 @@ class FilterRenderer:
             hidden_m = np.where(holds, view.hidden_depth_m, np.float32(1.0))
             hidden_dpt = object_dpt(view, hidden_m)[holds]
             distances = np.concatenate([distances.ravel(), hidden_dpt])
-        low_dpt, high_dpt = store.spec.settings.object_range_dpt
+        low_dpt, high_dpt = store.spec.object_range_dpt
         margin = 1e-6 * max(high_dpt, 1.0)
         clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
         return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))

@@ -1,0 +1,263 @@
+"""Nodes of total defocus: closer where blur hides less, none where frames read none.
+
+A node is one defocus for all channels, or one for green with red and blue beside it at
+their chromatic differences.  The first suits deep scenes, the second what is seen at
+few distances, where the three of a distance are read alike; each group has what needs
+fewer nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.eye_optics import EyeOptics
+from filter_service.constants import RGB
+from filter_service.planning.error_law import (
+    allowed_difference_px,
+    half_way_error,
+    mean_square,
+    spot_covariance,
+)
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import RaggedNodes
+from filter_service.planning.readable import ReadableDefocus, joined_ranges
+from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+
+_LADDER = 49
+
+_LARGEST_RATIO = 0.86
+"""Of the largest kernel: how far rays may land; diffraction and the rim lie beyond."""
+
+EXACT_DPT = 1e-9
+"""A range as narrow as this is one value."""
+
+DEEP_DPT = 6.0
+"""From here on, the shift saves a range too little to be tried."""
+
+Ranges = list[NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class DefocusNodes:
+    """Nodes of total defocus of all groups of a plan; fields as in `CachePlan`."""
+
+    nodes: RaggedNodes
+    channel_shift_dpt: NDArray[np.float64]
+    is_limited: NDArray[np.bool_]
+    shrink_ratio: NDArray[np.float64]
+
+    @classmethod
+    def unlimited(
+        cls, nodes: RaggedNodes, channel_shift_dpt: NDArray[np.float64]
+    ) -> DefocusNodes:
+        """Return nodes whose kernels are all taken as they are."""
+        count = len(nodes.starts) - 1
+        return cls(nodes, channel_shift_dpt, np.zeros(count, bool), np.ones(count))
+
+
+def defocus_nodes(
+    eye: EyeOptics,
+    spec: GridSpec,
+    groups: PupilStates,
+    readable: ReadableDefocus,
+    *,
+    allowed_error: float,
+    unit_px: NDArray[np.float64],
+) -> DefocusNodes:
+    """Nodes of total defocus of every group, for a mean square error.
+
+    Parameters
+    ----------
+    groups : PupilStates
+        Field, pupil, accommodation and wavelength of each group (P,), no defocus.
+    readable : ReadableDefocus
+    unit_px : (P,)
+        lambda / pupil diameter.
+    """
+    rays = _Rays.of(eye, spec, groups, unit_px=unit_px, allowed_error=allowed_error)
+    split = joined_ranges(readable.of_any_channel_dpt)
+    whole_dpt = np.array([[own[0, 0], own[-1, 1]] for own in split])
+    limited_dpt, shrink_ratio = rays.limited(whole_dpt, spec, groups)
+    is_limited = np.any(limited_dpt != whole_dpt, axis=1)
+    every = np.arange(len(split))
+    nodes = rays.nodes(every, list(limited_dpt[:, None]))
+    shift_dpt = np.zeros((len(split), RGB))
+    free = np.flatnonzero(~is_limited)
+
+    def try_others(index: NDArray[np.int64], ranges: Ranges, shifts_dpt=None) -> None:
+        found = rays.nodes(index, ranges, shifts_dpt)
+        for k, own in zip(index.tolist(), found, strict=True):
+            if own.size < nodes[k].size:
+                nodes[k] = own
+                shift_dpt[k] = 0.0 if shifts_dpt is None else readable.shift_dpt[k]
+
+    several = free[[len(split[k]) > 1 for k in free.tolist()]]
+    try_others(several, [split[k] for k in several.tolist()])
+    narrow = free[np.ptp(whole_dpt[free], axis=1) < DEEP_DPT]
+    shifted = joined_ranges(readable.beside_shift_dpt[narrow])
+    hulls = [np.array([[own[0, 0], own[-1, 1]]]) for own in shifted]
+    try_others(narrow, hulls, readable.shift_dpt[narrow])
+    if any(len(own) > 1 for own in shifted):
+        try_others(narrow, shifted, readable.shift_dpt[narrow])
+    return DefocusNodes(RaggedNodes.of(nodes), shift_dpt, is_limited, shrink_ratio)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Where rays of each group (P,) land, px: in proportion to defocus.
+
+    Attributes
+    ----------
+    zero_px, per_dpt : (P, n, 2)
+    unit_px : (P,)
+    half_way_error : float
+        RMS error half-way between nodes.
+    """
+
+    zero_px: NDArray[np.float64]
+    per_dpt: NDArray[np.float64]
+    unit_px: NDArray[np.float64]
+    half_way_error: float
+
+    @classmethod
+    def of(
+        cls,
+        eye: EyeOptics,
+        spec: GridSpec,
+        groups: PupilStates,
+        *,
+        unit_px: NDArray[np.float64],
+        allowed_error: float,
+    ) -> _Rays:
+        count = groups.h_deg.size
+        columns = vars(groups.taken(np.tile(np.arange(count), 2)))
+        columns["total_defocus_dpt"] = np.repeat([0.0, 1.0], count)
+        zero_px, one_px = np.split(
+            slopes_px(state_frames(eye, spec, PupilStates(**columns))), 2
+        )
+        error = half_way_error("defocus", allowed_error)
+        return cls(zero_px, one_px - zero_px, unit_px, error)
+
+    def nodes(
+        self,
+        index: NDArray[np.int64],
+        ranges: Ranges,
+        shifts_dpt: NDArray[np.float64] | None = None,
+    ) -> list[NDArray[np.float64]]:
+        """Nodes of some groups (n,), over one or several ranges (k, 2) of each."""
+        if not index.size:
+            return []
+        counts = [len(own) for own in ranges]
+        lows, highs = np.concatenate(ranges).T
+        place = np.repeat(np.arange(index.size), counts)
+        shifts = np.zeros((1, lows.size))
+        if shifts_dpt is not None:
+            shifts = shifts_dpt[place].T
+        needed = self._needed(index[place], lows, highs, shifts)
+        pieces = iter(
+            _spread(*own)
+            for own in zip(lows.tolist(), highs.tolist(), needed, strict=True)
+        )
+        return [np.concatenate([next(pieces) for _ in range(n)]) for n in counts]
+
+    def _needed(
+        self,
+        index: NDArray[np.int64],
+        lows: NDArray[np.float64],
+        highs: NDArray[np.float64],
+        shifts: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Intervals (n, _LADDER) needed up to each step through ranges (n,).
+
+        The covariance is a square polynomial of defocus: through three points of it.
+        """
+        zero_px, per_dpt = self.zero_px[index], self.per_dpt[index]
+        at_zero, at_one, spread = (
+            spot_covariance(slopes) for slopes in (zero_px, zero_px + per_dpt, per_dpt)
+        )
+        steps_dpt = (highs - lows) / (_LADDER - 1)
+        difference_px = np.sqrt(mean_square(per_dpt)) * steps_dpt
+        middles = lows + steps_dpt * (np.arange(_LADDER - 1)[:, None] + 0.5)
+        allowed_px = np.full(middles.shape, np.inf)
+        for shift in shifts:
+            x = (middles + shift)[..., None]
+            covariance = at_zero + x * (at_one - at_zero - spread) + x * x * spread
+            of_channel_px = allowed_difference_px(
+                covariance,
+                unit_px=self.unit_px[index],
+                half_way_error=self.half_way_error,
+            )
+            allowed_px = np.minimum(allowed_px, of_channel_px)
+        needed = np.zeros((lows.size, _LADDER))
+        np.cumsum((difference_px / allowed_px).T, axis=1, out=needed[:, 1:])
+        return needed
+
+    def limited(
+        self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Ranges (P, 2) without the defocus whose kernels would be too large.
+
+        A range that holds no kernel small enough becomes the defocus of its smallest,
+        with the ratio (P,) by which that has to shrink.  On the axis it stays as it is,
+        to be refused with numbers when it is computed: what the eye looks at is never
+        drawn so.
+        """
+        lows, highs = ranges_dpt.T
+        limit_px = _LARGEST_RATIO * spec.max_blur_radius_px
+        first_dpt, last_dpt, room = self._within(limit_px)
+        fits = (room > 0.0).all(axis=1) & (
+            np.maximum(first_dpt, lows) <= np.minimum(last_dpt, highs)
+        )
+        limited_dpt = np.where(
+            fits[:, None],
+            np.stack(
+                [np.maximum(first_dpt, lows), np.minimum(last_dpt, highs)], axis=-1
+            ),
+            ranges_dpt,
+        )
+        away_deg = np.hypot(groups.h_deg, groups.v_deg)
+        shrunk = np.flatnonzero(~fits & (away_deg > away_deg.min() + 1e-9))
+        ratio = np.ones(lows.size)
+        if shrunk.size:
+            at_dpt = np.linspace(lows[shrunk], highs[shrunk], _LADDER)
+            slopes = (
+                self.zero_px[shrunk] + at_dpt[..., None, None] * self.per_dpt[shrunk]
+            )
+            largest_px = np.sqrt((slopes**2).sum(axis=-1)).max(axis=-1)
+            best, at = largest_px.argmin(axis=0), np.arange(shrunk.size)
+            limited_dpt[shrunk] = at_dpt[best, at][:, None]
+            ratio[shrunk] = limit_px / largest_px[best, at]
+        return limited_dpt, ratio
+
+    def _within(
+        self, limit_px: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """First and last defocus (P,) with all rays within a limit, if any are.
+
+        Where |zero + t per|² = limit², ray by ray; the room (P, n) is above zero for
+        rays that ever come within.
+        """
+        a = np.maximum((self.per_dpt**2).sum(axis=-1), 1e-12)
+        half_b = (self.zero_px * self.per_dpt).sum(axis=-1)
+        room = half_b**2 - a * ((self.zero_px**2).sum(axis=-1) - limit_px**2)
+        reach = np.sqrt(np.maximum(room, 0.0))
+        return (
+            ((-half_b - reach) / a).max(axis=1),
+            ((-half_b + reach) / a).min(axis=1),
+            room,
+        )
+
+
+def _spread(
+    low_dpt: float, high_dpt: float, needed: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Nodes from end to end of a range, as many as its ladder asks for."""
+    if high_dpt - low_dpt < EXACT_DPT:
+        return np.array([low_dpt])
+    count = 1 + max(1, math.ceil(needed[-1] - 1e-9))
+    ladder = np.linspace(low_dpt, high_dpt, _LADDER)
+    return np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
