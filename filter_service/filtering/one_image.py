@@ -11,6 +11,7 @@ import numpy as np
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.filtering.choose_engine import open_engine
+from filter_service.filtering.view_use import planes_of_view_dpt
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import plan_cache
@@ -88,6 +89,7 @@ def image_spec(
             pupil_range_mm=(pupil_diameter_mm, pupil_diameter_mm),
             focus_range_dpt=(focus_dpt, focus_dpt),
             object_range_dpt=object_range_dpt(view),
+            object_planes_dpt=planes_of_view_dpt(view),
             **settings,
         ),
         kept_energy_ratio=KEPT_ENERGY_RATIO,

@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from filter_service.building.used_ranges import Range, UsedRanges
-from filter_service.settings import FilterSettings
+from filter_service.settings import MAX_PLANES, FilterSettings
 
 HISTORY_S = 5.0
 """Frames so far back count: a gaze that goes to and fro comes back to where it was."""
@@ -42,12 +42,13 @@ FIRST_PUPIL_MM, FIRST_FOCUS_DPT, FIRST_OBJECT_DPT = (3.5, 4.5), (0.0, 0.5), (0.0
 
 @dataclass(frozen=True)
 class FrameUse:
-    """What one frame asks for."""
+    """What one frame asks for; planes where all its objects lie on such."""
 
     at_s: float
     pupil_mm: float
     focus_dpt: float
     object_dpt: Range
+    planes_dpt: tuple[float, ...] = ()
 
 
 class StreamUse:
@@ -72,6 +73,7 @@ class StreamUse:
             (last.pupil_mm, last.pupil_mm),
             (last.focus_dpt, last.focus_dpt),
             last.object_dpt,
+            last.planes_dpt,
         )
 
     def ahead(self, seconds: float) -> UsedRanges | None:
@@ -91,6 +93,7 @@ class StreamUse:
             _span(last.pupil_mm, last.pupil_mm + more_mm),
             _span(last.focus_dpt, last.focus_dpt + more_dpt),
             last.object_dpt,
+            last.planes_dpt,
         )
 
     def wanted(self, build_s: float, settings: FilterSettings) -> UsedRanges:
@@ -113,7 +116,15 @@ class StreamUse:
             _roomy(_span(*pupils, *coming.pupil_mm), PUPIL_ROOM_MM, PUPIL_GRID_MM),
             _roomy(_span(*foci, *coming.focus_dpt), FOCUS_ROOM_DPT, FOCUS_GRID_DPT),
             _roomy(_span(*objects), room_dpt, OBJECT_GRID_DPT),
+            self._planes_dpt(),
         ).within(settings)
+
+    def _planes_dpt(self) -> tuple[float, ...]:
+        """Planes of all frames; none where one has more, or where they move."""
+        planes_dpt = {p for frame in self._frames for p in frame.planes_dpt}
+        if len(planes_dpt) > MAX_PLANES or any(not f.planes_dpt for f in self._frames):
+            return ()
+        return tuple(sorted(planes_dpt))
 
     def leaves(
         self, prepared: UsedRanges, build_s: float, settings: FilterSettings

@@ -90,3 +90,34 @@ def test_nothing_beyond_the_settings_is_wanted():
 )
 def test_holding_is_in_all_three(other, holds):
     assert UsedRanges((3.0, 4.0), (0.0, 1.0), (0.0, 2.0)).holds(other) == holds
+
+
+def planes_stream(frames, settings=SETTINGS):
+    use = StreamUse()
+    for k, planes_dpt in enumerate(frames):
+        use.note(FrameUse(0.1 * k, 4.0, 1.0, SCENE, planes_dpt))
+    return use.wanted(1.0, settings).planes_dpt
+
+
+def test_planes_that_stay_are_prepared_alone():
+    assert planes_stream([(0.1, 1.4)] * 9) == (0.1, 1.4)
+    assert planes_stream([(0.1,), (1.4,)] * 9) == (0.1, 1.4)
+    nearer = FilterSettings(object_range_dpt=(0.5, 1.0))
+    assert planes_stream([(0.1, 0.2, 1.4)], nearer) == (0.5, 1.0)
+    told = FilterSettings(object_planes_dpt=(0.0, 2.0))
+    assert planes_stream([(0.1, 1.4)], told) == (0.0, 2.0)
+
+
+def test_planes_that_move_or_end_are_a_range():
+    assert planes_stream([(0.2 * k,) for k in range(9)]) == ()
+    assert planes_stream([(0.1, 1.4), (), (0.1, 1.4)]) == ()
+
+
+def test_what_is_prepared_for_planes_holds_these_alone():
+    ranges = (3.0, 4.0), (0.0, 1.0), (0.0, 2.0)
+    planes = UsedRanges(*ranges, (0.5, 1.5))
+    assert planes.holds(UsedRanges(*ranges, (1.5,)))
+    assert not planes.holds(UsedRanges(*ranges, (0.6,)))
+    assert not planes.holds(UsedRanges(*ranges))
+    assert UsedRanges(*ranges).holds(planes)
+    assert planes.applied(SETTINGS).object_planes_dpt == (0.5, 1.5)

@@ -1,0 +1,77 @@
+"""What a frame asks of an eye, read from its depth."""
+
+import numpy as np
+import pytest
+
+from filter_service.building.jobs import LookAt
+from filter_service.filtering.view_use import (
+    PLANE_STEP_DPT,
+    frame_use,
+    planes_of_view_dpt,
+)
+from filter_service.rgbd_view import RgbdView
+
+TANGENTS = (-0.6, 0.6, 0.4, -0.4)
+
+
+def view(depth_m, depth_kind="planar", **hidden):
+    color = np.zeros((*depth_m.shape, 3), np.float32)
+    if hidden:
+        hidden["hidden_color"] = color
+    return RgbdView(color, depth_m.astype(np.float32), TANGENTS, depth_kind, **hidden)
+
+
+def planes(*depths_m):
+    """Stripes of equal depth."""
+    depth_m = np.empty((80, 120))
+    depth_m[:] = np.repeat(depths_m, 120 // len(depths_m))
+    return depth_m
+
+
+@pytest.mark.parametrize(
+    ("depths_m", "expected_dpt"),
+    [
+        ((np.inf,), (0.0,)),
+        ((0.5,), (2.0,)),
+        ((np.inf, 0.25), (0.0, 4.0)),
+        ((0.25, 2.0, 1.0), (0.5, 1.0, 4.0)),
+        ((np.nan, 0.25), (4.0,)),
+        ((0.0, -1.0), ()),
+        ((5.0, 4.0, 3.0, 2.0, 1.0), ()),
+        ((1.0, 0.02), ()),  # nearer than any PSF
+    ],
+)
+def test_planes_are_found(depths_m, expected_dpt):
+    assert planes_of_view_dpt(view(planes(*depths_m))) == pytest.approx(expected_dpt)
+
+
+def test_depth_that_wavers_by_less_than_blur_shows_is_a_plane(rng):
+    depth_m = planes(0.5) * (1.0 + 1e-3 * rng.uniform(-1.0, 1.0, (80, 120)))
+    assert planes_of_view_dpt(view(depth_m)) == pytest.approx((2.0,), abs=2e-3)
+    slope_m = 1.0 / np.linspace(1.0, 1.0 + 20 * PLANE_STEP_DPT, 120)
+    assert planes_of_view_dpt(view(np.tile(slope_m, (80, 1)))) == ()
+
+
+def test_a_small_thing_before_a_plane_is_seen_and_distance_from_the_eye_is_none():
+    depth_m = planes(2.0)
+    depth_m[40:43, 61:64] = np.linspace(0.4, 0.6, 9).reshape(3, 3)
+    found = planes_of_view_dpt(view(depth_m))
+    assert len(found) != 1  # not the wall alone
+    assert planes_of_view_dpt(view(planes(2.0), "radial")) == ()
+
+
+def test_what_is_hidden_counts():
+    both = view(planes(0.5), hidden_depth_m=planes(4.0).astype(np.float32))
+    assert planes_of_view_dpt(both) == pytest.approx((0.25, 2.0))
+
+
+def test_views_of_a_frame_share_their_planes_and_ranges():
+    look_at = LookAt(4.0, 1.0)
+    use = frame_use([view(planes(0.5)), view(planes(2.0))], look_at, at_s=1.0)
+    assert use.planes_dpt == pytest.approx((0.5, 2.0))
+    stretch = np.sqrt(1.0 + 0.6**2 + 0.4**2)
+    assert use.object_dpt == pytest.approx((0.5 / stretch, 2.0))
+    scene = view(np.random.default_rng(0).uniform(1.0, 3.0, (80, 120)))
+    assert frame_use([view(planes(0.5)), scene], look_at, at_s=1.0).planes_dpt == ()
+    nothing = frame_use([view(planes(0.0))], look_at, at_s=1.0)
+    assert nothing.object_dpt == (0.0, 0.0) and nothing.planes_dpt == ()
