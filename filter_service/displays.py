@@ -1,14 +1,14 @@
-"""What light a display makes of red, green and blue: one wavelength for each.
+"""What light a display makes of red, green and blue: one or two wavelengths for each.
 
 The eye blurs every wavelength in its own way.  A primary's PSF is that of the one
 wavelength which stands best for its spectrum, in the light that people see of it.  Of
 six measured displays, a white point through 5 mm, against 31 wavelengths with the
 colour-matching functions of CIE 1931: 51 to 58 dB in linear light and 47.6 to 49.8 dB
 as encoded by "common", 54 to 58 and 48.3 to 49.8 dB by a display's own; 41 to 54 and
-43 to 48 dB by the three that the paper takes (tests/benchmarks/bench_displays.py).
+43 to 48 dB by the three that the paper takes.  Two wavelengths a primary, one standard
+deviation of its light to both sides, reach 50.1 to 52.1 dB as encoded by "common" and
+51.2 to 53.4 by a display's own (tests/benchmarks/bench_displays.py).
 """
-
-import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +25,27 @@ DISPLAYS = {
 """Wavelengths of red, green and blue, nm: the best single choice for common displays;
 an LCD with white LEDs; an OLED; phosphors; those of Csoba & Kunkli 2023."""
 
+WIDTHS_NM = {
+    "common": (13.0, 19.0, 13.0),
+    "lcd": (15.0, 18.0, 12.0),
+    "oled": (16.0, 18.5, 14.5),
+    "crt": (6.5, 20.5, 15.5),
+    "paper": (13.0, 19.0, 13.0),
+}
+"""Standard deviations of the light of red, green and blue."""
+
 LIMITS_NM = (380.0, 780.0)
+MAX_WIDTH_NM = 40.0
 ALLOWED = (
     f"{', '.join(DISPLAYS)}, or wavelengths of red, green and blue in nm as "
-    f"620,530,455, each from {LIMITS_NM[0]:g} to {LIMITS_NM[1]:g}"
+    f"620,530,455 or, with standard deviations, 620:13,530:19,455:13; each from "
+    f"{LIMITS_NM[0]:g} to {LIMITS_NM[1]:g}, deviations from 0 to {MAX_WIDTH_NM:g}"
 )
 
+Triple = tuple[float, float, float]
 
-def display_wavelengths_nm(display: str) -> tuple[float, float, float]:
+
+def display_wavelengths_nm(display: str) -> Triple:
     """Return the wavelengths of red, green and blue of a display by name, or as given.
 
     Raises
@@ -40,29 +53,51 @@ def display_wavelengths_nm(display: str) -> tuple[float, float, float]:
     BadMessage
         An unknown name, or wavelengths that nobody sees.
     """
-    if display in DISPLAYS:
-        return DISPLAYS[display]
+    return DISPLAYS[display] if display in DISPLAYS else _given_nm(display)[0]
+
+
+def display_widths_nm(display: str) -> Triple:
+    """Return the standard deviations of the same; the usual ones where none is given.
+
+    Raises
+    ------
+    BadMessage
+    """
+    return WIDTHS_NM[display] if display in DISPLAYS else _given_nm(display)[1]
+
+
+def _given_nm(display: str) -> tuple[Triple, Triple]:
+    """Return wavelengths and standard deviations as given in numbers."""
     try:
-        red_nm, green_nm, blue_nm = (float(part) for part in display.split(","))
+        parts = [[float(n) for n in part.split(":")] for part in display.split(",")]
     except ValueError:
         raise _refused(display) from None
-    given_nm = (red_nm, green_nm, blue_nm)
-    if not all(LIMITS_NM[0] <= nm <= LIMITS_NM[1] for nm in given_nm):
+    if len(parts) != 3 or any(len(part) > 2 for part in parts):
         raise _refused(display)
-    return given_nm
+    usual_nm = WIDTHS_NM["common"]
+    red, green, blue = (
+        (part[0], part[1] if len(part) == 2 else width_nm)
+        for part, width_nm in zip(parts, usual_nm, strict=True)
+    )
+    low_nm, high_nm = LIMITS_NM
+    for at_nm, width_nm in (red, green, blue):
+        if not (low_nm <= at_nm <= high_nm and 0.0 <= width_nm <= MAX_WIDTH_NM):
+            raise _refused(display)
+    return (red[0], green[0], blue[0]), (red[1], green[1], blue[1])
 
 
 def _refused(display: str) -> BadMessage:
     return BadMessage(f"it is {display!r:.60}", field="display", allowed=ALLOWED)
 
 
-def wavelengths_of_spectra(
+def primaries_of_spectra(
     wavelengths_nm: ArrayLike, spectra: ArrayLike
-) -> tuple[float, float, float]:
-    """Return the wavelengths that stand best for the measured primaries of a display.
+) -> tuple[Triple, Triple]:
+    """Return what stands best for the measured primaries of a display.
 
-    The centroid of each primary's spectrum, weighted by how much of each wavelength
-    ends up in that primary again when the display's own primaries are matched to it.
+    The centroid and standard deviation of each primary's spectrum, weighted by how much
+    of each wavelength ends up in that primary again when the display's own primaries
+    are matched to it.
 
     Parameters
     ----------
@@ -70,6 +105,10 @@ def wavelengths_of_spectra(
         Evenly spaced.
     spectra : (n, 3)
         Power of red, green and blue, in any unit.
+
+    Returns
+    -------
+    wavelengths_nm, widths_nm : (red, green, blue)
 
     Raises
     ------
@@ -84,11 +123,14 @@ def wavelengths_of_spectra(
         shares = primary_shares(at_nm, power)
     except np.linalg.LinAlgError:
         raise ValueError("spectra: red, green and blue must be three colours") from None
-    own = np.stack([shares[k, k] for k in range(3)])
-    found = (own @ at_nm / own.sum(axis=1)).tolist()
-    if not all(math.isfinite(nm) for nm in found):
+    own = np.stack([shares[k, k] / shares[k, k].sum() for k in range(3)])
+    found_nm = own @ at_nm
+    variance = np.sum(own * (at_nm - found_nm[:, None]) ** 2, axis=1)
+    widths_nm = np.sqrt(np.clip(variance, 0.0, MAX_WIDTH_NM**2))
+    if not np.isfinite(found_nm).all():
         raise ValueError("spectra: red, green and blue must be three colours")
-    return found[0], found[1], found[2]
+    red, green, blue = zip(found_nm.tolist(), widths_nm.tolist(), strict=True)
+    return (red[0], green[0], blue[0]), (red[1], green[1], blue[1])
 
 
 def primary_shares(

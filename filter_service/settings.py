@@ -115,10 +115,18 @@ class FilterSettings(Record):
         str,
         _doc(
             "What shows the picture: common, lcd, oled, crt, paper, or wavelengths of "
-            "red, green and blue in nm as 620,530,455.  A command also takes a .csv of "
-            "spectra: nm, red, green, blue."
+            "red, green and blue in nm as 620,530,455, with standard deviations as "
+            "620:13,530:19,455:13.  A command also takes a .csv of spectra: nm, red, "
+            "green, blue."
         ),
     ] = "common"
+    wide_primaries: Annotated[
+        bool,
+        _doc(
+            "Two wavelengths for each primary of the display instead of one; takes "
+            "twice as long to prepare, and no longer for a frame."
+        ),
+    ] = False
     diffraction: Annotated[bool, _doc("Off: geometrical optics only.")] = True
     chromatic: Annotated[bool, _doc("Off: all colours are focused alike.")] = True
     lateral_color: Annotated[

@@ -1,10 +1,10 @@
-"""Measured spectra of a display in a file, to the wavelengths that stand for them."""
+"""Measured spectra of a display in a file, to what stands for them."""
 
 from pathlib import Path
 
 import numpy as np
 
-from filter_service.displays import wavelengths_of_spectra
+from filter_service.displays import primaries_of_spectra
 
 
 def display_of_file(name: str) -> str:
@@ -37,7 +37,10 @@ def display_of_file(name: str) -> str:
         ) from None
     if not (steps_nm.size and np.allclose(steps_nm, steps_nm[0]) and steps_nm[0] > 0):
         raise ValueError(f"--display {name}: nm must rise in even steps")
-    return ",".join(f"{nm:.1f}" for nm in wavelengths_of_spectra(*columns))
+    return ",".join(
+        f"{nm:.1f}:{width_nm:.1f}"
+        for nm, width_nm in zip(*primaries_of_spectra(*columns), strict=True)
+    )
 
 
 def _is_words(line: str) -> bool:

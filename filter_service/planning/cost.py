@@ -41,9 +41,14 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
     survey = survey_pupils(state_frames(eye, spec, states))
     texels = float(np.mean(box_texels(spec, survey)))
     cores = thread_count()
-    time_us = relative_core_time() * sum(
-        TERM_US[name] * float(np.mean(values))
-        for name, values in cost_terms(spec, survey).items()
+    per_psf = len(spec.primary_wavelengths_nm)
+    time_us = (
+        per_psf
+        * relative_core_time()
+        * sum(
+            TERM_US[name] * float(np.mean(values))
+            for name, values in cost_terms(spec, survey).items()
+        )
     )
     return {
         "psf_count": count,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.camera import Camera, is_same_camera
-from filter_service.displays import display_wavelengths_nm
+from filter_service.displays import display_wavelengths_nm, display_widths_nm
 from filter_service.planning.field_directions import (
     MAX_FIELD_DEG,
     field_range_deg,
@@ -170,6 +170,21 @@ class GridSpec:
         if not self.settings.chromatic:
             return np.full(len(self.wavelengths_nm), REFERENCE_WAVELENGTH_NM)
         return np.array(self.wavelengths_nm)
+
+    @property
+    def primary_wavelengths_nm(self) -> NDArray[np.float64]:
+        """Wavelengths (n, 3) whose PSFs, averaged, are those of the channels."""
+        middle_nm = self.channel_wavelengths_nm
+        if not (self.settings.chromatic and self.settings.wide_primaries):
+            return middle_nm[None]
+        widths_nm = np.array(display_widths_nm(self.settings.display))
+        return np.stack([middle_nm - widths_nm, middle_nm + widths_nm])
+
+    @property
+    def traced_wavelengths_nm(self) -> NDArray[np.float64]:
+        """Wavelengths (n,) at which the eye must be known, ascending."""
+        every = (self.channel_wavelengths_nm, self.primary_wavelengths_nm.ravel())
+        return np.unique(np.concatenate(every))
 
     def blur_px_per_dpt(self, pupil_diameter_mm: float) -> float:
         """Radius of the geometric blur disc on axis per dioptre of defocus, px."""

@@ -139,8 +139,9 @@ def _readers(nodes: NDArray[np.float64], range_: tuple[float, float]) -> Readers
     if len(nodes) > 1:
         return nodes, _neighbours(len(nodes)), list(range(len(nodes)))
     values = np.unique(np.append(nodes, range_))
-    every = list(range(len(values)))
-    return values, [every], [int(np.searchsorted(values, nodes[0]))]
+    # A measured wavefront has its node at rest, beside the range that is read.
+    read = np.flatnonzero((values >= range_[0]) & (values <= range_[1]))
+    return values, [read.tolist()], [int(np.searchsorted(values, nodes[0]))]
 
 
 def _neighbours(count: int) -> list[list[int]]:

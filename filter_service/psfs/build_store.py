@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from filter_service.planning.slopes import PupilStates, apodisation
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import CPU, PsfEngine
 from filter_service.psfs.store import PsfStore
+from filter_service.psfs.wide_primaries import mean_batch, states_of_primaries
 
 
 def build_psf_store(
@@ -60,53 +61,17 @@ def build_psf_store(
     if isinstance(eye, EyeProfile):
         eye = MeasuredWavefront.from_profile(eye)
     plan = plan or plan_cache(eye, spec)
-    every = np.arange(len(plan.defocus.values_dpt))
-    kernels = compute_kernels(
-        eye,
-        spec,
-        plan,
-        every,
-        engine=engine,
-        progress=progress,
-        cancelled=cancelled,
-    )
-    build_ms = 1e3 * (time.perf_counter() - started_s)
-    return store_of(spec, eye, plan, kernels, build_ms=build_ms)
-
-
-@dataclass(frozen=True)
-class ComputedKernels:
-    """Kernels of some nodes, channel fastest, in pieces one after the other."""
-
-    packed: list[PackedKernels]
-    blur_px: NDArray[np.float64]
-    methods: Counter[str]
-
-
-def compute_kernels(
-    eye: EyeOptics,
-    spec: GridSpec,
-    plan: CachePlan,
-    nodes: NDArray[np.int64],
-    *,
-    engine: PsfEngine = CPU,
-    progress: Callable[[float, str], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-) -> ComputedKernels:
-    """Compute the kernels of some nodes (n,) of a plan; see `build_psf_store`."""
     channels = RGB if spec.settings.chromatic else 1
-    psfs = (channels * nodes[:, None] + np.arange(channels)).ravel()
-    states = _states(spec, plan, channels).taken(psfs)
-    count = states.h_deg.size
-    shrink = _shrink_ratios(plan, channels)[psfs]
+    states = _states(spec, plan, channels)
+    shrink = _shrink_ratios(plan, channels)
+    count, step = states.h_deg.size, engine.batch_count
     methods: Counter[str] = Counter()
     packed, blur_px = [], []
     with ThreadPoolExecutor(thread_count()) as pool:
-        for first in range(0, count, engine.batch_count):
+        for first in range(0, count, step):
             if cancelled is not None and cancelled():
                 raise BuildCancelled("a newer profile took over")
-            end = first + engine.batch_count
-            part = slice(first, end)
+            part = slice(first, first + step)
             batch = _computed(engine, eye, spec, states.taken(part), shrink[part])
             packed.append(
                 pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool)
@@ -114,8 +79,16 @@ def compute_kernels(
             blur_px.append(batch.blur_radius_px)
             methods += _methods(batch)
             if progress is not None:
-                progress(min(1.0, end / count), "psfs")
-    return ComputedKernels(packed, np.concatenate(blur_px), methods)
+                progress(min(1.0, (first + step) / count), "psfs")
+    return _joined(
+        packed,
+        spec=spec,
+        eye=eye,
+        plan=plan,
+        blur_px=np.concatenate(blur_px),
+        methods=dict(methods),
+        build_ms=1e3 * (time.perf_counter() - started_s),
+    )
 
 
 def _states(spec: GridSpec, plan: CachePlan, channels: int) -> PupilStates:
@@ -159,12 +132,16 @@ def _computed(
     states: PupilStates,
     shrink_ratio: NDArray[np.float64],
 ) -> PsfBatch:
+    per_psf = len(spec.primary_wavelengths_nm)
+    if per_psf > 1:
+        states = states_of_primaries(eye, spec, states)
+        shrink_ratio = np.repeat(shrink_ratio, per_psf)
     found = eye.wavefronts(**vars(states))
     zernike_um = found.zernike_um * shrink_ratio[:, None]
     if spec.settings.lateral_color and spec.settings.chromatic:
         shift_mrad = lateral_shift_mrad(eye, spec, states)
         zernike_um = with_tilt(zernike_um, found.circle_diameter_mm / 2.0, shift_mrad)
-    return engine.compute(
+    batch = engine.compute(
         zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
@@ -175,6 +152,7 @@ def _computed(
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )
+    return mean_batch(batch, per_psf)
 
 
 def lateral_shift_mrad(
@@ -200,16 +178,10 @@ def _methods(batch: PsfBatch) -> Counter[str]:
     return Counter({name: number for name, number in counts.items() if number})
 
 
-def store_of(
-    spec: GridSpec,
-    eye: EyeOptics,
-    plan: CachePlan,
-    kernels: ComputedKernels,
-    *,
-    build_ms: float,
+def _joined(
+    packed: list[PackedKernels], *, spec: GridSpec, blur_px: NDArray, **fields: Any
 ) -> PsfStore:
-    """Return the store of the kernels of all nodes of a plan."""
-    packed, blur_px = kernels.packed, kernels.blur_px
+    """Return the store of all kernels of a plan, from batches one after the other."""
 
     def joined(name: str) -> NDArray:
         return np.concatenate([getattr(part, name) for part in packed])
@@ -224,8 +196,6 @@ def store_of(
     copies = 1 if spec.settings.chromatic else RGB  # channels that share a kernel
     return PsfStore(
         spec=spec,
-        eye=eye,
-        plan=plan,
         kernels=joined("weights"),
         offsets=np.repeat(offsets, copies),
         reach_px=np.repeat(joined("reach_px"), copies, axis=0),
@@ -233,7 +203,6 @@ def store_of(
         blur_px=np.repeat(blur_px, copies),
         spread_px=np.repeat(joined("spread_px"), copies),
         peak_ratio=np.repeat(joined("peak_ratio"), copies),
-        methods=dict(kernels.methods),
         max_lost_energy_ratio=float(joined("lost_energy_ratio").max()),
-        build_ms=build_ms,
+        **fields,
     )

@@ -49,7 +49,7 @@ def eye_for_spec(
         profile,
         pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
         focus_range_dpt=settings.focus_range_dpt,
-        wavelengths_nm=spec.channel_wavelengths_nm,
+        wavelengths_nm=spec.traced_wavelengths_nm,
         field_range_deg=spec.field_range_deg,
         eye_model=settings.eye_model,
         accuracy=settings.accuracy,

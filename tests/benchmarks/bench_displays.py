@@ -1,4 +1,4 @@
-"""One wavelength for each primary of a display, against its whole spectrum.
+"""One or two wavelengths for each primary of a display, against its whole spectrum.
 
     python -m tests.benchmarks.bench_displays [--json]
 
@@ -7,8 +7,8 @@ A white point, seen by an eye without other aberrations than the colour of peopl
 seen with the colour-matching functions of CIE 1931 and shown in the display's own
 primaries.  Errors are those of the picture around the point, over its brightest pixel:
 in linear light, and encoded as sRGB.  ``ms`` is what the PSFs of one state cost: a
-display of one wavelength a primary costs no more whatever the wavelengths, two cost
-twice as much.  Writes results/displays.json.
+display of one wavelength a primary costs no more whatever the wavelengths, two ("wide")
+cost twice as much.  Writes results/displays.json.
 """
 
 import argparse
@@ -25,8 +25,10 @@ from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.psf.compute import compute_psfs
 from filter_service.displays import (
     DISPLAYS,
+    display_wavelengths_nm,
+    display_widths_nm,
+    primaries_of_spectra,
     primary_shares,
-    wavelengths_of_spectra,
 )
 from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
 
@@ -76,27 +78,14 @@ def single_picture(wavelengths_nm, defocus_dpt: float) -> NDArray:
     return np.stack([psf(nm, defocus_dpt) for nm in wavelengths_nm])
 
 
-def pairs_of(at_nm: NDArray, power: NDArray) -> list[tuple[NDArray, NDArray]]:
-    """Two wavelengths and their shares for each primary: a Gauss rule of it."""
-    shares, pairs = primary_shares(at_nm, power), []
-    for k in range(3):
-        own = shares[k, k] / shares[k, k].sum()
-        middle_nm = float(own @ at_nm)
-        moments = [float(own @ (at_nm - middle_nm) ** n) for n in range(4)]
-        nodes = np.roots([1.0, -moments[3] / moments[2], -moments[2]]).real
-        first = nodes[1] / (nodes[1] - nodes[0])
-        pairs.append((middle_nm + nodes, np.array([first, 1.0 - first])))
-    return pairs
-
-
-def paired_picture(pairs, defocus_dpt: float) -> NDArray:
+def wide_picture(wavelengths_nm, widths_nm, defocus_dpt: float) -> NDArray:
     """The same with two wavelengths for each primary."""
-    return np.stack(
-        [
-            sum(w * psf(float(nm), defocus_dpt) for nm, w in zip(*pair, strict=True))
-            for pair in pairs
-        ]
+    middle_nm, width_nm = np.array(wavelengths_nm), np.array(widths_nm)
+    low, high = (
+        single_picture((middle_nm + sign * width_nm).tolist(), defocus_dpt)
+        for sign in (-1.0, 1.0)
     )
+    return 0.5 * (low + high)
 
 
 def encoded(light: NDArray) -> NDArray:
@@ -119,23 +108,30 @@ def rows() -> list[Row]:
     """Every display by every choice of wavelengths."""
     found = []
     for name, (at_nm, power) in measured_displays().items():
-        own = wavelengths_of_spectra(at_nm, power)
+        choices = {
+            n: (display_wavelengths_nm(n), display_widths_nm(n)) for n in DISPLAYS
+        }
+        choices["its own spectra"] = primaries_of_spectra(at_nm, power)
         for defocus_dpt in DEFOCUS_DPT:
             truth = true_picture(at_nm, power, defocus_dpt)
-            choices = {display: DISPLAYS[display] for display in DISPLAYS}
-            choices["its own spectra"] = tuple(round(nm, 1) for nm in own)
-            for method, wavelengths_nm in choices.items():
+            for method, (wavelengths_nm, widths_nm) in choices.items():
+                setting = ", ".join(f"{nm:.4g}" for nm in wavelengths_nm)
                 psf.cache_clear()
                 started_s = time.perf_counter()
                 ours = single_picture(wavelengths_nm, defocus_dpt)
                 time_ms = 1e3 * (time.perf_counter() - started_s)
-                setting = ", ".join(f"{nm:g}" for nm in wavelengths_nm)
                 found += _rows(method, name, setting, defocus_dpt, time_ms, ours, truth)
-            psf.cache_clear()
-            started_s = time.perf_counter()
-            ours = paired_picture(pairs_of(at_nm, power), defocus_dpt)
-            time_ms = 1e3 * (time.perf_counter() - started_s)
-            found += _rows("two each", name, "", defocus_dpt, time_ms, ours, truth)
+                setting = ", ".join(
+                    f"{nm:.4g} ± {width_nm:.3g}"
+                    for nm, width_nm in zip(wavelengths_nm, widths_nm, strict=True)
+                )
+                psf.cache_clear()
+                started_s = time.perf_counter()
+                ours = wide_picture(wavelengths_nm, widths_nm, defocus_dpt)
+                time_ms = 1e3 * (time.perf_counter() - started_s)
+                found += _rows(
+                    f"{method}, wide", name, setting, defocus_dpt, time_ms, ours, truth
+                )
     return found
 
 

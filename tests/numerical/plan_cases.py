@@ -52,7 +52,7 @@ def traced_eye(name, spec):
         tuple(pupil_nodes_mm(spec.settings.pupil_range_mm)),
         spec.settings.focus_range_dpt,
         spec.field_range_deg,
-        tuple(spec.channel_wavelengths_nm),
+        tuple(spec.traced_wavelengths_nm),
     )
 
 

@@ -7,10 +7,12 @@ from estimator.optics.units import RGB_WAVELENGTHS_NM
 from filter_service.commands.display_file import display_of_file
 from filter_service.displays import (
     DISPLAYS,
+    WIDTHS_NM,
     display_wavelengths_nm,
+    display_widths_nm,
     matching_functions,
+    primaries_of_spectra,
     primary_shares,
-    wavelengths_of_spectra,
 )
 from filter_service.errors import BadMessage
 from filter_service.settings import FilterSettings
@@ -19,6 +21,7 @@ from tests.benchmarks.bench_displays import (
     measured_displays,
     single_picture,
     true_picture,
+    wide_picture,
 )
 from tests.grid_specs import grid_spec
 
@@ -50,14 +53,15 @@ def test_all_light_of_a_primary_is_seen_as_that_primary():
 
 
 def test_narrow_primaries_are_found_where_they_are():
-    found = wavelengths_of_spectra(AT_NM, lines(638, 521, 459))
+    found, widths_nm = primaries_of_spectra(AT_NM, lines(638, 521, 459))
     assert found == pytest.approx((638, 521, 459), abs=1.0)
+    assert widths_nm == pytest.approx((4.0, 4.0, 4.0), abs=1.5)
 
 
 @pytest.mark.parametrize("spectra", [np.ones((61, 2)), np.ones((61, 3))])
 def test_spectra_that_are_no_three_colours_are_refused(spectra):
     with pytest.raises(ValueError, match="spectra"):
-        wavelengths_of_spectra(AT_NM, spectra)
+        primaries_of_spectra(AT_NM, spectra)
 
 
 def test_both_packages_mean_the_same_by_default():
@@ -67,14 +71,37 @@ def test_both_packages_mean_the_same_by_default():
 def test_a_display_is_a_name_or_three_wavelengths():
     assert display_wavelengths_nm("oled") == DISPLAYS["oled"]
     assert display_wavelengths_nm("640, 525.5,450") == (640.0, 525.5, 450.0)
-    spec = grid_spec(
-        width_px=8, height_px=8, tangents=(-0.1, 0.1, 0.1, -0.1), display="638,521,459"
-    )
+    spec = spec_of(display="638,521,459")
     assert spec.channel_wavelengths_nm == pytest.approx([638, 521, 459])
+    assert spec.primary_wavelengths_nm == pytest.approx(np.array([[638, 521, 459]]))
+
+
+def spec_of(**settings):
+    return grid_spec(
+        width_px=8, height_px=8, tangents=(-0.1, 0.1, 0.1, -0.1), **settings
+    )
+
+
+def test_a_display_may_have_widths():
+    assert display_widths_nm("oled") == WIDTHS_NM["oled"]
+    assert display_wavelengths_nm("640:9,525.5,450:0") == (640.0, 525.5, 450.0)
+    assert display_widths_nm("640:9,525.5,450:0") == (9.0, WIDTHS_NM["common"][1], 0.0)
+    spec = spec_of(display="640:9,525.5:20,450:0", wide_primaries=True)
+    assert spec.primary_wavelengths_nm == pytest.approx(
+        np.array([[631.0, 505.5, 450.0], [649.0, 545.5, 450.0]])
+    )
+    every = [450.0, 505.5, 525.5, 545.5, 631.0, 640.0, 649.0]
+    assert spec.traced_wavelengths_nm == pytest.approx(every)
+    gray = spec_of(wide_primaries=True, chromatic=False)
+    assert gray.primary_wavelengths_nm.shape == (1, 3)
 
 
 @pytest.mark.parametrize(
-    "display", ["plasma", "", "620,530", "620,530,200", "620,530,nan", "a,b,c"]
+    "display",
+    [
+        *("plasma", "", "620,530", "620,530,200", "620,530,nan", "a,b,c"),
+        *("620:99,530,450", "620:-1,530,450", "620:1:2,530,450", "620:,530,450"),
+    ],
 )
 def test_what_is_no_display_is_refused_by_name(display):
     with pytest.raises(BadMessage, match="display") as caught:
@@ -89,7 +116,7 @@ def test_one_wavelength_a_primary_stands_for_a_measured_display(name):
     own, common, paper = (
         errors_db(single_picture(wavelengths_nm, 0.0), truth)
         for wavelengths_nm in (
-            wavelengths_of_spectra(at_nm, power),
+            primaries_of_spectra(at_nm, power)[0],
             DISPLAYS["common"],
             DISPLAYS["paper"],
         )
@@ -99,13 +126,27 @@ def test_one_wavelength_a_primary_stands_for_a_measured_display(name):
     assert common[1] > paper[1] + 1.0
 
 
+@pytest.mark.parametrize("name", list(measured_displays()))
+def test_two_wavelengths_a_primary_stand_for_it_better(name):
+    at_nm, power = measured_displays()[name]
+    truth = true_picture(at_nm, power, 0.0)
+    own = errors_db(wide_picture(*primaries_of_spectra(at_nm, power), 0.0), truth)
+    common = errors_db(
+        wide_picture(DISPLAYS["common"], WIDTHS_NM["common"], 0.0), truth
+    )
+    assert own[0] > 53.0 and own[1] > 51.0
+    assert common[0] > 51.0 and common[1] > 50.0
+
+
 def test_a_command_takes_spectra_from_a_file(tmp_path):
     at_nm, power = measured_displays()["OLED (Sony)"]
     path = tmp_path / "oled.csv"
     rows = (f"{nm:g},{r},{g},{b}" for nm, (r, g, b) in zip(at_nm, power, strict=True))
     path.write_text("nm,red,green,blue\n" + "\n".join(rows) + "\n", encoding="utf-8")
-    found = display_wavelengths_nm(display_of_file(str(path)))
-    assert found == pytest.approx(wavelengths_of_spectra(at_nm, power), abs=0.06)
+    display = display_of_file(str(path))
+    expected_nm, expected_widths_nm = primaries_of_spectra(at_nm, power)
+    assert display_wavelengths_nm(display) == pytest.approx(expected_nm, abs=0.06)
+    assert display_widths_nm(display) == pytest.approx(expected_widths_nm, abs=0.06)
 
 
 @pytest.mark.parametrize(
