@@ -151,6 +151,7 @@ class Steps:
 def steps_of(eye: str, walk: Walk, state_at, seen: Seen) -> Steps:
     """Compare the pictures of two stores where one takes the place of the other."""
     renderer, steps = NativeRenderer(), Steps()
+    whole = renderer.load(_built(eye, walk, None))
     for (_, before), (share, after) in zip(
         seen.switches, seen.switches[1:], strict=False
     ):
@@ -164,7 +165,6 @@ def steps_of(eye: str, walk: Walk, state_at, seen: Seen) -> Steps:
             "pupil_diameter_mm": state["pupil_diameter_mm"] + PUPIL_STEP_MM
         }
         first, second = (renderer.load(_built(eye, walk, r)) for r in (before, after))
-        whole = renderer.load(_built(eye, walk, None))
         old, new, narrow, wide = (
             renderer.render(view, handle, **own, output="srgb8").color / 255.0
             for handle, own in (
