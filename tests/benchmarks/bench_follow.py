@@ -138,10 +138,10 @@ class Steps:
 
     @property
     def words(self) -> str:
-        """Return the largest that 1 % of the pixels exceed, of 255."""
-        return f"; 99 % change by {max(self.p99_codes):.0f} of 255" * bool(
-            self.store_db
-        )
+        """Say which change 1 % of the pixels exceed at worst."""
+        if not self.p99_codes:
+            return ""
+        return f"; 99 % change by {max(self.p99_codes):.0f} of 255"
 
     def worst_db(self, name: str) -> float:
         """Return the largest change; not a number where there is none."""
