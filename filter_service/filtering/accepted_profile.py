@@ -20,6 +20,7 @@ class PreparedStore:
     ``is_complete`` is false for a preview, which a complete store will replace.
     ``ranges`` are those of a stream that it was built for, None for all that the
     settings allow; ``failed`` are such that could not be built, with the reason.
+    ``behind`` is the complete store that a preview of more stands before.
     """
 
     camera: Camera
@@ -28,6 +29,17 @@ class PreparedStore:
     ranges: UsedRanges | None = None
     build_s: float = 0.0
     failed: dict[UsedRanges, str] = field(default_factory=dict)
+    behind: PreparedStore | None = None
+
+    @property
+    def has_complete(self) -> bool:
+        """Return whether there is more than a preview."""
+        return self.is_complete or self.behind is not None
+
+    @property
+    def loaded(self) -> list[LoadedStore]:
+        """Return what is to be freed with it."""
+        return [self.store, *(self.behind.loaded if self.behind else ())]
 
 
 @dataclass(eq=False)

@@ -198,7 +198,7 @@ class EyeFilter:
         return self._newest
 
     def advance(self) -> None:
-        """Let builds go on where no frames do; `filter` does it by itself."""
+        """Let builds go on where no frames come, or where the workshop is another's."""
         self.workshop.advance()
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
@@ -363,6 +363,8 @@ class EyeFilter:
         look_at = LookAt(pupil_diameter_mm, focus_dpt)
         self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
         plan = self._eyes.plan([view.camera for view in views], look_at)
+        if self._shared is not None:  # else its owner advances it
+            self.workshop.advance()
         self.workshop.free_retired(self._eyes)
         self.is_extending = plan is not None and prepared_only and not plan.is_prepared
         if plan is None or self.is_extending:

@@ -6,7 +6,7 @@ State only: no GL, no processes.  `workshop` acts on what it says.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from estimator.profiles.parse import EyeProfile
@@ -91,7 +91,11 @@ class StreamEyes:
         newest = self.eyes[0]
         newest.want(cameras)
         for eye in self.eyes:
-            found = [s for c in cameras if (s := eye.store_for(c)) is not None]
+            found = [
+                self._best(eye, s)
+                for c in cameras
+                if (s := eye.store_for(c)) is not None
+            ]
             if len(found) < len(cameras):
                 continue
             for camera in cameras:
@@ -146,7 +150,7 @@ class StreamEyes:
 
         A preview is not one: the profile may still fail.
         """
-        if not self.eyes or any(s.is_complete for s in self.eyes[0].stores):
+        if not self.eyes or any(s.has_complete for s in self.eyes[0].stores):
             return None
         newest = self.eyes[0]
         return newest if newest.wanted or not newest.failures else None
@@ -203,6 +207,11 @@ class StreamEyes:
         outside = not self._holds(eye, prepared)
         return Wanted(eye, prepared.camera, ranges, extends=True, with_preview=outside)
 
+    def _best(self, eye: AcceptedProfile, prepared: PreparedStore) -> PreparedStore:
+        """Return what a frame sees through: a preview only where it shows more."""
+        behind = prepared.behind
+        return behind if behind and self._holds(eye, behind) else prepared
+
     def _holds(self, eye: AcceptedProfile, prepared: PreparedStore) -> bool:
         """Return whether a store was prepared for the state of the last frame."""
         now = self.use.now
@@ -226,21 +235,29 @@ class StreamEyes:
     def put_in_place(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
         """Let frames use a loaded store; forget the camera unused for longest.
 
-        It replaces the preview of its camera.
+        It replaces the preview of its camera; a preview of more stands before what is
+        complete, until there is more that is.
         """
         if prepared.is_complete:
             eye.want_no_more(prepared.camera)
         replaced = eye.store_for(prepared.camera)
         if replaced is not None:
             eye.stores.remove(replaced)
-            self.retired.append(replaced.store)
+            if replaced.is_complete and not prepared.is_complete:
+                prepared = replace(prepared, behind=replaced)
+            else:
+                self.retired += replaced.loaded
         eye.stores.append(prepared)
         while len(eye.stores) > self.max_cameras:
-            self.retired.append(eye.stores.pop(0).store)
+            self.retired += eye.stores.pop(0).loaded
 
     def fail_extension(self, wanted: Wanted, error: FilterError) -> None:
         """Note why more of a store could not be built; what there is goes on."""
-        prepared = wanted.eye.store_for(wanted.camera)
+        eye, prepared = wanted.eye, wanted.eye.store_for(wanted.camera)
+        if prepared is not None and prepared.behind is not None:
+            eye.stores[eye.stores.index(prepared)] = prepared.behind
+            self.retired.append(prepared.store)
+            prepared = prepared.behind
         if prepared is not None and wanted.ranges is not None:
             prepared.failed[wanted.ranges] = str(error)
 
@@ -250,7 +267,7 @@ class StreamEyes:
         """Note why a build failed; a profile that never worked gives way to the old."""
         eye.want_no_more(camera)
         eye.failures.append((camera, error))
-        has_worked = any(prepared.is_complete for prepared in eye.stores)
+        has_worked = any(prepared.has_complete for prepared in eye.stores)
         if not has_worked and len(self.eyes) > 1 and eye is self.eyes[0]:
             self._retire(self.eyes.pop(0))
 
@@ -266,5 +283,6 @@ class StreamEyes:
         self.eyes = self.eyes[:1]
 
     def _retire(self, eye: AcceptedProfile) -> None:
-        self.retired += [prepared.store for prepared in eye.stores]
+        for prepared in eye.stores:
+            self.retired += prepared.loaded
         eye.stores = []

@@ -113,6 +113,7 @@ def _send(eye_filter: EyeFilter, walk: Walk, state_at, seen: Seen) -> None:
         while time.monotonic() < started_s + number / FRAMES_PER_S:
             eye_filter.advance()
             time.sleep(0.001)
+        eye_filter.advance()  # a stream that is late has no time to wait
         share = number / count
         view = walk.views[int(share * len(walk.views))]
         before_s = time.perf_counter()

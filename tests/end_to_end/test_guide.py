@@ -27,7 +27,7 @@ def test_the_examples_run_and_print_what_they_say(tmp_path):
 def test_the_page_names_every_call_and_answer():
     for name in vars(EyeFilter):
         if not name.startswith("_") and callable(getattr(EyeFilter, name)):
-            assert f"`{name}(" in GUIDE or name in ("advance",), name
+            assert f"`{name}(" in GUIDE, name
     for field in fields(Filtered):
         if field.name not in ("profile_id", "pupil_diameter_mm", "focus_dpt"):
             assert f"`{field.name}`" in GUIDE or field.name == "gaze_deg", field.name

@@ -115,9 +115,10 @@ def test_a_scene_streams_with_what_it_hides(real_service):
 
 def test_one_profile_sent_twice_and_two_views_work(real_client):
     view = edge_view()
+    settings = NARROW | {"prepare": "ranges"}  # the same again
     colors = []
     for _ in range(2):
-        real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+        real_client.set_profile(MYOPIA, settings=settings, views=[view])
         reply = real_client.filter([view, view], **SEE)
         assert len(reply.colors) == 2
         colors += reply.colors
@@ -377,6 +378,7 @@ def test_cones_weigh_the_pupil_where_that_is_asked_for(real_client, eye_model):
     settings = {
         **NARROW,
         "focus_range_dpt": (0, 0),
+        "prepare": "ranges",
         "tolerance": "loose",
         "eye_model": eye_model,
     }

@@ -13,6 +13,7 @@ from filter_service.messages import Dropped, Ready
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
 SETTINGS = {
     "mode": "dynamic",
+    "prepare": "ranges",  # whatever frames came before
     "tolerance": "loose",
     "pupil_range_mm": (3.0, 4.5),
     "focus_range_dpt": (0.0, 1.0),

@@ -60,6 +60,48 @@ def test_first_a_little_is_built_and_then_what_frames_use():
     assert stream.build() is None
 
 
+class PreviewedStream(Stream):
+    """A stream whose frames have left what is prepared; a preview stands before it."""
+
+    def __init__(self, **settings):
+        super().__init__(**settings)
+        self.build()
+        self.whole = self.eye.store_for(CAMERA)
+        self.frame(6.0, 3.0)
+        self.wanted = self.eyes.next_build()
+        self.preview = PreparedStore(CAMERA, Store(), is_complete=False)
+        self.eyes.put_in_place(self.eye, self.preview)
+
+
+def test_a_preview_of_more_shows_what_was_not_there_and_nothing_else():
+    stream = PreviewedStream()
+    assert stream.frame(6.0, 3.0).stores == (stream.preview.store,)
+    inside = stream.frame(4.0, 0.0)
+    assert inside.stores == (stream.whole.store,) and inside.is_complete
+    assert not stream.eyes.retired
+    stream.eyes.put_in_place(
+        stream.eye, PreparedStore(CAMERA, Store(), ranges=stream.wanted.ranges)
+    )
+    assert stream.eyes.retired == [stream.preview.store, stream.whole.store]
+
+
+def test_an_eye_was_ready_while_more_of_it_is_previewed():
+    stream = PreviewedStream()
+    assert stream.eyes.unfinished_eye() is None
+    stream.eyes.end()
+    assert len(stream.eyes.retired) == 2
+
+
+def test_where_more_fails_after_its_preview_the_whole_is_back():
+    stream = PreviewedStream()
+    error = GridTooLarge("too large", field="settings")
+    stream.eyes.fail_extension(stream.wanted, error)
+    assert stream.eye.store_for(CAMERA) is stream.whole
+    assert stream.eyes.retired == [stream.preview.store]
+    plan = stream.frame(6.0, 3.0)
+    assert not plan.is_complete and "too large" in plan.notes[0]
+
+
 def test_frames_on_their_way_out_are_met_and_see_no_preview():
     stream = Stream()
     stream.build()
