@@ -15,9 +15,9 @@ SETTINGS = {
     "mode": "dynamic",
     "prepare": "ranges",  # whatever frames came before
     "tolerance": "loose",
-    "pupil_range_mm": (3.0, 4.5),
-    "focus_range_dpt": (0.0, 1.0),
-    "object_range_dpt": (0.0, 1.0),
+    "pupil_range_mm": (2.5, 6.0),
+    "focus_range_dpt": (0.0, 2.0),
+    "object_range_dpt": (0.0, 2.0),
 }
 EYE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2, "age_years": 20}
 FROM_DISK = "PSFs from the disk cache"
