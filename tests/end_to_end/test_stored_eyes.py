@@ -120,5 +120,6 @@ def test_a_damaged_file_costs_a_build_and_a_word(built, folder, view):
     ):
         ready = client.set_profile(EYE, settings=SETTINGS, views=[view])
         assert FROM_DISK not in ready.notes
-        np.testing.assert_array_equal(client.filter(view, **SEE).color, last.color)
+        again = client.filter(view, **SEE).color  # built anew: equal to rounding
+        np.testing.assert_allclose(again, last.color, atol=1e-5)
         assert "is removed" in service.log
