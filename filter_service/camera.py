@@ -98,7 +98,7 @@ class Camera(Record):
         return cls(width_px, height_px, tangents)
 
     @property
-    def corner_stretch(self) -> float:
+    def corner_distance_ratio(self) -> float:
         """Distance from the eye to the farthest corner, per unit of planar depth."""
         left, right, up, down = self.tangents
         across, along = max(abs(left), abs(right)), max(abs(up), abs(down))

@@ -20,6 +20,8 @@ MAX_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
 MAX_RENDER_TOLERANCE = 8.0
 MAX_PLANES = 4
+PLANE_ROOM_DPT = 0.005
+"""A plane is taken as so thick to both sides: a tenth of a pixel of blur at most."""
 MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 
 PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]

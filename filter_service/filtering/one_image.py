@@ -89,7 +89,7 @@ def image_spec(
             pupil_range_mm=(pupil_diameter_mm, pupil_diameter_mm),
             focus_range_dpt=(focus_dpt, focus_dpt),
             object_range_dpt=object_range_dpt(view),
-            object_planes_dpt=planes_of_view_dpt(view),
+            object_planes_dpt=planes_of_view_dpt(view, step_px=1),
             **settings,
         ),
         kept_energy_ratio=KEPT_ENERGY_RATIO,

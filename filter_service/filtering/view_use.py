@@ -11,17 +11,14 @@ from filter_service.building.jobs import LookAt
 from filter_service.building.used_ranges import Range
 from filter_service.filtering.stream_use import FrameUse
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import MAX_PLANES, MAX_VERGENCE_DPT
+from filter_service.settings import MAX_PLANES, MAX_VERGENCE_DPT, PLANE_ROOM_DPT
 
 STEP_PX = 8
 """Every so many pixels of a view are looked at: a thing so small is blurred by what it
 stands before."""
 
-PLANES_STEP_PX = 2
+PLANES_STEP_PX = 4
 """The same, where there seem to be planes and nothing else."""
-
-PLANE_STEP_DPT = 0.005
-"""Planes closer together are one: a tenth of a pixel of blur at most."""
 
 FIRST_LOOK_COUNT = 64
 """So many depths are looked at first, and most often show more than a few planes."""
@@ -42,28 +39,38 @@ def frame_use(views: Sequence[RgbdView], look_at: LookAt, *, at_s: float) -> Fra
     )
 
 
-def planes_of_view_dpt(view: RgbdView) -> tuple[float, ...]:
-    """Planes of a view that has a few and nothing else; missing depth aside."""
+def planes_of_view_dpt(
+    view: RgbdView, *, step_px: int = PLANES_STEP_PX
+) -> tuple[float, ...]:
+    """Planes of a view that has a few and nothing else, ascending; else none.
+
+    Missing depth aside.
+
+    Parameters
+    ----------
+    step_px : int
+        Every so many pixels are looked at.
+    """
     if view.depth_kind != "planar":
         return ()
     few_m = _valid_depths_m(view, step_px=STEP_PX)
     few_m = few_m[:: max(few_m.size // FIRST_LOOK_COUNT, 1)]
     if not _plane_steps(few_m):
         return ()
-    steps = _plane_steps(_valid_depths_m(view, step_px=PLANES_STEP_PX))
-    return tuple(PLANE_STEP_DPT * step for step in sorted(steps))
+    steps = _plane_steps(_valid_depths_m(view, step_px=step_px))
+    return tuple(PLANE_ROOM_DPT * step for step in sorted(steps))
 
 
 def _plane_steps(depths_m: NDArray[np.float32]) -> list[float]:
-    """Planes on which planar depths (n,) lie, in steps of `PLANE_STEP_DPT`.
+    """Planes on which planar depths (n,) lie, in steps of `PLANE_ROOM_DPT`.
 
     None where there are more than a few.
     """
     with np.errstate(divide="ignore"):
-        left = 1.0 / (PLANE_STEP_DPT * depths_m)
+        left = 1.0 / (PLANE_ROOM_DPT * depths_m)
     found: list[float] = []
     while left.size:
-        if len(found) == MAX_PLANES or left[0] * PLANE_STEP_DPT > MAX_VERGENCE_DPT:
+        if len(found) == MAX_PLANES or left[0] * PLANE_ROOM_DPT > MAX_VERGENCE_DPT:
             return []
         found.append(float(np.rint(left[0])))
         left = left[np.abs(left - found[-1]) > 1.0]
@@ -83,7 +90,7 @@ def _object_range_dpt(view: RgbdView) -> Range:
     valid_m = _valid_depths_m(view, step_px=STEP_PX)
     if valid_m.size == 0:
         return 0.0, 0.0
-    stretch = view.camera.corner_stretch if view.depth_kind == "planar" else 1.0
+    stretch = view.camera.corner_distance_ratio if view.depth_kind == "planar" else 1.0
     with np.errstate(divide="ignore"):
         far_dpt = 1.0 / (float(valid_m.max()) * stretch)
         near_dpt = float(1.0 / valid_m.min())

@@ -24,7 +24,7 @@ from filter_service.planning.field_directions import (
     nearest_inside_deg,
     pixel_from_mrad,
 )
-from filter_service.settings import DEFAULTS, FilterSettings
+from filter_service.settings import DEFAULTS, PLANE_ROOM_DPT, FilterSettings
 
 GREEN = 1
 """Channel that the others are compared with, and that lateral colour leaves."""
@@ -199,8 +199,14 @@ class GridSpec:
         planes_dpt = self.settings.object_planes_dpt
         if not planes_dpt:
             return [self.settings.object_range_dpt]
-        ratio = 1.0 / self.camera.corner_stretch
-        return [(ratio * plane_dpt, plane_dpt) for plane_dpt in planes_dpt]
+        corner_ratio = self.camera.corner_distance_ratio
+        return [
+            (
+                max(plane_dpt - PLANE_ROOM_DPT, 0.0) / corner_ratio,
+                plane_dpt + PLANE_ROOM_DPT,
+            )
+            for plane_dpt in planes_dpt
+        ]
 
     @property
     def object_range_dpt(self) -> tuple[float, float]:

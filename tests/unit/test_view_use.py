@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from filter_service.building.jobs import LookAt
-from filter_service.filtering.view_use import (
-    PLANE_STEP_DPT,
-    frame_use,
-    planes_of_view_dpt,
-)
+from filter_service.filtering.one_image import image_spec
+from filter_service.filtering.view_use import frame_use, planes_of_view_dpt
 from filter_service.rgbd_view import RgbdView
+from filter_service.settings import PLANE_ROOM_DPT
 
 TANGENTS = (-0.6, 0.6, 0.4, -0.4)
 
@@ -48,16 +46,35 @@ def test_planes_are_found(depths_m, expected_dpt):
 def test_depth_that_wavers_by_less_than_blur_shows_is_a_plane(rng):
     depth_m = planes(0.5) * (1.0 + 1e-3 * rng.uniform(-1.0, 1.0, (80, 120)))
     assert planes_of_view_dpt(view(depth_m)) == pytest.approx((2.0,), abs=2e-3)
-    slope_m = 1.0 / np.linspace(1.0, 1.0 + 20 * PLANE_STEP_DPT, 120)
+    slope_m = 1.0 / np.linspace(1.0, 1.0 + 20 * PLANE_ROOM_DPT, 120)
     assert planes_of_view_dpt(view(np.tile(slope_m, (80, 1)))) == ()
 
 
 def test_a_small_thing_before_a_plane_is_seen_and_distance_from_the_eye_is_none():
     depth_m = planes(2.0)
-    depth_m[40:43, 61:64] = np.linspace(0.4, 0.6, 9).reshape(3, 3)
+    depth_m[40:44, 61:65] = np.linspace(0.4, 0.6, 16).reshape(4, 4)
     found = planes_of_view_dpt(view(depth_m))
     assert len(found) != 1  # not the wall alone
     assert planes_of_view_dpt(view(planes(2.0), "radial")) == ()
+
+
+@pytest.mark.parametrize("depth_m", [0.4, 0.4095, 0.41, 2.03, 7.7])
+def test_all_of_a_plane_lies_within_its_range(depth_m):
+    one = view(planes(depth_m))
+    spec = image_spec(one, pupil_diameter_mm=4.0, focus_dpt=1.0)
+    assert len(spec.settings.object_planes_dpt) == 1
+    ((low_dpt, high_dpt),) = spec.object_ranges_dpt
+    nearest_dpt = 1.0 / float(one.depth_m[0, 0])
+    assert low_dpt <= nearest_dpt / spec.camera.corner_distance_ratio
+    assert nearest_dpt <= high_dpt
+
+
+def test_one_pixel_at_another_distance_counts_in_an_image():
+    depth_m = planes(2.0)
+    depth_m[41, 63] = 1.0
+    assert planes_of_view_dpt(view(depth_m)) == (0.5,)
+    spec = image_spec(view(depth_m), pupil_diameter_mm=4.0, focus_dpt=1.0)
+    assert spec.settings.object_planes_dpt == (0.5, 1.0)
 
 
 def test_what_is_hidden_counts():
