@@ -140,6 +140,18 @@ def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, 
     assert failed.eye.generation == 1
 
 
+def test_frames_that_never_wait_are_enough_to_prepare_an_eye():
+    """Nobody else lets the build go on where a filter has a workshop of its own."""
+    camera = Camera.from_fov(20.0, width_px=16, height_px=8)
+    settings = FilterSettings(mode="on-axis", eye_model="wavefront")
+    view, end_s = RgbdView(COLOR, DEPTH_M, camera.tangents), time.monotonic() + 60.0
+    with EyeFilter("myopia", camera, settings, engine="native") as eye_filter:
+        while (seen := eye_filter.try_filter([view], **SEE)) is None:
+            assert time.monotonic() < end_s, "the eye was never ready"
+            time.sleep(0.01)
+    assert seen.color.shape == COLOR.shape
+
+
 def test_a_new_eye_keeps_the_settings_unless_told_others(workshop):
     own = FilterSettings(mode="on-axis")
     with EyeFilter(None, CAMERA, own, workshop=workshop) as made:
