@@ -16,7 +16,8 @@ from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import OFFSET_SLICE, EyeParameters, column
 from estimator.optics.surfaces import pack_eye
 from estimator.optics.zernike import N_TERMS, zernike_gradient
-from estimator.wavefront.aberrations import FieldResults, eyes_aberrations
+from estimator.wavefront.aberrations import eyes_aberrations
+from estimator.wavefront.results import FieldResults
 from training.tasks import N_EYE, media_indices_of
 
 CIRCLE, LENS, SLIP, STRETCH = (

@@ -1,6 +1,7 @@
 """Wavefronts of a stack of surfaces, traced from the retina outwards.
 
 aberrations        coefficients at any field, pupil and wavelength; many eyes at once
+results            what is known of wavefronts and their pupils
 circle             on axis, on a given circle outside the eye, filled whatever the stop
 bundle             one bundle of rays aimed at the stop and followed out
 kernels            compiled steps of aiming and of optical paths

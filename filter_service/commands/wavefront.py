@@ -17,7 +17,7 @@ from filter_service.commands.console import (
 
 if TYPE_CHECKING:
     from estimator.optics.surfaces import EyeSurfaces
-    from estimator.wavefront.aberrations import Aberrations, PupilEllipse
+    from estimator.wavefront.results import Aberrations, PupilEllipse
 
 PUPIL_LIMITS_MM = (0.05, 12.0)
 WAVELENGTH_LIMITS_NM = (365.0, 1014.0)

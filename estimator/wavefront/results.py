@@ -1,0 +1,108 @@
+"""What is known of wavefronts and of the pupils that they fill."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.optics.raytrace import STATUS_WORDS, RayStatus
+from estimator.optics.zernike import N_TERMS
+from estimator.wavefront import bundle
+from estimator.wavefront.fit import N_ELLIPSE
+
+
+@dataclass(frozen=True)
+class PupilEllipse:
+    """Least-squares ellipse of the projected pupil's rim, chief ray at the origin.
+
+    ``major_axis_deg`` counts from +x towards +y, 0 to 180.
+    """
+
+    centre_x_mm: float
+    centre_y_mm: float
+    semi_major_mm: float
+    semi_minor_mm: float
+    major_axis_deg: float
+
+    @property
+    def axis_ratio(self) -> float:
+        """Minor over major semi-axis."""
+        return self.semi_minor_mm / self.semi_major_mm
+
+
+@dataclass(frozen=True)
+class FieldResults:
+    """Results of many evaluations, as arrays with common leading axes.
+
+    Attributes
+    ----------
+    zernike_um : (..., 28)
+        OSA coefficients, piston zero; nan where the chief ray fails.
+    zernike_radius_mm : (...)
+        Largest distance of the pupil's rim from the chief ray.
+    ellipse_mm : (..., 5)
+        Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad).
+    rms_residual_um : (...)
+        Of W against the fit.
+    open_ratio : (...)
+        Share of the stop's area that light passes; below 1 the pupil is vignetted.
+    chief_status_index, worst_status_index : (...) int
+        `RayStatus` of the chief ray, and the worst of all rays.
+    retinal_point_mm : (..., 3)
+        Where the chief ray meets the retina.
+    pupil_point_mm : (..., 3)
+        Where it meets the cornea, or the plane of the entrance pupil: origin of the
+        plane of the wavefront.
+    """
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    ellipse_mm: NDArray[np.float64]
+    rms_residual_um: NDArray[np.float64]
+    open_ratio: NDArray[np.float64]
+    chief_status_index: NDArray[np.int64]
+    worst_status_index: NDArray[np.int64]
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    @classmethod
+    def from_rows(cls, rows: NDArray) -> "FieldResults":
+        """Take apart the rows (..., N_RESULT) that the compiled code wrote."""
+        ellipse, retina, plane = bundle.ELLIPSE, bundle.RETINA_POINT, bundle.PLANE_POINT
+        return cls(
+            zernike_um=rows[..., :N_TERMS],
+            zernike_radius_mm=rows[..., bundle.RADIUS],
+            ellipse_mm=rows[..., ellipse : ellipse + N_ELLIPSE],
+            rms_residual_um=rows[..., bundle.RMS],
+            open_ratio=rows[..., bundle.OPEN_SHARE],
+            chief_status_index=rows[..., bundle.CHIEF_STATUS].astype(np.int64),
+            worst_status_index=rows[..., bundle.WORST_STATUS].astype(np.int64),
+            retinal_point_mm=rows[..., retina : retina + 3],
+            pupil_point_mm=rows[..., plane : plane + 3],
+        )
+
+
+@dataclass(frozen=True)
+class Aberrations:
+    """Aberrations of one eye, field, wavelength and stop; arrays as in FieldResults."""
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: float
+    pupil_ellipse: PupilEllipse
+    rms_residual_um: float
+    stop_diameter_mm: float
+    open_ratio: float
+    chief_status: RayStatus
+    worst_status: RayStatus
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say in words what did not go through; empty for a whole pupil."""
+        if self.chief_status != RayStatus.TRACED:
+            return (f"no chief ray: {STATUS_WORDS[self.chief_status]}",)
+        if self.worst_status != RayStatus.TRACED:
+            reason = STATUS_WORDS[self.worst_status]
+            return (f"vignetted to {self.open_ratio:.1%} of the stop ({reason})",)
+        return ()
