@@ -30,7 +30,7 @@ from filter_service.displays import (
     primaries_of_spectra,
     primary_shares,
 )
-from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
+from tests.benchmarks.harness import Row, memory_mb, publish
 
 SPECTRA = Path(__file__).parents[1] / "data" / "display_spectra.json"
 PITCH_MRAD = 0.29
@@ -154,12 +154,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print the report alone")
     options = parser.parse_args()
     found = rows()
-    content = report(found)
-    write_report("displays", content)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(found)
+    publish("displays", found, as_json=options.json, is_whole=True)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ results/focus.json.
 """
 
 import argparse
-import json
 import time
 
 import numpy as np
@@ -30,7 +29,7 @@ from estimator.optics.units import RGB_WAVELENGTHS_NM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile, parse_profile, preset_names
 from tests.benchmarks.forward_rays import WAVELENGTH_NM, ForwardEye
-from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
+from tests.benchmarks.harness import Row, memory_mb, publish
 
 PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
 FOCI_DPT = (0.0, 1.5, 3.0, 4.5, 6.0)
@@ -164,13 +163,7 @@ def main() -> None:
         rows += focus_rows(name, profile, with_visual=not options.quick)
         rows += far_point_rows(name, profile)
     rows = summary_rows(rows) + rows
-    content = report(rows)
-    if not options.quick:
-        write_report("focus", content)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
+    publish("focus", rows, as_json=options.json, is_whole=not options.quick)
 
 
 if __name__ == "__main__":

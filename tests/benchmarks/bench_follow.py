@@ -13,7 +13,6 @@ same frames: less than a breath does.  Writes results/follow.json.
 """
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Callable
@@ -33,7 +32,7 @@ from filter_service.filtering.filtered import EyeReady
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.native.renderer import NativeRenderer
 from filter_service.settings import FilterSettings
-from tests.benchmarks.harness import Row, memory_mb, print_rows, report, write_report
+from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.live_walk import Judge, Walk
 
 EYES = ("emmetropia", "myopia", "keratoconus")
@@ -260,13 +259,7 @@ def main() -> None:
         walk = Walk.of(size_px, COUNT)
         for eye in eyes:
             rows += _rows(eye, size_px, walk, judged=size_px == CASES[0][0])
-    content = report(rows)
-    if not options.quick:
-        write_report("follow", content)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
+    publish("follow", rows, as_json=options.json, is_whole=not options.quick)
 
 
 if __name__ == "__main__":

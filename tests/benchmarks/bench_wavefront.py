@@ -8,7 +8,6 @@ or positions after tracing in and out again.
 """
 
 import argparse
-import json
 
 import numpy as np
 
@@ -27,10 +26,8 @@ from estimator.wavefront.nodes import N_AZIMUTHS, N_REFERENCE_RINGS, N_RINGS
 from tests.benchmarks.harness import (
     Row,
     memory_mb,
-    print_rows,
-    report,
+    publish,
     time_calls,
-    write_report,
 )
 from tests.numerical.schematic_eyes import irregular_eye, navarro, reference
 
@@ -247,13 +244,7 @@ def main():
     parser.add_argument("--json", action="store_true", help="print JSON only")
     options = parser.parse_args()
     rows = measure(options.quick)
-    content = report(rows)
-    if not options.quick:
-        write_report("wavefront", content)
-    if options.json:
-        print(json.dumps(content))
-    else:
-        print_rows(rows)
+    publish("wavefront", rows, as_json=options.json, is_whole=not options.quick)
 
 
 if __name__ == "__main__":

@@ -112,13 +112,24 @@ def write_report(name: str, content: dict) -> Path:
     return path
 
 
+def publish(name: str, rows: list[Row], *, as_json: bool, is_whole: bool) -> None:
+    """Print rows as a table or as JSON, and write those of a whole run."""
+    content = report(rows)
+    if is_whole:
+        write_report(name, content)
+    if as_json:
+        print(json.dumps(content))
+    else:
+        print_rows(rows)
+
+
 def print_rows(rows: list[Row]) -> None:
     """Readable table of rows."""
     header = ("method", "case", "setting", "n", "ms", "p95", "error", "value")
-    print("{:<18}{:<14}{:<26}{:>5}{:>9}{:>9}  {:<14}{:>10}".format(*header))
+    print("{:<18} {:<14} {:<26}{:>5}{:>9}{:>9}  {:<14}{:>10}".format(*header))
     for row in rows:
         print(
-            f"{row.method:<18}{row.case:<14}{row.setting:<26}{row.n:>5}"
+            f"{row.method:<18} {row.case:<14} {row.setting:<26}{row.n:>5}"
             f"{row.median_ms:>9.3f}{row.p95_ms:>9.3f}  {row.error_name:<14}"
             f"{row.error:>10.4g}"
         )
