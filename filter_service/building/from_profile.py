@@ -40,9 +40,9 @@ Progress = Callable[[float, str], None]
 EYES_KEPT = 2
 """A stream comes back for other parts of its eye."""
 
-KnownEye = tuple[EyeOptics, tuple[str, ...]]
+_KnownEye = tuple[EyeOptics, tuple[str, ...]]
 
-_eyes: OrderedDict[str, KnownEye] = OrderedDict()
+_eyes: OrderedDict[str, _KnownEye] = OrderedDict()
 
 
 def grid_spec(job: BuildJob, *, whole: bool = False) -> GridSpec:
@@ -89,7 +89,7 @@ def build(
 
 def _known_eye(
     job: BuildJob, *, progress: Progress, cancelled: Callable[[], bool]
-) -> KnownEye:
+) -> _KnownEye:
     """Return the eye of a job and notes, made once for all parts of its ranges."""
     whole = grid_spec(job, whole=True)
     key = store_key(job.profile, whole)

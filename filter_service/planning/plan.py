@@ -7,6 +7,7 @@ reach, at the two neighbouring nodes of pupil and accommodation; only that is pl
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.axis_nodes import (
@@ -91,19 +92,9 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
         to change.
     """
     plan = unchecked_plan(eye, spec)
-    check_budget(eye, spec, plan)
-    return plan
-
-
-def check_budget(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> None:
-    """Refuse a plan whose kernels would exceed ``spec.memory_budget_mb``.
-
-    Raises
-    ------
-    PlanTooLarge
-    """
     if plan.prediction.memory_mb > spec.memory_budget_mb:
         raise PlanTooLarge(spec, plan.prediction, _advice(eye, spec))
+    return plan
 
 
 def unchecked_plan(
@@ -208,31 +199,33 @@ def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> DefocusN
     exact_dpt = joined_ranges(found.beside_shift_dpt)
     is_exact = np.array([np.ptp(ranges_dpt) < EXACT_DPT for ranges_dpt in exact_dpt])
     nodes = [
-        ranges_dpt[:1, 0]
-        if exact
-        else np.unique(
-            np.concatenate(
-                [
-                    defocus_nodes_dpt(
-                        *range_dpt,
-                        blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
-                        max_blur_step_px=spec.max_blur_step_px,
-                    )
-                    for range_dpt in wide_dpt.tolist()
-                ]
-            )
-        )
-        for pupil_mm, exact, ranges_dpt, wide_dpt in zip(
-            pupils_mm.tolist(),
+        own_dpt[:1, 0] if exact else _nodes_by_blur(spec, pupil_mm, ranges_dpt)
+        for exact, own_dpt, ranges_dpt, pupil_mm in zip(
             is_exact,
             exact_dpt,
             joined_ranges(found.of_any_channel_dpt),
+            pupils_mm.tolist(),
             strict=True,
         )
     ]
     return DefocusNodes.unlimited(
         RaggedNodes.of(nodes), np.where(is_exact[:, None], found.shift_dpt, 0.0)
     )
+
+
+def _nodes_by_blur(
+    spec: GridSpec, pupil_mm: float, ranges_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Nodes over ranges (n, 2) of total defocus."""
+    pieces = [
+        defocus_nodes_dpt(
+            *range_dpt,
+            blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
+            max_blur_step_px=spec.max_blur_step_px,
+        )
+        for range_dpt in ranges_dpt.tolist()
+    ]
+    return np.unique(np.concatenate(pieces))
 
 
 def _field_defocus(
