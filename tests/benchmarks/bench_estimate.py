@@ -16,7 +16,7 @@ import numpy as np
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.parameters import random_vectors
-from estimator.eye.tracing import zernike_of_vectors
+from estimator.eye.tracing import seen_refraction_of_vectors, zernike_of_vectors
 from estimator.profiles.parse import preset_names
 from tests.benchmarks.eye_ways import (
     ERROR_NAME,
@@ -127,13 +127,11 @@ def focus_rows(repeats: int) -> list[Row]:
             return made.focused_at(FOCUSES_DPT)
 
         states = eye.focused_at(FOCUSES_DPT)
-        refractions_dpt = [
-            AccommodatingEye(s.parameters, pupil_diameter_mm=4.0).refraction_dpt
-            for s in states
-        ]
-        error_dpt = max(
-            abs(m + s.focus_dpt) for m, s in zip(refractions_dpt, states, strict=True)
+        refractions_dpt = seen_refraction_of_vectors(
+            np.stack([s.parameters.to_vector() for s in states]), pupil_diameter_mm=4.0
         )
+        focuses_dpt = np.array([s.focus_dpt for s in states])
+        error_dpt = float(np.abs(refractions_dpt + focuses_dpt).max())
         times_ms = time_calls(focus_all, repeats=repeats)
         setting = f"{len(FOCUSES_DPT)} focus states"
         rows.append(
