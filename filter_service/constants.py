@@ -36,6 +36,31 @@ TOTAL_WORDS = 4
 """Words behind the bins' offsets: entries of all lists, the same as a float, entries
 that were not kept, length of the longest list."""
 
+STAT_MISSING = 0
+STAT_CLAMPED = 1
+STAT_BAD_COLOR = 2
+STAT_FRAGMENTS = 3
+STAT_MERGED = 4
+STAT_WORDS = 8
+STAT_LANES = 32
+"""What passes count of a frame: pixels without depth, at a distance that was not
+prepared, without a finite colour; fragments, and pixels merged.  In several rows, for
+work groups that all add to one word wait for each other."""
+
+DISPATCH_SCATTER = 0
+DISPATCH_SORT = 1
+DISPATCH_SPLAT = 4
+DISPATCH_COUNT = 5
+DISPATCH_BYTES = 16
+"""Dispatches whose size a pass decides: the scatter, a sort for each of three size
+classes, the splat; each is groups along three axes, and a word that is not used."""
+
+ENTRIES_EXACT = 2.0**31
+"""Sums of list lengths below this hold in a word."""
+
+FLOAT_INFINITY_BITS = 0x7F800000
+"""Of a 32-bit float; larger ones, without the sign, are no numbers."""
+
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS
 """Buckets of one sorting pass; with a group of 64 they fill 4 KiB of shared memory."""
@@ -47,7 +72,9 @@ distance, whose rule weighs every pair by its order, the float's own steps, 2**2
 most.  Equal keys keep the order of the list, which is scan order."""
 
 SORT_INDEX_BITS = 12
-SORT_CAPACITIES = (512, 2048)
+SORT_SMALL = 512
+SORT_LARGE = 2048
+SORT_CAPACITIES = (SORT_SMALL, SORT_LARGE)
 """Size classes of the sort: lists up to these lengths are sorted in shared memory, 4
 and 16 KiB, as words of depth and place in the list; longer ones through memory."""
 
@@ -204,8 +231,11 @@ BINDINGS = {
     "BINDING_LAYER_DPT": 13,
     "BINDING_USED": 14,
     "BINDING_COLOR_OUT": 15,
-    # The passes that make lists have no use for the input's colour.
+    # The passes that make lists have no use for the input's colour, those before them
+    # none for the output's, and the sum of the lists none for fragments.
     "BINDING_WINDOWS": 0,
+    "BINDING_STATS": 15,
+    "BINDING_DISPATCHES": 5,
     # The passes that build PSFs share no dispatch with those of a frame; core OpenGL
     # promises eight bindings.
     "BINDING_PSF_RECORDS": 0,

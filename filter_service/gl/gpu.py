@@ -11,6 +11,7 @@ from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
 from filter_service.gl.hardware import is_software_renderer
 from filter_service.gl.shader_source import legend, load_shader
+from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_storage
 
 Buffer = moderngl.Buffer
 Pages = moderngl.TextureArray
@@ -55,6 +56,19 @@ class Gpu:
         self._buffers: dict[str, moderngl.Buffer] = {}
         self._programs: dict[tuple, moderngl.ComputeShader] = {}
         self._atlases: dict[str, moderngl.Texture] = {}
+        self._uniforms: dict[moderngl.ComputeShader, dict] = {}
+        self._queries: list[moderngl.Query] = []
+        # On a software renderer all memory is the host's: a copy more gains nothing.
+        self.use_staging(not self.is_software)
+
+    def use_staging(self, wanted: bool) -> None:
+        """Send and fetch through mapped memory, where the driver has it, or not."""
+        calls = gl_calls() if wanted and has_buffer_storage(self.context) else None
+        self._staging = (
+            None
+            if calls is None
+            else {way: Staging(self.context, calls) for way in ("to", "from")}
+        )
 
     def close(self) -> None:
         """Free everything; the object is of no use afterwards."""
@@ -65,6 +79,8 @@ class Gpu:
             atlas.release()
         self._atlases.clear()
         self._programs.clear()
+        for block in (self._staging or {}).values():
+            block.release()
         self.context.release()
 
     # ----- buffers
@@ -91,7 +107,7 @@ class Gpu:
             del self._buffers[name]
         try:
             created = self.context.buffer(
-                reserve=min(wanted, self.max_block_bytes), dynamic=True
+                reserve=min(wanted, self.max_block_bytes)
             )
         except moderngl.Error as error:
             raise OutOfGpuMemory(
@@ -105,11 +121,22 @@ class Gpu:
         buffer = self.storage(name, sum(data.nbytes for data in arrays))
         start = 0
         for data in arrays:
-            if data.nbytes:
-                words = np.ascontiguousarray(data).reshape(-1).view(np.uint8)
-                buffer.write(words, offset=start)
+            self.write(buffer, data, offset=start)
             start += data.nbytes
         return buffer
+
+    def write(self, buffer: moderngl.Buffer, data: NDArray, *, offset: int = 0) -> None:
+        """Copy an array into a buffer."""
+        if not data.nbytes:
+            return
+        words = np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+        if self._staging is None:
+            buffer.write(words, offset=offset)
+            return
+        block = self._staging["to"]
+        start, free = block.take(words.size)
+        free[:] = words
+        block.copy_to(buffer, start, offset, words.size)
 
     def pages(self, n_words: int) -> Pages:
         """Texture array of 16-bit words for data that outlives a frame.
@@ -176,11 +203,31 @@ class Gpu:
         return atlas
 
     def read(self, buffer: moderngl.Buffer, shape: tuple, dtype) -> NDArray:
-        """Read the start of a buffer as an array."""
+        """Read the start of a buffer as an array; waits for the GPU."""
         out = np.empty(shape, dtype=dtype)
-        if out.nbytes:
-            buffer.read_into(out.reshape(-1).view(np.uint8), size=out.nbytes)
+        self.read_into((buffer, 0, out))
         return out
+
+    def read_into(self, *parts: tuple[moderngl.Buffer, int, NDArray]) -> None:
+        """Fill arrays from buffers, each from a byte on; waits for the GPU once."""
+        parts = tuple(part for part in parts if part[2].nbytes)
+        if self._staging is None:
+            for buffer, offset, out in parts:
+                buffer.read_into(_bytes_of(out), size=out.nbytes, offset=offset)
+            return
+        block = self._staging["from"]
+        room = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
+        first, free = block.take(room)
+        starts, start = [], 0
+        for buffer, offset, out in parts:
+            block.copy_from(buffer, offset, first + start, out.nbytes)
+            starts.append(start)
+            start += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
+        self.context.finish()
+        for (_, _, out), start in zip(parts, starts, strict=True):
+            _bytes_of(out)[:] = free[start : start + out.nbytes]
+        for block in self._staging.values():
+            block.reset()  # nothing waits any more
 
     @property
     def memory_mb(self) -> float:
@@ -217,6 +264,7 @@ class Gpu:
         defines: dict | None = None,
         images: dict[str, moderngl.Texture] | None = None,
         textures: dict[str, moderngl.Texture | Pages] | None = None,
+        indirect: tuple[moderngl.Buffer, int] | None = None,
     ) -> None:
         """Run a pass and order its writes before what follows.
 
@@ -231,21 +279,42 @@ class Gpu:
             Variant of the pass.
         images, textures : dict, optional
             Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture.
+        indirect : (buffer, byte), optional
+            Where on the GPU the groups stand; ``groups`` are not looked at.
         """
         program = self.program(name, **(defines or {}))
         for binding, buffer in buffers.items():
             buffer.bind_to_storage_buffer(constants.BINDINGS[f"BINDING_{binding}"])
-        for key, value in (uniforms or {}).items():
-            member = program.get(key, None)
-            if member is not None:
-                member.value = value
+        self._set_uniforms(program, uniforms or {})
         for name_of, image in (images or {}).items():
             unit = getattr(constants, f"IMAGE_{name_of}")
             image.bind_to_image(unit, read=True, write=True)
         for name_of, texture in (textures or {}).items():
             texture.use(getattr(constants, f"TEXTURE_{name_of}"))
-        program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
+        if indirect is not None:
+            program.run_indirect(*indirect)
+        else:
+            program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
         self.context.memory_barrier()
+
+    def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
+        """Set those that differ from the last dispatch's: each is a driver call."""
+        known = self._uniforms.setdefault(program, {})
+        for key, value in uniforms.items():
+            if key in known and known[key] == value:
+                continue
+            known[key] = value
+            member = program.get(key, None)
+            if member is not None:
+                member.value = value
+
+    def take_query(self) -> moderngl.Query:
+        """Return a timer that is not in use; see `give_queries`."""
+        return self._queries.pop() if self._queries else self.context.query(time=True)
+
+    def give_queries(self, queries: list[moderngl.Query]) -> None:
+        """Take timers back: none is ever freed, so each is used again."""
+        self._queries += queries
 
     def check(self, where: str) -> None:
         """Raise if OpenGL has noted an error since the last look."""
@@ -254,6 +323,10 @@ class Gpu:
             raise OutOfGpuMemory(f"{where}: {error}")
         if error != "GL_NO_ERROR":
             raise RenderFailed(f"{where}: {error}")
+
+
+def _bytes_of(array: NDArray) -> NDArray[np.uint8]:
+    return array.reshape(-1).view(np.uint8)
 
 
 class StageTimer:
@@ -275,7 +348,7 @@ class StageTimer:
                 yield
                 self._gpu.context.finish()
             return
-        query = self._gpu.context.query(time=True)
+        query = self._gpu.take_query()
         with query:
             yield
         self._queries.append((name, query))
@@ -292,5 +365,6 @@ class StageTimer:
         """Return times by stage; waits for the GPU."""
         for name, query in self._queries:
             self._ms[name] = self._ms.get(name, 0.0) + query.elapsed / 1e6
+        self._gpu.give_queries([query for _, query in self._queries])
         self._queries.clear()
         return dict(self._ms)

@@ -43,8 +43,9 @@ class PsfPasses:
         self, start: int, kernel: NDArray, *, slot: int, light_ratio: float
     ) -> None:
         """Write a kernel that was computed elsewhere, and its light."""
-        self.kernels.write(kernel.tobytes(), offset=4 * start)
-        self.totals.write(np.float32(light_ratio).tobytes(), offset=4 * slot)
+        self._gpu.write(self.kernels, kernel, offset=4 * start)
+        light = np.array([light_ratio], np.float32)
+        self._gpu.write(self.totals, light, offset=4 * slot)
 
     def waves(self, jobs: Jobs) -> None:
         """Compute wave-optical kernels."""
@@ -160,7 +161,7 @@ class PsfPasses:
     def read_kernels(self, out: NDArray[np.float32]) -> None:
         """Fill an array with the slab's kernels; waits for the GPU."""
         if out.size:
-            self.kernels.read_into(out.view(np.uint8), size=out.nbytes)
+            self._gpu.read_into((self.kernels, 0, out))
 
     def read_totals(self, count: int) -> NDArray[np.float64]:
         """Light (P,) in the discs of a block's kernels."""

@@ -61,38 +61,6 @@ def extended(view: RgbdView, border_px: int) -> RgbdView:
     return replace(view, **images, tangents=tangents)
 
 
-def finite_color(color: NDArray) -> tuple[NDArray, int]:
-    """Replace non-finite colour values by zero, and count their pixels.
-
-    Negative ones stay: filtering is linear, and colours outside of the client's
-    primaries have them.
-    """
-    if color.dtype == np.uint8:
-        return color, 0
-    finite = np.isfinite(color)
-    if finite.all():
-        return color, 0
-    count = int(np.count_nonzero(~finite.all(axis=2)))
-    return np.where(finite, color, color.dtype.type(0.0)), count
-
-
-def with_clean_hidden(view: RgbdView) -> tuple[RgbdView, int]:
-    """Set hidden depth to 0 where nothing is hidden, and count non-finite colours.
-
-    A hidden layer that holds nothing at all is left out.
-    """
-    holds = view.hidden_depth_m > 0.0
-    if not holds.any():
-        return replace(view, hidden_color=None, hidden_depth_m=None), 0
-    color, _ = finite_color(view.hidden_color)
-    depth_m = np.where(holds, view.hidden_depth_m, np.float32(0.0))
-    bad = np.zeros(holds.shape, bool)
-    if color is not view.hidden_color:
-        bad = holds & ~np.isfinite(view.hidden_color).all(axis=2)
-    clean = replace(view, hidden_color=color, hidden_depth_m=depth_m)
-    return clean, int(np.count_nonzero(bad))
-
-
 def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
     """Distance from the eye per unit of planar depth, (height, width)."""
     left, right, up, down = view.tangents

@@ -20,7 +20,7 @@ def white_level(color: NDArray) -> float:
     if color.dtype == np.uint8:
         return 1.0
     light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
-    lit = light[light > 0.0]
+    lit = light[(light > 0.0) & np.isfinite(light)]
     if lit.size == 0:
         return 0.0
     return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))

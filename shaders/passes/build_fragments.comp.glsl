@@ -3,10 +3,11 @@
 // seen, and what it hides.
 // In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
 //      COLOR_IS_HALF),
-//      DEPTH_IN (f32 metres; all valid in what is seen, 0 where nothing is hidden),
+//      DEPTH_IN (f32 metres; what is hidden lies where it is above 0),
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
-//      PIXEL_LAYER (position), USED (a bit per cell and interval).
+//      PIXEL_LAYER (position), USED (a bit per cell and interval), STATS (pixels without
+//      depth, beyond what was prepared, and without a finite colour, which is then 0).
 // Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
@@ -20,7 +21,9 @@ layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float lay
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
 layout(std430, binding = BINDING_FIELD_DEFOCUS) readonly buffer Field { float field_dpt[]; };
-layout(std430, binding = BINDING_USED) buffer Used { uint used[]; };
+// Coherent: what other groups have noted is seen, and not noted once more.
+layout(std430, binding = BINDING_USED) coherent buffer Used { uint used[]; };
+layout(std430, binding = BINDING_STATS) buffer Stats { uint stats[]; };
 
 #include "common/layers.glsl"
 #include "common/cells.glsl"
@@ -30,6 +33,8 @@ uniform int layer_count;
 uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
+uniform vec2 object_range_dpt;    // prepared distances of objects; others are counted
+uniform ivec4 counted_px;         // first column and row, last ones plus one, of what counts
 uniform vec2 vergence_range_dpt;  // beyond which vergences are taken as its ends
 uniform float vergence_scale;     // over distance and offset: vergence at the cornea
 uniform float vergence_offset_m;
@@ -38,6 +43,7 @@ bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; 
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
+shared uint group_stats[STAT_FRAGMENTS];  // those that are counted here
 
 uint byte_at(uint index) {
     uint word = color_in[index / uint(BYTES_PER_WORD)];
@@ -62,13 +68,35 @@ vec3 read_linear_rgb(uint pixel) {
 #endif
 }
 
+// A depth that there is: above 0, or infinite.  By its bits, for a compiler may take it
+// that nothing is "not a number".
+bool is_depth(float depth_m) {
+    uint bits = floatBitsToUint(depth_m);
+    return bits != 0u && bits <= uint(FLOAT_INFINITY_BITS);
+}
+
+vec3 finite(vec3 value, out bool is_finite) {
+    uvec3 infinity = uvec3(uint(FLOAT_INFINITY_BITS));
+    bvec3 bad = equal(floatBitsToUint(value) & infinity, infinity);
+    is_finite = !any(bad);
+    return mix(value, vec3(0.0), bad);
+}
+
 // Planar view depth to distance from the eye: the ray through a pixel has length
 // sqrt(1 + tan_x^2 + tan_y^2) per unit of depth.  Distance to vergence at the cornea.
-float vergence_dpt(float depth_m, vec2 position) {
+float stretch_at(vec2 position) {
     vec2 tangent = mix(tangents.xz, tangents.yw, (position + 0.5) / vec2(frame_size_px));
-    float stretch = depth_is_planar != 0 ? sqrt(1.0 + dot(tangent, tangent)) : 1.0;
-    float distance_m = max(depth_m * stretch, NEAREST_M) + vergence_offset_m;
+    return depth_is_planar != 0 ? sqrt(1.0 + dot(tangent, tangent)) : 1.0;
+}
+
+float vergence_dpt(float depth_m, vec2 position) {
+    float distance_m = max(depth_m * stretch_at(position), NEAREST_M) + vergence_offset_m;
     return isinf(depth_m) ? 0.0 : vergence_scale / distance_m;
+}
+
+bool is_prepared(float depth_m, vec2 position) {
+    float dpt = isinf(depth_m) ? 0.0 : 1.0 / (depth_m * stretch_at(position));
+    return dpt >= object_range_dpt.x && dpt <= object_range_dpt.y;
 }
 
 // Change of defocus over the field, between the corners of a pixel's cell.
@@ -100,7 +128,7 @@ float layer_position(float dpt) {
 // surface before it: the two would blur alike.
 float distance_of(uint pixel, uint seen, vec2 at) {
     if (pixel == seen) return vergence_dpt(depth_in[pixel], at);
-    if (depth_in[pixel] == 0.0) return NOTHING_DPT;
+    if (!is_depth(depth_in[pixel])) return NOTHING_DPT;
     float dpt = vergence_dpt(depth_in[pixel], at);
     float behind = vergence_dpt(depth_in[seen], at) - dpt;
     return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
@@ -117,15 +145,29 @@ void note_use(ivec2 at, int interval) {
     if ((used[word] & bit) == 0u) atomicOr(used[word], bit);
 }
 
+// Counts what is wrong with a pixel, once: not in what a frame repeats of it.
+void note_faults(ivec2 at, uint pixel, uint seen, bool is_finite) {
+    if (any(lessThan(at, counted_px.xy)) || any(greaterThanEqual(at, counted_px.zw))) return;
+    bool holds = is_depth(depth_in[pixel]);
+    if (!holds && pixel == seen) atomicAdd(group_stats[STAT_MISSING], 1u);
+    if (!is_finite && (holds || pixel == seen)) atomicAdd(group_stats[STAT_BAD_COLOR], 1u);
+    if (holds && !is_prepared(depth_in[pixel], vec2(at)))
+        atomicAdd(group_stats[STAT_CLAMPED], 1u);
+}
+
 void main() {
     uint thread = gl_LocalInvocationIndex;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
         group_used[word] = 0u;
+    if (thread < uint(STAT_FRAGMENTS)) group_stats[thread] = 0u;
     barrier();  // no bit is left from before
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (all(lessThan(at, frame_size_px))) {
         uint seen = uint(at.y * frame_size_px.x + at.x);
         uint pixel = seen + gl_WorkGroupID.z * uint(frame_size_px.x * frame_size_px.y);
+        bool is_finite;
+        vec3 linear_rgb = finite(read_linear_rgb(pixel), is_finite);
+        note_faults(at, pixel, seen, is_finite);
         float dpt = distance_of(pixel, seen, vec2(at));
         if (dpt >= 0.0) {
             dpt = clamp(dpt, vergence_range_dpt.x, vergence_range_dpt.y);
@@ -133,11 +175,17 @@ void main() {
             position[pixel] = place;
             note_use(at, position_interval(place, layer_count));
         }
-        pixels[pixel] = vec4(read_linear_rgb(pixel), dpt);
+        pixels[pixel] = vec4(linear_rgb, dpt);
     }
     barrier();  // all pixels of the group have noted theirs
+    uint lane = (gl_WorkGroupID.x + gl_WorkGroupID.y) % uint(STAT_LANES);
+    if (thread < uint(STAT_FRAGMENTS) && group_stats[thread] != 0u)
+        atomicAdd(stats[lane * uint(STAT_WORDS) + thread], group_stats[thread]);
     if (!group_lies_in_one_cell()) return;
     int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
-    for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
-        if (group_used[word] != 0u) atomicOr(used[uint(first) + word], group_used[word]);
+    for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS)) {
+        uint bits = group_used[word];
+        // Most groups find theirs noted: thousands that add to one word wait in a line.
+        if ((used[uint(first) + word] & bits) != bits) atomicOr(used[uint(first) + word], bits);
+    }
 }

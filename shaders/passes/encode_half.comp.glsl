@@ -5,6 +5,8 @@
 
 layout(local_size_x = THREADS) in;
 
+#include "common/line.glsl"
+
 layout(std430, binding = BINDING_COLOR_OUT) readonly buffer ColorOut { vec4 color_out[]; };
 layout(std430, binding = BINDING_COLOR_IN) writeonly buffer Packed { uint packed_rgb[]; };
 
@@ -20,11 +22,11 @@ vec3 rounded(vec3 linear_rgb) {
 }
 
 void main() {
-    int first = int(gl_GlobalInvocationID.x) * HALVES_PER_WORD;
+    int first = thread_index() * HALVES_PER_WORD;
     if (first >= pixel_count) return;
     vec3 left = rounded(color_out[first].rgb);
     vec3 right = rounded(color_out[min(first + 1, pixel_count - 1)].rgb);
-    int target = int(gl_GlobalInvocationID.x) * RGB;
+    int target = thread_index() * RGB;
     packed_rgb[target] = packHalf2x16(left.rg);
     packed_rgb[target + 1] = packHalf2x16(vec2(left.b, right.r));
     packed_rgb[target + 2] = packHalf2x16(right.gb);

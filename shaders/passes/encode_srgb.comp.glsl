@@ -7,13 +7,15 @@
 
 layout(local_size_x = THREADS) in;
 
+#include "common/line.glsl"
+
 layout(std430, binding = BINDING_COLOR_OUT) readonly buffer ColorOut { vec4 color_out[]; };
 layout(std430, binding = BINDING_COLOR_IN) writeonly buffer Packed { uint packed_rgb[]; };
 
 uniform int pixel_count;
 
 void main() {
-    int first = int(gl_GlobalInvocationID.x) * BYTES_PER_WORD;
+    int first = thread_index() * BYTES_PER_WORD;
     if (first >= pixel_count) return;
     uint words[RGB] = uint[RGB](0u, 0u, 0u);
     for (int i = 0; i < BYTES_PER_WORD; ++i) {
@@ -25,7 +27,7 @@ void main() {
                 bytes[channel] << (BYTE_BITS * (position % BYTES_PER_WORD));
         }
     }
-    int target = int(gl_GlobalInvocationID.x) * RGB;
+    int target = thread_index() * RGB;
     for (int channel = 0; channel < RGB; ++channel)
         packed_rgb[target + channel] = words[channel];
 }

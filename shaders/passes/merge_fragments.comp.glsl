@@ -5,7 +5,7 @@
 // In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for what
 //      is hidden, BLOCKS of what is seen.
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
-//      reach bits, order matters, pixels merged).
+//      reach bits, order matters, pixels merged), STATS (fragments, pixels merged).
 // Dispatch: one group a block, one thread a quad of pixels.
 // Twin: tests/numerical/test_renderer_passes.py.  Source: section 6.3 (merging of tiled
 // splatting), there one level.
@@ -19,6 +19,7 @@ layout(std430, binding = BINDING_KERNEL_OF) readonly buffer KernelOf { uint kern
 layout(std430, binding = BINDING_FRAGMENT_COLOR) writeonly buffer Color { vec4 colors[]; };
 layout(std430, binding = BINDING_FRAGMENT_PLACE) writeonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) buffer Blocks { uvec4 blocks[]; };
+layout(std430, binding = BINDING_STATS) buffer Stats { uint stats[]; };
 
 #include "common/layers.glsl"
 #include "common/cells.glsl"
@@ -292,5 +293,8 @@ void main() {
     if (quad == 0u) {
         uint count = bitCount(alive[0]) + bitCount(alive[1]);
         blocks[block] = uvec4(count, largest_reach_bits, block_has_edge, block_merged_count);
+        uint lane = block % uint(STAT_LANES) * uint(STAT_WORDS);
+        atomicAdd(stats[lane + uint(STAT_FRAGMENTS)], count);
+        atomicAdd(stats[lane + uint(STAT_MERGED)], block_merged_count);
     }
 }

@@ -1,7 +1,9 @@
 // Exclusive sum of the bins' counts: where each list starts.
 // In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
 //      as float bits, by which a caller notices a 32-bit overflow, entries that were not
-//      kept, and the length of the longest list).
+//      kept, and the length of the longest list), DISPATCHES (groups of the passes that
+//      follow: scatter, a sort for each size class, splat; none where the lists do not
+//      fit their buffers, so that the caller can make room and run them then).
 // Dispatch: one group.
 // Twin: tests/numerical/tile_lists.py (numpy.cumsum).
 
@@ -10,7 +12,11 @@ layout(local_size_x = SCAN_THREADS) in;
 layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 counts[]; };
 layout(std430, binding = BINDING_BIN_OFFSETS) writeonly buffer Offsets { uint offsets[]; };
 
+layout(std430, binding = BINDING_DISPATCHES) writeonly buffer Dispatches { uvec4 groups[]; };
+
 uniform int bin_count;
+uniform uint entry_capacity;      // of ENTRIES
+uniform uint spare_capacity;      // of ENTRIES_SPARE
 
 shared uint sums[SCAN_THREADS];
 shared float float_sums[SCAN_THREADS];
@@ -58,5 +64,15 @@ void main() {
         offsets[bin_count + TOTAL_ENTRIES_FLOAT] = floatBitsToUint(float_start + float_sum);
         offsets[bin_count + TOTAL_LOST] = lost_count;
         offsets[bin_count + TOTAL_LONGEST] = longest;
+        bool fits = start <= entry_capacity && float_start + float_sum < ENTRIES_EXACT
+                 && (longest <= uint(SORT_LARGE) || start <= spare_capacity);
+        uint bins = fits ? uint(bin_count) : 0u;
+        groups[DISPATCH_SCATTER] = uvec4(bins, 1u, 1u, 0u);
+        uvec3 before = uvec3(1u, uint(SORT_SMALL), uint(SORT_LARGE));
+        for (int size_class = 0; size_class < before.length(); ++size_class) {
+            uint sorted = longest > before[size_class] ? bins : 0u;
+            groups[DISPATCH_SORT + size_class] = uvec4(sorted, 1u, 1u, 0u);
+        }
+        groups[DISPATCH_SPLAT] = uvec4(uint(TILES_PER_BIN), bins, 1u, 0u);
     }
 }

@@ -96,8 +96,11 @@ def made_lists(passes, blocks, place, color, *, reach_px):
             passes.strip.buffers[name] = gpu.upload(name, words)
         passes.search_blocks = -(-(reach_px + 1) // constants.TILE_SIZE_PX)
         passes.count_bins()
-        assert len(passes.bands) == 1
+        totals = np.empty(constants.TOTAL_WORDS, np.uint32)
+        gpu.read_into((*passes.totals, totals))
+        passes.take_totals(totals)
         passes.reserve_lists()
+        assert len(passes.bands) == 1
         passes.make_lists(0, passes.strip.bin_count)
         n_bins = passes.strip.bin_count
         counts = gpu.read(passes.strip.buffers["BIN_COUNTS"], (n_bins, 4), np.uint32)

@@ -6,6 +6,13 @@ from numpy.typing import NDArray
 from filter_service.constants import (
     BYTES_PER_WORD,
     MAX_LEVEL,
+    STAT_BAD_COLOR,
+    STAT_CLAMPED,
+    STAT_FRAGMENTS,
+    STAT_LANES,
+    STAT_MERGED,
+    STAT_MISSING,
+    STAT_WORDS,
     THREADS,
     TILE_SIZE_PX,
 )
@@ -45,6 +52,10 @@ class FragmentPasses:
         Of the whole image, where the frame has a border around it.
     border_px : int
         Columns and rows around the image.
+    counted_px : (left, top, right, bottom), optional
+        Part of the strip whose pixels are counted; all where it is None.
+    object_range_dpt : (low, high)
+        Distances that were prepared; others are counted.
     white_level : float
         Light against which the contrast of a merged quad counts.
     is_encoded : bool
@@ -54,6 +65,8 @@ class FragmentPasses:
     ----------
     search_blocks : int
         How far a bin must look for fragments that reach it; known once they are merged.
+    stats : (STAT_LANES, STAT_WORDS), uint32
+        What the passes count; filled when the frame is fetched.
     """
 
     def __init__(
@@ -67,6 +80,8 @@ class FragmentPasses:
         frame_pixel_count: int | None = None,
         image_size_px: tuple[int, int] | None = None,
         border_px: int = 0,
+        counted_px: tuple[int, int, int, int] | None = None,
+        object_range_dpt: tuple[float, float] = (0.0, np.inf),
         white_level: float = 1.0,
         is_encoded: bool = False,
     ):
@@ -81,6 +96,9 @@ class FragmentPasses:
         )
         self.image_size_px = image_size_px or strip.size
         self.border_px = border_px
+        self.counted_px = counted_px or (0, 0, *strip.size)
+        self.object_range_dpt = object_range_dpt
+        self.stats = np.zeros((STAT_LANES, STAT_WORDS), np.uint32)
         self.white_level = white_level
         self.is_encoded = is_encoded and white_level > 0.0
         self.search_blocks = 0
@@ -115,12 +133,13 @@ class FragmentPasses:
             "FIELD_DEFOCUS", self.corner_change_dpt
         )
         self.strip.buffers["USED"] = self.strip.gpu.upload("USED", used)
+        self.strip.buffers["STATS"] = self.strip.gpu.upload("STATS", self.stats)
         with self.strip.timer.stage("fragments_ms"):
             self.strip.run(
                 "build_fragments",
                 (*self.strip.grid, self.strip.surface_count),
                 *("COLOR_IN", "DEPTH_IN", "LAYER_DPT", "FIELD_DEFOCUS"),
-                *("PIXELS", "PIXEL_LAYER", "USED"),
+                *("PIXELS", "PIXEL_LAYER", "USED", "STATS"),
                 **self._common,
                 words_per_cell=n_words,
                 tangents=self.strip.view.tangents,
@@ -129,6 +148,8 @@ class FragmentPasses:
                 vergence_offset_m=self.strip.layers.vergence.offset_m,
                 depth_is_planar=int(self.strip.view.depth_kind == "planar"),
                 blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
+                object_range_dpt=self.object_range_dpt,
+                counted_px=self.counted_px,
                 defines=COLOR_VARIANTS[self.strip.view.color.dtype.name],
             )
         with self.strip.timer.wall("psf_plan_ms"):
@@ -167,7 +188,7 @@ class FragmentPasses:
                     "merge_fragments",
                     self.strip.grid,
                     *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
-                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS"),
+                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS", "STATS"),
                     **self._common,
                     blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                     max_level=self._max_level,
@@ -194,13 +215,14 @@ class FragmentPasses:
         return min(most, cell_px.bit_length() - 1) if cell_px else most
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `Rendered` by name."""
-        blocks = self.strip.gpu.read(
-            self.strip.buffers["BLOCKS"], (self.strip.block_count, 4), np.uint32
-        )
+        """Return counts of `FilteredView` by name, once the frame was fetched."""
+        stats = self.stats.sum(axis=0, dtype=np.int64).tolist()
         return {
-            "fragment_count": int(blocks[:, 0].sum()),
-            "merged_count": int(blocks[:, 3].sum()),
+            "missing_depth_count": stats[STAT_MISSING],
+            "clamped_depth_count": stats[STAT_CLAMPED],
+            "bad_color_count": stats[STAT_BAD_COLOR],
+            "fragment_count": stats[STAT_FRAGMENTS],
+            "merged_count": stats[STAT_MERGED],
             "kernel_count": self.kernel_count,
             "kernel_texel_count": self.kernel_texel_count,
         }

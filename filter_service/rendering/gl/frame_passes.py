@@ -5,17 +5,24 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import BYTES_PER_WORD, HALVES_PER_WORD, RGB, THREADS
+from filter_service.constants import (
+    BYTES_PER_WORD,
+    HALVES_PER_WORD,
+    RGB,
+    THREADS,
+    TOTAL_WORDS,
+)
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import KernelSet
 from filter_service.rendering.gl.list_passes import ListPasses
-from filter_service.rendering.gl.strip import Strip, group_count
+from filter_service.rendering.gl.strip import Strip, grid_of, group_count
 
 ENCODERS = {
     "srgb8": ("encode_srgb", BYTES_PER_WORD, np.uint8),
     "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
+    "linear": ("encode_float", 1, np.float32),
 }
-"""Outputs that are packed on the GPU: pass, pixels a thread (for RGB words), dtype."""
+"""How a picture is packed: pass, pixels a thread (for RGB words), dtype."""
 
 
 class FramePasses:
@@ -48,15 +55,28 @@ class FramePasses:
         self.lists.run()
 
     def read_back(self, output: str) -> NDArray:
-        """Fetch the filtered picture, encoded as asked."""
+        """Fetch the filtered picture, encoded as asked, and all that was counted."""
         width, height = self.strip.size
-        if output == "linear":
-            with self.strip.timer.wall("readback_ms"):
-                pixels = self.strip.gpu.read(
-                    self.strip.buffers["COLOR_OUT"], (height, width, 4), np.float32
-                )
-                return np.ascontiguousarray(pixels[..., :RGB])
-        name, pixels_per_thread, dtype = ENCODERS[output]
+        picture = np.empty((height, width, RGB), ENCODERS[output][2])
+        if not self._fetch(picture, output):
+            self.lists.splat_bands()
+            self._fetch(picture, output)
+        return picture
+
+    def _fetch(self, picture: NDArray, output: str) -> bool:
+        """Fill a picture, and note what was counted; whether it is whole."""
+        name, pixels_per_thread, _ = ENCODERS[output]
+        self._encode(name, pixels_per_thread)
+        totals = np.empty(TOTAL_WORDS, np.uint32)
+        with self.strip.timer.wall("readback_ms"):
+            self.strip.gpu.read_into(
+                (self.strip.buffers["COLOR_IN"], 0, picture),
+                (*self.lists.totals, totals),
+                (self.strip.buffers["STATS"], 0, self.fragments.stats),
+            )
+        return self.lists.take_totals(totals)
+
+    def _encode(self, name: str, pixels_per_thread: int) -> None:
         with self.strip.timer.stage("encode_ms"):
             threads = group_count(self.strip.pixel_count, pixels_per_thread)
             self.strip.reserve(
@@ -64,13 +84,9 @@ class FramePasses:
             )  # its light is used
             self.strip.run(
                 name,
-                (group_count(threads, THREADS), 1),
+                grid_of(group_count(threads, THREADS)),
                 *("COLOR_OUT", "COLOR_IN"),
                 pixel_count=self.strip.pixel_count,
-            )
-        with self.strip.timer.wall("readback_ms"):
-            return self.strip.gpu.read(
-                self.strip.buffers["COLOR_IN"], (height, width, RGB), dtype
             )
 
     def counts(self) -> dict[str, int]:

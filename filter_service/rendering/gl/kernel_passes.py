@@ -20,17 +20,13 @@ from filter_service.rendering.frame_kernels import (
     part_table,
     work_list,
 )
+from filter_service.rendering.gl.strip import grid_of
 from filter_service.rendering.image_cells import (
     ImageCells,
     KernelsTooLarge,
     can_coarsen,
     check_texels,
 )
-
-MAX_GROUPS = 65535
-"""Work groups along one axis that every OpenGL 4.3 allows."""
-
-
 MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
 
@@ -153,10 +149,9 @@ class KernelMaker:
         work = work_list(n_texels, THREADS)
         if not len(work):
             return
-        columns = min(len(work), MAX_GROUPS)
         self._gpu.dispatch(
             name,
-            (columns, -(-len(work) // columns)),
+            grid_of(len(work)),
             buffers={**buffers, "WORK": self._gpu.upload("WORK", work)},
             uniforms={"group_count": len(work), **(uniforms or {})},
             **bindings,

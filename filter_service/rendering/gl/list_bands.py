@@ -10,9 +10,8 @@ from filter_service.constants import (
     TOTAL_ENTRIES_FLOAT,
     TOTAL_LONGEST,
     TOTAL_LOST,
-    TOTAL_WORDS,
 )
-from filter_service.rendering.gl.kernel_passes import MAX_GROUPS
+from filter_service.rendering.gl.strip import MAX_GROUPS
 
 ENTRY_BYTES = 4
 MAX_BAND_ENTRIES = 16 * 2**20
@@ -41,9 +40,8 @@ class ListTotals:
     longest: int = 0
 
 
-def read_totals(words: bytes) -> ListTotals:
+def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
     """Totals from the words behind the bins' offsets."""
-    whole = np.frombuffer(words, np.uint32, TOTAL_WORDS)
     as_float = whole[TOTAL_ENTRIES_FLOAT : TOTAL_ENTRIES_FLOAT + 1].view(np.float32)
     rounded = round(float(as_float[0]))
     return ListTotals(

@@ -1,16 +1,23 @@
 """The passes that make lists of fragments, order and splat them."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from filter_service.constants import (
     PAPER_SORT_KEY_BITS,
     SORT_CAPACITIES,
     SORT_KEY_BITS,
+    DISPATCH_BYTES,
+    DISPATCH_COUNT,
+    DISPATCH_SCATTER,
+    DISPATCH_SORT,
+    DISPATCH_SPLAT,
     THREADS,
     TILE_SIZE_PX,
     TILES_PER_BIN,
     TOTAL_WORDS,
 )
+from filter_service.gl.gpu import Buffer
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.strip import Strip
 
@@ -38,17 +45,54 @@ class ListPasses:
         self.bands: list[tuple[int, int, int]] = []
 
     def run(self) -> None:
-        """Count, list, sort and splat."""
+        """Count, list, sort and splat, in the buffers that there are.
+
+        Nothing is read: where the lists do not fit, the passes after the count do
+        nothing, and `take_totals` says so.
+        """
+        self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
-        self.splat_bands()
+        if self.strip.bin_count <= list_bands.MAX_GROUPS:
+            self._make_lists_and_splat(0, self.strip.bin_count, indirect=True)
+
+    @property
+    def totals(self) -> tuple[Buffer, int]:
+        """Where the totals stand: a buffer, and a byte of it."""
+        return self.strip.buffers["BIN_OFFSETS"], 4 * self.strip.bin_count
+
+    def take_totals(self, words: NDArray[np.uint32]) -> bool:
+        """Take note of the totals; whether the frame is whole.
+
+        If not, `splat_bands` makes it so.
+        """
+        self.lists = list_bands.read_totals(words)
+        entries, spare = self._capacities
+        needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
+        return (
+            self.strip.bin_count <= list_bands.MAX_GROUPS
+            and self.lists.entry_count <= entries
+            and (not needs_spare or self.lists.entry_count <= spare)
+        )
+
+    @property
+    def _capacities(self) -> tuple[int, int]:
+        """Entries that the two buffers of lists hold, as one band."""
+        return tuple(
+            min(self.strip.buffers[name].size // list_bands.ENTRY_BYTES, self._list_limit)
+            for name in ("ENTRIES", "ENTRIES_SPARE")
+        )
 
     def count_bins(self) -> None:
-        """Lengths and offsets of the lists, and the bands they are made in."""
+        """Lengths and offsets of the lists."""
         self.strip.reserve(
             BIN_COUNTS=16 * self.strip.bin_count,
             WINDOWS=16 * self.strip.bin_count,
             BIN_OFFSETS=4 * (self.strip.bin_count + TOTAL_WORDS),
+            DISPATCHES=DISPATCH_BYTES * DISPATCH_COUNT,
+            ENTRIES=16,
+            ENTRIES_SPARE=16,
         )
+        entry_capacity, spare_capacity = self._capacities
         with self.strip.timer.stage("bin_ms"):
             self.strip.run(
                 "count_bins",
@@ -61,11 +105,11 @@ class ListPasses:
             self.strip.run(
                 "scan_bins",
                 (1, 1),
-                *("BIN_COUNTS", "BIN_OFFSETS"),
+                *("BIN_COUNTS", "BIN_OFFSETS", "DISPATCHES"),
                 bin_count=self.strip.bin_count,
+                entry_capacity=entry_capacity,
+                spare_capacity=spare_capacity,
             )
-        with self.strip.timer.wall("plan_ms"):
-            self.bands = self._plan_bands()
 
     @property
     def _walk(self) -> dict:
@@ -84,11 +128,7 @@ class ListPasses:
         return min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
-        """Bands as (first bin, bin count, entries)."""
-        words = self.strip.buffers["BIN_OFFSETS"].read(
-            4 * TOTAL_WORDS, offset=4 * self.strip.bin_count
-        )
-        self.lists = list_bands.read_totals(words)
+        """Bands as (first bin, bin count, entries), once the totals are known."""
         limit = self._list_limit
         if (
             self.lists.entry_count <= limit
@@ -99,11 +139,15 @@ class ListPasses:
             self.strip.buffers["BIN_COUNTS"], (self.strip.bin_count, 4), np.uint32
         )[:, 0].astype(np.int64)
         offsets, bands = list_bands.split(counts, limit)
-        self.strip.buffers["BIN_OFFSETS"].write(offsets.astype(np.uint32))
+        self.strip.gpu.write(
+            self.strip.buffers["BIN_OFFSETS"], offsets.astype(np.uint32)
+        )
         return bands
 
     def reserve_lists(self) -> None:
-        """Buffers for the lists of the longest band."""
+        """Cut the lists into bands, and make room for the longest."""
+        with self.strip.timer.wall("plan_ms"):
+            self.bands = self._plan_bands()
         n_bytes = list_bands.ENTRY_BYTES * max(entries for _, _, entries in self.bands)
         self.strip.reserve(ENTRIES=n_bytes)
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
@@ -112,12 +156,23 @@ class ListPasses:
     def splat_bands(self) -> None:
         """Scatter, sort and splat, band by band."""
         self.reserve_lists()
-        self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         for first_bin, bin_count, _ in self.bands:
-            self.make_lists(first_bin, bin_count)
-            self._splat(first_bin, bin_count)
+            self._make_lists_and_splat(first_bin, bin_count)
 
-    def make_lists(self, first_bin: int, bin_count: int) -> None:
+    def _make_lists_and_splat(
+        self, first_bin: int, bin_count: int, *, indirect: bool = False
+    ) -> None:
+        self.make_lists(first_bin, bin_count, indirect=indirect)
+        self._splat(first_bin, bin_count, indirect=indirect)
+
+    def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[Buffer, int] | None:
+        """Where the scan has put the size of a dispatch."""
+        place = self.strip.buffers["DISPATCHES"], DISPATCH_BYTES * index
+        return place if indirect else None
+
+    def make_lists(
+        self, first_bin: int, bin_count: int, *, indirect: bool = False
+    ) -> None:
         """Scatter and sort the lists of a band."""
         with self.strip.timer.stage("bin_ms"):
             self.strip.run(
@@ -128,11 +183,12 @@ class ListPasses:
                 bin_columns=self.strip.bin_grid[0],
                 first_bin=first_bin,
                 defines=self._list_threads,
+                indirect=self._groups_on_gpu(DISPATCH_SCATTER, indirect),
             )
         with self.strip.timer.stage("sort_ms"):
-            self._sort(first_bin, bin_count)
+            self._sort(first_bin, bin_count, indirect)
 
-    def _splat(self, first_bin: int, bin_count: int) -> None:
+    def _splat(self, first_bin: int, bin_count: int, *, indirect: bool) -> None:
         with self.strip.timer.stage("splat_ms"):
             self.strip.run(
                 "splat_tiles",
@@ -146,17 +202,15 @@ class ListPasses:
                 first_bin=first_bin,
                 blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                 defines=self._splat_variant(),
+                indirect=self._groups_on_gpu(DISPATCH_SPLAT, indirect),
             )
 
-    def _sort(self, first_bin: int, bin_count: int) -> None:
-        """Sort the lists of a band, a size class at a time.
-
-        A frame of one bin meets every class, so that a warm-up compiles them all.
-        """
+    def _sort(self, first_bin: int, bin_count: int, indirect: bool) -> None:
+        """Sort the lists of a band, a size class at a time."""
         key_bits = PAPER_SORT_KEY_BITS if self.strip.paper_rule else SORT_KEY_BITS
         longest_before = 1
-        for capacity in (*SORT_CAPACITIES, 0):
-            if self.lists.longest <= longest_before and bin_count > 1:
+        for index, capacity in enumerate((*SORT_CAPACITIES, 0)):
+            if not indirect and self.lists.longest <= longest_before:
                 return
             spare = () if capacity else ("ENTRIES_SPARE",)
             self.strip.run(
@@ -171,6 +225,7 @@ class ListPasses:
                     "CAPACITY": capacity,
                     "KEY_BITS": key_bits,
                 },
+                indirect=self._groups_on_gpu(DISPATCH_SORT + index, indirect),
             )
             longest_before = capacity
 

@@ -18,15 +18,8 @@ from filter_service.rendering.frame import (
     border_px_of,
     extended,
     fill_missing_depth,
-    finite_color,
-    object_dpt,
-    with_clean_hidden,
 )
-from filter_service.rendering.frame_options import (
-    OUTPUT_DTYPES,
-    FrameOptions,
-    frame_options,
-)
+from filter_service.rendering.frame_options import FrameOptions, frame_options
 from filter_service.rendering.frame_states import FrameStates, FrameStore
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
@@ -65,6 +58,7 @@ class FilterRenderer:
         self._gpu = gpu
         self._states = FrameStates()
         self._kernels = KernelMaker(gpu)
+        self._lacks_depth = False
 
     @property
     def name(self) -> str:
@@ -152,24 +146,15 @@ class FilterRenderer:
         self, view, handle, pupil_diameter_mm, focus_dpt, options: FrameOptions
     ) -> FilteredView:
         timer = StageTimer(self._gpu)
-        with timer.wall("prepare_ms"):
-            depth = self._prepared_depth(view, handle.store)
-            color, bad_color_count = finite_color(view.color)
-            whole = replace(view, color=color, depth_m=depth.depth_m)
-            if view.surface_count > 1:
-                whole, bad_count = with_clean_hidden(whole)
-                bad_color_count += bad_count
         layers = self._states.layers(
             timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
         )
-        picture, counts = self._filtered(timer, whole, handle, layers, options)
+        picture, counts = self._filled(timer, view, handle, layers, options)
         self._gpu.check("render")
+        bad_color_count = counts["bad_color_count"]
         return FilteredView(
             color=picture,
             stage_times_ms=timer.result_ms(),
-            missing_depth_count=depth.missing_count,
-            clamped_depth_count=depth.clamped_count,
-            bad_color_count=bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
             gaze_deg=options.gaze_deg,
@@ -177,6 +162,30 @@ class FilterRenderer:
             layer_count=len(layers.layer_dpt),
             notes=[*layers.notes, *options.gaze_notes, *color_notes(bad_color_count)],
         )
+
+    def _filled(
+        self, timer, view: RgbdView, handle, layers: FrameLayers, options: FrameOptions
+    ) -> tuple[NDArray, dict[str, int]]:
+        """Picture and counts of a view, whose missing depth is filled in.
+
+        The GPU counts what is missing.  A frame that turns out to lack depth is done
+        again; after one that does, the next is looked at first.
+        """
+        with timer.wall("prepare_ms"):
+            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
+                view = replace(view, hidden_color=None, hidden_depth_m=None)
+        missing_count = 0
+        if not self._lacks_depth:
+            picture, counts = self._filtered(timer, view, handle, layers, options)
+            self._lacks_depth = counts["missing_depth_count"] > 0
+            if not self._lacks_depth:
+                return picture, counts
+        with timer.wall("prepare_ms"):
+            depth_m, missing_count = fill_missing_depth(view.depth_m)
+            view = replace(view, depth_m=depth_m)
+        self._lacks_depth = missing_count > 0
+        picture, counts = self._filtered(timer, view, handle, layers, options)
+        return picture, {**counts, "missing_depth_count": missing_count}
 
     def _filtered(
         self, timer, view: RgbdView, handle, layers: FrameLayers, options: FrameOptions
@@ -197,7 +206,7 @@ class FilterRenderer:
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = self._states.corner_change_dpt(timer, layers, image)
-        picture = np.empty(whole.color.shape, OUTPUT_DTYPES[options.output])
+        pictures: list[NDArray] = []
         counts: Counter[str] = Counter()
         for rows in _strips(whole, reach_px, self._gpu.max_block_bytes):
             shared = Strip(
@@ -216,6 +225,8 @@ class FilterRenderer:
                 frame_pixel_count=whole.width_px * whole.height_px,
                 image_size_px=(view.width_px, view.height_px),
                 border_px=border_px,
+                counted_px=_counted_px(rows, view, border_px),
+                object_range_dpt=_prepared_range_dpt(handle.store),
                 white_level=white_level(view.color),
                 is_encoded=options.is_encoded,
             )
@@ -225,25 +236,29 @@ class FilterRenderer:
                     handle.store, handle.pages, layers, image, used, timer
                 )
             )
-            picture[rows.wanted] = passes.read_back(options.output)[rows.kept]
+            pictures.append(passes.read_back(options.output)[rows.kept])
             counts.update(passes.counts())
+        picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
         rows, columns = (
             slice(border_px, border_px + n) for n in (view.height_px, view.width_px)
         )
         return np.ascontiguousarray(picture[rows, columns]), dict(counts)
 
-    def _prepared_depth(self, view: RgbdView, store: PsfStore) -> "_Depth":
-        depth_m, missing_count = fill_missing_depth(view.depth_m)
-        distances = object_dpt(view, depth_m)
-        if view.surface_count > 1:
-            holds = view.hidden_depth_m > 0.0
-            hidden_m = np.where(holds, view.hidden_depth_m, np.float32(1.0))
-            hidden_dpt = object_dpt(view, hidden_m)[holds]
-            distances = np.concatenate([distances.ravel(), hidden_dpt])
-        low_dpt, high_dpt = store.spec.object_range_dpt
-        margin = 1e-6 * max(high_dpt, 1.0)
-        clamped = (distances < low_dpt - margin) | (distances > high_dpt + margin)
-        return _Depth(depth_m, missing_count, int(np.count_nonzero(clamped)))
+
+def _counted_px(
+    rows: "_Rows", view: RgbdView, border_px: int
+) -> tuple[int, int, int, int]:
+    """Pixels (left, top, right, bottom) of a strip that are its part of the image."""
+    top, bottom = border_px - rows.first_row, border_px + view.height_px - rows.first_row
+    first, last, _ = rows.kept.indices(rows.view.height_px)
+    return border_px, max(top, first), border_px + view.width_px, min(bottom, last)
+
+
+def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
+    """Object distances that a store is for, with room for rounding."""
+    low_dpt, high_dpt = store.spec.object_range_dpt
+    margin = 1e-6 * max(high_dpt, 1.0)
+    return low_dpt - margin, high_dpt + margin
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
@@ -256,23 +271,15 @@ def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16
 
 
 @dataclass(frozen=True)
-class _Depth:
-    depth_m: NDArray[np.float32]
-    missing_count: int
-    clamped_count: int
-
-
-@dataclass(frozen=True)
 class _Rows:
     """Rows of a frame that go through the passes together.
 
-    ``view`` has the rows that send light to the wanted ones; ``wanted`` are the rows of
-    the frame to fill and ``kept`` the rows of the strip that do it.
+    ``view`` has the rows that send light to those ``kept``, which are the strip's part
+    of the picture.
     """
 
     view: RgbdView
     first_row: int
-    wanted: slice
     kept: slice
 
 
@@ -286,7 +293,7 @@ def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Rows]:
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
     rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
-        return [_Rows(view, 0, slice(None), slice(None))]
+        return [_Rows(view, 0, slice(None))]
     step = rows - 2 * halo
     if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
@@ -301,7 +308,6 @@ def _strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[_Rows]:
             _Rows(
                 view=_rows_of(view, first, last),
                 first_row=first,
-                wanted=slice(top, bottom),
                 kept=slice(top - first, bottom - first),
             )
         )

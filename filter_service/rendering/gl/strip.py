@@ -5,10 +5,19 @@ from filter_service.gl.gpu import Buffer, Gpu, StageTimer
 from filter_service.psfs.store import FrameLayers
 from filter_service.rgbd_view import RgbdView
 
+MAX_GROUPS = 65535
+"""Work groups along one axis that every OpenGL 4.3 allows."""
+
 
 def group_count(count: int, size: int) -> int:
     """Return how many groups of a size hold a count."""
     return (count + size - 1) // size
+
+
+def grid_of(groups: int) -> tuple[int, int]:
+    """Return columns and rows of at least so many groups, of those OpenGL allows."""
+    columns = min(groups, MAX_GROUPS)
+    return columns, group_count(groups, columns)
 
 
 class Strip:
@@ -60,6 +69,7 @@ class Strip:
         """Dispatch a pass on buffers by name."""
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
+        indirect = uniforms.pop("indirect", None)
         self.gpu.dispatch(
             name,
             groups,
@@ -67,4 +77,5 @@ class Strip:
             uniforms=uniforms,
             defines=defines,
             textures=textures,
+            indirect=indirect,
         )

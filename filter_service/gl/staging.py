@@ -1,0 +1,138 @@
+"""Memory that both sides see: pinned, mapped for good, filled and emptied by copies.
+
+A driver moves a buffer that is mapped for reading to the host's memory, and every pass
+that uses it then works over the bus.  So buffers that passes use are never mapped; what
+goes to them or comes from them lies in a block of its own on the way.  That takes
+`glBufferStorage` (OpenGL 4.4, or ARB_buffer_storage), which moderngl does not have: its
+few calls are made here.
+"""
+
+import ctypes
+import ctypes.util
+from collections.abc import Callable
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER = 0x8F36, 0x8F37
+GL_MAP_READ_BIT, GL_MAP_WRITE_BIT = 0x1, 0x2
+GL_MAP_PERSISTENT_BIT, GL_MAP_COHERENT_BIT = 0x40, 0x80
+GL_CLIENT_STORAGE_BIT = 0x200
+
+ALIGNMENT = 256
+"""Parts of a block start at multiples of this."""
+
+FIRST_BYTES = 1 << 20
+
+_uint, _size, _pointer = ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p
+_SIGNATURES = {
+    "glGenBuffers": (None, ctypes.c_int, _pointer),
+    "glDeleteBuffers": (None, ctypes.c_int, _pointer),
+    "glBindBuffer": (None, _uint, _uint),
+    "glBufferStorage": (None, _uint, _size, _pointer, _uint),
+    "glMapBufferRange": (_pointer, _uint, _size, _size, _uint),
+    "glCopyBufferSubData": (None, _uint, _uint, _size, _size, _size),
+}
+
+
+def gl_calls() -> dict[str, Callable] | None:
+    """Return the calls that `Staging` needs; None where EGL knows one of them not."""
+    library = ctypes.util.find_library("EGL") or "libEGL.so.1"
+    try:
+        address_of = ctypes.CDLL(library).eglGetProcAddress
+    except (OSError, AttributeError):
+        return None
+    address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
+    calls = {}
+    for name, (result, *arguments) in _SIGNATURES.items():
+        address = address_of(name.encode())
+        if not address:
+            return None
+        calls[name] = ctypes.CFUNCTYPE(result, *arguments)(address)
+    return calls
+
+
+def has_buffer_storage(context: moderngl.Context) -> bool:
+    """Whether the context may map a buffer for good."""
+    return context.version_code >= 440 or "GL_ARB_buffer_storage" in context.extensions
+
+
+class Staging:
+    """A block of mapped memory, given out from its start; starts anew when it is full.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+    calls : dict
+        From `gl_calls`.
+    """
+
+    def __init__(self, context: moderngl.Context, calls: dict[str, Callable]):
+        self._context = context
+        self._calls = calls
+        self._name = _uint(0)
+        self._bytes: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._used = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of the block."""
+        return self._bytes.size
+
+    def release(self) -> None:
+        """Free the block; what was given out must not be touched again."""
+        if self._name.value:
+            self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
+        self._name, self._bytes, self._used = _uint(0), np.zeros(0, np.uint8), 0
+
+    def reset(self) -> None:
+        """Give out the block from its start; the caller knows that no copy waits."""
+        self._used = 0
+
+    def take(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
+        """Return the place of free bytes and the bytes.
+
+        Waits for the GPU where there are none, for its copies of what was given out.
+        """
+        if self._used + n_bytes > self.size:
+            self._context.finish()
+            if n_bytes > self.size:
+                self._allocate(max(2 * n_bytes, FIRST_BYTES))
+            self._used = 0
+        start = self._used
+        self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
+        return start, self._bytes[start : start + n_bytes]
+
+    def copy_to(self, buffer: moderngl.Buffer, start: int, at: int, n_bytes: int):
+        """Have bytes from a place of the block copied to a buffer."""
+        self._copy(self._name.value, buffer.glo, start, at, n_bytes)
+
+    def copy_from(self, buffer: moderngl.Buffer, at: int, start: int, n_bytes: int):
+        """Have bytes of a buffer copied to a place of the block."""
+        self._copy(buffer.glo, self._name.value, at, start, n_bytes)
+
+    def _copy(self, source: int, target: int, read_at: int, write_at: int, n_bytes):
+        calls = self._calls
+        calls["glBindBuffer"](GL_COPY_READ_BUFFER, source)
+        calls["glBindBuffer"](GL_COPY_WRITE_BUFFER, target)
+        calls["glCopyBufferSubData"](
+            GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER, read_at, write_at, n_bytes
+        )
+
+    def _allocate(self, n_bytes: int) -> None:
+        self.release()
+        calls = self._calls
+        access = GL_MAP_READ_BIT | GL_MAP_WRITE_BIT
+        access |= GL_MAP_PERSISTENT_BIT | GL_MAP_COHERENT_BIT
+        calls["glGenBuffers"](1, ctypes.byref(self._name))
+        calls["glBindBuffer"](GL_COPY_READ_BUFFER, self._name)
+        calls["glBufferStorage"](
+            GL_COPY_READ_BUFFER, n_bytes, None, access | GL_CLIENT_STORAGE_BIT
+        )
+        address = calls["glMapBufferRange"](GL_COPY_READ_BUFFER, 0, n_bytes, access)
+        if not address:
+            self.release()
+            raise MemoryError(f"no {n_bytes / 1e6:.0f} MB of memory to map")
+        memory = (ctypes.c_uint8 * n_bytes).from_address(address)
+        self._bytes = np.frombuffer(memory, np.uint8)
