@@ -250,6 +250,8 @@ BINDINGS = {
     "BINDING_RECIPES": 2,
     "BINDING_WORK": 3,
     "BINDING_FIELD_DEFOCUS": 12,
+    "BINDING_ATLAS": 13,
+    "BINDING_NODE_ATLAS": 14,
 }
 """Storage buffer bindings; the reference software renderer allows 16 per stage.  Those
 of the blending passes take numbers of the frame's again."""

@@ -15,12 +15,22 @@ from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_s
 
 Buffer = moderngl.Buffer
 Pages = moderngl.TextureArray
+Atlas = moderngl.Buffer | moderngl.Texture
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than asked, so that slowly rising needs
 do not reallocate every frame."""
 
 ATLAS_TEXEL_BYTES = 16
+
+ATLAS_BYTES = 1 << 30
+"""More than an atlas ever takes: twice the kernels of a frame."""
+
+ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
+"""Of atlases that are buffers, by the name of their texture."""
+
+PASS_BLOCKS = 9
+"""Storage blocks of the pass with most, if an atlas is one of them."""
 
 
 class Gpu:
@@ -58,8 +68,14 @@ class Gpu:
         self._atlases: dict[str, moderngl.Texture] = {}
         self._uniforms: dict[moderngl.ComputeShader, dict] = {}
         self._queries: list[moderngl.Query] = []
+        self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
         # On a software renderer all memory is the host's: a copy more gains nothing.
         self.use_staging(not self.is_software)
+
+    def _holds_large_atlases(self) -> bool:
+        """Whether a pass may have an atlas of any size beside its other buffers."""
+        blocks = int(self.context.info["GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS"])
+        return blocks >= PASS_BLOCKS and self.max_block_bytes >= ATLAS_BYTES
 
     def use_staging(self, wanted: bool) -> None:
         """Send and fetch through mapped memory, where the driver has it, or not."""
@@ -180,8 +196,13 @@ class Gpu:
             )
             first_line, lines = first_line + count, lines[count:]
 
-    def atlas(self, name: str, n_texels: int) -> moderngl.Texture:
-        """Named, grow-only texture of four uints a texel, in lines of ATLAS_WIDTH."""
+    def atlas(self, name: str, n_texels: int) -> Atlas:
+        """Named, grow-only line of texels of four uints.
+
+        A storage buffer, or a texture in lines of ATLAS_WIDTH, see `atlas_is_buffer`.
+        """
+        if self.atlas_is_buffer:
+            return self.storage(f"{name} atlas", ATLAS_TEXEL_BYTES * n_texels)
         rows = -(-n_texels // constants.ATLAS_WIDTH)
         atlas = self._atlases.get(name)
         if atlas is not None and atlas.height >= rows:
@@ -262,8 +283,8 @@ class Gpu:
         buffers: dict[str, moderngl.Buffer],
         uniforms: dict | None = None,
         defines: dict | None = None,
-        images: dict[str, moderngl.Texture] | None = None,
-        textures: dict[str, moderngl.Texture | Pages] | None = None,
+        images: dict[str, Atlas] | None = None,
+        textures: dict[str, Atlas | Pages] | None = None,
         indirect: tuple[moderngl.Buffer, int] | None = None,
     ) -> None:
         """Run a pass and order its writes before what follows.
@@ -278,18 +299,25 @@ class Gpu:
         defines : dict, optional
             Variant of the pass.
         images, textures : dict, optional
-            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture.
+            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture, or to what
+            `atlas` returned.
         indirect : (buffer, byte), optional
             Where on the GPU the groups stand; ``groups`` are not looked at.
         """
-        program = self.program(name, **(defines or {}))
+        buffers, defines = dict(buffers), dict(defines or {})
+        images, textures = dict(images or {}), dict(textures or {})
+        for named in (images, textures):
+            for key in [k for k, v in named.items() if isinstance(v, Buffer)]:
+                buffers[ATLAS_BINDINGS[key]] = named.pop(key)
+                defines["ATLAS_IS_BUFFER"] = 1
+        program = self.program(name, **defines)
         for binding, buffer in buffers.items():
             buffer.bind_to_storage_buffer(constants.BINDINGS[f"BINDING_{binding}"])
         self._set_uniforms(program, uniforms or {})
-        for name_of, image in (images or {}).items():
+        for name_of, image in images.items():
             unit = getattr(constants, f"IMAGE_{name_of}")
             image.bind_to_image(unit, read=True, write=True)
-        for name_of, texture in (textures or {}).items():
+        for name_of, texture in textures.items():
             texture.use(getattr(constants, f"TEXTURE_{name_of}"))
         if indirect is not None:
             program.run_indirect(*indirect)

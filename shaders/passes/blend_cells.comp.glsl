@@ -14,8 +14,13 @@ layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; }
 layout(std430, binding = BINDING_PARTS) readonly buffer Parts { uvec4 parts[]; };
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+#ifdef ATLAS_IS_BUFFER
+layout(std430, binding = BINDING_NODE_ATLAS) readonly buffer NodeAtlas { uvec4 node_atlas[]; };
+layout(std430, binding = BINDING_ATLAS) writeonly buffer Atlas { uvec4 atlas[]; };
+#else
 layout(binding = TEXTURE_NODES) uniform usampler2D node_atlas;
 layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
+#endif
 
 #include "common/atlas.glsl"
 #include "common/kernels.glsl"
@@ -25,7 +30,7 @@ layout(rgba32ui, binding = IMAGE_ATLAS) writeonly uniform uimage2D atlas;
 void add_texel(int first, Reach reach, ivec2 at, float weight, inout vec3 near,
                inout vec3 far) {
     if (!within(reach, at)) return;
-    uvec4 ends = texelFetch(node_atlas, atlas_position(first + reach_texel(reach, at)), 0);
+    uvec4 ends = ATLAS_FETCH(node_atlas, first + reach_texel(reach, at));
     near += weight * near_weights(ends);
     far += weight * far_weights(ends);
 }
@@ -71,5 +76,5 @@ void main() {
     for (uint index = 0u; index < uint(FIELD_CORNERS); ++index)
         add_node(part, index, at, near, far);
     uvec4 ends = pack_weights(near, far, kernel_scale(kernel, 0));
-    imageStore(atlas, atlas_position(int(kernel_offset(kernel, 0)) + texel), ends);
+    ATLAS_STORE(atlas, int(kernel_offset(kernel, 0)) + texel, ends);
 }

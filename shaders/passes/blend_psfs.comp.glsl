@@ -13,7 +13,11 @@ layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uvec4 recipe
 layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
 layout(binding = TEXTURE_STORE) uniform usampler2DArray store;
+#ifdef ATLAS_IS_BUFFER
+layout(std430, binding = BINDING_NODE_ATLAS) writeonly buffer NodeAtlas { uvec4 node_atlas[]; };
+#else
 layout(rgba32ui, binding = IMAGE_NODES) writeonly uniform uimage2D node_atlas;
+#endif
 
 #include "common/atlas.glsl"
 #include "common/work.glsl"
@@ -61,5 +65,5 @@ void main() {
     if (texel >= reach_width(reach) * reach_height(reach)) return;
     ivec2 at = reach_offset(reach, texel);
     uvec4 ends = pack_weights(recipe_weight(place.x, at), recipe_weight(place.y, at), scale);
-    imageStore(node_atlas, atlas_position(int(place.z) + texel), ends);
+    ATLAS_STORE(node_atlas, int(place.z) + texel, ends);
 }

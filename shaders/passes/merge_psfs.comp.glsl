@@ -9,7 +9,11 @@ layout(local_size_x = THREADS) in;
 
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+#ifdef ATLAS_IS_BUFFER
+layout(std430, binding = BINDING_ATLAS) buffer Atlas { uvec4 atlas[]; };
+#else
 layout(rgba32ui, binding = IMAGE_ATLAS) uniform uimage2D atlas;
+#endif
 
 #include "common/atlas.glsl"
 #include "common/kernels.glsl"
@@ -36,11 +40,11 @@ void main() {
             ivec2 from = at - half_side * ivec2(dx, dy);
             if (any(lessThan(from, ivec2(0))) || any(greaterThanEqual(from, size))) continue;
             int source = int(kernel_offset(kernel, level - 1)) + from.y * size.x + from.x;
-            uvec4 ends = imageLoad(atlas, atlas_position(source));
+            uvec4 ends = ATLAS_LOAD(atlas, source);
             near += near_weights(ends) * step_size;
             far += far_weights(ends) * step_size;
         }
     }
     uvec4 ends = pack_weights(near, far, kernel_scale(kernel, level));
-    imageStore(atlas, atlas_position(int(kernel_offset(kernel, level)) + texel), ends);
+    ATLAS_STORE(atlas, int(kernel_offset(kernel, level)) + texel, ends);
 }

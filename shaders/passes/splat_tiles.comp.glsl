@@ -6,7 +6,8 @@
 // Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD
 //      pixels of a column (8 on a software renderer, where a staged fragment is then read
 //      once by one vector of threads; 1 on hardware).
-// Variants: PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
+// Variants: SKIP_UNLIT, of one pixel a thread (where no thread of a warp is lit, the warp
+//      goes on at once; a software renderer's vectors do not); PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
 //      fragments of one depth (to DISCONTINUITY_PX of blur), front to back, each of which
 //      shares what the nearer ones leave free: of a surface that another hides in part,
 //      no part is taken before the rest.
@@ -34,7 +35,11 @@ uniform ivec2 tile_grid;
 uniform int bin_columns;
 uniform int first_bin;            // of the band
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
+#ifdef ATLAS_IS_BUFFER
+layout(std430, binding = BINDING_ATLAS) readonly buffer Atlas { uvec4 atlas[]; };
+#else
 layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
+#endif
 
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
@@ -202,7 +207,10 @@ void main() {
                 int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
                 for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                     bool lit = (rows & (1u << uint(p))) != 0u;
-                    uvec4 ends = texelFetch(atlas, atlas_position(lit ? texel : 0), 0);
+#ifdef SKIP_UNLIT
+                    if (!lit) continue;
+#endif
+                    uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
                     vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
                     weight *= lit ? scale : 0.0;
 #ifdef PAPER_RULE

@@ -60,8 +60,25 @@ def merged_twin(kernel, edge):
 
 def atlas_line(gpu, name):
     with gpu.context:
-        line = np.frombuffer(gpu.atlas(name, 1).read(), np.uint32)
+        atlas = gpu.atlas(name, 1)
+        if gpu.atlas_is_buffer:
+            line = gpu.read(atlas, (atlas.size // 4,), np.uint32)
+        else:
+            line = np.frombuffer(atlas.read(), np.uint32)
     return line.reshape(-1, 4)[:, :3]
+
+
+@pytest.mark.parametrize("mode", ["on-axis", "dynamic"])
+def test_atlases_in_buffers_make_the_same_frame(gl_engine, rng, monkeypatch, mode):
+    """What a hardware GPU has, though a software renderer reads textures faster."""
+    bench = Bench(gl_engine, MYOPIA, **SIZE, mode=mode)
+    view = bench.view(texture(rng, 101, 150), depth_scene())
+    pictures = []
+    for is_buffer in (False, True):
+        monkeypatch.setattr(bench.gpu, "atlas_is_buffer", is_buffer)
+        bench.renderer = gl_engine.new_renderer()
+        pictures.append(bench.render(view).color)
+    assert np.array_equal(*pictures)
 
 
 def made_kernels(bench, view, **state):

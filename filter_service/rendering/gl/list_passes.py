@@ -241,7 +241,8 @@ class ListPasses:
     def _splat_variant(self) -> dict[str, int]:
         pixels = SOFTWARE_PIXELS_PER_THREAD if self.strip.gpu.is_software else 1
         rows = TILE_SIZE_PX // pixels
-        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **self._rule}
+        skip = {"SKIP_UNLIT": 1} if pixels == 1 else {}
+        return {"PIXELS_PER_THREAD": pixels, "GROUP_ROWS": rows, **skip, **self._rule}
 
     def counts(self) -> dict[str, int]:
         """Return counts of `Rendered` by name."""

@@ -1,0 +1,69 @@
+"""What goes to the GPU and comes from it through mapped memory, byte for byte."""
+
+import numpy as np
+import pytest
+
+from filter_service.gl.staging import FIRST_BYTES
+from tests.numerical.synthetic import Bench, depth_scene, texture
+
+SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
+
+
+@pytest.fixture(params=[True, False], ids=["staged", "plain"])
+def staged(gpu, request):
+    was_staged = gpu._staging is not None
+    with gpu.context:
+        gpu.use_staging(request.param)
+        if request.param and gpu._staging is None:
+            pytest.skip("the driver has no buffer storage")
+    yield gpu
+    with gpu.context:
+        gpu.use_staging(was_staged)
+
+
+@pytest.mark.parametrize("count", [1, 3, 1000, FIRST_BYTES // 4 + 5])
+def test_arrays_come_back_as_they_went(staged, rng, count):
+    sent = rng.random((2, count)).astype(np.float32)
+    with staged.context:
+        buffer = staged.upload("staging test", *sent)
+        whole = staged.read(buffer, (2, count), np.float32)
+        first, last = np.empty(1, np.float32), np.empty(count, np.float32)
+        staged.read_into((buffer, 0, first), (buffer, 4 * count, last))
+    assert np.array_equal(whole, sent)
+    assert first[0] == sent[0, 0]
+    assert np.array_equal(last, sent[1])
+
+
+def test_a_full_block_starts_anew_without_losing_what_was_sent(staged, rng):
+    sent = [rng.integers(0, 2**32, FIRST_BYTES // 12, np.uint32) for _ in range(9)]
+    with staged.context:
+        buffers = [
+            staged.upload(f"staging test {n}", words) for n, words in enumerate(sent)
+        ]
+        for buffer, words in zip(buffers, sent, strict=True):
+            assert np.array_equal(staged.read(buffer, words.shape, np.uint32), words)
+
+
+def test_a_part_of_a_buffer_is_overwritten_and_no_more(staged):
+    with staged.context:
+        buffer = staged.upload("staging test", np.arange(10, dtype=np.uint32))
+        staged.write(buffer, np.array([77, 78], np.uint32), offset=12)
+        found = staged.read(buffer, (10,), np.uint32)
+    assert found.tolist() == [0, 1, 2, 77, 78, 5, 6, 7, 8, 9]
+
+
+def test_frames_are_the_same_either_way(gl_engine, rng):
+    bench = Bench(gl_engine, {"kind": "preset", "name": "myopia"}, **SIZE)
+    view = bench.view(texture(rng, 101, 150), depth_scene())
+    pictures = []
+    gpu, was_staged = bench.gpu, bench.gpu._staging is not None
+    for wanted in (True, False):
+        with gpu.context:
+            gpu.use_staging(wanted)
+        pictures += [
+            bench.render(view, output=output, focus_dpt=0.1).color.tobytes()
+            for output in ("linear", "linear16", "srgb8")
+        ]
+    with gpu.context:
+        gpu.use_staging(was_staged)
+    assert pictures[:3] == pictures[3:]
