@@ -58,6 +58,10 @@ classes, the splat; each is groups along three axes, and a word that is not used
 ENTRIES_EXACT = 2.0**31
 """Sums of list lengths below this hold in a word."""
 
+EXACT_FLOAT = 2.0**23
+EXACT_FLOAT_BITS = 0x4B000000
+"""From here on floats are whole numbers; and its bits."""
+
 FLOAT_INFINITY_BITS = 0x7F800000
 """Of a 32-bit float; larger ones, without the sign, are no numbers."""
 

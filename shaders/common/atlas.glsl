@@ -26,4 +26,13 @@ uvec4 pack_weights(vec3 near, vec3 far, float scale) {
 
 vec3 near_weights(uvec4 texel) { return vec3(texel.rgb & WEIGHT_MASK); }
 
+// Weights at a fraction of the way from one end to the other, in steps.  A step number
+// below the bits of 2^23 is that float plus the number: a GPU converts integers to floats
+// at a quarter of the rate of anything else here.
+vec3 weights_between(uvec4 texel, float fraction) {
+    vec3 near = uintBitsToFloat((texel.rgb & WEIGHT_MASK) | uint(EXACT_FLOAT_BITS));
+    vec3 far = uintBitsToFloat((texel.rgb >> WEIGHT_BITS) | uint(EXACT_FLOAT_BITS));
+    return (near - EXACT_FLOAT) + fraction * (far - near);
+}
+
 vec3 far_weights(uvec4 texel) { return vec3(texel.rgb >> WEIGHT_BITS); }

@@ -46,12 +46,12 @@ const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
 // Staged fragments: what the pixel loop needs, ready to use, in as few words as may be: on
 // a software renderer each word that it reads costs a tenth of an evaluation.
-shared vec4 staged_color[BATCH];      // linear RGB, layer fraction
-shared uint staged_shape[BATCH];      // columns and rows of the tile that it lights, a
-                                      // bit each; level; length of its kernel's rows
-shared int staged_texel[BATCH];       // of the tile's first pixel, were it lit
-shared float staged_scale[BATCH];     // of the weights
-shared float staged_depth[BATCH];     // read where order matters
+shared vec4 staged_color[BATCH];      // linear RGB, by the scale of the weights but for
+                                      // the paper's rule; layer fraction
+shared uvec4 staged_mark[BATCH];      // columns and rows of the tile that it lights, a bit
+                                      // each, level, length of its kernel's rows; texel of
+                                      // the tile's first pixel, were it lit; as float bits
+                                      // the scale, and the depth
 shared uint staged_slot[BATCH];
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
@@ -79,14 +79,20 @@ void stage(uint slot, int at, ivec2 tile_first) {
     ivec2 last = origin + ivec2(reach.right, reach.down) + extent;
     uint columns = bits_between(first.x, last.x);
     uint rows = bits_between(first.y, last.y);
-    staged_color[at] = vec4(color.rgb, place_fraction(place));
-    staged_shape[at] = columns | (rows << uint(ROWS_SHIFT))
-                     | (uint(level) << uint(SHAPE_LEVEL_SHIFT))
-                     | (uint(width) << uint(WIDTH_SHIFT));
-    staged_texel[at] = int(kernel_offset(kernel, level)) - first.y * width - first.x;
-    staged_scale[at] = kernel_scale(kernel, level) / WEIGHT_MAX;
-    staged_depth[at] = color.a;
+    float scale = kernel_scale(kernel, level) / WEIGHT_MAX;
+#ifdef PAPER_RULE
+    vec3 light = color.rgb;
+#else
+    vec3 light = color.rgb * scale;
+#endif
+    staged_color[at] = vec4(light, place_fraction(place));
+    uint shape = columns | (rows << uint(ROWS_SHIFT))
+               | (uint(level) << uint(SHAPE_LEVEL_SHIFT)) | (uint(width) << uint(WIDTH_SHIFT));
+    int texel = int(kernel_offset(kernel, level)) - first.y * width - first.x;
+    staged_mark[at] = uvec4(shape, uint(texel), floatBitsToUint(scale), floatBitsToUint(color.a));
 }
+
+float staged_depth(int at) { return uintBitsToFloat(staged_mark[at].w); }
 
 // Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
 uint find_hits(uint first, uint end, uint tile_bit) {
@@ -187,37 +193,42 @@ void main() {
             int run_end = staged;
 #ifndef PAPER_RULE
             if (ordered) {
-                if (is_beyond(staged_depth[i], group_depth)) {
+                if (is_beyond(staged_depth(i), group_depth)) {
                     for (int p = 0; p < PIXELS_PER_THREAD; ++p) close_depth(sums[p]);
-                    group_depth = staged_depth[i];
+                    group_depth = staged_depth(i);
                 }
                 run_end = i + 1;
-                while (run_end < staged && !is_beyond(staged_depth[run_end], group_depth))
+                while (run_end < staged && !is_beyond(staged_depth(run_end), group_depth))
                     ++run_end;
             }
 #endif
             for (; i < run_end; ++i) {
                 vec4 color = staged_color[i];
-                uint shape = staged_shape[i];
-                float scale = staged_scale[i];
+                uvec4 mark = staged_mark[i];
+                uint shape = mark.x;
+                float scale = uintBitsToFloat(mark.z);
                 int width = int(shape >> uint(WIDTH_SHIFT));
                 int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
                 uint column = (shape >> uint(in_tile.x)) & 1u;
                 uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
-                int texel = staged_texel[i] + in_tile.y * width + in_tile.x;
+                int texel = int(mark.y) + in_tile.y * width + in_tile.x;
                 for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                     bool lit = (rows & (1u << uint(p))) != 0u;
 #ifdef SKIP_UNLIT
                     if (!lit) continue;
 #endif
                     uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
-                    vec3 weight = mix(near_weights(ends), far_weights(ends), color.a);
-                    weight *= lit ? scale : 0.0;
+                    vec3 weight = weights_between(ends, color.a);
+#ifndef SKIP_UNLIT
+                    weight = lit ? weight : vec3(0.0);
+#endif
 #ifdef PAPER_RULE
-                    weight = paper_weight(weight, sums[p].coverage, level);
+                    weight = paper_weight(weight * scale, sums[p].coverage, level);
+                    sums[p].coverage += weight;
+#else
+                    sums[p].coverage += weight * scale;
 #endif
                     sums[p].light += weight * color.rgb;
-                    sums[p].coverage += weight;
                     texel += width;
                 }
             }
