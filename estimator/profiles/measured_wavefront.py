@@ -101,6 +101,8 @@ class MeasuredWavefront(FocusingEye):
         self.vergence = ObjectVergence.seen_through(
             profile.correction, entrance_pupil_mm=depth_mm
         )
+        # of the last pupil: a frame asks for its refraction five times
+        self._relaxed: tuple[float, float] | None = None
         self.eye_side = profile.eye_side
         self.zernike_um = zernike_um
         self.zernike_radius_mm = radius_mm
@@ -123,6 +125,11 @@ class MeasuredWavefront(FocusingEye):
         self, *, pupil_diameter_mm: float, accommodation_dpt: float = 0.0
     ) -> float:
         """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        if self._relaxed is None or self._relaxed[0] != pupil_diameter_mm:
+            self._relaxed = pupil_diameter_mm, self._relaxed_dpt(pupil_diameter_mm)
+        return self._relaxed[1] - accommodation_dpt
+
+    def _relaxed_dpt(self, pupil_diameter_mm: float) -> float:
         radius_mm = pupil_diameter_mm / 2.0
         relaxed_dpt, _, _ = rx.power_vector_from_zernike(
             rescale_pupil(
@@ -130,8 +137,7 @@ class MeasuredWavefront(FocusingEye):
             ),
             zernike_radius_mm=radius_mm,
         )
-        shift_dpt = self.chromatic_shift_dpt(REFERENCE_WAVELENGTH_NM)
-        return relaxed_dpt + shift_dpt - accommodation_dpt
+        return relaxed_dpt + self.chromatic_shift_dpt(REFERENCE_WAVELENGTH_NM)
 
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
