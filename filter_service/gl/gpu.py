@@ -122,9 +122,7 @@ class Gpu:
             buffer.release()
             del self._buffers[name]
         try:
-            created = self.context.buffer(
-                reserve=min(wanted, self.max_block_bytes)
-            )
+            created = self.context.buffer(reserve=min(wanted, self.max_block_bytes))
         except moderngl.Error as error:
             raise OutOfGpuMemory(
                 f"buffer '{name}' of {wanted} bytes: {error}"

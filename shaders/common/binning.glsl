@@ -1,7 +1,8 @@
 // Walk over the fragments whose light reaches a bin, in scan order: blocks row by row
 // through the bin's window, surface after surface, and the fragments of each in order.
-// Each thread takes one stretch of that line; so the list is the same for any number of
-// threads, and for every run.
+// Each thread takes one part of that line; so the list is the same for any number of
+// threads, and for every run.  It is counted in stretches of a block's slots: of blocks
+// there are fewer than threads where no blur is wide.
 // A window (first column and row of blocks, last ones plus one) holds every block that
 // reaches the bin, and no row or column without one.
 // Needs buffers `blocks`, `places` and uniforms `tile_grid`, `surface_count` in scope.
@@ -10,13 +11,21 @@ struct Walk {
     ivec2 bin;
     ivec2 first;                  // block of the window
     ivec2 size;                   // of the window in blocks
-    int next;                     // next block of this thread in the line
+    int next;                     // next stretch of this thread in the line
     int end;
 };
 
+struct Stretch {
+    int block;
+    uint first;                   // slot
+    uint end;
+};
+
+const int STRETCHES = THREADS / STRETCH_SLOTS;  // of a block
+
 Walk start_walk(ivec2 bin, ivec4 window) {
     ivec2 size = max(window.zw - window.xy, 0);
-    int length = surface_count * size.x * size.y;
+    int length = surface_count * size.x * size.y * STRETCHES;
     int share = (length + GROUP_THREADS - 1) / GROUP_THREADS;
     int start = int(gl_LocalInvocationIndex) * share;
     return Walk(bin, window.xy, size, start, min(start + share, length));
@@ -32,16 +41,24 @@ bool block_reaches(int block, ivec2 at, ivec2 bin) {
     return blocks[block].x != 0u && gap_squared <= reach * reach;
 }
 
-// Next block in reach, or -1.
-int next_block(inout Walk walk) {
+// Next fragments of this thread's part, of a block in reach; false where there are none.
+bool next_stretch(inout Walk walk, out Stretch stretch) {
     while (walk.next < walk.end) {
-        int row = walk.next / walk.size.x;
-        ivec2 at = walk.first + ivec2(walk.next - row * walk.size.x, row % walk.size.y);
+        int place = walk.next / STRETCHES;
+        int part = walk.next - place * STRETCHES;
+        int row = place / walk.size.x;
+        ivec2 at = walk.first + ivec2(place - row * walk.size.x, row % walk.size.y);
         int block = (row / walk.size.y * tile_grid.y + at.y) * tile_grid.x + at.x;
-        ++walk.next;
-        if (block_reaches(block, at, walk.bin)) return block;
+        int count = int(blocks[block].x) - part * STRETCH_SLOTS;
+        if (count > 0 && block_reaches(block, at, walk.bin)) {
+            int first = block * THREADS + part * STRETCH_SLOTS;
+            stretch = Stretch(block, uint(first), uint(first + min(count, STRETCH_SLOTS)));
+            ++walk.next;
+            return true;
+        }
+        walk.next = (place + 1) * STRETCHES;
     }
-    return -1;
+    return false;
 }
 
 // A bit for each tile of the bin that the fragment lights: within the box of its kernel

@@ -70,12 +70,11 @@ void main() {
     Walk walk = start_walk(bin, window);
     uint count = 0u;
     uint edges = 0u;
-    for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
-        uint first = uint(block * THREADS);
-        uint end = first + blocks[block].x;
+    Stretch stretch;
+    while (next_stretch(walk, stretch)) {
         // Where a hidden surface arrives, something lies in front of it.
-        bool hidden = block >= tile_grid.x * tile_grid.y;
-        for (uint slot = first; slot < end; ++slot) {
+        bool hidden = stretch.block >= tile_grid.x * tile_grid.y;
+        for (uint slot = stretch.first; slot < stretch.end; ++slot) {
             uvec4 place = places[slot];
             uint tiles = tiles_in_reach(place, bin);
             count += tiles != 0u ? 1u : 0u;

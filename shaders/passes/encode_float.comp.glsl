@@ -1,7 +1,7 @@
 // Packs the filtered frame as linear floats, twelve bytes a pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
 // Dispatch: one thread a pixel (three words).
-// Twin: the first three of each four floats.
+// Twin: reference.gather (the picture itself, without its coverage).
 
 layout(local_size_x = THREADS) in;
 

@@ -29,11 +29,10 @@ void main() {
     int index = first_bin + int(gl_WorkGroupID.x);
     ivec2 bin = ivec2(index % bin_columns, index / bin_columns);
     uint count = 0u;
+    Stretch stretch;
     Walk walk = start_walk(bin, windows[index]);
-    for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
-        uint first = uint(block * THREADS);
-        uint end = first + blocks[block].x;
-        for (uint slot = first; slot < end; ++slot)
+    while (next_stretch(walk, stretch)) {
+        for (uint slot = stretch.first; slot < stretch.end; ++slot)
             count += tiles_in_reach(places[slot], bin) != 0u ? 1u : 0u;
     }
     counts[gl_LocalInvocationIndex] = count;
@@ -42,10 +41,8 @@ void main() {
     uint last = at + list_capacity;
     for (uint other = 0u; other < gl_LocalInvocationIndex; ++other) at += counts[other];
     walk = start_walk(bin, windows[index]);
-    for (int block = next_block(walk); block >= 0; block = next_block(walk)) {
-        uint first = uint(block * THREADS);
-        uint end = first + blocks[block].x;
-        for (uint slot = first; slot < end; ++slot) {
+    while (next_stretch(walk, stretch)) {
+        for (uint slot = stretch.first; slot < stretch.end; ++slot) {
             uint tiles = tiles_in_reach(places[slot], bin);
             if (tiles == 0u) continue;
             if (at < last) entries[at] = pack_entry(slot, tiles);

@@ -20,7 +20,10 @@ layout(std430, binding = BINDING_ENTRIES) coherent buffer Entries { uint entries
 uniform int first_bin;            // of the band
 uniform uint longest_before;      // list of the class below
 
-shared uint buckets[RADIX * GROUP_THREADS];
+// A bucket's row is a word longer than the group: a column of them then lies in as many
+// banks of a GPU's shared memory.
+const int BUCKET_WORDS = GROUP_THREADS + 1;
+shared uint buckets[RADIX * BUCKET_WORDS];
 shared uint bucket_totals[RADIX];
 shared uint nearest;              // as ordered bits
 shared uint farthest;
@@ -95,17 +98,17 @@ void sort_digit(uint first, uint my_first, uint my_end, int shift, bool odd) {
     uint thread = gl_LocalInvocationIndex;
     uint digit_mask = uint(RADIX - 1);
     for (int digit = 0; digit < RADIX; ++digit)
-        buckets[digit * GROUP_THREADS + int(thread)] = 0u;
+        buckets[digit * BUCKET_WORDS + int(thread)] = 0u;
     for (uint i = my_first; i < my_end; ++i) {
         uint digit = (item_key(read_item(i, first, odd)) >> shift) & digit_mask;
-        buckets[digit * uint(GROUP_THREADS) + thread] += 1u;
+        buckets[digit * uint(BUCKET_WORDS) + thread] += 1u;
     }
     barrier();  // counts of all threads are in
     for (int bucket = int(thread); bucket < RADIX; bucket += GROUP_THREADS) {
         uint sum = 0u;
         for (int other = 0; other < GROUP_THREADS; ++other) {
-            uint value = buckets[bucket * GROUP_THREADS + other];
-            buckets[bucket * GROUP_THREADS + other] = sum;
+            uint value = buckets[bucket * BUCKET_WORDS + other];
+            buckets[bucket * BUCKET_WORDS + other] = sum;
             sum += value;
         }
         bucket_totals[bucket] = sum;
@@ -113,14 +116,14 @@ void sort_digit(uint first, uint my_first, uint my_end, int shift, bool odd) {
     barrier();  // places within a bucket are known
     uint base = 0u;
     for (int digit = 0; digit < RADIX; ++digit) {
-        buckets[digit * GROUP_THREADS + int(thread)] += base;
+        buckets[digit * BUCKET_WORDS + int(thread)] += base;
         base += bucket_totals[digit];
     }
     for (uint i = my_first; i < my_end; ++i) {
         uint item = read_item(i, first, odd);
         uint digit = (item_key(item) >> shift) & digit_mask;
-        uint at = buckets[digit * uint(GROUP_THREADS) + thread];
-        buckets[digit * uint(GROUP_THREADS) + thread] = at + 1u;
+        uint at = buckets[digit * uint(BUCKET_WORDS) + thread];
+        buckets[digit * uint(BUCKET_WORDS) + thread] = at + 1u;
         write_item(at, first, odd, item);
     }
     memoryBarrierBuffer();

@@ -4,13 +4,13 @@
 //      the kernel atlas, PIXELS (own colour where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
 // Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD
-//      pixels of a column (8 on a software renderer, where a staged fragment is then read
-//      once by one vector of threads; 1 on hardware).
-// Variants: SKIP_UNLIT, of one pixel a thread (where no thread of a warp is lit, the warp
-//      goes on at once; a software renderer's vectors do not); PAPER_RULE (alpha-over by weight, as the paper); otherwise coverage: sums of
-//      fragments of one depth (to DISCONTINUITY_PX of blur), front to back, each of which
-//      shares what the nearer ones leave free: of a surface that another hides in part,
-//      no part is taken before the rest.
+//      pixels of a column: 8 on a software renderer, where a staged fragment is then read
+//      once by one vector of threads; 2 on hardware, where a tile is one warp.
+// Variants: FRAGMENTS_A_TURN, whose weights are on their way together; PAPER_RULE
+//      (alpha-over by weight, as the paper), otherwise coverage: sums of fragments of one
+//      depth (to DISCONTINUITY_PX of blur), front to back, each of which shares what the
+//      nearer ones leave free: of a surface that another hides in part, no part is taken
+//      before the rest.
 // Twin: reference.gather.  Source: section 6.1; accumulation DESIGN 4.
 
 #include "common/reach.glsl"
@@ -51,8 +51,8 @@ shared vec4 staged_color[BATCH];      // linear RGB, by the scale of the weights
 shared uvec4 staged_mark[BATCH];      // columns and rows of the tile that it lights, a bit
                                       // each, level, length of its kernel's rows; texel of
                                       // the tile's first pixel, were it lit; as float bits
-                                      // the scale, and the depth
-shared uint staged_slot[BATCH];
+                                      // the scale, and the depth.  Before, x is the slot:
+                                      // little shared memory lets many groups run at once
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
 const int ROWS_SHIFT = TILE_SIZE_PX;
@@ -129,11 +129,11 @@ int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
     uint at = rank_of(mine);
     for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i)
         if ((found & (1u << i)) != 0u)
-            staged_slot[at++] = entries[batch + mine + i] >> uint(TILES_PER_BIN);
+            staged_mark[at++].x = entries[batch + mine + i] >> uint(TILES_PER_BIN);
     int count = hit_count();
     barrier();  // the fragments of the new batch are known
     for (int i = int(gl_LocalInvocationIndex); i < count; i += GROUP_THREADS)
-        stage(staged_slot[i], i, tile_first);
+        stage(staged_mark[i].x, i, tile_first);
     barrier();  // and staged
     return count;
 }
@@ -167,6 +167,33 @@ vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
     return weight * (1.0 - coverage);
 }
 #endif
+
+// Whether a fragment lights a pixel of the tile.
+bool is_lit(uvec4 mark, ivec2 in_tile) {
+    return ((mark.x >> uint(in_tile.x)) & (mark.x >> uint(ROWS_SHIFT + in_tile.y)) & 1u) != 0u;
+}
+
+uvec4 fetch_weights(uvec4 mark, ivec2 in_tile) {
+    int width = int(mark.x >> uint(WIDTH_SHIFT));
+    int texel = int(mark.y) + in_tile.y * width + in_tile.x;
+    return ATLAS_FETCH(atlas, is_lit(mark, in_tile) ? texel : 0);
+}
+
+void add_fragment(inout Sum sum, int at, ivec2 in_tile, uvec4 ends) {
+    vec4 color = staged_color[at];
+    uvec4 mark = staged_mark[at];
+    float scale = uintBitsToFloat(mark.z);
+    vec3 weight = weights_between(ends, color.a);
+    weight = is_lit(mark, in_tile) ? weight : vec3(0.0);
+#ifdef PAPER_RULE
+    int level = int(mark.x >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
+    weight = paper_weight(weight * scale, sum.coverage, level);
+    sum.coverage += weight;
+#else
+    sum.coverage += weight * scale;
+#endif
+    sum.light += weight * color.rgb;
+}
 
 void main() {
     int bin = first_bin + int(gl_WorkGroupID.y);
@@ -202,6 +229,20 @@ void main() {
                     ++run_end;
             }
 #endif
+#if FRAGMENTS_A_TURN > 1
+            // Several fetches on their way at a time.
+            for (; i + FRAGMENTS_A_TURN <= run_end; i += FRAGMENTS_A_TURN) {
+                uvec4 ends[FRAGMENTS_A_TURN * PIXELS_PER_THREAD];
+                for (int n = 0; n < FRAGMENTS_A_TURN; ++n)
+                    for (int p = 0; p < PIXELS_PER_THREAD; ++p)
+                        ends[n * PIXELS_PER_THREAD + p] =
+                            fetch_weights(staged_mark[i + n], in_tile + ivec2(0, p));
+                for (int n = 0; n < FRAGMENTS_A_TURN; ++n)
+                    for (int p = 0; p < PIXELS_PER_THREAD; ++p)
+                        add_fragment(sums[p], i + n, in_tile + ivec2(0, p),
+                                     ends[n * PIXELS_PER_THREAD + p]);
+            }
+#endif
             for (; i < run_end; ++i) {
                 vec4 color = staged_color[i];
                 uvec4 mark = staged_mark[i];
@@ -214,14 +255,9 @@ void main() {
                 int texel = int(mark.y) + in_tile.y * width + in_tile.x;
                 for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                     bool lit = (rows & (1u << uint(p))) != 0u;
-#ifdef SKIP_UNLIT
-                    if (!lit) continue;
-#endif
                     uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
                     vec3 weight = weights_between(ends, color.a);
-#ifndef SKIP_UNLIT
                     weight = lit ? weight : vec3(0.0);
-#endif
 #ifdef PAPER_RULE
                     weight = paper_weight(weight * scale, sums[p].coverage, level);
                     sums[p].coverage += weight;

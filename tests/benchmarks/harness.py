@@ -60,7 +60,10 @@ def machine_info() -> dict:
 
 
 def commit_id() -> str:
-    """Short hash of the checkout, with "+" where files differ from it."""
+    """Short hash of the checkout, with "+" where files differ from it.
+
+    Of a copy without its history OCUFILTER_COMMIT tells.
+    """
 
     def git(*arguments: str) -> str:
         answer = subprocess.run(
@@ -69,7 +72,9 @@ def commit_id() -> str:
         return answer.stdout.strip() if answer.returncode == 0 else ""
 
     changed = git("status", "--porcelain", "--untracked-files=no")
-    return (git("rev-parse", "--short", "HEAD") or "none") + ("+" if changed else "")
+    head = git("rev-parse", "--short", "HEAD")
+    head = head or os.environ.get("OCUFILTER_COMMIT") or "none"
+    return head + ("+" if changed else "")
 
 
 def time_calls(

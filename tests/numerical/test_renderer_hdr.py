@@ -35,7 +35,8 @@ def test_the_filter_scales_with_the_light(bench, rng, unit):
     plain = bench.render(bench.view(color, depth_m))
     scaled = bench.render(bench.view((color * unit).astype(np.float32), depth_m))
     assert 0 < scaled.merged_count == plain.merged_count
-    assert relative_error(scaled.color / unit, plain.color) <= 1e-6
+    # float32 sums of hundreds of weights, in which a scaled light rounds otherwise
+    assert relative_error(scaled.color / unit, plain.color) <= 4e-6
 
 
 def test_merging_keeps_the_dark_of_a_bright_scene(bench, rng):

@@ -62,7 +62,7 @@ def atlas_line(gpu, name):
     with gpu.context:
         atlas = gpu.atlas(name, 1)
         if gpu.atlas_is_buffer:
-            line = gpu.read(atlas, (atlas.size // 4,), np.uint32)
+            line = gpu.read(atlas, (atlas.size // 16, 4), np.uint32)
         else:
             line = np.frombuffer(atlas.read(), np.uint32)
     return line.reshape(-1, 4)[:, :3]

@@ -27,6 +27,7 @@ from filter_service.rendering.image_cells import (
     can_coarsen,
     check_texels,
 )
+
 MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
 

@@ -249,7 +249,10 @@ def _counted_px(
     rows: "_Rows", view: RgbdView, border_px: int
 ) -> tuple[int, int, int, int]:
     """Pixels (left, top, right, bottom) of a strip that are its part of the image."""
-    top, bottom = border_px - rows.first_row, border_px + view.height_px - rows.first_row
+    top, bottom = (
+        border_px - rows.first_row,
+        border_px + view.height_px - rows.first_row,
+    )
     first, last, _ = rows.kept.indices(rows.view.height_px)
     return border_px, max(top, first), border_px + view.width_px, min(bottom, last)
 
