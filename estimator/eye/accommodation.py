@@ -139,6 +139,14 @@ class Rest(Protocol):
         """Monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
 
 
+def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
+    """How many of these, from the first on, are finite and fall."""
+    usable = np.isfinite(refractions_dpt)
+    usable[1:] &= np.diff(refractions_dpt) < 0.0
+    usable[0] = True
+    return int(np.argmin(usable)) if not usable.all() else usable.size
+
+
 class AccommodatingEye(Focusing):
     """An eye that can be asked to focus, at any pupil.
 
@@ -284,36 +292,46 @@ class AccommodatingEye(Focusing):
             -math.inf, pupil_diameter_mm=pupil_diameter_mm
         )
 
-    def _cornea_refractions_dpt(self) -> NDArray[np.float64]:
-        """M at the cornea of the traced eye alone, at the lens diameters of the table.
+    def _cornea_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Accommodations of the table, and M at the cornea of the traced eye alone.
 
-        Through its own pupil: what the networks know.
+        Through its own pupil: what the networks know.  As far as light passes there and
+        M falls: at the cornea a pupil is wider than in its own plane, and a strongly
+        bent lens lets less of it through.
         """
-        return refraction_of_vectors(
+        refractions_dpt = refraction_of_vectors(
             accommodated_vectors(self._vector, lens_diameter_mm=self._diameters_mm),
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
         )
+        if not np.isfinite(refractions_dpt[0]):
+            raise TraceFailed(
+                "light does not pass the relaxed eye's cornea at "
+                f"{self.pupil_diameter_mm:g} mm"
+            )
+        count = _falling_count(refractions_dpt)
+        return self._accommodations_dpt[:count], refractions_dpt[:count]
 
     def at_cornea_dpt(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
-        """M at the cornea (n,) of the traced eye alone, at accommodations (n,)."""
+        """M at the cornea (n,) of the traced eye alone, at accommodations (n,).
+
+        Beyond what light passes at the cornea, at the last that does.
+        """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
-        refractions_dpt = self._cornea_refractions_dpt()
-        return BarycentricInterpolator(self._accommodations_dpt, refractions_dpt)(
-            used_dpt
+        known_dpt, refractions_dpt = self._cornea_table()
+        return BarycentricInterpolator(known_dpt, refractions_dpt)(
+            np.minimum(used_dpt, known_dpt[-1])
         )
 
     def accommodations_at_cornea_dpt(
         self, refractions_dpt: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Accommodations (n,) within the amplitude for M at the cornea (n,)."""
-        known_dpt = self._cornea_refractions_dpt()
+        known_dpt, at_cornea_dpt = self._cornea_table()
         if known_dpt.size == 1:
             return np.zeros(np.shape(refractions_dpt))
-        wanted_dpt = np.clip(refractions_dpt, known_dpt[-1], known_dpt[0])
-        used_dpt = BarycentricInterpolator(known_dpt, self._accommodations_dpt)(
-            wanted_dpt
-        )
+        wanted_dpt = np.clip(refractions_dpt, at_cornea_dpt[-1], at_cornea_dpt[0])
+        used_dpt = BarycentricInterpolator(at_cornea_dpt, known_dpt)(wanted_dpt)
         return np.clip(used_dpt, 0.0, self.amplitude_dpt)
 
     def _refraction_table(self):
@@ -327,10 +345,7 @@ class AccommodatingEye(Focusing):
             raise TraceFailed(
                 f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
             )
-        usable = np.isfinite(refractions_dpt)
-        usable[1:] &= np.diff(refractions_dpt) < 0.0
-        usable[0] = True
-        count = int(np.argmin(usable)) if not usable.all() else usable.size
+        count = _falling_count(refractions_dpt)
         return diameters_mm[:count], refractions_dpt[:count]
 
     def _refractions_dpt(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 gpu            context, buffers, textures, programs, timers
 hardware       which renderers are a GPU
 shader_source  shader text: includes, defines, line numbers
+staging        memory that both sides see, for what goes to the GPU and comes from it
 """
 
 import lazy_loader

@@ -10,10 +10,13 @@ few calls are made here.
 import ctypes
 import ctypes.util
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-import moderngl
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import moderngl
 
 GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER = 0x8F36, 0x8F37
 GL_MAP_READ_BIT, GL_MAP_WRITE_BIT = 0x1, 0x2
@@ -53,7 +56,7 @@ def gl_calls() -> dict[str, Callable] | None:
     return calls
 
 
-def has_buffer_storage(context: moderngl.Context) -> bool:
+def has_buffer_storage(context: "moderngl.Context") -> bool:
     """Whether the context may map a buffer for good."""
     return context.version_code >= 440 or "GL_ARB_buffer_storage" in context.extensions
 
@@ -68,7 +71,7 @@ class Staging:
         From `gl_calls`.
     """
 
-    def __init__(self, context: moderngl.Context, calls: dict[str, Callable]):
+    def __init__(self, context: "moderngl.Context", calls: dict[str, Callable]):
         self._context = context
         self._calls = calls
         self._name = _uint(0)
@@ -104,11 +107,11 @@ class Staging:
         self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
         return start, self._bytes[start : start + n_bytes]
 
-    def copy_to(self, buffer: moderngl.Buffer, start: int, at: int, n_bytes: int):
+    def copy_to(self, buffer: "moderngl.Buffer", start: int, at: int, n_bytes: int):
         """Have bytes from a place of the block copied to a buffer."""
         self._copy(self._name.value, buffer.glo, start, at, n_bytes)
 
-    def copy_from(self, buffer: moderngl.Buffer, at: int, start: int, n_bytes: int):
+    def copy_from(self, buffer: "moderngl.Buffer", at: int, start: int, n_bytes: int):
         """Have bytes of a buffer copied to a place of the block."""
         self._copy(buffer.glo, self._name.value, at, start, n_bytes)
 

@@ -4,11 +4,11 @@
 
 The courtyard over the whole visual field ("dynamic"), colour and depth in host memory,
 8-bit sRGB in and out, one eye or two of a headset.  "moving": pupil and focus change
-with every frame, so that its kernels are blended anew; "frozen": they stay.  Frames come
-one after the other for two seconds before any is timed, for a GPU that rests runs at a
-fifth of its clock; what the clock then was stands with the machine, where nvidia-smi
-tells.  "passes" is the sum of the GPU's own timers, "around" the rest of the wall time:
-copies to and from the GPU, planning, calls of the driver.
+with every frame, so that its kernels are blended anew; "frozen": they stay.  Frames
+come one after the other for two seconds before any is timed, for a GPU that rests runs
+at a fifth of its clock; the clocks stand with the machine, where nvidia-smi tells them.
+"passes" is the sum of the GPU's own timers, "around" the rest of the wall time: copies
+to and from the GPU, planning, calls of the driver.
 
 Error: PSNR in linear light against the native engine, whose loops have no code in
 common with the passes; its own error against the dense reference is in live.json.

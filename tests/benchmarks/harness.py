@@ -64,6 +64,9 @@ def commit_id() -> str:
 
     Of a copy without its history OCUFILTER_COMMIT tells.
     """
+    told = os.environ.get("OCUFILTER_COMMIT")
+    if told:
+        return told
 
     def git(*arguments: str) -> str:
         answer = subprocess.run(
@@ -73,8 +76,7 @@ def commit_id() -> str:
 
     changed = git("status", "--porcelain", "--untracked-files=no")
     head = git("rev-parse", "--short", "HEAD")
-    head = head or os.environ.get("OCUFILTER_COMMIT") or "none"
-    return head + ("+" if changed else "")
+    return (head or "none") + ("+" if changed else "")
 
 
 def time_calls(

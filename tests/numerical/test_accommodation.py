@@ -269,3 +269,25 @@ def test_a_far_sighted_eye_runs_into_the_bound_of_the_published_search():
 def test_spot_criterion_refuses_a_distance_behind_the_head():
     with pytest.raises(ValueError, match="0 \\(infinity\\) or more"):
         focus_by_spot(EyeParameters.mean_eye(), focus_dpt=-1.0)
+
+
+@pytest.mark.parametrize("pupil_mm", [4.0, 6.0, 7.0])
+@pytest.mark.parametrize("name", ["cataract", "keratoconus"])
+def test_refraction_at_the_cornea_is_known_as_far_as_light_passes(name, pupil_mm):
+    """A wide pupil of a bent lens lets no light pass at the cornea any more."""
+    found = estimate_eye(parse_profile({"kind": "preset", "name": name}))
+    eye = AccommodatingEye(
+        found.accommodating.parameters,
+        retina=found.accommodating.retina,
+        pupil_diameter_mm=pupil_mm,
+    )
+    used_dpt = np.linspace(0.0, min(eye.amplitude_dpt, 12.0), 7)
+    at_cornea_dpt = eye.at_cornea_dpt(used_dpt)
+    assert np.isfinite(at_cornea_dpt).all()
+    assert (np.diff(at_cornea_dpt) <= 0.0).all()
+    again_dpt = eye.accommodations_at_cornea_dpt(at_cornea_dpt)
+    assert np.isfinite(eye.lens_diameters_mm(again_dpt)).all()
+    known_dpt, _ = eye._cornea_table()
+    inside = used_dpt <= known_dpt[-1]
+    assert inside.any()
+    assert np.abs(again_dpt - used_dpt)[inside].max() < 0.01

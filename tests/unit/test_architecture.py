@@ -76,6 +76,7 @@ HOME = {
     ),
     "moderngl": (
         "filter_service/gl/gpu.py",  # one owner of the context
+        "filter_service/gl/staging.py",  # names its types
         "clients/window.py",  # shows frames in a window of its own
     ),
     "glfw": ("clients/window.py",),

@@ -19,6 +19,7 @@ from filter_service.constants import (
 )
 from filter_service.gl.gpu import Buffer
 from filter_service.rendering.gl import list_bands
+from filter_service.rendering.gl.list_bands import ENTRY_BYTES
 from filter_service.rendering.gl.strip import Strip
 
 SOFTWARE_SPLAT = {
@@ -26,7 +27,7 @@ SOFTWARE_SPLAT = {
     "GROUP_ROWS": 1,
     "FRAGMENTS_A_TURN": 1,
 }
-"""2.8 times the evaluations per second of one pixel a thread on llvmpipe (8 float lanes)."""
+"""2.8 times the evaluations a second of one pixel a thread on llvmpipe (8 floats)."""
 
 HARDWARE_SPLAT = {
     "PIXELS_PER_THREAD": 2,
@@ -35,13 +36,13 @@ HARDWARE_SPLAT = {
     "BATCH": 32,
     "HIT_WORDS": 1,
 }
-"""One warp a tile, and little shared memory, so that many tiles are under way at once and
-wait for each other's fetches: on an H100 1.4 to 1.9 times as fast as groups of 64 threads
-that stage 128 fragments and fetch one at a time."""
+"""One warp a tile, and little shared memory, so that many tiles are under way at once
+while others wait for their fetches: on an H100 1.4 to 1.9 times as fast as groups of 64
+threads that stage 128 fragments and fetch one at a time."""
 
 HARDWARE_STRETCH_SLOTS = 16
-"""Slots of a block that a thread walks over at a time, where there are more threads than
-blocks in reach; on a software renderer whole blocks."""
+"""Slots of a block that a thread walks over at a time, where there are more threads
+than blocks in reach; on a software renderer whole blocks."""
 
 SOFTWARE_LIST_THREADS = 8
 """Threads that make and sort a bin's list on a software renderer: one vector."""
@@ -98,7 +99,7 @@ class ListPasses:
         """Entries that the two buffers of lists hold, as one band."""
         return tuple(
             min(
-                self.strip.buffers[name].size // list_bands.ENTRY_BYTES,
+                self.strip.buffers[name].size // ENTRY_BYTES,
                 self._list_limit,
             )
             for name in ("ENTRIES", "ENTRIES_SPARE")
@@ -146,7 +147,7 @@ class ListPasses:
     @property
     def _list_limit(self) -> int:
         """Entries of a band, and of the longest list that is kept."""
-        fit = self.strip.gpu.max_block_bytes // list_bands.ENTRY_BYTES
+        fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES
         return min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
@@ -170,7 +171,7 @@ class ListPasses:
         """Cut the lists into bands, and make room for the longest."""
         with self.strip.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
-        n_bytes = list_bands.ENTRY_BYTES * max(entries for _, _, entries in self.bands)
+        n_bytes = ENTRY_BYTES * max(entries for _, _, entries in self.bands)
         self.strip.reserve(ENTRIES=n_bytes)
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         self.strip.reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
