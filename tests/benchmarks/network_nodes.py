@@ -107,7 +107,9 @@ def reference_focus(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
         eye = AccommodatingEye(
             EyeParameters.from_vector(vector), pupil_diameter_mm=pupil_mm
         )
-        ends_mm = eye.lens_diameters_mm([0.0, eye.lens_range_dpt])
+        # as far as light passes at the cornea, where the networks' focus is counted
+        nearest_dpt = eye.accommodations_at_cornea_dpt(np.array([-np.inf]))
+        ends_mm = eye.lens_diameters_mm([0.0, *nearest_dpt])
 
         def off_dpt(diameter_mm, focus_dpt, pupil_mm=pupil_mm):
             return focus_dpt + refraction_dpt([diameter_mm], vector, pupil_mm)[0]
