@@ -203,10 +203,14 @@ def measure(view: RgbdView, settings: dict, eyes: list[str], repeats: int):
             FilterClient(service.endpoint) as client,
         ):
             client.set_profile(START, settings=settings, views=[view])
-            for name in eyes:
-                client.set_profile(EYES[name], settings=settings, views=[view])
+            # The stream is known from here on: a plan follows it, so what is kept of an
+            # eye that was there before any frame would be another part of it.
+            for _ in range(STEADY_FRAMES):
                 client.filter(view, **STATE)
-                _await_file(folder, 2 + eyes.index(name))
+            for name in eyes:
+                kept = len(list(Path(folder).glob("*.psfs")))
+                switch(client, view, EYES[name], settings)
+                _await_file(folder, kept + 1)
             for name in eyes:
                 found = [
                     switch(client, view, EYES[name], settings) for _ in range(repeats)
