@@ -8,7 +8,7 @@ decentration and offsets add, some hundredths of a dioptre and smooth in everyth
 import torch
 from torch import Tensor, nn
 
-from estimator.eye.accommodation import AQUEOUS, DIAMETER
+from estimator.eye.lens_change import AQUEOUS, DIAMETER
 from estimator.eye.lens_shape import ANTERIOR_THICKNESS_RATIO
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from training.eye_features import EyeFeatures, lens_thickness_mm, named

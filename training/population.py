@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from estimator.estimate.prior import REFRACTION_LIMITS_DPT, deviations, mean_eyes
-from estimator.eye.accommodation import (
+from estimator.eye.lens_change import (
     AQUEOUS,
     DIAMETER,
     SMALLEST_AQUEOUS_MM,

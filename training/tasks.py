@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.eye.accommodation import (
+from estimator.eye.accommodation import AccommodatingEye
+from estimator.eye.assembly import pack_eyes
+from estimator.eye.lens_change import (
     AQUEOUS,
     DIAMETER,
-    AccommodatingEye,
     accommodated_eyes,
     smallest_diameter_mm,
 )
-from estimator.eye.assembly import pack_eyes
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
 from estimator.eye.tracing import MEDIA_INWARDS, TraceFailed, eye_indices
 from estimator.networks.card import INPUTS, OUTPUTS, ZERNIKE_NAMES

@@ -3,6 +3,7 @@
 checked_fields  reading one field of a profile, every refusal with its range
 parameters      the 45 parameters by name, as vectors, with their ranges
 lens_shape      the lens at constant volume
+lens_change     the lens at other diameters, and the chamber before it
 assembly        from parameters to surfaces, one eye or many
 explicit        an eye given surface by surface
 tracing         coefficients and refractions of many eyes

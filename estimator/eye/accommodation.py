@@ -1,10 +1,7 @@
 """Accommodation: the lens diameter and chamber depth that focus an eye at a distance.
 
-The lens shrinks at constant volume, which steepens both surfaces (rule C); its anterior
-pole, and the stop with it, moves forward by the growth of the thickness before the
-equator, so the aqueous thins; the eye's length stays.  The eye is focused at f dpt when
-its ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm, is
--f.
+How the lens changes stands in `lens_change`.  The eye is focused at f dpt when its
+ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm, is -f.
 """
 
 import math
@@ -18,12 +15,14 @@ from scipy.interpolate import BarycentricInterpolator
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.focus_table import FocusTable, table_pupils_mm
 from estimator.eye.focusing import Focusing
-from estimator.eye.lens_shape import (
-    ANTERIOR_THICKNESS_RATIO,
-    CAP_VOLUME_RATIO,
-    lens_shape,
+from estimator.eye.lens_change import (
+    AQUEOUS,
+    DIAMETER,
+    accommodated,
+    accommodated_vectors,
+    smallest_diameter_mm,
 )
-from estimator.eye.parameters import EyeParameters, RetinaShape, column
+from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.eye.tracing import (
     TraceFailed,
     refraction_of_vectors,
@@ -40,13 +39,6 @@ from estimator.wavefront.field_wavefronts import (
     zernike_from_polynomial,
 )
 
-SMALLEST_DIAMETER_RATIO = 0.84
-"""Smallest lens diameter over the relaxed one.  The earlier search stopped at 0.91, on
-which most of its targets then sat (optics.md 0, defect 4)."""
-
-SMALLEST_AQUEOUS_MM = 1.0
-"""Depth of the anterior chamber below which the lens would press on the cornea."""
-
 N_TABLE = 10
 """Lens diameters at which the refraction is traced before the root is refined."""
 
@@ -55,64 +47,6 @@ N_FOCUS = 6
 
 REFRACTION_TOLERANCE_DPT = 1e-6
 MAX_REFINEMENTS = 6
-
-DIAMETER = column("lens_diameter_mm")
-VOLUME = column("lens_volume_mm3")
-AQUEOUS = column("aqueous_thickness_mm")
-
-
-def accommodated_vectors(
-    vector: NDArray[np.float64], *, lens_diameter_mm: ArrayLike
-) -> NDArray[np.float64]:
-    """Vectors (P, 45) of one relaxed eye with these lens diameters (P,)."""
-    lens_diameter_mm = np.atleast_1d(np.asarray(lens_diameter_mm, dtype=np.float64))
-    vectors = np.repeat(vector[None], lens_diameter_mm.size, axis=0)
-    return accommodated_eyes(vectors, lens_diameter_mm)
-
-
-def accommodated_eyes(
-    vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Relaxed eyes (P, 45) with other lens diameters (P,), their volumes kept."""
-    volume_mm3 = vectors[:, VOLUME]
-    relaxed = lens_shape(diameter_mm=vectors[:, DIAMETER], volume_mm3=volume_mm3)
-    shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=volume_mm3)
-    focused = vectors.copy()
-    focused[:, DIAMETER] = lens_diameter_mm
-    focused[:, AQUEOUS] -= shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
-    return focused
-
-
-def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
-    """Return the same eye with another lens diameter, its volume kept.
-
-    Raises
-    ------
-    ValueError
-        A diameter that is not positive.
-    """
-    vectors = accommodated_vectors(
-        parameters.to_vector(), lens_diameter_mm=lens_diameter_mm
-    )
-    return replace(
-        parameters,
-        lens_diameter_mm=float(vectors[0, DIAMETER]),
-        aqueous_thickness_mm=float(vectors[0, AQUEOUS]),
-    )
-
-
-def smallest_diameter_mm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lens diameters (...) to which relaxed eyes (..., 45) can shrink their lens.
-
-    `SMALLEST_DIAMETER_RATIO` of the relaxed one, or where the chamber is
-    `SMALLEST_AQUEOUS_MM` deep: the lens thickens before its equator by
-    c (1/D² - 1/D0²), c = 8 eta V tau / (pi (1 + tau)), see `lens_shape`.
-    """
-    relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
-    room_mm = np.maximum(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, 0.0)
-    c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
-    fitting_mm = (relaxed_mm**-2 + room_mm / c_mm3) ** -0.5
-    return np.maximum(fitting_mm, SMALLEST_DIAMETER_RATIO * relaxed_mm)
 
 
 @dataclass(frozen=True)

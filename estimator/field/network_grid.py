@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.estimation import EstimatedEye
-from estimator.eye.accommodation import FocusedEye, accommodated_vectors
+from estimator.eye.accommodation import FocusedEye
+from estimator.eye.lens_change import accommodated_vectors
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
 from estimator.networks.card import NetworkUnfit

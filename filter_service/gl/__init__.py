@@ -1,8 +1,9 @@
 """OpenGL: one owner of the context.
 
-gpu            context, buffers, textures, programs, timers
+gpu            context, buffers, textures, programs
 hardware       which renderers are a GPU
 shader_source  shader text: includes, defines, line numbers
+stage_timer    times of a frame's stages
 staging        memory that both sides see, for what goes to the GPU and comes from it
 """
 

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.errors import OutOfGpuMemory
+
 if TYPE_CHECKING:
     import moderngl
 
@@ -97,6 +99,11 @@ class Staging:
         """Return the place of free bytes and the bytes.
 
         Waits for the GPU where there are none, for its copies of what was given out.
+
+        Raises
+        ------
+        OutOfGpuMemory
+            The driver maps no block of that size.
         """
         if self._used + n_bytes > self.size:
             self._context.finish()
@@ -136,6 +143,6 @@ class Staging:
         address = calls["glMapBufferRange"](GL_COPY_READ_BUFFER, 0, n_bytes, access)
         if not address:
             self.release()
-            raise MemoryError(f"no {n_bytes / 1e6:.0f} MB of memory to map")
+            raise OutOfGpuMemory(f"no {n_bytes / 1e6:.0f} MB of memory to map")
         memory = (ctypes.c_uint8 * n_bytes).from_address(address)
         self._bytes = np.frombuffer(memory, np.uint8)

@@ -1,7 +1,7 @@
 // The kernel atlas: one long line of texels.  A texel holds, for red, green and blue, the
 // weights at both ends of an interval of layers.
-// ATLAS_IS_BUFFER: a storage buffer; a GPU reads 16 bytes of one eight times as fast as of
-// a texture.  Otherwise a 2D texture: on a software renderer that costs half.
+// ATLAS_IS_BUFFER: a storage buffer, which a GPU reads faster (shaders/README.md).
+// Otherwise a 2D texture: on a software renderer that costs half.
 
 #ifdef ATLAS_IS_BUFFER
 #define ATLAS_FETCH(atlas, texel) atlas[texel]
@@ -27,8 +27,8 @@ uvec4 pack_weights(vec3 near, vec3 far, float scale) {
 vec3 near_weights(uvec4 texel) { return vec3(texel.rgb & WEIGHT_MASK); }
 
 // Weights at a fraction of the way from one end to the other, in steps.  A step number
-// below the bits of 2^23 is that float plus the number: a GPU converts integers to floats
-// at a quarter of the rate of anything else here.
+// below the bits of 2^23 is that float plus the number: no conversion, of which a GPU does
+// fewer at a time than of sums.
 vec3 weights_between(uvec4 texel, float fraction) {
     vec3 near = uintBitsToFloat((texel.rgb & WEIGHT_MASK) | uint(EXACT_FLOAT_BITS));
     vec3 far = uintBitsToFloat((texel.rgb >> WEIGHT_BITS) | uint(EXACT_FLOAT_BITS));

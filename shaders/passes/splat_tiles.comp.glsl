@@ -179,12 +179,10 @@ uvec4 fetch_weights(uvec4 mark, ivec2 in_tile) {
     return ATLAS_FETCH(atlas, is_lit(mark, in_tile) ? texel : 0);
 }
 
-void add_fragment(inout Sum sum, int at, ivec2 in_tile, uvec4 ends) {
-    vec4 color = staged_color[at];
-    uvec4 mark = staged_mark[at];
+// Adds a fragment's light at a pixel that it lights, or not, by the weights fetched for it.
+void add_fragment(inout Sum sum, uvec4 ends, bool lit, vec4 color, uvec4 mark) {
+    vec3 weight = lit ? weights_between(ends, color.a) : vec3(0.0);
     float scale = uintBitsToFloat(mark.z);
-    vec3 weight = weights_between(ends, color.a);
-    weight = is_lit(mark, in_tile) ? weight : vec3(0.0);
 #ifdef PAPER_RULE
     int level = int(mark.x >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
     weight = paper_weight(weight * scale, sum.coverage, level);
@@ -239,32 +237,21 @@ void main() {
                             fetch_weights(staged_mark[i + n], in_tile + ivec2(0, p));
                 for (int n = 0; n < FRAGMENTS_A_TURN; ++n)
                     for (int p = 0; p < PIXELS_PER_THREAD; ++p)
-                        add_fragment(sums[p], i + n, in_tile + ivec2(0, p),
-                                     ends[n * PIXELS_PER_THREAD + p]);
+                        add_fragment(sums[p], ends[n * PIXELS_PER_THREAD + p],
+                                     is_lit(staged_mark[i + n], in_tile + ivec2(0, p)),
+                                     staged_color[i + n], staged_mark[i + n]);
             }
 #endif
             for (; i < run_end; ++i) {
                 vec4 color = staged_color[i];
                 uvec4 mark = staged_mark[i];
-                uint shape = mark.x;
-                float scale = uintBitsToFloat(mark.z);
-                int width = int(shape >> uint(WIDTH_SHIFT));
-                int level = int(shape >> uint(SHAPE_LEVEL_SHIFT)) & LEVEL_MASK;
-                uint column = (shape >> uint(in_tile.x)) & 1u;
-                uint rows = column * (shape >> uint(ROWS_SHIFT + in_tile.y));
+                int width = int(mark.x >> uint(WIDTH_SHIFT));
+                uint column = (mark.x >> uint(in_tile.x)) & 1u;
+                uint rows = column * (mark.x >> uint(ROWS_SHIFT + in_tile.y));
                 int texel = int(mark.y) + in_tile.y * width + in_tile.x;
                 for (int p = 0; p < PIXELS_PER_THREAD; ++p) {
                     bool lit = (rows & (1u << uint(p))) != 0u;
-                    uvec4 ends = ATLAS_FETCH(atlas, lit ? texel : 0);
-                    vec3 weight = weights_between(ends, color.a);
-                    weight = lit ? weight : vec3(0.0);
-#ifdef PAPER_RULE
-                    weight = paper_weight(weight * scale, sums[p].coverage, level);
-                    sums[p].coverage += weight;
-#else
-                    sums[p].coverage += weight * scale;
-#endif
-                    sums[p].light += weight * color.rgb;
+                    add_fragment(sums[p], ATLAS_FETCH(atlas, lit ? texel : 0), lit, color, mark);
                     texel += width;
                 }
             }

@@ -5,8 +5,8 @@
 The courtyard over the whole visual field ("dynamic"), colour and depth in host memory,
 8-bit sRGB in and out, one eye or two of a headset.  "moving": pupil and focus change
 with every frame, so that its kernels are blended anew; "frozen": they stay.  Frames
-come one after the other for two seconds before any is timed, for a GPU that rests runs
-at a fifth of its clock; the clocks stand with the machine, where nvidia-smi tells them.
+come one after the other for two seconds before any is timed, for a GPU that rests
+lowers its clock; the clocks stand with the machine, where nvidia-smi tells them.
 "passes" is the sum of the GPU's own timers, "around" the rest of the wall time: copies
 to and from the GPU, planning, calls of the driver.
 
@@ -67,7 +67,6 @@ class Case:
     eye: str
     setting: str
     view: RgbdView
-    view_count: int
     renderers: list[FilterRenderer]
     handles: list
     memory_mb: float
@@ -146,7 +145,6 @@ def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Cas
         eye,
         setting,
         view,
-        view_count,
         renderers,
         handles,
         gpu.memory_mb,

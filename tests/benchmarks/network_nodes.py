@@ -10,13 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from estimator.eye.accommodation import (
-    AQUEOUS,
-    DIAMETER,
-    AccommodatingEye,
-    accommodated_vectors,
-)
+from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import pack_eyes
+from estimator.eye.lens_change import AQUEOUS, DIAMETER, accommodated_vectors
 from estimator.eye.parameters import N_PARAMETERS, EyeParameters
 from estimator.eye.tracing import eye_indices, refraction_of_vectors
 from estimator.networks import inference as networks

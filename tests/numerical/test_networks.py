@@ -11,8 +11,9 @@ import pytest
 
 from estimator.estimate.estimation import GOOD_FIT_UM, estimate_eye
 from estimator.estimate.network_guess import network_guess
-from estimator.eye.accommodation import AccommodatingEye, accommodated_vectors
+from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import eye_surfaces
+from estimator.eye.lens_change import accommodated_vectors
 from estimator.eye.parameters import EyeParameters, column, random_vectors
 from estimator.eye.tracing import TraceFailed, zernike_of_vectors
 from estimator.networks import inference as networks

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service import constants
-from filter_service.gl.gpu import StageTimer
+from filter_service.gl.stage_timer import StageTimer
 from filter_service.rendering.gl import list_bands, list_passes
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip

@@ -5,6 +5,7 @@ import pytest
 
 from filter_service import constants
 from filter_service.rendering import frame_kernels, reference
+from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
 from tests.numerical.synthetic import Bench, depth_scene, texture
@@ -126,6 +127,60 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
                 assert np.abs(made - twin).max() <= rounding + 1e-6
                 levels.add(level)
     assert len(levels) >= 2
+
+
+def test_a_frame_whose_lists_outgrow_their_buffers_loses_nothing(gl_engine, rng):
+    """Lists are made in the buffers that there are, and again where those are small."""
+    bench = Bench(gl_engine, MYOPIA, **SIZE)
+    view = bench.view(texture(rng, 101, 150), depth_scene())
+    wide = {"pupil_diameter_mm": 5.0, "merge": False}
+    with bench.gpu.context:
+        bench.gpu.storage("ENTRIES", 4 << 20)
+    expected = bench.render(view, **wide)
+    assert 1000 < expected.entry_count < 1 << 20
+    for name in ("ENTRIES", "ENTRIES_SPARE"):
+        bench.gpu._buffers.pop(name, None)
+    small = bench.render(view, pupil_diameter_mm=3.0)
+    assert expected.entry_count > 2 * small.entry_count
+    assert bench.render(view, **wide).color.tobytes() == expected.color.tobytes()
+
+
+def faulty_view(bench, rng):
+    """A scene with pixels without depth, too near, and without a finite colour."""
+    color, depth_m = texture(rng, 101, 150), depth_scene()
+    color[70:73, 20:30, 1] = np.nan
+    color[90, 100] = np.inf
+    depth_m[5:9, 40:60] = 0.03
+    return bench.view(color, depth_m)
+
+
+def test_faults_are_counted_once_whatever_the_frame_is_cut_into(
+    bench, rng, monkeypatch
+):
+    view = faulty_view(bench, rng)
+    whole = bench.render(view)
+    assert (whole.bad_color_count, whole.clamped_depth_count) == (31, 80)
+    monkeypatch.setattr(bench.gpu, "max_block_bytes", 16 * 152 * 80)
+    cut = bench.render(view)
+    assert cut.fragment_count > whole.fragment_count
+    assert (cut.bad_color_count, cut.clamped_depth_count) == (31, 80)
+
+
+def test_depth_that_goes_missing_in_a_stream_is_filled_from_that_frame_on(
+    gl_engine, rng
+):
+    whole_m, lacking_m = depth_scene(), depth_scene()
+    lacking_m[40:50, 90:97] = np.nan
+    color = texture(rng, 101, 150)
+    bench = Bench(gl_engine, MYOPIA, **SIZE)
+    stream = [bench.view(color, m) for m in (whole_m, lacking_m, lacking_m, whole_m)]
+    seen = [bench.render(view) for view in stream]
+    assert [frame.missing_depth_count for frame in seen] == [0, 70, 70, 0]
+    assert seen[1].color.tobytes() == seen[2].color.tobytes()
+    assert seen[0].color.tobytes() == seen[3].color.tobytes()
+    filled_m, _ = fill_missing_depth(lacking_m)
+    filled = bench.render(bench.view(color, filled_m))
+    assert seen[1].color.tobytes() == filled.color.tobytes()
 
 
 @pytest.mark.parametrize("accumulation", ["coverage", "paper"])

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from estimator.eye.accommodation import (
+from estimator.eye.accommodation import MAX_REFINEMENTS, N_TABLE
+from estimator.eye.lens_change import (
     AQUEOUS,
     DIAMETER,
-    MAX_REFINEMENTS,
-    N_TABLE,
     SMALLEST_AQUEOUS_MM,
     SMALLEST_DIAMETER_RATIO,
     VOLUME,
@@ -61,7 +60,7 @@ def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
 
 
 def smallest_diameters_mm(vectors: Tensor) -> Tensor:
-    """See `estimator.eye.accommodation.smallest_diameter_mm`."""
+    """See `estimator.eye.lens_change.smallest_diameter_mm`."""
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
     c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
 from filter_service.errors import GridTooLarge
-from filter_service.gl.gpu import Buffer, Gpu, Pages, StageTimer
+from filter_service.gl.gpu import Buffer, Gpu, Pages
+from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame_kernels import (

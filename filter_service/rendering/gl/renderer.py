@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from filter_service.constants import BIN_SIZE_PX, STORE_SIDE, TILE_SIZE_PX
 from filter_service.errors import OutOfGpuMemory
-from filter_service.gl.gpu import Gpu, Pages, StageTimer
+from filter_service.gl.gpu import Gpu, Pages
+from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import (

@@ -1,7 +1,8 @@
 """One frame, or a strip of it, on its way through the passes: its size, its buffers."""
 
 from filter_service.constants import BIN_TILES, TILE_SIZE_PX
-from filter_service.gl.gpu import Buffer, Gpu, StageTimer
+from filter_service.gl.gpu import Buffer, Gpu
+from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers
 from filter_service.rgbd_view import RgbdView
 
