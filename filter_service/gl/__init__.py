@@ -1,5 +1,6 @@
 """OpenGL: one owner of the context.
 
+copying        copies of large images by several threads
 gpu            context, buffers, textures, programs
 hardware       which renderers are a GPU
 shader_source  shader text: includes, defines, line numbers

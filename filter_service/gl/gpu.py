@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
+from filter_service.gl.copying import copy_bytes
 from filter_service.gl.hardware import is_software_renderer
 from filter_service.gl.shader_source import legend, load_shader
 from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_storage
@@ -147,7 +148,7 @@ class Gpu:
             return
         block = self._staging["to"]
         start, free = block.take(words.size)
-        free[:] = words
+        copy_bytes(free, words)
         block.copy_to(buffer, start, offset, words.size)
 
     def pages(self, n_words: int) -> Pages:
@@ -242,7 +243,7 @@ class Gpu:
             start += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
         self.context.finish()
         for (_, _, out), start in zip(parts, starts, strict=True):
-            _bytes_of(out)[:] = free[start : start + out.nbytes]
+            copy_bytes(_bytes_of(out), free[start : start + out.nbytes])
         for block in self._staging.values():
             block.reset()  # nothing waits any more
 
