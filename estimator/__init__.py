@@ -8,6 +8,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     eye/           the 45-parameter model
     profiles/      what is known of one eye
     networks/      the trained networks
+    periphery/     how people's wavefronts change off the axis, measured
     estimate/      from a measurement to the eye
     field/         an eye over its visual field
     threads        how many threads this machine gives us

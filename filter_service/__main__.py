@@ -9,6 +9,7 @@ from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.commands.console import CommandFailed
 from filter_service.commands.doctor import doctor
 from filter_service.commands.estimate import estimate
+from filter_service.commands.field import field
 from filter_service.commands.filter_image import filter_image
 from filter_service.commands.prepare import prepare
 from filter_service.commands.programs import bench, demo
@@ -35,6 +36,7 @@ app.command()(serve)
 app.command(name="filter")(filter_image)
 app.command()(estimate)
 app.command()(wavefront)
+app.command()(field)
 app.command()(psf)
 app.command()(bench)
 app.command()(prepare)

@@ -48,7 +48,7 @@ class EstimationProblem:
 
     def __init__(self, profile: EyeProfile):
         self.profile = profile
-        self.measurements = profile.measurements or (
+        self.measurements = profile.compared_measurements or (
             Measurement(
                 profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
             ),

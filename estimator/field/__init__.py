@@ -5,9 +5,12 @@ aberration_grid  wavefronts traced at the nodes of a grid
 network_grid     the same by network
 grid_source      which of the two, by cost and error
 interpolation    between the nodes
+peripheral_rest  what people's periphery has beyond the model's
 traced_fields    fixed fields, changing pupil and focus
 traced_eye       an estimated eye, ray-traced over the field
 prepare          from a profile to such an eye: the entry
+field_table      its wavefronts in many directions, as an instrument gives them
+plot             maps of them
 notes            what is said of how it was made
 """
 

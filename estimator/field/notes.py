@@ -6,8 +6,10 @@ A part that fell back from a network says which input left its training range.
 from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.field.grid_source import GridSource, GridUse
-from estimator.field.traced_eye import TRACED_ERROR_UM
+from estimator.field.traced_eye import TRACED_ERROR_UM, TracedEye
 from estimator.networks.inference import load_network
+from estimator.periphery.change import DISAGREES_UM
+from estimator.periphery.meridian import KNOTS_DEG
 
 _STARTS = {"network": "the network's guess", "table": "a table's eye"}
 
@@ -32,6 +34,23 @@ def eye_notes(
         *_of_aberrations(source.uses),
         *said,
     )
+
+
+def periphery_note(eye: TracedEye) -> str:
+    """Say where an eye's periphery comes from, and how well it is known."""
+    if eye.periphery is None:
+        return "periphery: the eye model's own, not that of people"
+    change = eye.periphery.change
+    at_deg = (10.0, 20.0, 30.0)
+    known_dpt = dict(zip(KNOTS_DEG, change.sphere_deviation_dpt, strict=True))
+    known = ", ".join(f"{max(known_dpt[a], known_dpt[-a]):.1f}" for a in at_deg)
+    whose = "typical of people with such an axis"
+    if change.measured_count:
+        whose = f"measured in {change.measured_count} directions beside the axis"
+    found = f"periphery: {whose}; M at 10, 20, 30 deg known to +-{known} dpt"
+    if change.miss_um > DISAGREES_UM:
+        found += f"; the measurements contradict each other by {change.miss_um:.2f} um"
+    return found
 
 
 def _of_eye(estimated: EstimatedEye) -> str:

@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.grid_source import GridSource
-from estimator.field.notes import eye_notes
+from estimator.field.notes import eye_notes, periphery_note
 from estimator.field.traced_eye import ON_AXIS_DEG, FieldRange, TracedEye
 from estimator.networks.card import NetworkUnavailable
 from estimator.networks.inference import load_network
@@ -106,7 +107,10 @@ def prepare_eye(
             ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"
         ),
     )
-    return eye, eye_notes(estimated, source, network_reason=network_reason)
+    notes = eye_notes(estimated, source, network_reason=network_reason)
+    if np.any(field_range_deg):
+        notes = (*notes, periphery_note(eye))
+    return eye, notes
 
 
 def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:

@@ -21,7 +21,9 @@ from estimator.field.interpolation import (
     accommodation_nodes_dpt,
     field_nodes_deg,
 )
+from estimator.field.peripheral_rest import PeripheralRest
 from estimator.field.traced_fields import TracedFields, check_limits
+from estimator.periphery.change import peripheral_change
 from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
@@ -87,6 +89,10 @@ class TracedEye(FocusingEye):
         Fields that may be asked for.
     traced_range_deg : the same
         Fields beyond it answer as its edge.
+    entrance_pupil_mm : float
+        How deep it lies behind the cornea.
+    periphery : PeripheralRest or None
+        What is added off the axis, see there; None where the eye model has its own.
     """
 
     pupil_limit = "traced"
@@ -99,6 +105,7 @@ class TracedEye(FocusingEye):
         *,
         field_range_deg: FieldRange = ON_AXIS_DEG,
         traced_range_deg: FieldRange = ON_AXIS_DEG,
+        periphery: PeripheralRest | None = None,
     ):
         self.grid = axis.grid
         self.eye_side = eye.profile.eye_side
@@ -109,12 +116,13 @@ class TracedEye(FocusingEye):
         self.max_pupil_diameter_mm = largest_open_pupil_mm(axis.grid)
         self.field_range_deg = field_range_deg
         self.traced_range_deg = traced_range_deg
+        self.periphery = periphery
         self._field = field or axis
         has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
         self._on_axis = self._field if has_axis else axis
+        self.entrance_pupil_mm = eye.accommodating.entrance_pupil_mm
         self._correction = correction_polynomial(
-            eye.profile.correction,
-            entrance_pupil_mm=eye.accommodating.entrance_pupil_mm,
+            eye.profile.correction, entrance_pupil_mm=self.entrance_pupil_mm
         )
         self._rest = eye.rest(axis.grid.wavelengths_nm)
 
@@ -188,6 +196,7 @@ class TracedEye(FocusingEye):
             field,
             field_range_deg=field_range_deg,
             traced_range_deg=traced_range_deg,
+            periphery=_peripheral_rest(eye, traced_range_deg),
         )
 
     def refraction_at_dpt(
@@ -312,6 +321,30 @@ class TracedEye(FocusingEye):
             total_defocus_dpt=total_dpt,
         )
 
+    def states(
+        self,
+        *,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        pupil_diameter_mm: ArrayLike,
+        accommodation_dpt: ArrayLike,
+        wavelength_nm: ArrayLike,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients (P, 28), rims (P, 5), mm, and radii (P,), object at infinity.
+
+        P in C order of the broadcast arguments.
+
+        Raises
+        ------
+        ValueError
+            A state outside of what was traced.
+        """
+        states = np.broadcast_arrays(
+            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
+        )
+        zernike_um, rim_mm, radius_mm, number = self._distinct(list(states))
+        return zernike_um[number], rim_mm[number], radius_mm[number]
+
     def chief_ray_shift_mrad(
         self,
         *,
@@ -361,6 +394,7 @@ class TracedEye(FocusingEye):
             self._on_axis,
             self._correction,
             self._rest,
+            periphery=self.periphery,
             h_deg=h_deg,
             v_deg=v_deg,
             wavelength_nm=wavelength_nm,
@@ -428,6 +462,19 @@ def _trace_field(
             return field, tuple(map(tuple, traced))
         share *= SHRINK_RATIO
     return axis, ON_AXIS_DEG
+
+
+def _peripheral_rest(
+    eye: EstimatedEye, field_range_deg: FieldRange
+) -> PeripheralRest | None:
+    """Return people's periphery for an eye; None where it has its model's.
+
+    So it has where light does not pass the usual eye over the whole range.
+    """
+    if eye.profile.periphery == "model" or not np.any(field_range_deg):
+        return None
+    rest = PeripheralRest(peripheral_change(eye.profile), eye, field_range_deg)
+    return rest if rest.passes else None
 
 
 def _share(

@@ -4,11 +4,14 @@ What depends on field and wavelength alone is interpolated once, see `FieldValue
 stream of frames asks for the same fields again and again.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.measured_rest import MeasuredRest
 from estimator.field.interpolation import FieldInterpolation
+from estimator.field.peripheral_rest import PeripheralRest, stretch_ratio
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     distinct_rows,
@@ -46,6 +49,9 @@ class TracedFields:
         What a worn correction takes off.
     rest : MeasuredRest
         What is added.
+    periphery : PeripheralRest, optional
+        What is added off the axis; the rest is then the same over the field: people's
+        wavefronts are told as changes from the axis.
     h_deg, v_deg, wavelength_nm : (n,)
         Within what was traced.
     pupil_diameter_mm : (n,), optional
@@ -59,6 +65,7 @@ class TracedFields:
         correction_um: NDArray[np.float64],
         rest: MeasuredRest,
         *,
+        periphery: PeripheralRest | None = None,
         h_deg: NDArray[np.float64],
         v_deg: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
@@ -73,7 +80,10 @@ class TracedFields:
             h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm, **pupils
         )
         self._rest = rest
-        self._left_share = rest.left_share(h_deg, v_deg)
+        self._left_share, self._people_um = rest.left_share(h_deg, v_deg), None
+        if periphery is not None:
+            self._left_share = np.ones(h_deg.size)
+            self._people_um = _of_distinct(periphery.at, h_deg, v_deg)
         self._added_um = rest.color_um(wavelength_nm) - correction_um
         zeros = np.zeros(h_deg.size)
         self._axis_states = on_axis.values(
@@ -104,6 +114,8 @@ class TracedFields:
         rim_mm = rim_mm * self._rim_scale(pupil_mm, used_dpt)[:, None]
         radius_mm = circumscribed_radius_mm(rim_mm)
         residue_um = self._rest.residues_um(pupil_mm / 2.0, self._left_share)
+        if self._people_um is not None:
+            residue_um += self._people_um * stretch_ratio(pupil_mm / 2.0)
         zernike_um = zernike_from_polynomial(
             polynomial_um + self._added_um + residue_um, radius_mm
         )
@@ -126,3 +138,11 @@ class TracedFields:
         if self._open_mm is None:
             return pupil_mm
         return np.minimum(pupil_mm, self._open_mm)
+
+
+def _of_distinct(
+    function: Callable[..., NDArray], h_deg: NDArray, v_deg: NDArray
+) -> NDArray[np.float64]:
+    """Return rows of a function of directions (n,), each worked out once."""
+    first, number = distinct_rows(h_deg, v_deg)
+    return function(h_deg[first], v_deg[first])[number]

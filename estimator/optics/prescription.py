@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.units import ASTIGMATISM_PER_C22, MM_PER_M, SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, index_from_nm
@@ -68,12 +68,17 @@ def power_vector_from_zernike(
     zernike_um: NDArray[np.float64], *, zernike_radius_mm: float
 ) -> tuple[float, float, float]:
     """Least-squares M, J0, J45 in dpt: from the second-order coefficients alone."""
-    area = zernike_radius_mm**2
-    return (
-        float(-SPHERE_PER_C20 * zernike_um[C20] / area),
-        float(-ASTIGMATISM_PER_C22 * zernike_um[C22] / area),
-        float(-ASTIGMATISM_PER_C22 * zernike_um[C2M2] / area),
-    )
+    m, j0, j45 = power_vectors_dpt(np.asarray(zernike_um), zernike_radius_mm).tolist()
+    return m, j0, j45
+
+
+def power_vectors_dpt(
+    zernike_um: NDArray[np.float64], zernike_radius_mm: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the same (..., 3) of sets (..., 28) on circles (...)."""
+    second = zernike_um[..., [C20, C22, C2M2]]
+    per_um = -np.array([SPHERE_PER_C20, ASTIGMATISM_PER_C22, ASTIGMATISM_PER_C22])
+    return per_um * second / np.square(zernike_radius_mm)[..., None]
 
 
 def prescription_from_power_vector(

@@ -41,7 +41,19 @@ __all__ = [
     "preset_names",
 ]
 
-COMMON_FIELDS = ("kind", "eye_side", "age_years", "correction", "name", "retina")
+COMMON_FIELDS = (
+    "kind",
+    "eye_side",
+    "age_years",
+    "correction",
+    "name",
+    "retina",
+    "periphery",
+)
+PERIPHERIES = ("people", "model")
+"""Where a traced eye's wavefronts off the axis come from: measured people with such an
+axis, or the surfaces of the eye model alone."""
+
 PRESCRIPTION_FIELDS = (
     "sphere_dpt",
     "cylinder_dpt",
@@ -115,6 +127,9 @@ class EyeProfile:
         The eye itself, for kind ``eye``.
     retina : RetinaShape or None
         Instead of the sphere of radius eye length / 2.
+    periphery : {"people", "model"}
+        Whether a traced eye has people's periphery; a given eye, and one with a retina
+        of its own, has the model's.
     higher_order : {"typical", "none"}
         Aberrations to be added where an eye is traced (`typical_aberrations`); a
         prescription alone asks for any.
@@ -133,6 +148,18 @@ class EyeProfile:
     eye: EyeParameters | None = None
     retina: RetinaShape | None = None
     higher_order: str = "none"
+    periphery: str = "people"
+
+    @cached_property
+    def compared_measurements(self) -> tuple[Measurement, ...]:
+        """Return what the eye model is fitted to, the leading one first.
+
+        What was measured off the axis is part of people's periphery, where the eye
+        takes that.
+        """
+        if self.periphery == "model":
+            return self.measurements
+        return tuple(m for m in self.measurements if m.is_on_axis)
 
     @cached_property
     def zernike_um(self) -> NDArray[np.float64]:
@@ -200,11 +227,23 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
         body = fields.mapping(data["correction"], "correction")
         fields.only_known(body, PRESCRIPTION_FIELDS[:4], path="correction.")
         correction = _prescription(body, path="correction.")
+    retina = parse_retina(data)
+    is_model = retina is not None or data.get("kind") == "eye"
+    periphery = fields.choice(
+        data, "periphery", PERIPHERIES, default="model" if is_model else "people"
+    )
+    if is_model and periphery != "model":
+        raise ProfileError(
+            "periphery",
+            "is 'people', but the profile gives the eye's own surfaces",
+            "model, for kind 'eye' and beside 'retina'",
+        )
     return {
         "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
         "age_years": age_years,
         "correction": correction,
-        "retina": parse_retina(data),
+        "retina": retina,
+        "periphery": periphery,
     }
 
 

@@ -11,6 +11,7 @@ image_files      pictures and depth in files
 plan_text        a plan in words
 estimate         an eye from a profile
 wavefront        its aberrations
+field            those of its whole visual field
 psf              its PSFs
 doctor           what works here
 doctor_checks    each thing tried

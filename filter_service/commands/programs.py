@@ -23,6 +23,7 @@ class Bench(StrEnum):
 
     ESTIMATE = "estimate"
     FOCUS = "focus"
+    PEOPLE = "people"
     DISPLAYS = "displays"
     NETWORKS = "networks"
     PLAN = "plan"
@@ -44,6 +45,7 @@ class Bench(StrEnum):
 BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
     Bench.FOCUS: "tests.benchmarks.bench_focus",
+    Bench.PEOPLE: "tests.benchmarks.bench_people",
     Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",

@@ -13,10 +13,11 @@ from filter_service.planning.grid import GREEN, GridSpec
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
 
-COLUMNS, ROWS = 13, 9
+COLUMNS, ROWS = 17, 11
 """Directions at which the eye is asked.  Between them, over +-40 x 25 deg at 5 mm, the
-spline is within 0.0025 dpt (emmetropia, myopia, astigmatism), 0.007 (post-LASIK), 0.009
-(keratoconus) and 0.012 (cataract)."""
+spline is within 0.011 dpt (emmetropia), 0.022 (keratoconus) and 0.030 (myopia), worst
+in the corners, beyond where people were measured, and 99 % within 0.008, 0.014 and
+0.021.  With 13 x 9 it is 0.055 in myopia, and a new state takes 0.1 ms less."""
 
 
 @dataclass(frozen=True)

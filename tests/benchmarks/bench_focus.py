@@ -2,20 +2,11 @@
 
     python -m tests.benchmarks.bench_focus [--quick] [--json]
 
-<<<<<<< HEAD
 Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to 7
 mm.  Rays from points at many distances then run inwards to the retina: error is how far
 the distance of the smallest RMS wavefront lies from the focus that the eye reported.
 Beside it stands the distance of the largest visual Strehl ratio, the criterion not
 taken.  Far points are those of both eye models.  Writes results/focus.json.
-=======
-Every eye is asked, as a frame asks it, to look at distances through pupils of 2 to
-7 mm.  Rays from points at many distances then run inwards to the retina: error is how
-far the distance of the smallest RMS wavefront lies from the focus that the eye
-reported.  Beside it stands the distance of the largest visual Strehl ratio, the
-criterion not taken.  Far points are those of both eye models.  Writes
-results/focus.json.
->>>>>>> hoa
 """
 
 import argparse

@@ -6,7 +6,7 @@ accommodations and two nodes of defocus each, every kernel computed, none from a
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -45,10 +45,11 @@ def spec_for(width_px=480, height_px=270, vertical_fov_deg=50.0, **settings):
     )
 
 
-def traced_eye(name, spec):
+def traced_eye(name, spec, periphery="people"):
     """The traced eye of a preset for all that a spec asks for."""
     return _traced(
         name,
+        periphery,
         tuple(pupil_nodes_mm(spec.settings.pupil_range_mm)),
         spec.settings.focus_range_dpt,
         spec.field_range_deg,
@@ -57,14 +58,16 @@ def traced_eye(name, spec):
 
 
 @cache
-def _estimated(name):
-    return estimate_eye(load_profile(name))
+def _estimated(name, periphery):
+    return estimate_eye(replace(load_profile(name), periphery=periphery))
 
 
 @cache
-def _traced(name, pupils_mm, focus_range_dpt, field_range_deg, wavelengths_nm):
+def _traced(
+    name, periphery, pupils_mm, focus_range_dpt, field_range_deg, wavelengths_nm
+):
     return TracedEye.trace(
-        _estimated(name),
+        _estimated(name, periphery),
         pupil_diameters_mm=pupils_mm,
         focus_range_dpt=focus_range_dpt,
         wavelengths_nm=wavelengths_nm,

@@ -125,7 +125,8 @@ def test_exact_asks_no_network(monkeypatch):
     _, notes = prepared("exact")
     assert not any("network" in note for note in notes)
     assert "refined from a table's eye" in notes[0]
-    assert len(notes) == 3
+    assert len(notes) == 4
+    assert notes[-1].startswith("periphery: ")
 
 
 @pytest.mark.parametrize("accuracy", ["fast", "balanced"])

@@ -196,7 +196,9 @@ def test_fields_and_pupils_together_determine_more_of_the_eye(rng):
         parse_profile({"kind": "zernike_set", "measurements": bodies[:1]})
     )
     several = estimate_eye(
-        parse_profile({"kind": "zernike_set", "measurements": bodies})
+        parse_profile(
+            {"kind": "zernike_set", "measurements": bodies, "periphery": "model"}
+        )
     )
     assert several.mean_abs_error_um <= PRESET_LIMIT_UM
     for name in ("lens_decentration_x_mm", "aqueous_thickness_mm"):

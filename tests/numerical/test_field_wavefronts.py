@@ -31,7 +31,8 @@ WORST_RIM_RATIO = 0.012
 
 
 def estimated(**body):
-    return estimate_eye(parse_profile(body))
+    """Eyes whose periphery is the model's, as it is traced."""
+    return estimate_eye(parse_profile({**body, "periphery": "model"}))
 
 
 def traced(eye, *, pupils_mm=(2.0, 4.0, 7.0), foci_dpt=(0.0, 4.0), fields=WIDE_DEG):
@@ -174,7 +175,7 @@ def test_a_worn_correction_is_taken_off_alike_at_all_fields():
     worn = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 30.0}
     body = {"kind": "prescription", **worn, "higher_order": "none"}
     bare_eye = traced(estimated(**body), foci_dpt=(-4.0, 0.0))
-    worn_profile = parse_profile({**body, "correction": worn})
+    worn_profile = parse_profile({**body, "correction": worn, "periphery": "model"})
     worn_eye = traced(estimate_eye(worn_profile), foci_dpt=(-4.0, 0.0))
     state = {
         **{"h_deg": np.array([0.0, 33.0, -12.0]), "v_deg": np.array([0.0, -20.0, 9.0])},

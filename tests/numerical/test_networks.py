@@ -264,7 +264,9 @@ def test_of_several_measurements_the_axial_one_is_asked_of():
     profile = parse_profile({"kind": "preset", "name": "myopia"})
     measurements = [measurement(profile, h_deg=10.0), measurement(profile)]
     measurements[0]["zernike_um"]["2,0"] += 1.0
-    several = parse_profile({"kind": "zernike_set", "measurements": measurements})
+    several = parse_profile(
+        {"kind": "zernike_set", "measurements": measurements, "periphery": "model"}
+    )
     np.testing.assert_allclose(network_guess(several), network_guess(profile))
     found = estimate_eye(several, method="network")
     assert found.method == "network" and found.mean_abs_error_um > 0.01

@@ -41,9 +41,13 @@ EYE_ROOMS = {
     "psf": ("optics",),
     "eye": ("wavefront", "optics"),
     "profiles": ("eye", "wavefront", "optics"),
+    "periphery": ("profiles", "optics"),
     "networks": ("eye", "optics"),
     "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
-    "field": ("estimate", "networks", "profiles", "eye", "wavefront", "optics"),
+    "field": (
+        *("estimate", "networks", "periphery", "profiles"),
+        *("eye", "wavefront", "optics"),
+    ),
 }
 """From light to an eye over its field: each room knows only those before it."""
 
@@ -115,6 +119,7 @@ HOME = {
         "clients/*",
         "tests/*",  # plots of measurements
         "estimator/estimate/plot.py",  # `ocufilter estimate --plot`
+        "estimator/field/plot.py",  # `ocufilter field --plot`
         "training/learning_curve.py",
     ),
     "OpenEXR": ("filter_service/commands/image_files.py",),

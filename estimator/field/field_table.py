@@ -1,0 +1,125 @@
+"""The wavefronts of a profile's eye in many directions, as an instrument gives them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.field.prepare import prepare_eye
+from estimator.field.traced_eye import TracedEye
+from estimator.optics import prescription as rx
+from estimator.profiles.parse import EyeProfile
+from estimator.wavefront.field_wavefronts import (
+    ellipse_from_rim,
+    polynomial_in_mm,
+    zernike_from_polynomial,
+)
+from estimator.wavefront.moved_plane import moved_polynomial
+
+RELAXED_DPT = -60.0
+"""A distance that no eye accommodates for."""
+
+LEAST_EXTENT_DEG = 1.0
+"""Half extent of the traced field about the axis, whatever is asked for."""
+
+
+@dataclass(frozen=True)
+class FieldTable:
+    """Wavefronts over the visual field of one eye in one state.
+
+    Attributes
+    ----------
+    h_deg, v_deg : (n,)
+    zernike_um : (n, 28)
+        At the cornea, on circles about the chief ray, see ``zernike_radius_mm`` (n,).
+    power_dpt : (n, 3)
+        M, J0 and J45 of those.
+    pupil_ellipse : (n, 5)
+        Pupil within the circle: centre x, y and semi-axes, mm, and angle, rad.
+    notes : tuple of str
+    """
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    power_dpt: NDArray[np.float64]
+    pupil_ellipse: NDArray[np.float64]
+    notes: tuple[str, ...]
+
+
+def field_table(
+    profile: EyeProfile,
+    *,
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    pupil_diameter_mm: float,
+    wavelength_nm: float,
+    focus_dpt: float | None = None,
+) -> FieldTable:
+    """Return the wavefronts of an eye in directions (n,).
+
+    Parameters
+    ----------
+    focus_dpt : float, optional
+        Distance made sharpest; relaxed where None.
+
+    Raises
+    ------
+    ValueError
+        Light does not pass the eye, or the pupil is wider than it lets through.
+    """
+    h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
+    at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
+    eye, notes = prepare_eye(
+        profile,
+        pupil_diameters_mm=[pupil_diameter_mm],
+        focus_range_dpt=(at_dpt, at_dpt),
+        wavelengths_nm=[wavelength_nm],
+        field_range_deg=(_around_axis(h_deg), _around_axis(v_deg)),
+    )
+    if eye.usable_pupil_mm(pupil_diameter_mm) < pupil_diameter_mm:
+        raise ValueError(
+            f"pupil {pupil_diameter_mm:g} mm: light passes this eye up to "
+            f"{eye.max_pupil_diameter_mm:.3g} mm"
+        )
+    zernike_um, rim_mm, radius_mm = eye.states(
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameter_mm=pupil_diameter_mm,
+        accommodation_dpt=eye.grid.accommodations_dpt[0],
+        wavelength_nm=wavelength_nm,
+    )
+    # Frames need wavefronts in the entrance pupil; instruments tell them at the cornea.
+    at_cornea_um = moved_polynomial(
+        polynomial_in_mm(zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
+    )
+    zernike_um = zernike_from_polynomial(at_cornea_um, radius_mm)
+    return FieldTable(
+        h_deg=h_deg,
+        v_deg=v_deg,
+        zernike_um=zernike_um,
+        zernike_radius_mm=radius_mm,
+        power_dpt=rx.power_vectors_dpt(zernike_um, radius_mm),
+        pupil_ellipse=ellipse_from_rim(rim_mm),
+        notes=(*notes, *_edge_notes(eye, h_deg, v_deg)),
+    )
+
+
+def _around_axis(angles_deg: NDArray) -> tuple[float, float]:
+    return (
+        min(float(angles_deg.min()), -LEAST_EXTENT_DEG),
+        max(float(angles_deg.max()), LEAST_EXTENT_DEG),
+    )
+
+
+def _edge_notes(eye: TracedEye, h_deg: NDArray, v_deg: NDArray) -> tuple[str, ...]:
+    (h_low, h_high), (v_low, v_high) = eye.traced_range_deg
+    inside = (h_deg >= h_low) & (h_deg <= h_high) & (v_deg >= v_low) & (v_deg <= v_high)
+    if inside.all():
+        return ()
+    return (
+        f"light passes the eye's pupil from h {h_low:.1f} to {h_high:.1f} deg and v "
+        f"{v_low:.1f} to {v_high:.1f} deg: {np.count_nonzero(~inside)} directions "
+        "beyond answer as its edge",
+    )

@@ -1,0 +1,142 @@
+"""What of people's periphery an estimated eye does not show; it travels as a phase.
+
+An eye that has a person's axis does not have their periphery: the model's lens is
+homogeneous, its retina a sphere, and the axis says nothing of either.  What measured
+people with such an axis have there (`periphery`), less what their eye model has, is
+added to the traced wavefronts.  On the axis that is nothing.
+
+An eye unlike the measured people, such as one with keratoconus, gets what the nearest
+usual eye is lacking; by what it differs from that one, it is traced.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.estimate.estimation import EstimatedEye, estimate_eye
+from estimator.eye.tracing import on_axis_zernike_um
+from estimator.field.aberration_grid import aberration_grid
+from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import N_TERMS, flip_horizontal, remove_central_tilt
+from estimator.periphery.change import PeripheralChange
+from estimator.periphery.meridian import CIRCLE_MM, TERMS
+from estimator.profiles.parse import EyeProfile, Measurement
+from estimator.wavefront.field_wavefronts import (
+    DEGREE,
+    polynomial_in_mm,
+    zernike_from_polynomial,
+)
+from estimator.wavefront.moved_plane import moved_polynomial
+
+WIDEST_RATIO = 1.5
+"""Pupils wider than so many times the measured one are filled by stretched terms of
+the third and fourth order: polynomials go anywhere beyond what was measured."""
+
+RINGS, AZIMUTHS = 5, 14
+
+
+class PeripheralRest:
+    """Phase (n, 28), in the plane of the entrance pupil, over a range of fields.
+
+    Parameters
+    ----------
+    change : PeripheralChange
+    eye : EstimatedEye
+        Whose wavefronts it is added to.
+    field_range_deg : ((h_low, h_high), (v_low, v_high))
+        Fields that light passes.
+    """
+
+    def __init__(
+        self,
+        change: PeripheralChange,
+        eye: EstimatedEye,
+        field_range_deg: tuple[tuple[float, float], tuple[float, float]],
+    ):
+        self.change = change
+        usual = usual_eye(change, eye)
+        self._traced = FieldInterpolation(
+            aberration_grid(
+                usual,
+                h_deg=field_nodes_deg(*field_range_deg[0]),
+                v_deg=field_nodes_deg(*field_range_deg[1]),
+                pupil_diameters_mm=[2.0 * CIRCLE_MM],
+                accommodations_dpt=[0.0],
+                wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
+                n_rings=RINGS,
+                n_azimuths=AZIMUTHS,
+            )
+        )
+        self._depth_mm = usual.accommodating.entrance_pupil_mm
+        self._at_cornea_um = _on_circle(usual)
+        self._on_axis_um = self._difference_um(np.zeros(1), np.zeros(1))
+
+    @property
+    def passes(self) -> bool:
+        """Whether the usual eye could be traced over the whole range."""
+        return self._traced.passes
+
+    def at(
+        self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
+        return self._difference_um(h_deg, v_deg) - self._on_axis_um
+
+    def _difference_um(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
+        people_um = self._at_cornea_um + self.change.zernike_um(h_deg, v_deg)
+        people_um = moved_polynomial(
+            polynomial_in_mm(remove_central_tilt(people_um), CIRCLE_MM),
+            depth_mm=self._depth_mm,
+        )
+        traced_um, _ = self._traced.at(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            pupil_diameter_mm=np.full(h_deg.size, 2.0 * CIRCLE_MM),
+            accommodation_dpt=np.zeros(h_deg.size),
+            wavelength_nm=np.full(h_deg.size, REFERENCE_WAVELENGTH_NM),
+        )
+        missing_um = zernike_from_polynomial(people_um - traced_um, CIRCLE_MM)
+        known = np.isin(np.arange(N_TERMS), TERMS)
+        missing_um = remove_central_tilt(np.where(known, missing_um, 0.0))
+        return polynomial_in_mm(missing_um, CIRCLE_MM)
+
+
+def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Factors (n, 28) of the phase's monomials in pupils of radii (n,)."""
+    ratio = np.minimum(WIDEST_RATIO * CIRCLE_MM / radius_mm, 1.0)
+    return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
+
+
+def usual_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
+    """Return the eye with the axis that a change is for; itself, where it is usual."""
+    if change.is_usual:
+        return eye
+    zernike_um = np.zeros(N_TERMS)
+    zernike_um[list(TERMS)] = change.axis_um
+    if change.eye_side == "OS":
+        zernike_um = flip_horizontal(zernike_um)
+    return estimate_eye(_with_axis(eye.profile, zernike_um))
+
+
+def _with_axis(profile: EyeProfile, zernike_um: NDArray) -> EyeProfile:
+    measurement = Measurement(zernike_um, 2.0 * CIRCLE_MM, profile.wavelength_nm)
+    return replace(
+        profile,
+        kind="zernike",
+        pupil_diameter_mm=measurement.pupil_diameter_mm,
+        measurements=(measurement,),
+        eye=None,
+        periphery="model",
+    )
+
+
+def _on_circle(eye: EstimatedEye) -> NDArray[np.float64]:
+    """Wavefront (28,) of an eye at the cornea, on the population's circle."""
+    return on_axis_zernike_um(
+        eye.parameters,
+        retina=eye.retina,
+        pupil_diameter_mm=2.0 * CIRCLE_MM,
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+    )

@@ -1,0 +1,62 @@
+"""Maps of an eye's wavefronts over its visual field, as a picture."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from estimator.field.field_table import FieldTable
+
+ARCMIN_PER_MRAD = 3.4377
+COMA = [7, 8]
+
+
+def plot_field(table: "FieldTable", file: Path, *, title: str) -> None:
+    """Draw M, astigmatism, coma and blur of a table; lines, where it has one elevation.
+
+    Blur is the root mean square of what the wavefront's second order makes of a point
+    in the pupil's circle, in minutes of arc.
+    """
+    from matplotlib.figure import Figure  # loads slowly
+
+    m_dpt, j0_dpt, j45_dpt = table.power_dpt.T
+    maps = {
+        "M, dpt": m_dpt,
+        "astigmatism J, dpt": np.hypot(j0_dpt, j45_dpt),
+        "coma, µm": np.linalg.norm(table.zernike_um[:, COMA], axis=1),
+        "blur, RMS, arcmin": blur_arcmin(table),
+    }
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    figure.suptitle(title)
+    for axes, (name, values) in zip(
+        figure.subplots(2, 2).ravel(), maps.items(), strict=True
+    ):
+        _draw(figure, axes, table, values)
+        axes.set_title(name)
+    figure.savefig(file, dpi=110)
+
+
+def blur_arcmin(table: "FieldTable") -> NDArray[np.float64]:
+    """Return the root mean square blur (n,) of the second order, minutes of arc."""
+    m_dpt, j0_dpt, j45_dpt = table.power_dpt.T
+    # A point at r mm is sent aside by r times the power, in mrad; mean r² is R² / 2.
+    power_dpt = np.sqrt(m_dpt**2 + j0_dpt**2 + j45_dpt**2)
+    return ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
+
+
+def _draw(figure, axes, table: "FieldTable", values: NDArray) -> None:
+    h_deg, v_deg = np.unique(table.h_deg), np.unique(table.v_deg)
+    axes.set_xlabel("h, deg")
+    if h_deg.size < 2 or v_deg.size < 2:
+        along = table.h_deg if h_deg.size > 1 else table.v_deg
+        order = np.argsort(along)
+        axes.plot(along[order], values[order], "o-")
+        return
+    order = np.lexsort((table.h_deg, table.v_deg))
+    grid = values[order].reshape(v_deg.size, h_deg.size)
+    drawn = axes.contourf(h_deg, v_deg, grid, levels=16, cmap="viridis")
+    axes.set_ylabel("v, deg")
+    axes.set_aspect("equal")
+    figure.colorbar(drawn, ax=axes)

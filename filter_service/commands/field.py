@@ -1,0 +1,172 @@
+"""`ocufilter field`: the wavefronts of an eye over its visual field, in one call."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from filter_service.commands.console import Json, check_range, print_json, say
+from filter_service.commands.wavefront import (
+    FOCUS_LIMITS_DPT,
+    PUPIL_LIMITS_MM,
+    WAVELENGTH_LIMITS_NM,
+)
+
+if TYPE_CHECKING:
+    from estimator.field.field_table import FieldTable
+
+FIELD_LIMIT_DEG = 60.0
+MAX_DIRECTIONS = 10_000
+HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
+
+
+def field(
+    profile: Annotated[
+        str,
+        typer.Argument(help="A preset name, or a .json, .abp or .csv profile."),
+    ],
+    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
+    wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    h_deg: Annotated[
+        str, typer.Option(metavar="LIST", help="Azimuths, deg; positive is right.")
+    ] = HORIZONTAL,
+    v_deg: Annotated[
+        str, typer.Option(metavar="LIST", help="Elevations, deg; positive is up.")
+    ] = VERTICAL,
+    focus_dpt: Annotated[
+        float | None,
+        typer.Option(help="Distance made sharpest, dpt; relaxed if not given."),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.png", help="Maps of M, astigmatism, coma and blur."),
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Tell refraction and aberrations in every direction of two lists.
+
+    Each azimuth with each elevation.  Coefficients are OSA, um, at the cornea, on the
+    circle about the chief ray that encloses the pupil; M, J0 and J45 are their least
+    squares.  Off the axis they are those of people with such an axis, or what the
+    profile has measured there; "periphery": "model" in the profile asks for the eye
+    model's own.
+
+    ocufilter field keratoconus --pupil-mm 4 --wavelength-nm 555 --v-deg=-20,0,20
+    """
+    check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
+    check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
+    if focus_dpt is not None:
+        check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
+    azimuths, elevations = _angles("--h-deg", h_deg), _angles("--v-deg", v_deg)
+    if len(azimuths) * len(elevations) > MAX_DIRECTIONS:
+        raise ValueError(
+            f"--h-deg, --v-deg: {len(azimuths)} x {len(elevations)} directions; "
+            f"allowed are {MAX_DIRECTIONS}"
+        )
+
+    import numpy as np
+
+    from estimator.field.field_table import field_table
+    from estimator.profiles.files import load_profile
+    from filter_service.commands.image_files import check_output
+
+    if plot is not None:
+        check_output(plot, (".png",))
+    eye = load_profile(profile)
+    across, along = np.meshgrid(azimuths, elevations)
+    found = field_table(
+        eye,
+        h_deg=across.ravel(),
+        v_deg=along.ravel(),
+        pupil_diameter_mm=pupil_mm,
+        wavelength_nm=wavelength_nm,
+        focus_dpt=focus_dpt,
+    )
+    if plot is not None:
+        from estimator.field.plot import plot_field
+
+        plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm")
+    notes = list(found.notes)
+    if eye.correction is not None:
+        notes.append("seen through the worn correction")
+    if json_output:
+        print_json({"directions": _directions(found), "notes": notes})
+    else:
+        _report(found, notes)
+
+
+def _angles(option: str, text: str) -> list[float]:
+    """Read a list of angles.
+
+    Raises
+    ------
+    ValueError
+        Names the option, the value and what is allowed.
+    """
+    allowed = f"allowed are numbers from -{FIELD_LIMIT_DEG:g} to {FIELD_LIMIT_DEG:g}"
+    angles = []
+    for word in text.replace(",", " ").split():
+        try:
+            angle = float(word)
+        except ValueError:
+            angle = math.nan
+        if not abs(angle) <= FIELD_LIMIT_DEG:
+            raise ValueError(f"{option} {word!r}: {allowed}, with commas between")
+        angles.append(angle)
+    if not angles:
+        raise ValueError(f"{option} is empty: {allowed}, with commas between")
+    return angles
+
+
+def _directions(found: "FieldTable") -> list[dict]:
+    return [
+        {
+            "h_deg": float(h),
+            "v_deg": float(v),
+            "zernike_um": zernike_um.tolist(),
+            "zernike_radius_mm": float(radius_mm),
+            "M_dpt": power_dpt[0],
+            "J0_dpt": power_dpt[1],
+            "J45_dpt": power_dpt[2],
+            "pupil_ellipse": _ellipse(*ellipse),
+        }
+        for h, v, zernike_um, radius_mm, power_dpt, ellipse in zip(
+            found.h_deg,
+            found.v_deg,
+            found.zernike_um,
+            found.zernike_radius_mm,
+            found.power_dpt.tolist(),
+            found.pupil_ellipse.tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _ellipse(x_mm, y_mm, major_mm, minor_mm, angle_rad) -> dict:
+    from estimator.wavefront.results import PupilEllipse
+    from filter_service.commands.wavefront import ellipse_facts
+
+    return ellipse_facts(
+        PupilEllipse(x_mm, y_mm, major_mm, minor_mm, math.degrees(angle_rad))
+    )
+
+
+def _report(found: "FieldTable", notes: list[str]) -> None:
+    import numpy as np
+
+    for note in notes:
+        say(f"note: {note}")
+    say("  h deg   v deg    M dpt   J0 dpt  J45 dpt   coma um  RMS 3-6 um  circle mm")
+    coma_um = np.hypot(*found.zernike_um[:, [7, 8]].T)
+    higher_um = np.linalg.norm(found.zernike_um[:, 6:], axis=1)
+    rows = zip(
+        *(found.h_deg, found.v_deg, *found.power_dpt.T),
+        *(coma_um, higher_um, found.zernike_radius_mm),
+        strict=True,
+    )
+    for h, v, m, j0, j45, coma, higher, radius in rows:
+        say(
+            f"{h:7.1f} {v:7.1f} {m:+8.2f} {j0:+8.2f} {j45:+8.2f} {coma:9.3f} "
+            f"{higher:11.3f} {radius:10.3f}"
+        )

@@ -1,0 +1,290 @@
+"""The periphery of people left out: our eyes beside linear predictors.
+
+    python -m tests.benchmarks.bench_people [--quick] [--json]
+
+129 eyes of 65 people along the horizontal meridian (4 mm), in folds that keep a
+person's eyes together.  Ours is `field_table` of a profile that has the axis alone, or
+the axis and 20 deg to both sides, with the population fitted to the other folds; linear
+predictors are fitted to the same folds.  Five people measured over 40 x 25 deg follow,
+with the shipped population.  Error is the median over eyes of the length of the error
+in (M, J0, J45), dpt, of the change from the axis; beside it stands that of the RMS of
+all terms from the second to the fourth order, um.  Writes results/people.json.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.field_table import field_table
+from estimator.optics.prescription import power_vectors_dpt
+from estimator.optics.zernike import N_TERMS, nm_from_index, rescale_pupil
+from estimator.periphery.meridian import CIRCLE_MM, TERMS
+from estimator.periphery.people import People, load_over_field, load_people
+from estimator.periphery.population import Population, measured_population
+from estimator.profiles.parse import parse_profile
+from filter_service.progress import Progress
+from tests.benchmarks.harness import Row, memory_mb, publish
+
+FILE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
+ANGLES_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
+"""On the retina of a right eye, positive temporal: h = -angle."""
+
+GIVEN_DEG = (-20.0, 20.0)
+FOLDS, QUICK_FOLDS = 5, 2
+SEED = 0
+RIDGES = {"M": 1.0, "all central terms": 100.0, "axis and +-20 deg": 10.0}
+"""Of standardised inputs; each is the best of 1, 3, 10, 30, 100."""
+
+WAVELENGTH_NM = 555.0
+
+
+def profile_of(zernike_um: NDArray, others: dict[float, NDArray] | None = None, **more):
+    """Return a profile with the axis (12,), and other azimuths' (12,), if any."""
+
+    def entry(terms_um: NDArray, h_deg: float) -> dict:
+        return {
+            "kind": "zernike",
+            "pupil_diameter_mm": 2.0 * CIRCLE_MM,
+            "wavelength_nm": WAVELENGTH_NM,
+            "h_deg": h_deg,
+            "zernike_um": {
+                "{},{}".format(*nm_from_index(j)): float(um)
+                for j, um in zip(TERMS, terms_um, strict=True)
+            },
+        }
+
+    all_um = {0.0: zernike_um, **(others or {})}
+    entries = [entry(terms_um, h_deg) for h_deg, terms_um in all_um.items()]
+    return parse_profile({"kind": "zernike_set", "measurements": entries, **more})
+
+
+def told_change_um(profile, h_deg, v_deg=0.0) -> NDArray[np.float64]:
+    """Change (n, 12) from the axis that `field_table` tells, on the people's circle."""
+    h_deg, v_deg = np.broadcast_arrays(h_deg, v_deg)
+    table = field_table(
+        profile,
+        h_deg=np.append(0.0, h_deg),
+        v_deg=np.append(0.0, v_deg),
+        pupil_diameter_mm=2.0 * CIRCLE_MM,
+        wavelength_nm=WAVELENGTH_NM,
+    )
+    zernike_um = rescale_pupil(
+        table.zernike_um, radius_ratio=CIRCLE_MM / table.zernike_radius_mm
+    )[:, list(TERMS)]
+    return zernike_um[1:] - zernike_um[0]
+
+
+def folds(people: People, count: int) -> Iterator[NDArray[np.bool_]]:
+    """Yield who is left out (n,), a share of the persons each time."""
+    persons = np.random.default_rng(SEED).permutation(np.unique(people.person))
+    for k in range(count):
+        yield np.isin(people.person, persons[k::count])
+
+
+def fitted_ridge(inputs: NDArray, targets: NDArray, strength: float) -> Callable:
+    """Fit targets (n, k), nan where unknown, linearly to inputs (n, m)."""
+    mean, deviation = inputs.mean(axis=0), inputs.std(axis=0)
+
+    def rows(values):
+        return np.c_[np.ones(len(values)), (values - mean) / deviation]
+
+    weights = np.zeros((inputs.shape[1] + 1, targets.shape[1]))
+    penalty = strength * np.diag([0.0, *np.ones(inputs.shape[1])])
+    for k, column in enumerate(targets.T):
+        known = np.isfinite(column)
+        used = rows(inputs[known])
+        weights[:, k] = np.linalg.solve(used.T @ used + penalty, used.T @ column[known])
+    return lambda values: rows(values) @ weights
+
+
+class Meridian:
+    """What every method is judged by: changes of people at the angles."""
+
+    def __init__(self, people: People):
+        known = np.isfinite(people.axis_um).all(axis=-1)
+        self.people = people.of(known)
+        place = {float(h): k for k, h in enumerate(self.people.h_deg)}
+        at = [place[-angle] for angle in ANGLES_DEG]
+        self.change_um = self.people.change_um[:, at]
+        given = [place[-angle] for angle in GIVEN_DEG]
+        self.given_um = self.people.zernike_um[:, given]
+        self.has_given = np.isfinite(self.given_um).all(axis=(1, 2))
+
+    def linear(self, name: str, out: NDArray) -> NDArray[np.float64]:
+        """Predict the eyes left out from those that are not."""
+        inputs = self.people.axis_um
+        if name == "M":
+            inputs = inputs[:, [TERMS.index(4)]]
+        elif name != "all central terms":
+            inputs = np.c_[inputs, self.given_um.reshape(len(inputs), -1)]
+        targets = self.change_um.reshape(len(inputs), -1)
+        usable = np.isfinite(inputs).all(axis=1)
+        predict = fitted_ridge(
+            inputs[~out & usable], targets[~out & usable], RIDGES[name]
+        )
+        return predict(inputs[out]).reshape(-1, *self.change_um.shape[1:])
+
+    def ours(self, out: NDArray, *, given: bool, **more) -> NDArray[np.float64]:
+        """Predict the eyes left out by the public function."""
+        found = np.full((int(out.sum()), *self.change_um.shape[1:]), np.nan)
+        for row, eye in enumerate(np.flatnonzero(out)):
+            others = None
+            if given:
+                if not self.has_given[eye]:
+                    continue
+                others = {
+                    -angle: self.given_um[eye, k] for k, angle in enumerate(GIVEN_DEG)
+                }
+            profile = profile_of(self.people.axis_um[eye], others, **more)
+            found[row] = told_change_um(profile, [-angle for angle in ANGLES_DEG])
+        return found
+
+
+def median_errors(predicted_um, measured_um) -> tuple[NDArray, NDArray]:
+    """Medians over eyes (k,) of the error in (M, J0, J45), dpt, and of the RMS, um."""
+    error_um = np.full((*predicted_um.shape[:-1], N_TERMS), 0.0)
+    error_um[..., list(TERMS)] = predicted_um - measured_um
+    lengths_dpt = np.linalg.norm(power_vectors_dpt(error_um, CIRCLE_MM), axis=-1)
+    return (
+        np.nanmedian(lengths_dpt, axis=0),
+        np.nanmedian(np.linalg.norm(error_um, axis=-1), axis=0),
+    )
+
+
+def meridian_predictions(
+    judged: Meridian, fold_count: int, task: Callable[[float], None]
+) -> dict[str, tuple[NDArray, float]]:
+    """Predictions (n, 8, 12) of each method, and what one of ours takes, ms."""
+    shape = judged.change_um.shape
+    names = ("linear, M", "linear, all central terms", "linear, axis and +-20 deg")
+    ours = ("people", "people, +-20 deg given", "eye model alone")
+    found = {name: np.full(shape, np.nan) for name in (*names, *ours)}
+    times_ms = dict.fromkeys(found, 0.0)
+    for k, out in enumerate(folds(judged.people, fold_count)):
+        for name in names:
+            found[name][out] = judged.linear(name.removeprefix("linear, "), out)
+        population = Population.of(judged.people.of(~out))
+        with patch(
+            "estimator.periphery.change.measured_population", lambda p=population: p
+        ):
+            for name, options in (
+                ("people", {"given": False}),
+                ("people, +-20 deg given", {"given": True}),
+                ("eye model alone", {"given": False, "periphery": "model"}),
+            ):
+                start_s = time.perf_counter()
+                found[name][out] = judged.ours(out, **options)
+                elapsed_ms = 1e3 * (time.perf_counter() - start_s)
+                times_ms[name] += elapsed_ms / shape[0]
+        task((k + 1) / fold_count)
+    mean = np.full(shape, np.nan)
+    for out in folds(judged.people, fold_count):
+        mean[out] = np.nanmean(judged.change_um[~out], axis=0)
+    return {
+        "the axis everywhere": (np.zeros(shape), 0.0),
+        "mean change": (mean, 0.0),
+        **{name: (values, times_ms[name]) for name, values in found.items()},
+    }
+
+
+def _rows(method, setting, count, time_ms, errors, reference) -> Iterator[Row]:
+    for name, error in zip(("power_error_dpt", "rms_um"), errors, strict=True):
+        yield Row(
+            *("people", method, "left out", setting, count, time_ms, time_ms),
+            *(memory_mb(), name, float(error), reference),
+        )
+
+
+def meridian_rows(judged: Meridian, predictions: dict) -> Iterator[Row]:
+    """Errors of each method at each angle."""
+    for method, (predicted_um, time_ms) in predictions.items():
+        errors = median_errors(predicted_um, judged.change_um)
+        known = np.isfinite(predicted_um + judged.change_um).all(axis=-1).sum(axis=0)
+        for k, angle in enumerate(ANGLES_DEG):
+            if "20 deg" in method and angle in GIVEN_DEG:
+                continue
+            yield from _rows(
+                *(method, f"retina {angle:+.0f} deg", int(known[k]), time_ms),
+                *((errors[0][k], errors[1][k]), "Jaeken & Artal 2012"),
+            )
+
+
+def field_rows() -> Iterator[Row]:
+    """Errors over the whole field of five people that no population has seen."""
+    directions_deg, zernike_um = load_over_field(FILE)
+    h_deg, v_deg = directions_deg.T
+    axis = int(np.flatnonzero((h_deg == 0.0) & (v_deg == 0.0))[0])
+    on_disc = (h_deg >= 10.0) & (h_deg <= 20.0)  # the optic disc spoils these
+    judged = (h_deg % 10.0 == 0.0) & ~on_disc & (np.hypot(h_deg, v_deg) > 5.0)
+    change_um = zernike_um[:, judged] - zernike_um[:, [axis]]
+    others = [
+        np.mean(np.delete(change_um, k, axis=0), axis=0) for k in range(len(change_um))
+    ]
+    methods = {
+        "the axis everywhere": np.zeros_like(change_um),
+        "mean change of the other four": np.array(others),
+    }
+    times_ms = dict.fromkeys(methods, 0.0)
+    for method, more in (("eye model alone", {"periphery": "model"}), ("people", {})):
+        start_s = time.perf_counter()
+        methods[method] = np.array(
+            [
+                told_change_um(profile_of(eye[axis], **more), *directions_deg[judged].T)
+                for eye in zernike_um
+            ]
+        )
+        times_ms[method] = 1e3 * (time.perf_counter() - start_s) / len(zernike_um)
+    for method, predicted_um in methods.items():
+        flat = [values.reshape(-1, len(TERMS)) for values in (predicted_um, change_um)]
+        errors = [float(error) for error in median_errors(*flat)]
+        yield from _rows(
+            *(method, "40 x 25 deg", len(flat[0]), times_ms[method], errors),
+            "Polans 2015",
+        )
+
+
+def print_table(rows: list[Row]) -> None:
+    """Print the table of `periphery.md`, a method a line."""
+    print(f"{'retina, deg':34s}" + "".join(f"{a:+7.0f}" for a in ANGLES_DEG))
+    for name, unit in (("power_error_dpt", "dpt"), ("rms_um", "um")):
+        for method in dict.fromkeys(row.method for row in rows):
+            cells = {
+                row.setting: row.error
+                for row in rows
+                if row.method == method and row.error_name == name
+            }
+            line = [cells.get(f"retina {angle:+.0f} deg") for angle in ANGLES_DEG]
+            if any(cell is not None for cell in line):
+                print(
+                    f"{method + ', ' + unit:34s}"
+                    + "".join("      -" if c is None else f"{c:7.2f}" for c in line)
+                )
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="two folds")
+    parser.add_argument("--json", action="store_true", help="print the report alone")
+    options = parser.parse_args()
+    judged = Meridian(load_people(FILE))
+    measured_population()
+    with Progress(quiet=options.json) as progress:
+        task = progress.task("people", total=1.0, unit="%")
+        count = QUICK_FOLDS if options.quick else FOLDS
+        predictions = meridian_predictions(
+            judged, count, lambda done: task.update(done, "folds")
+        )
+    rows = [*meridian_rows(judged, predictions), *field_rows()]
+    if not options.json:
+        print_table(rows)
+    publish("people", rows, as_json=options.json, is_whole=not options.quick)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,337 @@
+"""The periphery of eyes: closed forms, measured people left out, hard cases."""
+
+import numpy as np
+import pytest
+
+from estimator.field.field_table import field_table
+from estimator.optics.prescription import power_vectors_dpt
+from estimator.optics.zernike import N_TERMS, flip_horizontal, nm_from_index
+from estimator.periphery.change import peripheral_change
+from estimator.periphery.meridian import (
+    CIRCLE_MM,
+    KNOTS_DEG,
+    MEASURED_DEG,
+    TERMS,
+    field_matrix,
+    meridian_weights,
+)
+from estimator.periphery.people import load_people
+from estimator.periphery.population import Population, measured_population
+from estimator.profiles.parse import ProfileError, parse_profile
+from tests.benchmarks.bench_people import (
+    ANGLES_DEG,
+    FILE,
+    Meridian,
+    folds,
+    median_errors,
+    profile_of,
+)
+
+GRID_DEG = np.stack(
+    np.meshgrid(np.linspace(-38.0, 38.0, 9), np.linspace(-24.0, 24.0, 7)), axis=-1
+).reshape(-1, 2)
+
+
+@pytest.fixture(scope="module")
+def people():
+    return Meridian(load_people(FILE))
+
+
+def asked(profile, h_deg, v_deg=0.0, pupil_mm=4.0, **options):
+    return field_table(
+        profile,
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameter_mm=pupil_mm,
+        wavelength_nm=options.pop("wavelength_nm", 555.0),
+        **options,
+    )
+
+
+def preset(name, **more):
+    return parse_profile({"kind": "preset", "name": name, **more})
+
+
+# ----- from the meridian to the field
+
+
+def nodal(h_deg, v_deg):
+    """Aberrations of a round eye about an axis of its own, in closed form (n, 12)."""
+    place = h_deg + 1j * v_deg
+    centre = 5.0 - 2.0j
+    terms = np.zeros((place.size, len(TERMS)))
+    defocus = 1e-3 * np.abs(place - centre) ** 2
+    astigmatism = 8e-4 * (place - centre) ** 2
+    coma = -6e-3 * (place - centre)
+    for index, values in (
+        (4, defocus),
+        (5, astigmatism.real),
+        (3, astigmatism.imag),
+        (8, coma.real),
+        (7, coma.imag),
+    ):
+        terms[:, TERMS.index(index)] = values
+    return terms
+
+
+def test_a_round_eye_about_another_axis_is_told_by_its_meridian():
+    """All but defocus off the meridian, whose axis lies above the horizontal one."""
+    on_axis = nodal(np.zeros(1), np.zeros(1))
+    knots = (nodal(np.array(KNOTS_DEG), 0.0 * np.array(KNOTS_DEG)) - on_axis).T
+    h_deg, v_deg = GRID_DEG[np.hypot(*GRID_DEG.T) <= MEASURED_DEG].T
+    told = np.einsum("nijk,jk->ni", field_matrix(h_deg, v_deg), knots)
+    expected = nodal(h_deg, v_deg) - on_axis
+    expected[:, TERMS.index(4)] -= 1e-3 * 4.0 * v_deg  # the part the meridian hides
+    assert np.allclose(told, expected, atol=1e-12)
+
+
+def test_the_spline_ends_softly_where_nobody_was_measured():
+    knots = np.square(KNOTS_DEG) * 1e-3
+    at_deg = np.linspace(30.0, 75.0, 901)
+    values = meridian_weights(at_deg) @ knots
+    steps = np.diff(values)
+    assert np.abs(np.diff(steps)).max() < 1e-3 * np.ptp(values)
+    assert values[-1] - values[at_deg == 40.0][0] < 15.0 * 0.08 + 1e-9
+
+
+# ----- the population
+
+
+def test_the_file_holds_what_the_measured_people_give():
+    fitted = Population.of(load_people(FILE))
+    shipped = measured_population()
+    assert np.allclose(shipped.mean_um, fitted.mean_um, atol=1e-4)
+    assert np.allclose(shipped.deviation_um, fitted.deviation_um, atol=1e-4)
+    assert np.allclose(shipped.correlation_ratio, fitted.correlation_ratio, atol=1e-4)
+
+
+def predicted(people, out, population, *, given):
+    found = np.full((int(out.sum()), *people.change_um.shape[1:]), np.nan)
+    for row, eye in enumerate(np.flatnonzero(out)):
+        if given and not people.has_given[eye]:
+            continue
+        others = {20.0: people.given_um[eye, 0], -20.0: people.given_um[eye, 1]}
+        profile = profile_of(people.people.axis_um[eye], others if given else None)
+        change = peripheral_change(profile, population)
+        found[row] = change.zernike_um(-np.array(ANGLES_DEG), 0.0)[:, list(TERMS)]
+    return found
+
+
+@pytest.fixture(scope="module")
+def left_out(people):
+    """Predictions of people left out, five folds: ours, and linear ones."""
+    shape = people.change_um.shape
+    found = {
+        name: np.full(shape, np.nan)
+        for name in ("ours", "M", "ours given", "linear given")
+    }
+    for out in folds(people.people, 5):
+        population = Population.of(people.people.of(~out))
+        found["ours"][out] = predicted(people, out, population, given=False)
+        found["ours given"][out] = predicted(people, out, population, given=True)
+        found["M"][out] = people.linear("M", out)
+        found["linear given"][out] = people.linear("axis and +-20 deg", out)
+    return {
+        name: median_errors(values, people.change_um)[0]
+        for name, values in found.items()
+    }
+
+
+def test_people_left_out_are_told_better_than_by_their_refraction(left_out):
+    assert left_out["ours"].mean() < left_out["M"].mean()
+    assert np.all(left_out["ours"] <= 1.15 * left_out["M"])
+
+
+def test_two_measured_directions_tell_the_others(left_out):
+    others = [k for k, angle in enumerate(ANGLES_DEG) if abs(angle) != 20.0]
+    given, linear = left_out["ours given"][others], left_out["linear given"][others]
+    assert np.all(given <= 1.2 * linear)
+    assert np.all(given < left_out["ours"][others])
+
+
+def test_the_stated_uncertainty_is_that_of_people(people):
+    """M of people lies within one stated deviation about as often as it should."""
+    measured_dpt = power_vectors_dpt(_all_terms(people.change_um), CIRCLE_MM)[..., 0]
+    inside = []
+    for out in folds(people.people, 5):
+        population = Population.of(people.people.of(~out))
+        for eye in np.flatnonzero(out):
+            change = peripheral_change(
+                profile_of(people.people.axis_um[eye]), population
+            )
+            told = change.zernike_um(-np.array(ANGLES_DEG), 0.0)
+            told_dpt = power_vectors_dpt(told, CIRCLE_MM)[:, 0]
+            place = [KNOTS_DEG.index(-angle) for angle in ANGLES_DEG]
+            deviation_dpt = change.sphere_deviation_dpt[place]
+            error = np.abs(measured_dpt[eye] - told_dpt) / deviation_dpt
+            inside += (error[np.isfinite(error)] < 1.0).tolist()
+    assert 0.6 < np.mean(inside) < 0.82
+
+
+def _all_terms(terms_um):
+    zernike_um = np.zeros((*terms_um.shape[:-1], N_TERMS))
+    zernike_um[..., list(TERMS)] = terms_um
+    return zernike_um
+
+
+# ----- the eye of a profile
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus", "cataract"])
+@pytest.mark.parametrize("side", ["OD", "OS"])
+def test_the_axis_is_what_was_measured(name, side):
+    profile = preset(name, eye_side=side)
+    table = asked(
+        profile,
+        0.0,
+        pupil_mm=profile.pupil_diameter_mm,
+        wavelength_nm=profile.wavelength_nm,
+    )
+    assert table.zernike_um[0, 3:] == pytest.approx(profile.zernike_um[3:], abs=1e-4)
+    assert table.zernike_radius_mm[0] == pytest.approx(profile.pupil_diameter_mm / 2)
+
+
+def test_a_usual_eye_has_the_change_of_people():
+    profile = preset("myopia")
+    h_deg, v_deg = GRID_DEG.T
+    table = asked(profile, np.append(0.0, h_deg), np.append(0.0, v_deg))
+    told_um = peripheral_change(profile).zernike_um(h_deg, v_deg)
+    told_dpt = power_vectors_dpt(told_um, CIRCLE_MM)
+    found_dpt = table.power_dpt[1:] - table.power_dpt[0]
+    # On circles that are up to 3 % wider, and through terms of the sixth order.
+    assert np.abs(found_dpt - told_dpt).max() < 0.15
+    assert np.median(np.abs(found_dpt - told_dpt)) < 0.02
+
+
+def test_a_left_eye_is_a_right_eye_in_the_mirror():
+    zernike_um = preset("astigmatism").zernike_um + preset("keratoconus").zernike_um / 4
+    right, left = (
+        parse_profile(
+            {
+                "kind": "zernike",
+                "eye_side": side,
+                "pupil_diameter_mm": 5.0,
+                "wavelength_nm": 555.0,
+                "zernike_um": {
+                    "{},{}".format(*nm_from_index(j)): float(um)
+                    for j, um in enumerate(values)
+                },
+            }
+        )
+        for side, values in (("OD", zernike_um), ("OS", flip_horizontal(zernike_um)))
+    )
+    h_deg, v_deg = GRID_DEG.T
+    seen_right = peripheral_change(right).zernike_um(h_deg, v_deg)
+    seen_left = peripheral_change(left).zernike_um(-h_deg, v_deg)
+    assert np.allclose(flip_horizontal(seen_left), seen_right, atol=1e-12)
+
+
+def test_astigmatism_is_least_on_the_side_of_the_nose():
+    """People's axis of least astigmatism: 5 to 8 deg of temporal retina, at h < 0."""
+    h_deg = np.linspace(-20.0, 20.0, 81)
+    for side, sign in (("OD", -1.0), ("OS", 1.0)):
+        profile = preset("emmetropia", eye_side=side)
+        j0_dpt = asked(profile, h_deg).power_dpt[:, 1]
+        assert 3.0 < sign * h_deg[np.argmax(j0_dpt)] < 10.0
+
+
+def test_the_model_alone_stays_what_it_was():
+    profile = preset("emmetropia", periphery="model")
+    table = asked(profile, [-30.0, 30.0])
+    assert table.power_dpt[0] == pytest.approx(table.power_dpt[1], abs=1e-3)
+    assert any("eye model's own" in note for note in table.notes)
+
+
+# ----- directions that were measured
+
+
+def measured_set(entries, **more):
+    zernike_um = preset("myopia").zernike_um
+
+    def body(h_deg, v_deg, sphere_dpt):
+        values = {"2,0": float(zernike_um[4] - sphere_dpt * 9.0 / 6.9282)}
+        return {
+            "h_deg": h_deg,
+            "v_deg": v_deg,
+            "pupil_diameter_mm": 6.0,
+            "wavelength_nm": 555.0,
+            "zernike_um": values,
+        }
+
+    measurements = [body(0.0, 0.0, 0.0), *(body(*entry) for entry in entries)]
+    return parse_profile({"kind": "zernike_set", "measurements": measurements, **more})
+
+
+@pytest.mark.parametrize("side", ["OD", "OS"])
+@pytest.mark.parametrize(
+    "entries",
+    [
+        [(20.0, 0.0, 1.0), (-20.0, 0.0, 0.5)],
+        [(25.0, 0.0, -1.0)],
+        [(0.0, 20.0, 1.0), (0.0, -20.0, -1.0), (15.0, 15.0, 0.5)],
+    ],
+    ids=["both sides", "one side", "up and down"],
+)
+def test_what_was_measured_overrides_the_population(entries, side):
+    profile = measured_set(entries, eye_side=side)
+    h_deg, v_deg, sphere_dpt = (
+        np.array(column) for column in zip(*entries, strict=True)
+    )
+    table = asked(profile, np.append(0.0, h_deg), np.append(0.0, v_deg))
+    found_dpt = table.power_dpt[1:, 0] - table.power_dpt[0, 0]
+    assert found_dpt == pytest.approx(sphere_dpt, abs=0.1)
+    assert any("measured in" in note for note in table.notes)
+
+
+def test_measurements_that_contradict_each_other_meet_in_the_middle_and_say_so():
+    profile = measured_set([(20.0, 0.0, 2.0), (20.0, 0.0, -2.0)])
+    table = asked(profile, [0.0, 20.0])
+    assert table.power_dpt[1, 0] - table.power_dpt[0, 0] == pytest.approx(0.0, abs=0.3)
+    assert any("contradict" in note for note in table.notes)
+
+
+# ----- hard cases
+
+
+HARD = {
+    "-20 dpt": {"kind": "prescription", "sphere_dpt": -20.0},
+    "+20 dpt": {"kind": "prescription", "sphere_dpt": 20.0},
+    "cataract": {"kind": "preset", "name": "cataract"},
+    "left keratoconus": {"kind": "preset", "name": "keratoconus", "eye_side": "OS"},
+    "post-LASIK": {"kind": "preset", "name": "post_lasik"},
+}
+
+
+@pytest.mark.parametrize("pupil_mm", [1.0, 8.0])
+@pytest.mark.parametrize("case", HARD)
+def test_hard_eyes_are_finite_and_smooth_or_refused(case, pupil_mm):
+    h_deg = np.linspace(-40.0, 40.0, 81)
+    try:
+        table = asked(parse_profile(HARD[case]), h_deg, 5.0, pupil_mm=pupil_mm)
+    except ValueError as error:
+        assert "pupil" in str(error) or "light" in str(error)
+        return
+    assert np.isfinite(table.zernike_um).all()
+    m_dpt = table.power_dpt[:, 0]
+    bends = np.abs(np.diff(m_dpt, 2))
+    assert bends.max() < 0.02 + 0.02 * np.ptp(m_dpt)
+
+
+def test_one_point_far_out_bends_nothing_near_the_axis():
+    profile = measured_set([(40.0, 0.0, 6.0)])
+    table = asked(profile, np.linspace(-40.0, 40.0, 81))
+    m_dpt = table.power_dpt[:, 0]
+    assert np.isfinite(m_dpt).all()
+    assert np.abs(np.diff(m_dpt, 2)).max() < 0.15
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"kind": "preset", "name": "myopia", "retina": {"radius_mm": 12.0}},
+        {"kind": "preset", "name": "myopia", "periphery": "typical"},
+    ],
+)
+def test_a_periphery_that_cannot_be_is_refused(body):
+    with pytest.raises(ProfileError, match="periphery"):
+        parse_profile({"periphery": "people", **body})
