@@ -24,6 +24,13 @@ from estimator.eye.parameters import (
     parse_parameters,
     parse_retina,
 )
+from estimator.media.absorption import YELLOWINGS
+from estimator.media.straylight import (
+    BROWN,
+    CATARACTS,
+    DEFAULT_AGE_YEARS,
+    Straylight,
+)
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (
@@ -49,7 +56,10 @@ COMMON_FIELDS = (
     "name",
     "retina",
     "periphery",
+    "straylight",
+    "yellowing",
 )
+STRAYLIGHT_FIELDS = ("pigmentation", "log_s", "cataract")
 PERIPHERIES = ("people", "model")
 """Where a traced eye's wavefronts off the axis come from: measured people with such an
 axis, or the surfaces of the eye model alone."""
@@ -127,6 +137,10 @@ class EyeProfile:
         The eye itself, for kind ``eye``.
     retina : RetinaShape or None
         Instead of the sphere of radius eye length / 2.
+    straylight : Straylight or None
+        Scatter in the media, where it is to be seen.
+    yellowing : {"seen", "adapted"} or None
+        Absorption of the ageing lens, where it is to be seen.
     periphery : {"people", "model"}
         Whether a traced eye has people's periphery; a given eye, and one with a retina
         of its own, has the model's.
@@ -149,6 +163,8 @@ class EyeProfile:
     retina: RetinaShape | None = None
     higher_order: str = "none"
     periphery: str = "people"
+    straylight: Straylight | None = None
+    yellowing: str | None = None
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
@@ -244,7 +260,41 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
         "correction": correction,
         "retina": retina,
         "periphery": periphery,
+        "straylight": _straylight(data, age_years),
+        "yellowing": _yellowing(data),
     }
+
+
+def _straylight(data: Mapping[str, Any], age_years: float | None) -> Straylight | None:
+    if data.get("straylight") is None:
+        return None
+    path = "straylight."
+    body = fields.mapping(data["straylight"], "straylight")
+    fields.only_known(body, STRAYLIGHT_FIELDS, path=path)
+    log_s = None
+    if "cataract" in body:
+        log_s = CATARACTS[fields.choice(body, "cataract", tuple(CATARACTS), path=path)]
+    if "log_s" in body:
+        if log_s is not None:
+            raise ProfileError(
+                path + "log_s", "stands beside a cataract", "one of the two"
+            )
+        log_s = fields.number(body, "log_s", 0.5, 2.5, path=path)
+    return Straylight(
+        age_years=DEFAULT_AGE_YEARS if age_years is None else age_years,
+        pigment_ratio=fields.number(
+            body, "pigmentation", 0.0, 1.2, default=BROWN, path=path
+        ),
+        log_s=log_s,
+    )
+
+
+def _yellowing(data: Mapping[str, Any]) -> str | None:
+    if data.get("yellowing") is None:
+        return None
+    if "age_years" not in data:
+        raise ProfileError("age_years", "is missing beside yellowing", "3 to 120")
+    return fields.choice(data, "yellowing", YELLOWINGS)
 
 
 def _prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:

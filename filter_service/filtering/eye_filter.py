@@ -30,6 +30,7 @@ from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.filtering.view_use import frame_use
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
+from filter_service.rendering.haze import MediaEffects, render_through_media
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -370,10 +371,13 @@ class EyeFilter:
         if plan is None or self.is_extending:
             return None
         started_s = time.monotonic()
+        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
         rendered = [
-            self.workshop.engine.render(
+            render_through_media(
+                self.workshop.engine,
                 view,
                 store,
+                effects,
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
                 accumulation=accumulation,

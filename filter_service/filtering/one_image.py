@@ -19,6 +19,7 @@ from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
+from filter_service.rendering.haze import MediaEffects, render_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     MAX_VERGENCE_DPT,
@@ -145,9 +146,11 @@ def filter_one_image(
         chosen = open_engine(engine, closing)
         handle = chosen.engine.load(store)
         clock_s.append(time.perf_counter())
-        rendered = chosen.engine.render(
+        rendered = render_through_media(
+            chosen.engine,
             view,
             handle,
+            MediaEffects.of(profile, spec.settings.display),
             pupil_diameter_mm=spec.settings.pupil_range_mm[0],
             focus_dpt=spec.settings.focus_range_dpt[0],
             accumulation=accumulation,

@@ -13,6 +13,8 @@ map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
+haze           light that the media scatter and absorb, over a picture
+haze_loops     its compiled loops
 plan_once      what plans need, loaded ahead
 reference      numpy twins of the passes
 gl/            the engine of compute shaders

@@ -6,7 +6,9 @@ spends after it is ready; compiling them, once on a machine, 10 s.
 
 import numpy as np
 
+from estimator.media.straylight import Straylight
 from filter_service.camera import Camera
+from filter_service.constants import RGB
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
@@ -16,6 +18,7 @@ from filter_service.rendering.frame_kernels import (
     node_table,
     work_list,
 )
+from filter_service.rendering.haze import MediaEffects, add_haze, encoded
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
@@ -40,3 +43,6 @@ def plan_once() -> None:
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
+    light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
+    effects = MediaEffects(Straylight(), (1.0, 1.0, 1.0))
+    encoded(add_haze(light, store.spec.camera, effects), "srgb8")

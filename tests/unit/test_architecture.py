@@ -39,8 +39,9 @@ EYE_ROOMS = {
     "optics": (),
     "wavefront": ("optics",),
     "psf": ("optics",),
+    "media": (),
     "eye": ("wavefront", "optics"),
-    "profiles": ("eye", "wavefront", "optics"),
+    "profiles": ("eye", "media", "wavefront", "optics"),
     "periphery": ("profiles", "optics"),
     "networks": ("eye", "optics"),
     "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
@@ -105,6 +106,7 @@ HOME = {
         "filter_service/psfs/pack.py",  # loops over single kernels
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/rendering/map_loops.py",
+        "filter_service/rendering/haze_loops.py",
         "filter_service/rendering/kernel_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",

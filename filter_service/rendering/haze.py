@@ -1,0 +1,287 @@
+"""Light that the eye's media scatter and absorb, over a filtered picture.
+
+Scattered light has no detail, so it is made on a coarse grid of visual angle: the mean
+of the pixels in each cell, spread by the scatter function (a convolution by FFT), and
+interpolated back.  Rows and columns of the grid are even in the angle along the axes
+of the image, so that one axis is worked out at a time; in the corner of a field of 80 x
+50 deg distances along v come out a fifth too long.  What lies beyond the picture is
+taken to be as bright as its edge, so that an even picture stays what it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from estimator.media.absorption import channel_gains
+from estimator.media.straylight import DEFAULT_AGE_YEARS, Straylight
+from estimator.profiles.parse import EyeProfile
+from estimator.threads import thread_count
+from filter_service.camera import Camera
+from filter_service.constants import RGB
+from filter_service.displays import display_wavelengths_nm
+from filter_service.rendering.engine import FrameEngine, Rendered
+from filter_service.rendering.frame_options import OUTPUT_DTYPES
+from filter_service.rgbd_view import RgbdView
+
+CELL_DEG = 0.25
+"""Edge of a cell, unless there would be too many of them."""
+
+MOST_CELLS = 384
+"""Along one axis: wider fields have larger cells."""
+
+SAMPLES = 4
+"""Points along each edge of a cell that the scatter function is averaged over."""
+
+ENCODE_STEPS = 1 << 16
+
+
+@dataclass(frozen=True)
+class MediaEffects:
+    """What the media of one eye do to a picture.
+
+    Attributes
+    ----------
+    straylight : Straylight or None
+    gain_ratio : (red, green, blue)
+    """
+
+    straylight: Straylight | None
+    gain_ratio: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
+        """Return those that a profile asks for; None where it asks for none."""
+        if profile.straylight is None and profile.yellowing is None:
+            return None
+        gains = (1.0, 1.0, 1.0)
+        if profile.yellowing is not None:
+            age_years = profile.age_years or DEFAULT_AGE_YEARS
+            found = channel_gains(
+                display_wavelengths_nm(display),
+                age_years=age_years,
+                yellowing=profile.yellowing,
+            )
+            gains = tuple(found.tolist())
+        return cls(profile.straylight, gains)
+
+
+def render_through_media(
+    engine: FrameEngine,
+    view: RgbdView,
+    handle: Any,
+    effects: MediaEffects | None,
+    *,
+    output: str,
+    **options: Any,
+) -> Rendered:
+    """Filter a view as `FrameEngine.render` does, with the media's effects."""
+    if effects is None:
+        return engine.render(view, handle, output=output, **options)
+    rendered = engine.render(view, handle, output="linear", **options)
+    started_s = time.perf_counter()
+    color = np.ascontiguousarray(rendered.color, dtype=np.float32)
+    color = add_haze(color, view.camera, effects)
+    color = encoded(color, output)
+    stages_ms = {
+        **rendered.stage_times_ms,
+        "media_ms": 1e3 * (time.perf_counter() - started_s),
+    }
+    return replace(rendered, color=color, stage_times_ms=stages_ms)
+
+
+def add_haze(
+    color: NDArray[np.float32], camera: Camera, effects: MediaEffects
+) -> NDArray[np.float32]:
+    """Return linear light (height, width, 3) behind the media; works in place."""
+    from filter_service.rendering.haze_loops import add_scattered, mean_light
+
+    gains = np.array(effects.gain_ratio)
+    if effects.straylight is None:
+        color *= gains.astype(np.float32)
+        return color
+    grid = haze_grid(camera, effects.straylight)
+    rows, columns = grid.rows, grid.columns
+    coarse = np.empty((*grid.shape, RGB), np.float32)
+    cells = (rows.first_px, rows.shares, columns.first_px, columns.shares)
+    _shared(mean_light, rows.count, color, *cells, coarse)
+    places = (rows.place, columns.place)
+    kept = 1.0 - grid.fraction
+    _shared(
+        add_scattered, len(color), color, grid.scatter(coarse), *places, kept, gains
+    )
+    return color
+
+
+def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
+    """Return linear light as an output has it."""
+    if output != "srgb8":
+        return color.astype(OUTPUT_DTYPES[output], copy=False)
+    from filter_service.rendering.haze_loops import encode_srgb
+
+    found = np.empty(color.shape, np.uint8)
+    _shared(encode_srgb, color.size, color.reshape(-1), _encoding(), found.reshape(-1))
+    return found
+
+
+def _shared(loop: Callable[..., None], count: int, *arguments: Any) -> None:
+    """Run a loop over 0 to a count, shared between threads."""
+    edges = [count * k // thread_count() for k in range(thread_count() + 1)]
+    waiting = [_pool().submit(loop, *part, *arguments) for part in pairwise(edges)]
+    for part in waiting:
+        part.result()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_count(), thread_name_prefix="haze")
+
+
+@lru_cache(maxsize=1)
+def _encoding() -> NDArray[np.uint8]:
+    light = np.linspace(0.0, 1.0, ENCODE_STEPS)
+    curve = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055
+    )
+    return np.round(255.0 * curve).astype(np.uint8)
+
+
+class HazeGrid:
+    """Cells of a camera's image, and what of their light each scatters to the others.
+
+    Parameters
+    ----------
+    camera : Camera
+    straylight : Straylight
+    """
+
+    def __init__(self, camera: Camera, straylight: Straylight):
+        left, right, up, down = camera.tangents
+        self.columns = _Axis.of(left, right, camera.width_px)
+        self.rows = _Axis.of(up, down, camera.height_px)
+        self.fraction = straylight.fraction
+        n, m = self.shape = self.rows.count, self.columns.count
+        self._padded = tuple(fft.next_fast_len(2 * k - 1, real=True) for k in (n, m))
+        kernel = _kernel(
+            straylight, self.shape, (self.rows.cell_deg, self.columns.cell_deg)
+        )
+        self._spectrum = fft.rfft2(
+            _wrapped(kernel, self._padded), workers=thread_count()
+        )
+        inside = self._spread(np.ones((n, m, 1), np.float32))[..., 0]
+        self._outside = np.maximum(self.fraction - inside, 0.0)[..., None]
+
+    def scatter(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what of a coarse picture (n, m, 3) arrives in each cell."""
+        beyond = self._outside * _edge_light(coarse)
+        return (self._spread(coarse) + beyond).astype(np.float32)
+
+    def _spread(self, coarse: NDArray) -> NDArray:
+        n, m = coarse.shape[:2]
+        spectrum = fft.rfft2(coarse, self._padded, axes=(0, 1), workers=thread_count())
+        spectrum *= self._spectrum[..., None]
+        found = fft.irfft2(spectrum, self._padded, axes=(0, 1), workers=thread_count())
+        return found[:n, :m]
+
+
+@lru_cache(maxsize=8)
+def haze_grid(camera: Camera, straylight: Straylight) -> HazeGrid:
+    """Return the grid of a camera and an eye; made once."""
+    return HazeGrid(camera, straylight)
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Cells along one axis of an image.
+
+    Attributes
+    ----------
+    first_px : (n,)
+        Pixel that each cell begins in.
+    shares : (n, k)
+        Of the cell, that this pixel and those after it take.
+    place : (n_px,)
+        Of pixels between the middles of cells, in cells.
+    cell_deg : float
+    """
+
+    first_px: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    place: NDArray[np.float64]
+    cell_deg: float
+
+    @property
+    def count(self) -> int:
+        """Return the number of cells."""
+        return self.first_px.size
+
+    @classmethod
+    def of(cls, first: float, last: float, n_px: int) -> _Axis:
+        """Cut the angle between two tangents."""
+        edges_deg = np.degrees(np.arctan(np.linspace(first, last, n_px + 1)))
+        edges_deg = np.abs(edges_deg - edges_deg[0])
+        span_deg = float(edges_deg[-1])
+        count = int(np.clip(round(span_deg / CELL_DEG), 1, MOST_CELLS))
+        count = min(count, n_px)
+        cells_deg = np.linspace(0.0, span_deg, count + 1)
+        starts = np.searchsorted(edges_deg, cells_deg[:-1], side="right") - 1
+        ends = np.searchsorted(edges_deg, cells_deg[1:], side="left")
+        pixels = starts[:, None] + np.arange(int((ends - starts).max()))
+        inside = np.minimum(pixels, n_px - 1)
+        low_deg = np.maximum(edges_deg[inside], cells_deg[:-1, None])
+        high_deg = np.minimum(edges_deg[inside + 1], cells_deg[1:, None])
+        overlap_deg = np.where(pixels < n_px, np.maximum(high_deg - low_deg, 0.0), 0.0)
+        middles_deg = 0.5 * (edges_deg[1:] + edges_deg[:-1])
+        return cls(
+            first_px=starts.astype(np.int64),
+            shares=overlap_deg / overlap_deg.sum(axis=1, keepdims=True),
+            place=np.clip(middles_deg / span_deg * count - 0.5, 0.0, count - 1.0),
+            cell_deg=span_deg / count,
+        )
+
+
+def _kernel(
+    straylight: Straylight, counts: tuple[int, int], cell_deg: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Light (2 n - 1, 2 m - 1) that a cell sends to those around it, of unit light."""
+    sub = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+    offsets = [
+        (np.arange(1 - n, n)[:, None] + sub) * size
+        for n, size in zip(counts, cell_deg, strict=True)
+    ]
+    square = (
+        np.square(offsets[0])[:, :, None, None]
+        + np.square(offsets[1])[None, None, :, :]
+    )
+    table_deg = np.geomspace(1e-3, 180.0, 4000)
+    per_sr = straylight.per_sr(table_deg)
+    log_per_sr = np.interp(
+        0.5 * np.log(np.maximum(square, table_deg[0] ** 2)),
+        np.log(table_deg),
+        np.log(np.maximum(per_sr, 1e-12)),
+    )
+    found = np.exp(log_per_sr).mean(axis=(1, 3))
+    return found * np.radians(cell_deg[0]) * np.radians(cell_deg[1])
+
+
+def _edge_light(coarse: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Mean light (3,) of the outermost cells."""
+    edges = (coarse[0], coarse[-1], coarse[:, 0], coarse[:, -1])
+    return np.concatenate(edges).mean(axis=0, dtype=np.float64)
+
+
+def _wrapped(kernel: NDArray, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Kernel with its middle at the first element, as an FFT wants it."""
+    n, m = (kernel.shape[0] + 1) // 2, (kernel.shape[1] + 1) // 2
+    found = np.zeros((max(shape[0], 2 * n - 1), max(shape[1], 2 * m - 1)))
+    found[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return np.roll(found, (1 - n, 1 - m), axis=(0, 1)).astype(np.float32)

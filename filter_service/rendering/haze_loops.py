@@ -1,0 +1,84 @@
+"""Compiled loops of `haze.py`: to a coarse grid of angles and back.
+
+Each works on some of the rows, so that threads share them: numba's own threads may end
+a process in which two start at once.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mean_light(start, end, image, rows, row_shares, columns, column_shares, coarse):
+    """Fill coarse cells (n, m, 3) with the mean of the pixels that lie in them.
+
+    Parameters
+    ----------
+    rows, columns : (n,), (m,)
+        First pixel of each cell.
+    row_shares, column_shares : (n, k), (m, l)
+        Share of a cell that it and those after it take; they sum to 1.
+    """
+    for i in range(start, end):
+        for j in range(coarse.shape[1]):
+            red, green, blue = 0.0, 0.0, 0.0
+            for k in range(row_shares.shape[1]):
+                if row_shares[i, k] == 0.0:
+                    continue
+                y = rows[i] + k
+                for n in range(column_shares.shape[1]):
+                    share = row_shares[i, k] * column_shares[j, n]
+                    if share == 0.0:
+                        continue
+                    x = columns[j] + n
+                    red += share * image[y, x, 0]
+                    green += share * image[y, x, 1]
+                    blue += share * image[y, x, 2]
+            coarse[i, j, 0] = red
+            coarse[i, j, 1] = green
+            coarse[i, j, 2] = blue
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
+    """Weaken an image (h, w, 3) by what is scattered, and add that, in place.
+
+    Parameters
+    ----------
+    coarse : (n, m, 3)
+        Scattered light.
+    row_at, column_at : (h,), (w,)
+        Where pixels lie between the cells' centres, in cells.
+    kept : float
+        Part of the light that is not scattered.
+    gains : (3,)
+        What of each channel the media let through.
+    """
+    last_row, last_column = coarse.shape[0] - 1, coarse.shape[1] - 1
+    for y in range(start, end):
+        i = min(int(row_at[y]), max(last_row - 1, 0))
+        below = min(i + 1, last_row)
+        v = row_at[y] - i
+        for x in range(image.shape[1]):
+            j = min(int(column_at[x]), max(last_column - 1, 0))
+            right = min(j + 1, last_column)
+            u = column_at[x] - j
+            for c in range(3):
+                over = coarse[i, j, c] + u * (coarse[i, right, c] - coarse[i, j, c])
+                under = coarse[below, j, c] + u * (
+                    coarse[below, right, c] - coarse[below, j, c]
+                )
+                light = kept * image[y, x, c] + over + v * (under - over)
+                image[y, x, c] = np.float32(gains[c] * light)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def encode_srgb(start, end, image, table, encoded):
+    """Encode linear light (n,) in bytes (n,) by a table (size,) over 0 to 1."""
+    last = table.size - 1
+    for k in range(start, end):
+        light = image[k]
+        if light > 0.0:
+            encoded[k] = table[int(min(light, 1.0) * last + 0.5)]
+        else:
+            encoded[k] = 0
