@@ -24,6 +24,7 @@ class Bench(StrEnum):
     ESTIMATE = "estimate"
     FOCUS = "focus"
     PEOPLE = "people"
+    MEDIA = "media"
     DISPLAYS = "displays"
     NETWORKS = "networks"
     PLAN = "plan"
@@ -46,6 +47,7 @@ BENCH_MODULES = {
     Bench.ESTIMATE: "tests.benchmarks.bench_estimate",
     Bench.FOCUS: "tests.benchmarks.bench_focus",
     Bench.PEOPLE: "tests.benchmarks.bench_people",
+    Bench.MEDIA: "tests.benchmarks.bench_media",
     Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",

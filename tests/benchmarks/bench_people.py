@@ -1,6 +1,6 @@
 """The periphery of people left out: our eyes beside linear predictors.
 
-    python -m tests.benchmarks.bench_people [--quick] [--json]
+    python -m tests.benchmarks.bench_people [--quick] [--json] [--plot]
 
 129 eyes of 65 people along the horizontal meridian (4 mm), in folds that keep a
 person's eyes together.  Ours is `field_table` of a profile that has the axis alone, or
@@ -22,13 +22,16 @@ from numpy.typing import NDArray
 
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import power_vectors_dpt
+from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, nm_from_index, rescale_pupil
+from estimator.periphery.change import peripheral_change
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
 from estimator.periphery.people import People, load_over_field, load_people
 from estimator.periphery.population import Population, measured_population
-from estimator.profiles.parse import parse_profile
+from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.progress import Progress
-from tests.benchmarks.harness import Row, memory_mb, publish
+from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish
+from tests.benchmarks.people_picture import plot_fields, show_scene
 
 FILE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
 ANGLES_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
@@ -37,6 +40,7 @@ ANGLES_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
 GIVEN_DEG = (-20.0, 20.0)
 FOLDS, QUICK_FOLDS = 5, 2
 SEED = 0
+REPEATS = 5
 RIDGES = {"M": 1.0, "all central terms": 100.0, "axis and +-20 deg": 10.0}
 """Of standardised inputs; each is the best of 1, 3, 10, 30, 100."""
 
@@ -214,6 +218,32 @@ def meridian_rows(judged: Meridian, predictions: dict) -> Iterator[Row]:
             )
 
 
+def direction_rows() -> Iterator[Row]:
+    """What 627 directions of each preset take, and how far M is from people's."""
+    h_deg, v_deg = (
+        values.ravel()
+        for values in np.meshgrid(np.linspace(-40, 40, 33), np.linspace(-24, 24, 19))
+    )
+    for name in preset_names():
+        profile = parse_profile({"kind": "preset", "name": name})
+        times_ms = []
+        for _ in range(REPEATS):
+            start_s = time.perf_counter()
+            found_um = told_change_um(profile, h_deg, v_deg)
+            times_ms.append(1e3 * (time.perf_counter() - start_s))
+        told_um = peripheral_change(profile).zernike_um(h_deg, v_deg)
+        error_um = found_um - told_um[:, list(TERMS)]
+        sphere = TERMS.index(4)
+        error_dpt = SPHERE_PER_C20 * np.abs(error_um[:, sphere]) / CIRCLE_MM**2
+        yield Row(
+            *("people", "627 directions", name, "40 x 24 deg", REPEATS),
+            float(np.median(times_ms)),
+            float(np.max(times_ms)),
+            *(memory_mb(), "M, median error, dpt", float(np.median(error_dpt))),
+            "people's change for such an axis",
+        )
+
+
 def field_rows() -> Iterator[Row]:
     """Errors over the whole field of five people that no population has seen."""
     directions_deg, zernike_um = load_over_field(FILE)
@@ -271,6 +301,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="two folds")
     parser.add_argument("--json", action="store_true", help="print the report alone")
+    parser.add_argument("--plot", action="store_true", help="fields of the presets")
     options = parser.parse_args()
     judged = Meridian(load_people(FILE))
     measured_population()
@@ -280,9 +311,12 @@ def main() -> None:
         predictions = meridian_predictions(
             judged, count, lambda done: task.update(done, "folds")
         )
-    rows = [*meridian_rows(judged, predictions), *field_rows()]
+    rows = [*meridian_rows(judged, predictions), *field_rows(), *direction_rows()]
     if not options.json:
         print_table(rows)
+    if options.plot:
+        plot_fields(RESULTS / "people.png")
+        show_scene(RESULTS / "people_scene.jpg")
     publish("people", rows, as_json=options.json, is_whole=not options.quick)
 
 
