@@ -1,8 +1,10 @@
 """Mean and covariance of people's wavefronts, on the axis and along the meridian.
 
-Few people, many numbers: of what a sample's covariance says between different terms,
-and between the axis and the periphery, a share is believed.  The shares are those at
-which people left out are predicted best.
+Few people, many numbers.  What the axis says of the periphery is a ridge regression:
+the sphere counts for more than other terms, and each place's answer is shrunk by how
+much of it chance explains (James and Stein).  What is left is a covariance of which a
+share is believed.  The strengths are those at which people left out are told best, at
+no angle worse than by their sphere alone.
 """
 
 import json
@@ -21,14 +23,12 @@ POPULATION_FILE = Path(__file__).parent / "population.json"
 PLACES = 1 + len(KNOTS_DEG)
 """The axis and the knots: what is known of each term."""
 
-SAME_SHARE, OTHER_SHARE = 0.95, 0.5
-"""Of covariances between angles of one term, and those between terms; on the axis all
-terms count as one."""
+SPHERE_RIDGE, OTHER_RIDGE = 20.0, 400.0
+"""Penalties of the regression on standardised terms of the axis."""
 
-AXIS_SHARE, AXIS_SPHERE_SHARE = 0.3, 0.7
-"""Of those between the axis and the periphery; for the sphere on the axis, which says
-most: with more of the others, people left out are told worse than by it alone at 10 and
-20 deg of temporal retina."""
+SAME_SHARE, OTHER_SHARE = 0.95, 0.5
+"""Of covariances between angles of one term, and between terms, that are believed; on
+the axis all terms count as one."""
 
 ROUNDS = 15
 """Of expectation and maximisation: some people were not measured everywhere."""
@@ -54,16 +54,30 @@ class Population:
     @classmethod
     def of(cls, people: People) -> "Population":
         """Fit that of measured people; those without an axis are left out."""
-        values_um = np.concatenate(
-            [people.axis_um[:, :, None], knots_um(people)], axis=-1
+        people = people.of(np.isfinite(people.axis_um).all(axis=-1))
+        axis_um = people.axis_um
+        away_um = axis_um - axis_um.mean(axis=0)
+        changes_um = knots_um(people).reshape(len(axis_um), -1)
+        slopes, mean_um = _regressed(away_um, changes_um)
+        axis_um2 = away_um.T @ away_um / len(away_um)
+        axis_um2 *= np.where(np.eye(len(TERMS), dtype=bool), 1.0, SAME_SHARE)
+        rest_um2 = _rest_um2(changes_um - mean_um - away_um @ slopes.T)
+        covariance_um2 = np.block(
+            [
+                [axis_um2, axis_um2 @ slopes.T],
+                [slopes @ axis_um2, slopes @ axis_um2 @ slopes.T + rest_um2],
+            ]
         )
-        values_um = values_um[np.isfinite(people.axis_um).all(axis=-1)]
-        mean_um = np.nanmean(values_um, axis=0)
-        deviation_um = np.nanstd(values_um, axis=0)
-        units = ((values_um - mean_um) / deviation_um).reshape(len(values_um), -1)
-        centre, correlation = _fitted(units)
-        mean_um = mean_um + deviation_um * centre.reshape(mean_um.shape)
-        return cls(mean_um, deviation_um, correlation)
+        order = _by_terms()
+        covariance_um2 = covariance_um2[np.ix_(order, order)]
+        deviation_um = np.sqrt(np.diag(covariance_um2))
+        mean_um = np.concatenate([axis_um.mean(axis=0), mean_um])[order]
+        shape = (len(TERMS), PLACES)
+        return cls(
+            mean_um.reshape(shape),
+            deviation_um.reshape(shape),
+            covariance_um2 / np.outer(deviation_um, deviation_um),
+        )
 
     def to_json(self) -> dict:
         """Return the content of a file."""
@@ -99,25 +113,56 @@ def _rounded(values: NDArray[np.float64]) -> list:
     return np.vectorize(lambda v: float(f"{v:.5g}"))(values).tolist()
 
 
-def _fitted(
-    units: NDArray[np.float64],
+def _by_terms() -> NDArray[np.int64]:
+    """Where the values (108,) of terms and places stand: the axis first, then knots."""
+    axis = np.arange(len(TERMS))[:, None]
+    knots = len(TERMS) + np.arange(len(TERMS) * len(KNOTS_DEG))
+    return np.concatenate([axis, knots.reshape(len(TERMS), -1)], axis=1).ravel()
+
+
+def _regressed(
+    axis_um: NDArray[np.float64], changes_um: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean (108,) and covariance (108, 108) of rows with gaps, shrunk."""
-    centre, covariance = np.zeros(units.shape[1]), np.eye(units.shape[1])
-    share = _believed()
+    """Slopes (96, 12) over the axis less its mean (n, 12), and values (96,) at that."""
+    deviation_um = axis_um.std(axis=0)
+    penalty = np.full(len(TERMS), OTHER_RIDGE)
+    penalty[TERMS.index(4)] = SPHERE_RIDGE
+    slopes, mean_um = np.zeros((changes_um.shape[1], len(TERMS))), []
+    for k, column in enumerate(changes_um.T):
+        known = np.isfinite(column)
+        inputs = axis_um[known] / deviation_um
+        centre = inputs.mean(axis=0)
+        inputs, targets = inputs - centre, column[known] - column[known].mean()
+        square = inputs.T @ inputs
+        ridge = np.linalg.inv(square + np.diag(penalty))
+        weights = ridge @ inputs.T @ targets
+        left = float(np.mean((targets - inputs @ weights) ** 2))
+        explained = max(float(np.mean(targets**2)) - left, 1e-12)
+        freedom = float(np.trace(ridge @ square)) / known.sum()
+        weights *= max(1.0 - freedom * left / explained, 0.0)
+        slopes[k] = weights / deviation_um
+        mean_um.append(column[known].mean() - centre @ weights)
+    return slopes, np.array(mean_um)
+
+
+def _rest_um2(rest_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance (96, 96) of what the axis does not tell, (n, 96) with gaps."""
+    deviation_um = np.nanstd(rest_um, axis=0)
+    covariance = _fitted(rest_um / deviation_um)
+    return covariance * np.outer(deviation_um, deviation_um)
+
+
+def _fitted(units: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance (96, 96) of rows with gaps about 0, shrunk."""
+    covariance, share = np.eye(units.shape[1]), _believed()
     for _ in range(ROUNDS):
-        filled, spread = _expected(units, centre, covariance)
-        away = filled - centre
-        centre = filled.mean(axis=0)
-        covariance = (away.T @ away + spread) / len(units) * share
-        covariance += RIDGE * np.eye(len(centre))
-    lowest = float(np.linalg.eigvalsh(covariance)[0])
-    return centre, covariance + max(RIDGE - lowest, 0.0) * np.eye(len(centre))
+        filled, spread = _expected(units, covariance)
+        covariance = (filled.T @ filled + spread) / len(units) * share
+        covariance += RIDGE * np.eye(len(covariance))
+    return covariance
 
 
-def _expected(
-    units: NDArray, centre: NDArray, covariance: NDArray
-) -> tuple[NDArray, NDArray]:
+def _expected(units: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
     """Rows with their gaps filled in, and the covariance of what was filled in."""
     filled, spread = units.copy(), np.zeros_like(covariance)
     for row in filled:
@@ -128,7 +173,7 @@ def _expected(
         gain = np.linalg.solve(
             covariance[np.ix_(known, known)], covariance[np.ix_(known, gap)]
         ).T
-        row[gap] = centre[gap] + gain @ (row[known] - centre[known])
+        row[gap] = gain @ row[known]
         spread[np.ix_(gap, gap)] += (
             covariance[np.ix_(gap, gap)] - gain @ covariance[np.ix_(known, gap)]
         )
@@ -136,14 +181,8 @@ def _expected(
 
 
 def _believed() -> NDArray[np.float64]:
-    """Share (108, 108) of each sample covariance."""
-    term, place = np.divmod(np.arange(len(TERMS) * PLACES), PLACES)
-    is_axis = place == 0
-    is_sphere = is_axis & (term == TERMS.index(4))
+    """Share (96, 96) of each sample covariance; no covariance loses its sign by it."""
+    term = np.repeat(np.arange(len(TERMS)), len(KNOTS_DEG))
     share = np.where(term[:, None] == term, SAME_SHARE, OTHER_SHARE)
-    share = np.where(is_axis[:, None] & is_axis, SAME_SHARE, share)
-    share = np.where(is_axis[:, None] != is_axis, AXIS_SHARE, share)
-    outside = (is_sphere[:, None] & ~is_axis) | (~is_axis[:, None] & is_sphere)
-    share = np.where(outside, AXIS_SPHERE_SHARE, share)
     np.fill_diagonal(share, 1.0)
     return share
