@@ -24,6 +24,9 @@ from tests.benchmarks.view_sources import EyeState
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 
+PERIPHERY = "model"
+"""The paper's eyes: their periphery follows from their surfaces, a sphere as retina."""
+
 PUPIL_RANGE_MM = (2.0, 7.0)
 FOCUS_RANGE_DPT = (0.0, 3.0)
 PAPER_RANGES = {"pupil_range_mm": (2.0, 6.0), "focus_range_dpt": (0.125, 4.125)}
@@ -120,13 +123,13 @@ class EyeBench:
             pupil_range_mm=(state.pupil_mm,) * 2,
             focus_range_dpt=(state.focus_dpt,) * 2,
         )
-        eye = traced_eye(self._name, spec)
+        eye = traced_eye(self._name, spec, periphery=PERIPHERY)
         return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
 
     def grid_state(self, state: State) -> EyeState:
         """Eye traced as far as the paper's grids reach, in angle, pupil and focus."""
         spec = self.spec("quality", grid="paper", **PAPER_RANGES)
-        eye = traced_eye(self._name, spec)
+        eye = traced_eye(self._name, spec, periphery=PERIPHERY)
         return EyeState(eye, spec, state.pupil_mm, state.focus_dpt)
 
     def store(self, method: "Ours", state: State):
@@ -135,7 +138,7 @@ class EyeBench:
         key = tuple(settings.values())
         if key not in self._stores:
             spec = self.spec(**settings)
-            eye = traced_eye(self._name, spec)
+            eye = traced_eye(self._name, spec, periphery=PERIPHERY)
             start_s = time.perf_counter()
             store = build_psf_store(eye, spec)
             build_ms = 1e3 * (time.perf_counter() - start_s)
