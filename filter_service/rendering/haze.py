@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from estimator.media.absorption import channel_gains
 from estimator.media.straylight import DEFAULT_AGE_YEARS, Straylight
@@ -165,6 +164,8 @@ class HazeGrid:
     """
 
     def __init__(self, camera: Camera, straylight: Straylight):
+        from scipy import fft  # frames without haze do without
+
         left, right, up, down = camera.tangents
         self.columns = _Axis.of(left, right, camera.width_px)
         self.rows = _Axis.of(up, down, camera.height_px)
@@ -186,6 +187,8 @@ class HazeGrid:
         return (self._spread(coarse) + beyond).astype(np.float32)
 
     def _spread(self, coarse: NDArray) -> NDArray:
+        from scipy import fft
+
         n, m = coarse.shape[:2]
         spectrum = fft.rfft2(coarse, self._padded, axes=(0, 1), workers=thread_count())
         spectrum *= self._spectrum[..., None]

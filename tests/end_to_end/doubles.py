@@ -116,6 +116,8 @@ def _as_floats(color):
 @dataclass(frozen=True)
 class ProfileDouble:
     body: dict
+    straylight: None = None
+    yellowing: None = None
 
 
 def read_profile(body):

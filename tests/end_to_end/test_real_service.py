@@ -395,6 +395,7 @@ def test_cones_weigh_the_pupil_where_that_is_asked_for(real_client, eye_model):
                 "eye_side": eye_side,
                 "sphere_dpt": -2,
                 "higher_order": "none",  # which are of one side
+                "periphery": "model",  # so is that of people
             },
             settings=settings | {"stiles_crawford": stiles_crawford},
             views=[view],
