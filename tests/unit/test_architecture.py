@@ -40,6 +40,7 @@ EYE_ROOMS = {
     "wavefront": ("optics",),
     "psf": ("optics",),
     "media": (),
+    "acuity": ("optics",),
     "eye": ("wavefront", "optics"),
     "profiles": ("eye", "media", "wavefront", "optics"),
     "periphery": ("profiles", "optics"),

@@ -7,7 +7,7 @@ from tests.source_tree import PACKAGES, ROOT, python_files
 
 UNITS = (
     *("mm", "um", "nm", "m", "mm3", "deg", "rad", "mrad", "arcmin", "dpt", "px"),
-    *("s", "ms", "hz", "db", "mb", "bytes", "years", "nit"),
+    *("s", "ms", "hz", "db", "mb", "bytes", "years", "nit", "cpd"),
 )
 KINDS = ("ratio", "index", "count", "fraction", "constant")
 """Last words that say what kind of pure number this is."""
@@ -18,6 +18,7 @@ DIMENSIONLESS = {
     "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",
     "hidden_color": "as color",
+    "log_mar": "logarithm of minutes of arc",
     "pupil_ellipse": "centre and semi-axes in mm, angle in rad",
     "values": "polynomials in um/mm^degree, and rims in mm",
     "maps": "pixels per pixel",

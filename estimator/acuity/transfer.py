@@ -1,0 +1,163 @@
+"""Optical transfer functions of wavefronts: autocorrelations of the pupil, by FFT."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from estimator.optics.zernike import (
+    EXPONENTS,
+    MAX_RADIAL_ORDER,
+    wavefront_polynomial,
+    zernike_gradient,
+)
+
+LEAST_SAMPLES, MOST_SAMPLES = 128, 1024
+"""Across the pupil's circle."""
+
+FREQUENCY_STEP_CPD = 0.3
+"""Largest step of the grid: out of focus, all that is seen lies below 2 cpd."""
+
+STEP_WAVES = 0.25
+"""Largest step of the wavefront from one sample to the next."""
+
+NM_PER_MM = 1e6
+UM_PER_MM = 1e3
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Transfer function of one wavefront on a grid of spatial frequencies.
+
+    Attributes
+    ----------
+    frequency_cpd : (n,)
+        Along either axis, cycles per degree, ascending, 0 in the middle.
+    transfer_ratio : (n, n), complex
+        y, then x; 1 at frequency 0.
+    """
+
+    frequency_cpd: NDArray[np.float64]
+    transfer_ratio: NDArray[np.complex128]
+
+    @property
+    def radial_cpd(self) -> NDArray[np.float64]:
+        """Return the frequency (n, n) of each value."""
+        return np.hypot(self.frequency_cpd[:, None], self.frequency_cpd)
+
+    def modulation(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Return the mean of the modulation transfer function over all directions."""
+        return self._mean(np.abs(self.transfer_ratio), at_cpd)
+
+    def in_phase(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Return the mean of the real part over all directions.
+
+        Detail that is shifted in phase is seen where it is not, or reversed.
+        """
+        return self._mean(self.transfer_ratio.real, at_cpd)
+
+    def _mean(self, values: NDArray, at_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Mean (m,) of values (n, n) over all directions.
+
+        Parameters
+        ----------
+        at_cpd : (m,)
+        """
+        from scipy.ndimage import map_coordinates
+
+        at_cpd = np.atleast_1d(np.asarray(at_cpd, dtype=np.float64))
+        angles = 2.0 * np.pi * (np.arange(180) + 0.5) / 180
+        step_cpd = self.frequency_cpd[1] - self.frequency_cpd[0]
+        middle = (self.frequency_cpd.size - 1) / 2
+        places = (
+            middle
+            + at_cpd[:, None]
+            / step_cpd
+            * np.stack([np.sin(angles), np.cos(angles)])[:, None]
+        )
+        found = map_coordinates(values, places, order=1)
+        return found.mean(axis=-1)
+
+
+def optical_transfer(
+    zernike_um: NDArray[np.float64],
+    *,
+    zernike_radius_mm: float,
+    wavelength_nm: float,
+    pupil_ellipse: NDArray[np.float64] | None = None,
+) -> Transfer:
+    """Return the transfer function of a wavefront, for light of one wavelength.
+
+    Parameters
+    ----------
+    zernike_um : (28,)
+    pupil_ellipse : (5,), optional
+        Centre x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
+        the whole circle if not given.
+
+    Raises
+    ------
+    ValueError
+        A wavefront so steep that `MOST_SAMPLES` do not resolve it.
+    """
+    per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm
+    count = max(
+        _samples(zernike_um, wavelength_nm),
+        fft.next_fast_len(
+            math.ceil(2.0 * zernike_radius_mm * per_mm_cpd / FREQUENCY_STEP_CPD)
+        ),
+    )
+    step_mm = 2.0 * zernike_radius_mm / count
+    along_mm = (np.arange(count) + 0.5) * step_mm - zernike_radius_mm
+    x_mm, y_mm = np.meshgrid(along_mm, along_mm)
+    wavefront_um = _wavefront_um(zernike_um, along_mm / zernike_radius_mm)
+    inside = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
+    phase = 2.0 * np.pi * wavefront_um * UM_PER_MM / wavelength_nm
+    pupil = inside * np.exp(1j * phase)
+    padded = 2 * count
+    intensity = np.abs(fft.fft2(pupil, (padded, padded))) ** 2
+    transfer = fft.fftshift(fft.ifft2(intensity))[1:, 1:]  # odd, 0 in the middle
+    middle = count - 1
+    return Transfer(
+        frequency_cpd=(np.arange(2 * count - 1) - middle) * per_mm_cpd * step_mm,
+        transfer_ratio=transfer / transfer[middle, middle],
+    )
+
+
+def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
+    """Wavefront (n, n), y then x, at places (n,) of the unit circle's square."""
+    by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
+    by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)
+    powers = along[:, None] ** np.arange(MAX_RADIAL_ORDER + 1)
+    return powers @ by_powers @ powers.T
+
+
+def _samples(zernike_um: NDArray, wavelength_nm: float) -> int:
+    """Return samples across the circle that follow the steepest part of its rim."""
+    angles = 2.0 * np.pi * np.arange(72) / 72
+    slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
+    steepest_um = float(np.linalg.norm(slopes @ zernike_um, axis=-1).max())
+    waves_across = 2.0 * steepest_um * UM_PER_MM / wavelength_nm
+    wanted = max(LEAST_SAMPLES, math.ceil(waves_across / STEP_WAVES))
+    if wanted > MOST_SAMPLES:
+        raise ValueError(
+            f"wavefront of {steepest_um:.0f} um per pupil radius at its rim: transfer "
+            f"functions are for up to "
+            f"{MOST_SAMPLES * STEP_WAVES * wavelength_nm / 2.0 / UM_PER_MM:.0f}"
+        )
+    return fft.next_fast_len(wanted)
+
+
+def _inside(x_mm, y_mm, radius_mm, ellipse, step_mm) -> NDArray[np.float64]:
+    """Part of each sample that is within the pupil; its edge is a sample wide."""
+    circle = np.hypot(x_mm, y_mm) / radius_mm
+    found = np.clip(0.5 + (1.0 - circle) * radius_mm / step_mm, 0.0, 1.0)
+    if ellipse is None:
+        return found
+    cx, cy, major_mm, minor_mm, angle = ellipse
+    along = (x_mm - cx) * np.cos(angle) + (y_mm - cy) * np.sin(angle)
+    across = (y_mm - cy) * np.cos(angle) - (x_mm - cx) * np.sin(angle)
+    from_rim = 1.0 - np.hypot(along / major_mm, across / minor_mm)
+    return np.minimum(found, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0))
