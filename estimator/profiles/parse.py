@@ -58,6 +58,7 @@ COMMON_FIELDS = (
     "periphery",
     "straylight",
     "yellowing",
+    "spectacle_magnification",
 )
 STRAYLIGHT_FIELDS = ("pigmentation", "log_s", "cataract")
 PERIPHERIES = ("people", "model")
@@ -141,6 +142,8 @@ class EyeProfile:
         Scatter in the media, where it is to be seen.
     yellowing : {"seen", "adapted"} or None
         Absorption of the ageing lens, where it is to be seen.
+    spectacle_magnification : bool
+        Whether the world is seen as large as the worn correction shows it.
     periphery : {"people", "model"}
         Whether a traced eye has people's periphery; a given eye, and one with a retina
         of its own, has the model's.
@@ -165,6 +168,7 @@ class EyeProfile:
     periphery: str = "people"
     straylight: Straylight | None = None
     yellowing: str | None = None
+    spectacle_magnification: bool = False
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
@@ -262,6 +266,7 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
         "periphery": periphery,
         "straylight": _straylight(data, age_years),
         "yellowing": _yellowing(data),
+        "spectacle_magnification": _magnification(data),
     }
 
 
@@ -287,6 +292,17 @@ def _straylight(data: Mapping[str, Any], age_years: float | None) -> Straylight 
         ),
         log_s=log_s,
     )
+
+
+def _magnification(data: Mapping[str, Any]) -> bool:
+    wanted = data.get("spectacle_magnification", False)
+    if not isinstance(wanted, bool):
+        raise ProfileError(
+            "spectacle_magnification", f"{wanted!r:.40} is neither", "true or false"
+        )
+    if wanted and data.get("correction") is None:
+        raise ProfileError("correction", "is missing beside the magnification", "one")
+    return wanted
 
 
 def _yellowing(data: Mapping[str, Any]) -> str | None:

@@ -15,6 +15,8 @@ frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
 haze           light that the media scatter and absorb, over a picture
 haze_loops     its compiled loops
+spectacles     the size of what is seen through them
+spectacle_loops  its compiled loop
 plan_once      what plans need, loaded ahead
 reference      numpy twins of the passes
 gl/            the engine of compute shaders

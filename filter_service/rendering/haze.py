@@ -30,6 +30,11 @@ from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
 from filter_service.rendering.engine import FrameEngine, Rendered
 from filter_service.rendering.frame_options import OUTPUT_DTYPES
+from filter_service.rendering.spectacles import (
+    Matrix,
+    seen_through,
+    spectacle_magnification,
+)
 from filter_service.rgbd_view import RgbdView
 
 CELL_DEG = 0.25
@@ -41,6 +46,7 @@ MOST_CELLS = 384
 SAMPLES = 4
 """Points along each edge of a cell that the scatter function is averaged over."""
 
+UNCHANGED = (1.0, 1.0, 1.0)
 ENCODE_STEPS = 1 << 16
 
 
@@ -52,17 +58,21 @@ class MediaEffects:
     ----------
     straylight : Straylight or None
     gain_ratio : (red, green, blue)
+    magnification_ratio : (2, 2) or None
+        Of worn spectacles, see there.
     """
 
     straylight: Straylight | None
     gain_ratio: tuple[float, float, float]
+    magnification_ratio: Matrix | None = None
 
     @classmethod
     def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
         """Return those that a profile asks for; None where it asks for none."""
-        if profile.straylight is None and profile.yellowing is None:
+        larger = spectacle_magnification(profile)
+        if (profile.straylight, profile.yellowing, larger) == (None, None, None):
             return None
-        gains = (1.0, 1.0, 1.0)
+        gains = UNCHANGED
         if profile.yellowing is not None:
             age_years = profile.age_years or DEFAULT_AGE_YEARS
             found = channel_gains(
@@ -71,7 +81,7 @@ class MediaEffects:
                 yellowing=profile.yellowing,
             )
             gains = tuple(found.tolist())
-        return cls(profile.straylight, gains)
+        return cls(profile.straylight, gains, larger)
 
 
 def render_through_media(
@@ -86,6 +96,10 @@ def render_through_media(
     """Filter a view as `FrameEngine.render` does, with the media's effects."""
     if effects is None:
         return engine.render(view, handle, output=output, **options)
+    started_s = time.perf_counter()
+    if effects.magnification_ratio is not None:
+        view = seen_through(view, effects.magnification_ratio)
+    before_s = time.perf_counter() - started_s
     rendered = engine.render(view, handle, output="linear", **options)
     started_s = time.perf_counter()
     color = np.ascontiguousarray(rendered.color, dtype=np.float32)
@@ -93,7 +107,7 @@ def render_through_media(
     color = encoded(color, output)
     stages_ms = {
         **rendered.stage_times_ms,
-        "media_ms": 1e3 * (time.perf_counter() - started_s),
+        "media_ms": 1e3 * (time.perf_counter() - started_s + before_s),
     }
     return replace(rendered, color=color, stage_times_ms=stages_ms)
 
@@ -106,6 +120,8 @@ def add_haze(
 
     gains = np.array(effects.gain_ratio)
     if effects.straylight is None:
+        if effects.gain_ratio == UNCHANGED:
+            return color
         color *= gains.astype(np.float32)
         return color
     grid = haze_grid(camera, effects.straylight)

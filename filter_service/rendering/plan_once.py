@@ -26,6 +26,8 @@ from filter_service.rendering.perfect_eye import (
     TANGENTS,
     perfect_store,
 )
+from filter_service.rendering.spectacles import seen_through
+from filter_service.rgbd_view import RgbdView
 
 
 def plan_once() -> None:
@@ -44,5 +46,7 @@ def plan_once() -> None:
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
+    view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
+    seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
     effects = MediaEffects(Straylight(), (1.0, 1.0, 1.0))
     encoded(add_haze(light, store.spec.camera, effects), "srgb8")

@@ -118,6 +118,7 @@ class ProfileDouble:
     body: dict
     straylight: None = None
     yellowing: None = None
+    spectacle_magnification: bool = False
 
 
 def read_profile(body):

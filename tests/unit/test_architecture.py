@@ -108,6 +108,7 @@ HOME = {
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/rendering/map_loops.py",
         "filter_service/rendering/haze_loops.py",
+        "filter_service/rendering/spectacle_loops.py",
         "filter_service/rendering/kernel_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",

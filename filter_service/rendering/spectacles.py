@@ -1,0 +1,73 @@
+"""The size of what is seen through worn spectacles: smaller for a myope.
+
+A thin lens of power F at L before the entrance pupil shows every direction at
+1 / (1 - L F) of its tangent: 0.92 at -6 dpt, 12 mm before the cornea.  A cylinder does
+so by its meridians.  The view is drawn anew at that size before the eye filters it, for
+blur is of the eye and does not shrink; what then lies beyond the camera's image is its
+edge, repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.optics import prescription as rx
+from estimator.profiles.parse import EyeProfile
+from filter_service.rgbd_view import RgbdView
+
+ENTRANCE_PUPIL_MM = 3.05
+"""Behind the cornea, as everywhere that no eye model says otherwise."""
+
+MM_PER_M = 1e3
+Matrix = tuple[tuple[float, float], tuple[float, float]]
+
+
+def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
+    """Return tangents seen over tangents there are; None where nobody asks for it."""
+    if not profile.spectacle_magnification or profile.correction is None:
+        return None
+    m, j0, j45 = rx.power_vector(replace(profile.correction, vertex_mm=0.0))
+    power_dpt = np.array([[m + j0, j45], [j45, m - j0]])
+    before_m = (profile.correction.vertex_mm + ENTRANCE_PUPIL_MM) / MM_PER_M
+    found = np.linalg.inv(np.eye(2) - before_m * power_dpt)
+    (a, b), (c, d) = found.tolist()
+    return (a, b), (c, d)
+
+
+def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
+    """Return the view as it is seen through spectacles, in linear light."""
+    from filter_service.rendering.spectacle_loops import draw_anew
+
+    left, right, up, down = view.tangents
+    steps = (right - left) / view.width_px, (down - up) / view.height_px
+    place = np.array([left, up, *steps])
+    to_source = np.linalg.inv(np.array(magnification))
+    images = {}
+    for color, depth in (("color", "depth_m"), ("hidden_color", "hidden_depth_m")):
+        light, metres = getattr(view, color), getattr(view, depth)
+        if light is None:
+            continue
+        light = _linear(light)
+        drawn, deep = np.empty_like(light), np.empty_like(metres)
+        draw_anew(light, metres, place, to_source, drawn, deep)
+        images |= {color: drawn, depth: deep}
+    return replace(view, **images)
+
+
+def _linear(color: NDArray) -> NDArray[np.float32]:
+    if color.dtype == np.uint8:
+        return _decoding()[color]
+    return color.astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _decoding() -> NDArray[np.float32]:
+    encoded = np.arange(256) / 255.0
+    light = np.where(
+        encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4
+    )
+    return light.astype(np.float32)
