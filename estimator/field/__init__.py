@@ -6,6 +6,7 @@ network_grid     the same by network
 grid_source      which of the two, by cost and error
 interpolation    between the nodes
 peripheral_rest  what people's periphery has beyond the model's
+trace_range      what of the field is traced
 traced_fields    fixed fields, changing pupil and focus
 traced_eye       an estimated eye, ray-traced over the field
 prepare          from a profile to such an eye: the entry

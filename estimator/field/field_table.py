@@ -10,7 +10,6 @@ from estimator.field.traced_eye import TracedEye
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import (
-    ellipse_from_rim,
     polynomial_in_mm,
     zernike_from_polynomial,
 )
@@ -83,16 +82,18 @@ def field_table(
             f"pupil {pupil_diameter_mm:g} mm: light passes this eye up to "
             f"{eye.max_pupil_diameter_mm:.3g} mm"
         )
-    zernike_um, rim_mm, radius_mm = eye.states(
-        h_deg=h_deg,
-        v_deg=v_deg,
-        pupil_diameter_mm=pupil_diameter_mm,
-        accommodation_dpt=eye.grid.accommodations_dpt[0],
-        wavelength_nm=wavelength_nm,
-    )
+    states = {
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "pupil_diameter_mm": pupil_diameter_mm,
+        "accommodation_dpt": eye.grid.accommodations_dpt[0],
+        "wavelength_nm": wavelength_nm,
+    }
+    found = eye.wavefronts(**states, total_defocus_dpt=eye.total_defocus_dpt(**states))
+    radius_mm = found.circle_diameter_mm / 2.0
     # Frames need wavefronts in the entrance pupil; instruments tell them at the cornea.
     at_cornea_um = moved_polynomial(
-        polynomial_in_mm(zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
+        polynomial_in_mm(found.zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
     )
     zernike_um = zernike_from_polynomial(at_cornea_um, radius_mm)
     return FieldTable(
@@ -101,7 +102,7 @@ def field_table(
         zernike_um=zernike_um,
         zernike_radius_mm=radius_mm,
         power_dpt=rx.power_vectors_dpt(zernike_um, radius_mm),
-        pupil_ellipse=ellipse_from_rim(rim_mm),
+        pupil_ellipse=found.pupil_ellipse,
         notes=(*notes, *_edge_notes(eye, h_deg, v_deg)),
     )
 

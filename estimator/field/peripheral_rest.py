@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.eye.tracing import on_axis_zernike_um
-from estimator.field.aberration_grid import aberration_grid
+from estimator.field.aberration_grid import (
+    FIELD_AZIMUTHS,
+    FIELD_RINGS,
+    aberration_grid,
+)
 from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, flip_horizontal, remove_central_tilt
@@ -33,8 +37,6 @@ from estimator.wavefront.moved_plane import moved_polynomial
 WIDEST_RATIO = 1.5
 """Pupils wider than so many times the measured one are filled by stretched terms of
 the third and fourth order: polynomials go anywhere beyond what was measured."""
-
-RINGS, AZIMUTHS = 5, 14
 
 
 class PeripheralRest:
@@ -65,8 +67,8 @@ class PeripheralRest:
                 pupil_diameters_mm=[2.0 * CIRCLE_MM],
                 accommodations_dpt=[0.0],
                 wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
-                n_rings=RINGS,
-                n_azimuths=AZIMUTHS,
+                n_rings=FIELD_RINGS,
+                n_azimuths=FIELD_AZIMUTHS,
             )
         )
         self._depth_mm = usual.accommodating.entrance_pupil_mm

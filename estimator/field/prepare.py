@@ -10,7 +10,8 @@ from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.grid_source import GridSource
 from estimator.field.notes import eye_notes, periphery_note
-from estimator.field.traced_eye import ON_AXIS_DEG, FieldRange, TracedEye
+from estimator.field.trace_range import ON_AXIS_DEG, FieldRange
+from estimator.field.traced_eye import TracedEye
 from estimator.networks.card import NetworkUnavailable
 from estimator.networks.inference import load_network
 from estimator.optics.units import RGB_WAVELENGTHS_NM

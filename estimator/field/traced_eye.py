@@ -14,17 +14,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.focusing import FocusingEye
-from estimator.eye.tracing import TraceFailed
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.interpolation import (
     FieldInterpolation,
     accommodation_nodes_dpt,
-    field_nodes_deg,
 )
 from estimator.field.peripheral_rest import PeripheralRest
+from estimator.field.trace_range import (
+    ON_AXIS_DEG,
+    FieldRange,
+    check_field_range,
+    field_pupils_mm,
+    largest_open_pupil_mm,
+    peripheral_rest,
+    share_of,
+    trace_field,
+)
 from estimator.field.traced_fields import TracedFields, check_limits
-from estimator.periphery.change import peripheral_change
-from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
     correction_polynomial,
@@ -40,29 +46,13 @@ ACCOMMODATION_STEP_DPT = 1.0
 """Largest step between accommodations whose PSFs are blended; blending is at equal
 defocus, so only the slow change of the other aberrations is interpolated."""
 
-FIELD_PUPIL_RATIOS = (0.64, 1.0)
-"""Pupils traced over the field, of the largest one."""
-
-LARGE_PUPIL_MM = 7.2
-LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
-"""The same where the largest pupil is larger than that."""
-
-FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
-"""Rays per wavefront over the field: 70, 1e-3 um from many at 7 mm, 0.013 at worst."""
-
 TRACED_ERROR_UM = 1e-3
 """What a reply states of them."""
 
 PREPARED_MARGIN_DPT = 0.02
 """A focus that was not traced is met to this, or its reply says so."""
 
-ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
-SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
-"""Step by which the traced field is made smaller until light passes all of it."""
-
 AXIS_PROGRESS = 0.1
-
-FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
 
 class TracedEye(FocusingEye):
@@ -159,7 +149,7 @@ class TracedEye(FocusingEye):
         ValueError
             A field range that is not ascending.
         """
-        _check_field_range(field_range_deg)
+        check_field_range(field_range_deg)
         pupils_mm = np.unique(pupil_diameters_mm)
         used_dpt = eye.accommodating.accommodation_range_dpt(
             focus_range_dpt, pupil_range_mm=(pupils_mm[0], pupils_mm[-1])
@@ -174,12 +164,12 @@ class TracedEye(FocusingEye):
             eye,
             pupil_diameters_mm=pupils_mm,
             **states,
-            progress=_share(progress, 0.0, axis_share),
+            progress=share_of(progress, 0.0, axis_share),
         )
         axis = FieldInterpolation(axis_grid)
         if on_axis_only:
             return cls(eye, axis)
-        field, traced_range_deg = _trace_field(
+        field, traced_range_deg = trace_field(
             eye,
             axis,
             field_range_deg,
@@ -188,7 +178,7 @@ class TracedEye(FocusingEye):
                 axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
             ),
             **states,
-            progress=_share(progress, axis_share, 1.0),
+            progress=share_of(progress, axis_share, 1.0),
         )
         return cls(
             eye,
@@ -196,7 +186,7 @@ class TracedEye(FocusingEye):
             field,
             field_range_deg=field_range_deg,
             traced_range_deg=traced_range_deg,
-            periphery=_peripheral_rest(eye, traced_range_deg),
+            periphery=peripheral_rest(eye, traced_range_deg),
         )
 
     def refraction_at_dpt(
@@ -321,30 +311,6 @@ class TracedEye(FocusingEye):
             total_defocus_dpt=total_dpt,
         )
 
-    def states(
-        self,
-        *,
-        h_deg: ArrayLike,
-        v_deg: ArrayLike,
-        pupil_diameter_mm: ArrayLike,
-        accommodation_dpt: ArrayLike,
-        wavelength_nm: ArrayLike,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients (P, 28), rims (P, 5), mm, and radii (P,), object at infinity.
-
-        P in C order of the broadcast arguments.
-
-        Raises
-        ------
-        ValueError
-            A state outside of what was traced.
-        """
-        states = np.broadcast_arrays(
-            h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
-        )
-        zernike_um, rim_mm, radius_mm, number = self._distinct(list(states))
-        return zernike_um[number], rim_mm[number], radius_mm[number]
-
     def chief_ray_shift_mrad(
         self,
         *,
@@ -410,84 +376,3 @@ class TracedEye(FocusingEye):
         check_limits("pupil_diameter_mm", pupil_diameter_mm, 0.1, largest_mm)
         low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]]
         check_limits("accommodation_dpt", accommodation_dpt, low_dpt, high_dpt)
-
-
-def largest_open_pupil_mm(grid: AberrationGrid) -> float:
-    """Largest pupil of an on-axis grid that is open at all its states.
-
-    Raises
-    ------
-    TraceFailed
-        There is none.
-    """
-    is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
-    if not is_open.any():
-        raise TraceFailed(
-            f"no light passes the eye at {grid.pupil_diameters_mm[0]:g} mm"
-        )
-    return float(grid.pupil_diameters_mm[is_open][-1])
-
-
-def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
-    """Pupils (n,) to trace over the field for a range of them."""
-    large = high_mm > LARGE_PUPIL_MM
-    ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
-    pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
-    return np.unique(pupils_mm)
-
-
-def _trace_field(
-    eye: EstimatedEye,
-    axis: FieldInterpolation,
-    field_range_deg: FieldRange,
-    make_grid: Callable[..., AberrationGrid],
-    **axes,
-) -> tuple[FieldInterpolation, FieldRange]:
-    """Trace a range of fields, drawn in towards the axis until light passes it all."""
-    limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
-    share = 1.0
-    while share > SMALLEST_SHARE:
-        (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
-        field = FieldInterpolation(
-            make_grid(
-                eye,
-                h_deg=field_nodes_deg(h_low, h_high),
-                v_deg=field_nodes_deg(v_low, v_high),
-                n_rings=FIELD_RINGS,
-                n_azimuths=FIELD_AZIMUTHS,
-                **axes,
-            )
-        )
-        if field.passes:
-            return field, tuple(map(tuple, traced))
-        share *= SHRINK_RATIO
-    return axis, ON_AXIS_DEG
-
-
-def _peripheral_rest(
-    eye: EstimatedEye, field_range_deg: FieldRange
-) -> PeripheralRest | None:
-    """Return people's periphery for an eye; None where it has its model's.
-
-    So it has where light does not pass the usual eye over the whole range.
-    """
-    if eye.profile.periphery == "model" or not np.any(field_range_deg):
-        return None
-    rest = PeripheralRest(peripheral_change(eye.profile), eye, field_range_deg)
-    return rest if rest.passes else None
-
-
-def _share(
-    progress: Callable[[float], None] | None, low: float, high: float
-) -> Callable[[float], None] | None:
-    if progress is None:
-        return None
-    return lambda done: progress(low + (high - low) * done)
-
-
-def _check_field_range(field_range_deg: FieldRange) -> None:
-    for low, high in field_range_deg:
-        if not -90.0 < low <= high < 90.0:
-            raise ValueError(
-                f"field_range_deg {field_range_deg}: needs -90 < low <= high < 90 twice"
-            )

@@ -24,13 +24,7 @@ from estimator.eye.parameters import (
     parse_parameters,
     parse_retina,
 )
-from estimator.media.absorption import YELLOWINGS
-from estimator.media.straylight import (
-    BROWN,
-    CATARACTS,
-    DEFAULT_AGE_YEARS,
-    Straylight,
-)
+from estimator.media.straylight import Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (
@@ -39,6 +33,7 @@ from estimator.optics.zernike import (
     flip_horizontal,
     index_from_nm,
 )
+from estimator.profiles import options
 
 __all__ = [
     "EyeProfile",
@@ -55,16 +50,8 @@ COMMON_FIELDS = (
     "correction",
     "name",
     "retina",
-    "periphery",
-    "straylight",
-    "yellowing",
-    "spectacle_magnification",
+    *options.FIELDS,
 )
-STRAYLIGHT_FIELDS = ("pigmentation", "log_s", "cataract")
-PERIPHERIES = ("people", "model")
-"""Where a traced eye's wavefronts off the axis come from: measured people with such an
-axis, or the surfaces of the eye model alone."""
-
 PRESCRIPTION_FIELDS = (
     "sphere_dpt",
     "cylinder_dpt",
@@ -248,69 +235,16 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
         fields.only_known(body, PRESCRIPTION_FIELDS[:4], path="correction.")
         correction = _prescription(body, path="correction.")
     retina = parse_retina(data)
-    is_model = retina is not None or data.get("kind") == "eye"
-    periphery = fields.choice(
-        data, "periphery", PERIPHERIES, default="model" if is_model else "people"
-    )
-    if is_model and periphery != "model":
-        raise ProfileError(
-            "periphery",
-            "is 'people', but the profile gives the eye's own surfaces",
-            "model, for kind 'eye' and beside 'retina'",
-        )
     return {
         "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
         "age_years": age_years,
         "correction": correction,
         "retina": retina,
-        "periphery": periphery,
-        "straylight": _straylight(data, age_years),
-        "yellowing": _yellowing(data),
-        "spectacle_magnification": _magnification(data),
+        "periphery": options.periphery(data, has_own=retina is not None),
+        "straylight": options.straylight(data, age_years),
+        "yellowing": options.yellowing(data),
+        "spectacle_magnification": options.spectacle_magnification(data),
     }
-
-
-def _straylight(data: Mapping[str, Any], age_years: float | None) -> Straylight | None:
-    if data.get("straylight") is None:
-        return None
-    path = "straylight."
-    body = fields.mapping(data["straylight"], "straylight")
-    fields.only_known(body, STRAYLIGHT_FIELDS, path=path)
-    log_s = None
-    if "cataract" in body:
-        log_s = CATARACTS[fields.choice(body, "cataract", tuple(CATARACTS), path=path)]
-    if "log_s" in body:
-        if log_s is not None:
-            raise ProfileError(
-                path + "log_s", "stands beside a cataract", "one of the two"
-            )
-        log_s = fields.number(body, "log_s", 0.5, 2.5, path=path)
-    return Straylight(
-        age_years=DEFAULT_AGE_YEARS if age_years is None else age_years,
-        pigment_ratio=fields.number(
-            body, "pigmentation", 0.0, 1.2, default=BROWN, path=path
-        ),
-        log_s=log_s,
-    )
-
-
-def _magnification(data: Mapping[str, Any]) -> bool:
-    wanted = data.get("spectacle_magnification", False)
-    if not isinstance(wanted, bool):
-        raise ProfileError(
-            "spectacle_magnification", f"{wanted!r:.40} is neither", "true or false"
-        )
-    if wanted and data.get("correction") is None:
-        raise ProfileError("correction", "is missing beside the magnification", "one")
-    return wanted
-
-
-def _yellowing(data: Mapping[str, Any]) -> str | None:
-    if data.get("yellowing") is None:
-        return None
-    if "age_years" not in data:
-        raise ProfileError("age_years", "is missing beside yellowing", "3 to 120")
-    return fields.choice(data, "yellowing", YELLOWINGS)
 
 
 def _prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:

@@ -30,7 +30,7 @@ from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.filtering.view_use import frame_use
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
-from filter_service.rendering.haze import MediaEffects, render_through_media
+from filter_service.rendering.media_effects import MediaEffects, render_through_media
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -392,7 +392,7 @@ class EyeFilter:
         return _filtered(plan, rendered)
 
 
-def _filtered(plan: RenderPlan, rendered: list[Rendered]) -> Filtered:
+def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:
     first = rendered[0]
     stages_ms: dict[str, float] = {}
     for view in rendered:

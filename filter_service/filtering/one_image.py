@@ -19,7 +19,7 @@ from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.haze import MediaEffects, render_through_media
+from filter_service.rendering.media_effects import MediaEffects, render_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     MAX_VERGENCE_DPT,

@@ -13,7 +13,9 @@ map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
-haze           light that the media scatter and absorb, over a picture
+srgb           pictures as they are stored, and linear light
+media_effects  what media and spectacles do, where a profile asks for it
+haze           light that the media scatter, over a picture
 haze_loops     its compiled loops
 spectacles     the size of what is seen through them
 spectacle_loops  its compiled loop

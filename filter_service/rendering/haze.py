@@ -1,4 +1,4 @@
-"""Light that the eye's media scatter and absorb, over a filtered picture.
+"""Light that the eye's media scatter, over a filtered picture.
 
 Scattered light has no detail, so it is made on a coarse grid of visual angle: the mean
 of the pixels in each cell, spread by the scatter function (a convolution by FFT), and
@@ -10,10 +10,9 @@ taken to be as bright as its edge, so that an even picture stays what it is.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -21,21 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.media.absorption import channel_gains
-from estimator.media.straylight import DEFAULT_AGE_YEARS, Straylight
-from estimator.profiles.parse import EyeProfile
+from estimator.media.straylight import Straylight
 from estimator.threads import thread_count
 from filter_service.camera import Camera
 from filter_service.constants import RGB
-from filter_service.displays import display_wavelengths_nm
-from filter_service.rendering.engine import FrameEngine, Rendered
-from filter_service.rendering.frame_options import OUTPUT_DTYPES
-from filter_service.rendering.spectacles import (
-    Matrix,
-    seen_through,
-    spectacle_magnification,
-)
-from filter_service.rgbd_view import RgbdView
 
 CELL_DEG = 0.25
 """Edge of a cell, unless there would be too many of them."""
@@ -46,111 +34,37 @@ MOST_CELLS = 384
 SAMPLES = 4
 """Points along each edge of a cell that the scatter function is averaged over."""
 
-UNCHANGED = (1.0, 1.0, 1.0)
-ENCODE_STEPS = 1 << 16
-
-
-@dataclass(frozen=True)
-class MediaEffects:
-    """What the media of one eye do to a picture.
-
-    Attributes
-    ----------
-    straylight : Straylight or None
-    gain_ratio : (red, green, blue)
-    magnification_ratio : (2, 2) or None
-        Of worn spectacles, see there.
-    """
-
-    straylight: Straylight | None
-    gain_ratio: tuple[float, float, float]
-    magnification_ratio: Matrix | None = None
-
-    @classmethod
-    def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
-        """Return those that a profile asks for; None where it asks for none."""
-        larger = spectacle_magnification(profile)
-        if (profile.straylight, profile.yellowing, larger) == (None, None, None):
-            return None
-        gains = UNCHANGED
-        if profile.yellowing is not None:
-            age_years = profile.age_years or DEFAULT_AGE_YEARS
-            found = channel_gains(
-                display_wavelengths_nm(display),
-                age_years=age_years,
-                yellowing=profile.yellowing,
-            )
-            gains = tuple(found.tolist())
-        return cls(profile.straylight, gains, larger)
-
-
-def render_through_media(
-    engine: FrameEngine,
-    view: RgbdView,
-    handle: Any,
-    effects: MediaEffects | None,
-    *,
-    output: str,
-    **options: Any,
-) -> Rendered:
-    """Filter a view as `FrameEngine.render` does, with the media's effects."""
-    if effects is None:
-        return engine.render(view, handle, output=output, **options)
-    started_s = time.perf_counter()
-    if effects.magnification_ratio is not None:
-        view = seen_through(view, effects.magnification_ratio)
-    before_s = time.perf_counter() - started_s
-    rendered = engine.render(view, handle, output="linear", **options)
-    started_s = time.perf_counter()
-    color = np.ascontiguousarray(rendered.color, dtype=np.float32)
-    color = add_haze(color, view.camera, effects)
-    color = encoded(color, output)
-    stages_ms = {
-        **rendered.stage_times_ms,
-        "media_ms": 1e3 * (time.perf_counter() - started_s + before_s),
-    }
-    return replace(rendered, color=color, stage_times_ms=stages_ms)
-
 
 def add_haze(
-    color: NDArray[np.float32], camera: Camera, effects: MediaEffects
-) -> NDArray[np.float32]:
-    """Return linear light (height, width, 3) behind the media; works in place."""
+    color: NDArray[np.float32],
+    camera: Camera,
+    straylight: Straylight,
+    gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> None:
+    """Scatter linear light (height, width, 3) in place, and take the gains of it."""
     from filter_service.rendering.haze_loops import add_scattered, mean_light
 
-    gains = np.array(effects.gain_ratio)
-    if effects.straylight is None:
-        if effects.gain_ratio == UNCHANGED:
-            return color
-        color *= gains.astype(np.float32)
-        return color
-    grid = haze_grid(camera, effects.straylight)
+    grid = haze_grid(camera, straylight)
     rows, columns = grid.rows, grid.columns
     coarse = np.empty((*grid.shape, RGB), np.float32)
     cells = (rows.first_px, rows.shares, columns.first_px, columns.shares)
-    _shared(mean_light, rows.count, color, *cells, coarse)
-    places = (rows.place, columns.place)
-    kept = 1.0 - grid.fraction
-    _shared(
-        add_scattered, len(color), color, grid.scatter(coarse), *places, kept, gains
+    in_threads(mean_light, rows.count, color, *cells, coarse)
+    in_threads(
+        add_scattered,
+        len(color),
+        color,
+        grid.scatter(coarse),
+        rows.place,
+        columns.place,
+        1.0 - grid.fraction,
+        np.array(gain_ratio),
     )
-    return color
 
 
-def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
-    """Return linear light as an output has it."""
-    if output != "srgb8":
-        return color.astype(OUTPUT_DTYPES[output], copy=False)
-    from filter_service.rendering.haze_loops import encode_srgb
-
-    found = np.empty(color.shape, np.uint8)
-    _shared(encode_srgb, color.size, color.reshape(-1), _encoding(), found.reshape(-1))
-    return found
-
-
-def _shared(loop: Callable[..., None], count: int, *arguments: Any) -> None:
+def in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
     """Run a loop over 0 to a count, shared between threads."""
-    edges = [count * k // thread_count() for k in range(thread_count() + 1)]
+    n = thread_count()
+    edges = [count * k // n for k in range(n + 1)]
     waiting = [_pool().submit(loop, *part, *arguments) for part in pairwise(edges)]
     for part in waiting:
         part.result()
@@ -159,15 +73,6 @@ def _shared(loop: Callable[..., None], count: int, *arguments: Any) -> None:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), thread_name_prefix="haze")
-
-
-@lru_cache(maxsize=1)
-def _encoding() -> NDArray[np.uint8]:
-    light = np.linspace(0.0, 1.0, ENCODE_STEPS)
-    curve = np.where(
-        light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055
-    )
-    return np.round(255.0 * curve).astype(np.uint8)
 
 
 class HazeGrid:

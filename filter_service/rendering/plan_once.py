@@ -18,8 +18,8 @@ from filter_service.rendering.frame_kernels import (
     node_table,
     work_list,
 )
-from filter_service.rendering.haze import MediaEffects, add_haze, encoded
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.media_effects import MediaEffects, encoded
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
     SIDE_PX,
@@ -48,5 +48,5 @@ def plan_once() -> None:
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
-    effects = MediaEffects(Straylight(), (1.0, 1.0, 1.0))
-    encoded(add_haze(light, store.spec.camera, effects), "srgb8")
+    MediaEffects(Straylight()).change(light, view)
+    encoded(light, "srgb8")

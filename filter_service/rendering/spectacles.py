@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
+from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
 ENTRANCE_PUPIL_MM = 3.05
@@ -66,8 +67,4 @@ def _linear(color: NDArray) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=1)
 def _decoding() -> NDArray[np.float32]:
-    encoded = np.arange(256) / 255.0
-    light = np.where(
-        encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4
-    )
-    return light.astype(np.float32)
+    return linear_from_srgb(np.arange(256, dtype=np.uint8)).astype(np.float32)

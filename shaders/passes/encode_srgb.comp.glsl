@@ -1,7 +1,7 @@
 // Packs the filtered frame as 8-bit sRGB, three bytes a pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
 // Dispatch: one thread for four pixels (three words).
-// Twin: reference.srgb_from_linear.
+// Twin: filter_service.rendering.srgb.srgb_from_linear.
 
 #include "common/color.glsl"
 

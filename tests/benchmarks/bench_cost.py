@@ -30,6 +30,7 @@ from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.store import frame_layers
 from filter_service.rendering import reference
+from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
 from tests.benchmarks.dense_reference import dense_reference
@@ -93,7 +94,7 @@ def plane_view(width_px: int, height_px: int, pixel_mrad: float) -> RgbdView:
         )
         light += _bilinear(grid, y, x)
     light = 0.2 * np.exp(0.4 * light)
-    srgb = reference.srgb_from_linear(np.clip(light, 0.0, 1.0))
+    srgb = srgb_from_linear(np.clip(light, 0.0, 1.0))
     depth_m = np.full((height_px, width_px), np.inf, np.float32)
     return RgbdView(srgb, depth_m, tangents(width_px, height_px, pixel_mrad), "radial")
 

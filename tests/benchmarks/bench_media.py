@@ -19,9 +19,9 @@ from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.rendering.haze import (
+from filter_service.rendering.haze import add_haze
+from filter_service.rendering.media_effects import (
     MediaEffects,
-    add_haze,
     render_through_media,
 )
 from filter_service.rendering.native import NativeRenderer
@@ -52,7 +52,7 @@ def lamp_error(camera: Camera, straylight: Straylight) -> float:
     y, x = camera.height_px // 2, camera.width_px // 2
     color = np.zeros((camera.height_px, camera.width_px, 3), np.float32)
     color[y, x] = 1e6
-    seen = add_haze(color, camera, MediaEffects(straylight, (1.0, 1.0, 1.0)))
+    add_haze(color, camera, straylight)
     left, right, _, _ = camera.tangents
     pitch = (right - left) / camera.width_px
     angles_deg = np.degrees(np.arctan(pitch * (np.arange(camera.width_px) - x)))
@@ -65,7 +65,7 @@ def lamp_error(camera: Camera, straylight: Straylight) -> float:
             age_years=straylight.age_years,
             pigmentation=straylight.pigment_ratio,
         )
-        logs.append(np.log10(float(seen[y, at, 1]) / (1e6 * pixel_sr) / per_sr))
+        logs.append(np.log10(float(color[y, at, 1]) / (1e6 * pixel_sr) / per_sr))
     return float(np.abs(logs).max())
 
 

@@ -92,7 +92,10 @@ def test_people_in_focus_read_what_young_adults_do(pupil_mm):
 @pytest.mark.parametrize("pupil_mm", [2.0, 3.0, 4.0, 6.0])
 @pytest.mark.parametrize("defocus_dpt", [1.0, 2.0, 3.0, 4.0])
 def test_out_of_focus_acuity_follows_pupil_times_defocus(pupil_mm, defocus_dpt):
-    """Smith 1991: smallest angle = 0.65 x pupil mm x defocus dpt, minutes of arc."""
+    """Smith 1991: the smallest angle is linear in pupil x defocus.
+
+    The constant, 0.65 minutes of arc per mm and dpt, is as later papers cite it.
+    """
     found = predict_acuity(
         typical(pupil_mm, defocus_dpt), zernike_radius_mm=pupil_mm / 2
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.constants import HALF_MAX
-from filter_service.rendering import reference
+from filter_service.rendering.srgb import half_from_linear
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
 WIDTH, HEIGHT = 101, 61  # odd: halves of a pixel share words with its neighbours
@@ -88,7 +88,7 @@ def test_half_floats_out_equal_their_twin(bench, rng, dtype):
     )
     assert half.dtype == np.float16
     assert half.nbytes == linear.nbytes // 2
-    np.testing.assert_array_equal(half, reference.half_from_linear(linear))
+    np.testing.assert_array_equal(half, half_from_linear(linear))
     assert np.isfinite(half).all()
     if dtype == np.float32:
         assert half.max() == HALF_MAX < linear.max()

@@ -1,0 +1,119 @@
+"""What of an eye's visual field is traced, and through which pupils."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.estimate.estimation import EstimatedEye
+from estimator.eye.tracing import TraceFailed
+from estimator.field.aberration_grid import (
+    FIELD_AZIMUTHS,
+    FIELD_RINGS,
+    AberrationGrid,
+)
+from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.peripheral_rest import PeripheralRest
+from estimator.periphery.change import peripheral_change
+from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
+
+FIELD_PUPIL_RATIOS = (0.64, 1.0)
+"""Pupils traced over the field, of the largest one."""
+
+LARGE_PUPIL_MM = 7.2
+LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
+"""The same where the largest pupil is larger than that."""
+
+ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
+SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
+"""Step by which the traced field is made smaller until light passes all of it."""
+
+FieldRange = tuple[tuple[float, float], tuple[float, float]]
+
+
+def largest_open_pupil_mm(grid: AberrationGrid) -> float:
+    """Largest pupil of an on-axis grid that is open at all its states.
+
+    Raises
+    ------
+    TraceFailed
+        There is none.
+    """
+    is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
+    if not is_open.any():
+        raise TraceFailed(
+            f"no light passes the eye at {grid.pupil_diameters_mm[0]:g} mm"
+        )
+    return float(grid.pupil_diameters_mm[is_open][-1])
+
+
+def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
+    """Pupils (n,) to trace over the field for a range of them."""
+    large = high_mm > LARGE_PUPIL_MM
+    ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
+    pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
+    return np.unique(pupils_mm)
+
+
+def trace_field(
+    eye: EstimatedEye,
+    axis: FieldInterpolation,
+    field_range_deg: FieldRange,
+    make_grid: Callable[..., AberrationGrid],
+    **axes,
+) -> tuple[FieldInterpolation, FieldRange]:
+    """Trace a range of fields, drawn in towards the axis until light passes it all."""
+    limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
+    share = 1.0
+    while share > SMALLEST_SHARE:
+        (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
+        field = FieldInterpolation(
+            make_grid(
+                eye,
+                h_deg=field_nodes_deg(h_low, h_high),
+                v_deg=field_nodes_deg(v_low, v_high),
+                n_rings=FIELD_RINGS,
+                n_azimuths=FIELD_AZIMUTHS,
+                **axes,
+            )
+        )
+        if field.passes:
+            return field, tuple(map(tuple, traced))
+        share *= SHRINK_RATIO
+    return axis, ON_AXIS_DEG
+
+
+def peripheral_rest(
+    eye: EstimatedEye, field_range_deg: FieldRange
+) -> PeripheralRest | None:
+    """Return people's periphery for an eye; None where it has its model's.
+
+    So it has where light does not pass the usual eye over the whole range.
+    """
+    if eye.profile.periphery == "model" or not np.any(field_range_deg):
+        return None
+    rest = PeripheralRest(peripheral_change(eye.profile), eye, field_range_deg)
+    return rest if rest.passes else None
+
+
+def share_of(
+    progress: Callable[[float], None] | None, low: float, high: float
+) -> Callable[[float], None] | None:
+    """Return progress of a part that goes from one share of the whole to another."""
+    if progress is None:
+        return None
+    return lambda done: progress(low + (high - low) * done)
+
+
+def check_field_range(field_range_deg: FieldRange) -> None:
+    """Refuse a range that is not ascending.
+
+    Raises
+    ------
+    ValueError
+    """
+    for low, high in field_range_deg:
+        if not -90.0 < low <= high < 90.0:
+            raise ValueError(
+                f"field_range_deg {field_range_deg}: needs -90 < low <= high < 90 twice"
+            )

@@ -1,0 +1,119 @@
+"""Frames as an eye's media and its spectacles make them, where a profile asks for it.
+
+Spectacles draw the view anew before the eye filters it, media change its light after.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.media.absorption import channel_gains
+from estimator.media.straylight import Straylight
+from estimator.profiles.parse import EyeProfile
+from filter_service.displays import display_wavelengths_nm
+from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.haze import add_haze, in_threads
+from filter_service.rendering.spectacles import (
+    Matrix,
+    seen_through,
+    spectacle_magnification,
+)
+from filter_service.rendering.srgb import half_from_linear, srgb_from_linear
+from filter_service.rgbd_view import RgbdView
+
+UNCHANGED = (1.0, 1.0, 1.0)
+ENCODE_STEPS = 1 << 16
+
+
+@dataclass(frozen=True)
+class MediaEffects:
+    """What the media and the spectacles of one eye do to a picture.
+
+    Attributes
+    ----------
+    straylight : Straylight or None
+    gain_ratio : (red, green, blue)
+        Of the media, against those of the eye that pictures are made for.
+    magnification_ratio : (2, 2) or None
+        Of worn spectacles, see there.
+    """
+
+    straylight: Straylight | None
+    gain_ratio: tuple[float, float, float] = UNCHANGED
+    magnification_ratio: Matrix | None = None
+
+    @classmethod
+    def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
+        """Return those that a profile asks for; None where it asks for none."""
+        gain_ratio = UNCHANGED
+        if profile.yellowing is not None and profile.age_years is not None:
+            red, green, blue = channel_gains(
+                display_wavelengths_nm(display),
+                age_years=profile.age_years,
+                yellowing=profile.yellowing,
+            ).tolist()
+            gain_ratio = red, green, blue
+        found = cls(profile.straylight, gain_ratio, spectacle_magnification(profile))
+        return None if found == cls(None) else found
+
+    def change(self, color: NDArray[np.float32], view: RgbdView) -> None:
+        """Change the linear light (height, width, 3) of a filtered view in place."""
+        if self.straylight is not None:
+            add_haze(color, view.camera, self.straylight, self.gain_ratio)
+        elif self.gain_ratio != UNCHANGED:
+            color *= np.array(self.gain_ratio, np.float32)
+
+
+def render_through_media(
+    engine: FrameEngine,
+    view: RgbdView,
+    handle: Any,
+    effects: MediaEffects | None,
+    *,
+    output: str,
+    **options: Any,
+) -> FilteredView:
+    """Filter a view as `FrameEngine.render` does, with effects that are asked for."""
+    if effects is None:
+        return cast(FilteredView, engine.render(view, handle, output=output, **options))
+    started_s = time.perf_counter()
+    if effects.magnification_ratio is not None:
+        view = seen_through(view, effects.magnification_ratio)
+    before_s = time.perf_counter() - started_s
+    rendered = cast(
+        FilteredView, engine.render(view, handle, output="linear", **options)
+    )
+    started_s = time.perf_counter()
+    color = np.ascontiguousarray(rendered.color, dtype=np.float32)
+    effects.change(color, view)
+    color = encoded(color, output)
+    media_ms = 1e3 * (time.perf_counter() - started_s + before_s)
+    stages_ms = {**rendered.stage_times_ms, "media_ms": media_ms}
+    return replace(rendered, color=color, stage_times_ms=stages_ms)
+
+
+def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
+    """Return linear light as an output has it."""
+    if output == "linear":
+        return color
+    if output == "linear16":
+        return half_from_linear(color)
+    from filter_service.rendering.haze_loops import encode_srgb
+
+    found = np.empty(color.shape, np.uint8)
+    in_threads(
+        encode_srgb, color.size, color.reshape(-1), _encoding(), found.reshape(-1)
+    )
+    return found
+
+
+@lru_cache(maxsize=1)
+def _encoding() -> NDArray[np.uint8]:
+    return srgb_from_linear(np.linspace(0.0, 1.0, ENCODE_STEPS))
