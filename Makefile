@@ -4,10 +4,11 @@
 PYTHON := .venv/bin/python
 ARGS ?=
 RESULTS := tests/benchmarks/results
-BENCHES := estimate focus people media displays networks plan psf build layers render live follow field occlusion sequence cost peers switch roundtrip
+BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training validate check clean help setup setup-test setup-training
+.PHONY: demo test test-training validate witness check clean help setup setup-test
+.PHONY: setup-training setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -28,13 +29,16 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	done
 	$(PYTHON) -m tests.benchmarks.bench_wavefront
 
+witness: setup-witness  ## our frames against a path tracer through the same eyes
+	$(PYTHON) -m tests.benchmarks.bench_witness $(ARGS)
+
 check: setup  ## lint, formatting and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .witness out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list
@@ -48,3 +52,6 @@ setup-test:
 
 setup-training:
 	@sh setup.sh training
+
+setup-witness:
+	@sh setup.sh witness

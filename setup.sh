@@ -4,6 +4,7 @@
 #   sh setup.sh         the Python environment in .venv and the system libraries
 #   sh setup.sh test    the same, and a virtual screen for the window test
 #   sh setup.sh training  the first, and what training the networks needs (torch)
+#   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
 # only when this file, pyproject.toml, constraints.txt, the sources in C or the folder
@@ -16,6 +17,10 @@ C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
 # what the modules with compiled loops import
 COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
+# of `make witness`: nothing of the project imports it
+WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
+WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
+WITNESS_VENV=.witness
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
@@ -147,8 +152,29 @@ install_training_packages() { # on top of the others; the service never needs th
     cp $STAMP $TRAINING_STAMP
 }
 
+has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer
+    ldconfig -p | grep -Eq 'libLLVM(-|\.so\.)(1[6-9]|[2-9][0-9])'
+}
+
+install_witness() { # Mitsuba: a path tracer that the frames are compared with
+    if ! has_new_llvm; then
+        for package in $WITNESS_LLVM_PACKAGES; do
+            if apt_install "$package"; then break; fi
+        done
+        has_new_llvm || say "the path tracer needs LLVM 16 or newer:" \
+            "$(install_command "${WITNESS_LLVM_PACKAGES%% *}")"
+    fi
+    if [ -x $WITNESS_VENV/bin/python ] &&
+        $WITNESS_VENV/bin/python -c 'import mitsuba' 2>/dev/null; then return; fi
+    say "installing $WITNESS_PACKAGES into $WITNESS_VENV"
+    $VENV/bin/python -m venv --clear $WITNESS_VENV
+    $WITNESS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install $WITNESS_PACKAGES
+}
+
 install_system_libraries
 install_c_compiler
 install_packages
 if [ "${1:-}" = training ]; then install_training_packages; fi
 if [ "${1:-}" = test ]; then install_test_packages; fi
+if [ "${1:-}" = witness ]; then install_witness; fi

@@ -3,6 +3,8 @@
 transfer     transfer functions of wavefronts
 sensitivity  contrast that people see, with and without their optics
 predict      visual Strehl ratio and acuity
+retina       how fine the retina samples
+curves       acuity through focus and over the field
 """
 
 import lazy_loader

@@ -1,5 +1,10 @@
+from .curves import FieldAcuity as FieldAcuity
+from .curves import acuity_over_field as acuity_over_field
+from .curves import acuity_through_focus as acuity_through_focus
 from .predict import Acuity as Acuity
 from .predict import predict_acuity as predict_acuity
+from .retina import retina_log_mar as retina_log_mar
+from .retina import retina_nyquist_cpd as retina_nyquist_cpd
 from .sensitivity import mean_eye_transfer as mean_eye_transfer
 from .sensitivity import neural_sensitivity as neural_sensitivity
 from .transfer import Transfer as Transfer

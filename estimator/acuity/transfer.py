@@ -100,8 +100,11 @@ def optical_transfer(
     Raises
     ------
     ValueError
-        A wavefront so steep that `MOST_SAMPLES` do not resolve it.
+        A wavefront that is not finite, or so steep that `MOST_SAMPLES` do not resolve
+        it.
     """
+    if not np.all(np.isfinite(zernike_um)):
+        raise ValueError("zernike_um: all 28 coefficients must be finite")
     per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm
     count = max(
         _samples(zernike_um, wavelength_nm),

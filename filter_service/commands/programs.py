@@ -25,6 +25,7 @@ class Bench(StrEnum):
     FOCUS = "focus"
     PEOPLE = "people"
     MEDIA = "media"
+    ACUITY = "acuity"
     DISPLAYS = "displays"
     NETWORKS = "networks"
     PLAN = "plan"
@@ -48,6 +49,7 @@ BENCH_MODULES = {
     Bench.FOCUS: "tests.benchmarks.bench_focus",
     Bench.PEOPLE: "tests.benchmarks.bench_people",
     Bench.MEDIA: "tests.benchmarks.bench_media",
+    Bench.ACUITY: "tests.benchmarks.bench_acuity",
     Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",
