@@ -7,8 +7,7 @@ RESULTS := tests/benchmarks/results
 BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training validate witness check clean help setup setup-test
-.PHONY: setup-training setup-witness
+.PHONY: demo test test-training validate witness check clean help setup setup-test setup-training setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)

@@ -19,6 +19,7 @@ from filter_service.messages import (
     Accepted,
     Alive,
     Bye,
+    Closing,
     Dropped,
     ErrorReply,
     Hello,
@@ -101,6 +102,7 @@ class ServiceLink:
         self._max_in_flight = max_in_flight
         self._client_name = client_name
         self._connection = Connection(endpoint)
+        self._session_key = ""
         self._outbox: list[list[Any]] = []
         self._events: list[Event] = []
         self._refusal: FilterError | None = None
@@ -177,12 +179,14 @@ class ServiceLink:
         self._send_waiting()
 
     def greet(self) -> None:
-        """Say hello; the first connection and every later one take the same way."""
+        """Say hello; the first connection and every later one take the same way.
+
+        With its key the client comes back to its session; what `_begin` finds missing
+        there it says again.
+        """
         self.welcome = None
         self._refusal = None
-        self._outbox = [encode(Hello(self._client_name))]
-        if self.profile is not None:
-            self._outbox.append(encode(self.profile))
+        self._outbox = [encode(Hello(self._client_name, self._session_key))]
 
     def _lose_connection(self) -> None:
         self.welcome = None
@@ -219,12 +223,20 @@ class ServiceLink:
         elif isinstance(reply, ErrorReply):
             self._handle_error(reply)
         elif isinstance(reply, Welcome):
-            self.welcome = reply
+            self._begin(reply)
         elif isinstance(reply, Pong):
             self.pongs.append(reply)
-        elif not isinstance(reply, Alive):
+        elif not isinstance(reply, Alive | Closing):
             self._events.append(reply)
             self._bound_progress()
+
+    def _begin(self, welcome: Welcome) -> None:
+        """Begin or go on with a session; send the profile where it does not have it."""
+        self.welcome = welcome
+        self._session_key = welcome.session_key
+        profile = self.profile
+        if profile is not None and welcome.profile_id != profile.profile_id:
+            self.say(encode(profile))
 
     def _bound_progress(self) -> None:
         """Forget the oldest progress of a program that never polls for it."""

@@ -80,14 +80,31 @@ class ServiceProcess:
         """Return what the service has printed."""
         return self._log_file.read_text(encoding="utf-8", errors="replace")
 
+    def pids(self) -> dict[str, int]:
+        """Return the processes of the service by name: keeper, door, render (Linux)."""
+        keeper = self.process.pid
+        found = {"keeper": keeper}
+        children = Path(f"/proc/{keeper}/task/{keeper}/children").read_text().split()
+        for child in map(int, children):
+            try:
+                words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+            except FileNotFoundError:
+                continue
+            module = next((w for w in words if w.endswith(b"_process")), b"")
+            name = module.decode().rpartition(".")[2].removesuffix("_process")
+            if name:
+                found[name] = child
+        return found
+
     @property
     def memory_mb(self) -> float:
-        """Return the memory that the service holds now (Linux)."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        kilobytes = next(
-            line.split()[1] for line in status.splitlines() if line.startswith("VmRSS")
-        )
-        return int(kilobytes) / 1e3
+        """Return the memory that the service holds now, without its worker (Linux)."""
+        kilobytes = 0
+        for pid in self.pids().values():
+            status = Path(f"/proc/{pid}/status").read_text().splitlines()
+            line = next((li for li in status if li.startswith("VmRSS")), "VmRSS: 0")
+            kilobytes += int(line.split()[1])
+        return kilobytes / 1e3
 
     def stop(self, timeout_s: float = 10.0) -> int:
         """Ask the service to end; return its exit code."""

@@ -9,6 +9,7 @@ field's path, the offending value and what is allowed.  Types are dataclasses an
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
@@ -31,9 +32,18 @@ _STEP = re.compile(r"\.(\w+)|\[(\d+|\.\.\.)\]")
 _NUMBERS = {2: "two numbers", 3: "three numbers", 4: "four numbers"}
 
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 4
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 8
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = MAX_SHOWN_CHARACTERS
+
+
 def show(value: object) -> str:
-    """Return a short printable form of a value from outside."""
-    text = repr(value)
+    """Return a short printable form of a value from outside, however large it is."""
+    try:
+        text = _SHORT.repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return f"a value of type {type(value).__name__}"
     if len(text) <= MAX_SHOWN_CHARACTERS:
         return text
     return text[: MAX_SHOWN_CHARACTERS - 3] + "..."

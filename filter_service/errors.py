@@ -20,6 +20,7 @@
     │   ├── ShaderError          GLSL did not compile or link
     │   ├── CameraMismatch       the frame's pixel pitch is not the PSF store's
     │   ├── OutOfGpuMemory       a buffer or texture could not be made
+    │   ├── OutOfMemory          the service has no memory left for its images
     │   └── RenderFailed         anything else that went wrong while filtering
     └── TransportError           raised by the client library only
         ├── ServiceTimeout       an answer did not come in time
@@ -168,6 +169,12 @@ class OutOfGpuMemory(RenderError):
     """A buffer or a texture could not be made."""
 
     code = "out_of_gpu_memory"
+
+
+class OutOfMemory(RenderError):
+    """The service has no memory left for the images of a frame."""
+
+    code = "out_of_memory"
 
 
 class RenderFailed(RenderError):

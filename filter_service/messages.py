@@ -33,6 +33,7 @@ from filter_service.wire.replies import (
     DROP_REASONS,
     Accepted,
     Alive,
+    Closing,
     Dropped,
     ErrorReply,
     Pong,
@@ -67,6 +68,7 @@ __all__ = [
     "Alive",
     "Bye",
     "Camera",
+    "Closing",
     "Dropped",
     "ErrorReply",
     "FilterSettings",
@@ -100,7 +102,16 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
 
 Request = Hello | ProfileRequest | Frame | Ping | Bye
 Reply = (
-    Welcome | Accepted | Progress | Ready | Result | Dropped | ErrorReply | Pong | Alive
+    Welcome
+    | Accepted
+    | Progress
+    | Ready
+    | Result
+    | Dropped
+    | ErrorReply
+    | Pong
+    | Alive
+    | Closing
 )
 
 REQUESTS: dict[str, type[Message]] = {
@@ -110,7 +121,7 @@ REPLIES: dict[str, type[Message]] = {
     kind.type_name: kind
     for kind in (
         *(Welcome, Accepted, Progress, Ready, Result, Dropped),
-        *(ErrorReply, Pong, Alive),
+        *(ErrorReply, Pong, Alive, Closing),
     )
 }
 

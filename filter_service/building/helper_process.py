@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import Self
 
 
@@ -56,6 +57,15 @@ def start_module(*arguments: str) -> subprocess.Popen[bytes]:
 def import_path() -> list[str]:
     """Return where this process imports from; what is no text it skips, too."""
     return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
+
+
+def is_stopped(pid: int) -> bool:
+    """Return whether a signal has stopped a process (Linux; elsewhere never)."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state == "T"
 
 
 def end_with_parent() -> None:

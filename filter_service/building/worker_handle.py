@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from typing import Any
 
-from filter_service.building.helper_process import import_path
+from filter_service.building.helper_process import import_path, is_stopped
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.building.shared_buffers import map_shared
 from filter_service.errors import (
@@ -29,6 +29,9 @@ from filter_service.errors import (
 RECEIVE_BUDGET_S = 0.004  # the render loop's time for one call of poll
 RESTART_DELAY_S = 1.0  # after a worker that never got ready
 STOP_GRACE_S = 1.0
+WATCH_INTERVAL_S = 0.5
+STOPPED_LIMIT_S = 3.0
+"""Stopped by a signal for longer, a worker is taken for one that stays so."""
 
 BUILD = "filter_service.building.from_profile:build"
 WARM_UP = "filter_service.building.compile_builds:build_a_few_with_help"
@@ -107,6 +110,8 @@ class WorkerHandle:
         Of what a build does after the first store that it yields.
     cancel_grace_s : float
         A cancelled build that goes on longer is ended with its process.
+    build_limit_s : float
+        A build that takes longer is ended with its process.
     warm_up : str
         ``module:function`` of what the process does until the first job comes.
     """
@@ -114,6 +119,7 @@ class WorkerHandle:
     build: str = BUILD
     niceness: int = 5
     cancel_grace_s: float = 3.0
+    build_limit_s: float = 600.0
     warm_up: str = WARM_UP
     n_restarts: int = 0
     _queue: deque[tuple[int, BuildJob]] = field(default_factory=deque)
@@ -124,6 +130,9 @@ class WorkerHandle:
     _is_ready: bool = False
     _worker: _Worker | None = None
     _incoming: _Incoming | None = None
+    _began_s: float = 0.0
+    _next_watch_s: float = 0.0
+    _stopped_since_s: float | None = None
 
     def start(self) -> None:
         """Start the process, if there is none; it gets ready on its own time."""
@@ -196,6 +205,7 @@ class WorkerHandle:
         if self._kill_at_s is not None and now_s > self._kill_at_s:
             log.warning("a cancelled build did not stop; its process is ended")
             worker.process.kill()
+        self._watch(worker, now_s)
         try:
             while worker.pipe.poll(0):
                 self._receive(worker.pipe, events)
@@ -205,6 +215,22 @@ class WorkerHandle:
             events += self._after_crash(worker)
         self._start_next()
         return events
+
+    def _watch(self, worker: _Worker, now_s: float) -> None:
+        """End a worker that stands still, or whose build has no end."""
+        if now_s < self._next_watch_s:
+            return
+        self._next_watch_s = now_s + WATCH_INTERVAL_S
+        if self._running is not None and now_s - self._began_s > self.build_limit_s:
+            log.error("a build took longer than %g s; it is ended", self.build_limit_s)
+            worker.process.kill()
+        if not is_stopped(worker.process.pid):
+            self._stopped_since_s = None
+        elif self._stopped_since_s is None:
+            self._stopped_since_s = now_s
+        elif now_s - self._stopped_since_s > STOPPED_LIMIT_S:
+            log.error("the process that computes PSFs stands still; it is ended")
+            worker.process.kill()
 
     def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
         if self._incoming is not None:
@@ -236,6 +262,7 @@ class WorkerHandle:
         if self._running is None and self._is_ready and self._queue:
             ticket, job = self._queue.popleft()
             self._running = ticket
+            self._began_s = time.monotonic()
             self._tell(("build", ticket, job))
 
     def _tell(self, message: tuple[Any, ...]) -> None:

@@ -85,6 +85,8 @@ class EyeFilter:
         Where eyes are made; all filters of a process share one unless told otherwise.
     max_cameras : int
         Cameras that are kept prepared.
+    first_generation : int
+        Where profiles are counted from.
     engine : "auto", "gl" or "native"
         What filters frames where the workshop is shared: compute shaders, or compiled
         loops on all cores; "auto" takes gl on a hardware GPU, else native.
@@ -106,6 +108,7 @@ class EyeFilter:
         on_event: Callable[[EyeEvent], None] | None = None,
         workshop: Workshop | None = None,
         max_cameras: int = 4,
+        first_generation: int = 1,
         engine: Engine = "auto",
     ) -> None:
         first = None if profile is None else as_profile(profile)
@@ -114,7 +117,12 @@ class EyeFilter:
         self._on_event = on_event
         self._shared = shared(engine) if workshop is None else None
         self._workshop: Workshop | None = workshop or shared(engine).take()
-        self._eyes = StreamEyes(self._take_event, max_cameras, self.cameras)
+        self._eyes = StreamEyes(
+            self._take_event,
+            max_cameras,
+            self.cameras,
+            first_generation=first_generation,
+        )
         self._workshop.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None

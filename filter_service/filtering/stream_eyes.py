@@ -59,17 +59,20 @@ class StreamEyes:
         Stores that one eye keeps.
     first_cameras : tuple of Camera
         What to prepare for while no frame has come.
+    first_generation : int
+        Where profiles are counted from.
     """
 
     on_event: Callable[[EyeEvent], None]
     max_cameras: int = 4
     first_cameras: tuple[Camera, ...] = ()
+    first_generation: int = 1
     ticket: int | None = None
     building: Wanted | None = None
     look_at: LookAt | None = None  # of the last frame
     eyes: list[AcceptedProfile] = field(default_factory=list)  # newest first, two
     retired: list[LoadedStore] = field(default_factory=list)  # stores to be freed
-    _n_generations: int = 0
+    _n_accepted: int = 0
     use: StreamUse = field(default_factory=StreamUse)
     _last_cameras: tuple[Camera, ...] = ()
 
@@ -131,13 +134,14 @@ class StreamEyes:
         It is prepared for the given cameras, else for those of the last frame, else for
         those of the eye in use.
         """
-        self._n_generations += 1
+        generation = self.first_generation + self._n_accepted
+        self._n_accepted += 1
         in_use = [old for old in self.eyes if old.stores][:1]
         cameras = cameras or self._last_cameras
         cameras = cameras or [s.camera for old in in_use for s in old.stores]
         cameras = cameras or self.first_cameras
-        own_id = self._n_generations if profile_id is None else profile_id
-        eye = AcceptedProfile(self._n_generations, own_id, profile, settings)
+        own_id = generation if profile_id is None else profile_id
+        eye = AcceptedProfile(generation, own_id, profile, settings)
         eye.want(cameras)
         for old in self.eyes:
             if old not in in_use:

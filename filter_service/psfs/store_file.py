@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import struct
 import tempfile
 import zlib
@@ -92,7 +93,7 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
     OSError
         Also where it is not there.
     """
-    with path.open("rb", buffering=0) as file:
+    with open(path, "rb", buffering=0, opener=_open_plain_file) as file:
         preamble = file.read(PREAMBLE.size)
         if len(preamble) < PREAMBLE.size:
             raise DamagedFile("it is cut off")
@@ -123,6 +124,15 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
         return unpack(content["tree"], arrays)
     except (ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
         raise DamagedFile(f"it is of another version: {error}") from error
+
+
+def _open_plain_file(path: str, flags: int) -> int:
+    """Open a file, and nothing that could keep its reader waiting, as a FIFO does."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise DamagedFile("it is no plain file")
+    return descriptor
 
 
 def _round_up(size: int, step: int) -> int:

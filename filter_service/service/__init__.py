@@ -1,12 +1,20 @@
-"""The service: one loop that owns the socket.
+"""The service: a door with the socket, a process that filters, a keeper of both.
 
-launch        starting: signals, the line that says it is ready
-server        the loop
-session       one client: its filter, its credit
-frame_reply   a waiting frame and its answer
-mailbox       the ROUTER socket
-config        the settings file
-process_info  version and memory
+launch          starting: signals, the line that says it is ready
+keeper          starts the processes, and starts again what dies or stands still
+child           what those processes have in common
+door_process    the process of the door
+door            its loop: sessions, credit, answers while a frame is filtered
+mailbox         the ROUTER socket
+session         one client: its waiting frame, its credit, its profile
+turns           whose frame is next
+render_process  the process that filters
+render_loop     its loop: one filter for each session
+frame_reply     a frame and its answer
+link            messages between the processes
+slots           images between the processes
+config          the settings file
+process_info    version and memory
 """
 
 import lazy_loader

@@ -1,3 +1,2 @@
 from .config import ServiceConfig as ServiceConfig
 from .config import load_config as load_config
-from .server import FilterServer as FilterServer

@@ -60,8 +60,20 @@ class ServiceConfig:
         where cores are few.
     cancel_grace_s : float
         A build that does not stop within this time is stopped by force.
+    build_limit_s : float
+        The longest that a profile's build may take.
     alive_interval_s : float
-        How often clients are probed; a session without a client ends then.
+        How often clients are probed; who is gone is found out then.
+    session_keep_s : float
+        How long a client that is gone may come back to its session.
+    frame_limit_s : float
+        The longest that filtering one frame, or anything else in the process that does
+        it, may take: then it is taken for hung, and started again.
+    max_image_mb : int
+        Images of all frames and results that the service holds.
+    max_socket_mb : int
+        Memory of the process that owns the socket, incomplete messages included:
+        beyond it that process is started again.
     ready_file : Path, optional
         Written with the bound endpoint once the service is ready; removed at its end.
     """
@@ -85,7 +97,12 @@ class ServiceConfig:
     threads: int = 0
     build_niceness: int = 5
     cancel_grace_s: float = 3.0
+    build_limit_s: float = 600.0
     alive_interval_s: float = 5.0
+    session_keep_s: float = 30.0
+    frame_limit_s: float = 60.0
+    max_image_mb: int = 2000
+    max_socket_mb: int = 2000
     ready_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -145,7 +162,12 @@ _RANGES: dict[str, tuple[float, float]] = {
     "threads": (0, MAX_THREADS),
     "build_niceness": (0, 19),
     "cancel_grace_s": (0.05, 600.0),
+    "build_limit_s": (0.1, 86_400.0),
     "alive_interval_s": (0.05, 600.0),
+    "session_keep_s": (0.0, 86_400.0),
+    "frame_limit_s": (0.1, 3600.0),
+    "max_image_mb": (1, 1_000_000),
+    "max_socket_mb": (200, 1_000_000),
 }
 
 

@@ -1,28 +1,23 @@
-"""Filters one waiting frame and makes the reply to it, timed by stage."""
+"""Filters one frame and makes the reply to it."""
 
 from __future__ import annotations
 
 import logging
-import time
 
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.messages import Dropped, ErrorReply, Frame, Result, ResultView
-from filter_service.service.session import WaitingFrame
 from filter_service.wire.images import OUTPUT_OF_FORMAT
-
-MS_PER_S = 1000.0
 
 log = logging.getLogger("ocufilter")
 
 
-def frame_reply(
-    eye_filter: EyeFilter, waiting: WaitingFrame
-) -> Result | Dropped | ErrorReply:
-    """Return the reply to a frame; anything that goes wrong becomes an error reply."""
-    frame = waiting.frame
-    started_s = time.monotonic()
+def frame_reply(eye_filter: EyeFilter, frame: Frame) -> Result | Dropped | ErrorReply:
+    """Return the reply to a frame; anything that goes wrong becomes an error reply.
+
+    ``total_ms`` is for the caller to say: it knows when the frame came.
+    """
     try:
         seen = eye_filter.try_filter(
             [
@@ -48,19 +43,10 @@ def frame_reply(
     if seen is None:
         reason = "extending" if eye_filter.is_extending else "preparing"
         return Dropped(frame.frame_id, reason)
-    stages_ms = {
-        "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
-        "queue_ms": MS_PER_S * (started_s - waiting.decoded_s),
-        **seen.stage_times_ms,
-    }
-    total_ms = MS_PER_S * (time.monotonic() - waiting.received_s)
-    stages_ms["other_ms"] = total_ms - sum(stages_ms.values())
-    return _result(frame, seen, total_ms, stages_ms)
+    return _result(frame, seen)
 
 
-def _result(
-    frame: Frame, seen: Filtered, total_ms: float, stages_ms: dict[str, float]
-) -> Result:
+def _result(frame: Frame, seen: Filtered) -> Result:
     return Result(
         frame_id=frame.frame_id,
         profile_id=seen.profile_id,
@@ -75,8 +61,8 @@ def _result(
         clamped_depth_count=seen.clamped_depth_count,
         gaze_deg=seen.gaze_deg,
         overflow_count=seen.overflow_count,
-        total_ms=total_ms,
-        stage_times_ms=stages_ms,
+        total_ms=0.0,
+        stage_times_ms=seen.stage_times_ms,
         notes=seen.notes,
         is_complete=seen.is_complete,
         colors=seen.colors,

@@ -18,9 +18,8 @@ SEND_HIGH_WATER_MARK = 128
 # Counts messages, so it is what bounds memory: with the default of 1000 an overload of
 # 720p frames took 1.5 GB.  More wait in the kernel, and the client is held back.
 RECEIVE_HIGH_WATER_MARK = 4
-HEARTBEAT_INTERVAL_MS = 1000
-HEARTBEAT_TIMEOUT_MS = 4000
 RETRY_S = 0.001
+KEEPALIVE_IDLE_S = 20
 
 Tracker = zmq.MessageTracker
 
@@ -62,9 +61,12 @@ class Mailbox:
         Endpoint; ``tcp://127.0.0.1:*`` takes a free port.
     max_part_bytes : int
         A client that sends a larger part is cut off.
+    max_parts : int
+        Of one message, after the identity; more are thrown away unread.
     """
 
-    def __init__(self, bind: str, max_part_bytes: int) -> None:
+    def __init__(self, bind: str, max_part_bytes: int, max_parts: int) -> None:
+        self._max_parts = max_parts
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         socket = self._socket
@@ -73,8 +75,15 @@ class Mailbox:
         socket.sndhwm = SEND_HIGH_WATER_MARK
         socket.rcvhwm = RECEIVE_HIGH_WATER_MARK
         socket.maxmsgsize = max_part_bytes
-        socket.heartbeat_ivl = HEARTBEAT_INTERVAL_MS
-        socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+        # No heartbeats of our own: libzmq aborts the process (stream_engine_base.cpp)
+        # where one is due on a connection that has ended while more messages of it
+        # wait than the mark above.  `Alive` finds out who is gone, and answers to the
+        # clients' heartbeats are sent all the same.
+        socket.heartbeat_ivl = 0
+        socket.tcp_keepalive = 1
+        socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
+        if bind.startswith("tcp://["):
+            socket.ipv6 = 1
         try:
             _check_path_is_free(bind)
             socket.bind(bind)
@@ -88,25 +97,47 @@ class Mailbox:
         self._poller.register(socket, zmq.POLLIN)
         self._watched: set[int] = set()
 
-    def watch(self, file_descriptors: set[int]) -> None:
-        """Let `wait` also return when one of these is readable."""
-        for gone in self._watched - file_descriptors:
+    def watch(self, readable: set[int], writable: set[int]) -> None:
+        """Let `wait` also return when one of these can be read, or written."""
+        for gone in self._watched - readable - writable:
             self._poller.unregister(gone)
-        for new in file_descriptors - self._watched:
-            self._poller.register(new, zmq.POLLIN)
-        self._watched = set(file_descriptors)
+        for descriptor in readable | writable:
+            reads = zmq.POLLIN if descriptor in readable else 0
+            writes = zmq.POLLOUT if descriptor in writable else 0
+            self._poller.register(descriptor, reads | writes)
+        self._watched = readable | writable
 
     def wait(self, timeout_s: float) -> None:
         """Return when there is something to read, or in time."""
         self._poller.poll(max(0, round(1000 * timeout_s)))
 
-    def receive(self) -> tuple[bytes, list[memoryview]] | None:
-        """Return (identity, parts) of one waiting message without copying, or None."""
+    def receive(self) -> tuple[bytes, list[memoryview], int] | None:
+        """Return (identity, parts, number left out) of one message, or None.
+
+        Nothing is copied.  The whole message is taken off the socket whatever its
+        number of parts: what is left of it would be read as the next one.
+        """
         try:
-            frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        return frames[0].bytes, [frame.buffer for frame in frames[1:]]
+        identity, left_out = frame.bytes, 0
+        parts: list[memoryview] = []
+        while frame.more:
+            if len(parts) < self._max_parts:
+                frame = self._socket.recv(copy=False)
+                parts.append(frame.buffer)
+                continue
+            left_out += self._skip()
+            break
+        return identity, parts, left_out
+
+    def _skip(self) -> int:
+        """Throw away the rest of a message; return how many parts it had."""
+        receive, count = self._socket.recv, 1  # there may be millions of them
+        while receive(copy=False).more:
+            count += 1
+        return count
 
     def send(
         self, identity: bytes, parts: Sequence[Any]
@@ -147,7 +178,10 @@ class Mailbox:
             time.sleep(RETRY_S)
             self._socket.send(identity, flags)
 
-    def close(self) -> None:
-        """Close at once; what is not sent is lost."""
-        self._socket.close(linger=0)
+    def close(self, *, linger_ms: int = 0) -> None:
+        """Close; what is not sent then is lost."""
+        endpoint = getattr(self, "endpoint", "")
+        self._socket.close(linger=linger_ms)
         self._context.term()
+        if endpoint.startswith("ipc://"):
+            Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)

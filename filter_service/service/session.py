@@ -1,16 +1,19 @@
-"""One client's session: its filter, its waiting frame, its credit.
+"""One client's session: its waiting frame, its credit, its profile.
 
-State only: no sockets.  `server` acts on what it says.
+State only: no sockets.  `door` acts on what it says.
 """
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass, field
 
 from filter_service.errors import CreditExceeded
-from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.messages import Frame
+from filter_service.messages import Frame, ProfileRequest
 from filter_service.service.mailbox import Tracker
+from filter_service.service.slots import Slot
+
+KEY_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,11 @@ class WaitingFrame:
     decoded_s: float
 
 
+def new_key() -> str:
+    """Return a key that nobody guesses."""
+    return secrets.token_hex(KEY_BYTES)
+
+
 @dataclass(eq=False)
 class Session:
     """What the service knows of one client.
@@ -29,23 +37,31 @@ class Session:
     Parameters
     ----------
     session_id : int
-    identity : bytes
-        The client's routing id.
+    identity : bytes, optional
+        The client's routing id; None while it is away.
     client : str
         What it calls itself.
     credit : int
         Frames it may have unanswered.
-    eye_filter : EyeFilter
+    key : str
+        With which it may come back.
     """
 
     session_id: int
-    identity: bytes
+    identity: bytes | None
     client: str
     credit: int
-    eye_filter: EyeFilter
+    key: str = field(default_factory=new_key)
     n_unanswered: int = 0
     waiting: WaitingFrame | None = None
-    unsent: list[Tracker] = field(default_factory=list)  # large replies
+    unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # large replies
+    behind_since_s: float | None = None  # too many of them
+    away_since_s: float | None = None
+    profile: ProfileRequest | None = None  # the last that was accepted
+    asked_profile: ProfileRequest | None = None  # on its way
+    next_profile: ProfileRequest | None = None  # waits for the one on its way
+    profile_id: int | None = None
+    generation: int = 0
 
     def take_in(self, waiting: WaitingFrame) -> WaitingFrame | None:
         """Keep a frame as the newest; return the one that it supersedes.
@@ -64,3 +80,17 @@ class Session:
         self.n_unanswered += 1
         superseded, self.waiting = self.waiting, waiting
         return superseded
+
+    def leave(self, now_s: float) -> None:
+        """Note that the client is away; what it waited for it does not wait for."""
+        self.identity = None
+        self.away_since_s = now_s
+        self.waiting = None
+        self.n_unanswered = 0
+
+    def come_back(self, identity: bytes, client: str) -> None:
+        """Note that the client is there again, or from somewhere else."""
+        self.identity, self.client = identity, client
+        self.away_since_s = None
+        self.waiting = None
+        self.n_unanswered = 0

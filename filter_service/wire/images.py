@@ -127,9 +127,21 @@ class ViewHeader(Record):
         return Camera(self.width_px, self.height_px, self.tangents)
 
     @property
+    def images(self) -> tuple[tuple[str, tuple[int, ...], str], ...]:
+        """Return name, shape and type of each image, in the order of their parts."""
+        shape = (self.height_px, self.width_px)
+        kinds = (
+            ("color", (*shape, 3), self.color.dtype),
+            ("depth", shape, "float32"),
+            ("hidden_color", (*shape, 3), self.color.dtype),
+            ("hidden_depth", shape, "float32"),
+        )
+        return kinds if self.has_hidden else kinds[:2]
+
+    @property
     def part_count(self) -> int:
         """Return how many parts follow for this view."""
-        return 4 if self.has_hidden else 2
+        return len(self.images)
 
 
 @dataclass(frozen=True)
@@ -224,16 +236,9 @@ def images_from_parts(
     for i, view in enumerate(views):
         path = f"views[{i}]"
         check_part_size(view.camera, view.color, path, limits)
-        shape = (view.height_px, view.width_px)
-        kinds = (
-            ("color", (*shape, 3), view.color.dtype),
-            ("depth", shape, "float32"),
-            ("hidden_color", (*shape, 3), view.color.dtype),
-            ("hidden_depth", shape, "float32"),
-        )[: view.part_count]
         found = [
-            image_from_part(next(waiting), wanted, dtype, f"{path}.{name}")
-            for name, wanted, dtype in kinds
+            image_from_part(next(waiting), shape, dtype, f"{path}.{name}")
+            for name, shape, dtype in view.images
         ]
         images.append(ViewImages(*found))
     return tuple(images)

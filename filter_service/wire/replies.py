@@ -59,13 +59,20 @@ def _clipped(reply: Message, /, **limits: int) -> None:
 
 @dataclass(frozen=True)
 class Welcome(Message):
-    """The answer to hello: who serves, what it accepts, how many frames may wait."""
+    """The answer to hello: who serves, what it accepts, how many frames may wait.
+
+    With ``is_resumed`` the session of the key goes on with the profile named.
+    """
 
     session_id: Id
     server: dict[str, Text]
     limits: Limits
     credit: Annotated[int, Meta(ge=1, le=1000)]
     transports: Annotated[tuple[Word, ...], Meta(max_length=8)] = ("tcp",)
+    session_key: Word = ""
+    session_keep_s: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
+    is_resumed: bool = False
+    profile_id: Id | None = None
 
     type_name: ClassVar[str] = "welcome"
 
@@ -196,10 +203,14 @@ class Result(Message):
 
 @dataclass(frozen=True)
 class Dropped(Message):
-    """A frame that was not filtered, and why; reasons of later versions pass."""
+    """A frame that was not filtered, and why; reasons of later versions pass.
+
+    ``retry_after_ms`` says when the next may have more luck, where that is known.
+    """
 
     frame_id: Id
     reason: Word
+    retry_after_ms: Milliseconds | None = None
 
     type_name: ClassVar[str] = "dropped"
 
@@ -248,7 +259,10 @@ class ErrorReply(Message):
 
 @dataclass(frozen=True)
 class Pong(Message):
-    """The render loop's answer to ping, with the state of the service."""
+    """The answer to ping, with the state of the service.
+
+    ``render_silent_s`` is since when the loop that filters has given no sign of life.
+    """
 
     t: Moment
     server_time_s: Moment
@@ -257,8 +271,19 @@ class Pong(Message):
     n_rendered: Count = 0
     n_dropped: Count = 0
     is_building: bool = False
+    is_filtering: bool = False
+    render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
 
     type_name: ClassVar[str] = "pong"
+
+
+@dataclass(frozen=True)
+class Closing(Message):
+    """The service ends, by its owner's will; there may be another one later."""
+
+    reason: Word = "shutdown"
+
+    type_name: ClassVar[str] = "closing"
 
 
 @dataclass(frozen=True)

@@ -46,9 +46,10 @@ MAX_VIEWS = 8
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """The first message of a client."""
+    """The first message of a client; a key takes up the session of an earlier one."""
 
     client: Word = ""
+    session_key: Word = ""
 
     type_name: ClassVar[str] = "hello"
 

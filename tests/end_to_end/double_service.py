@@ -1,14 +1,30 @@
-"""Starts the real service loop with the doubles: ``python -m`` this, with --config."""
+"""Starts the real service with the doubles: ``python -m`` this, with --config."""
 
 import argparse
-import logging
+import os
 from pathlib import Path
 
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.workshop import Workshop
 from filter_service.service.config import load_config
-from filter_service.service.launch import serve
+from filter_service.service.launch import run
 from tests.end_to_end.doubles import EngineDouble, read_profile
+
+FILTER_MS = "OCUFILTER_TEST_FILTER_MS"
+
+
+def open_workshop(config, closing):
+    worker = WorkerHandle(
+        "tests.end_to_end.doubles:build",
+        config.build_niceness,
+        config.cancel_grace_s,
+        config.build_limit_s,
+        warm_up="",
+    )
+    closing.callback(worker.close)
+    engine = EngineDouble(float(os.environ[FILTER_MS]))
+    workshop = Workshop(worker, engine, config.build_limits)
+    return workshop, read_profile, lambda: None
 
 
 def main():
@@ -16,15 +32,11 @@ def main():
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--filter-ms", type=float, default=0.0)
     arguments = parser.parse_args()
-    logging.basicConfig(level=logging.INFO)
-    config = load_config(arguments.config)
-    build = "tests.end_to_end.doubles:build"
-    worker = WorkerHandle(
-        build, config.build_niceness, config.cancel_grace_s, warm_up=""
+    os.environ[FILTER_MS] = str(arguments.filter_ms)
+    run(
+        load_config(arguments.config),
+        open_workshop="tests.end_to_end.double_service:open_workshop",
     )
-    engine = EngineDouble(arguments.filter_ms)
-    workshop = Workshop(worker, engine, config.build_limits)
-    serve(config, workshop=workshop, read_profile=read_profile)
 
 
 if __name__ == "__main__":

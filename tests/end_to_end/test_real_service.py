@@ -214,7 +214,8 @@ def test_a_plan_beyond_the_memory_budget_is_refused_with_the_numbers(real_client
 def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_client):
     view = edge_view()
     real_client.set_profile(PLAIN, settings=NARROW, views=[view])
-    children = Path(f"/proc/{real_service.process.pid}/task").glob("*/children")
+    render = real_service.pids()["render"]
+    children = Path(f"/proc/{render}/task").glob("*/children")
     pids = {int(pid) for file in children for pid in file.read_text().split()}
     workers = [
         pid

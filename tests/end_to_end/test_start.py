@@ -4,20 +4,35 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.source_tree import ROOT
 
 UP_TO_READY = """
 import json, sys
-from filter_service import __main__
-from filter_service.service import launch
+from filter_service.service import render_process
 from filter_service.service.config import load_config
+from filter_service.service.link import Link
 
-def report(config, endpoint):
+keeper, end = Link.pair()
+keeper.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
+sys.argv[1:] = [str(end.detach()), render_process.OPEN_WORKSHOP]
+send = Link.send
+
+def report(link, message, descriptors=()):
+    if message[0] != "ready":
+        return send(link, message, descriptors)
     print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
     raise SystemExit
 
-launch._announce = report
-launch.run(load_config(bind="tcp://127.0.0.1:*", engine="native"))
+Link.send = report
+render_process.main()
+"""
+
+LIGHT = """
+import json, sys
+from filter_service.service import {module}
+print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
 """
 
 AFTER_READY = """
@@ -64,8 +79,19 @@ def _printed(script):
 
 def test_a_service_is_ready_before_it_loads_numba_or_scipy():
     loaded = set(_printed(UP_TO_READY))
-    assert {"zmq", "numpy"} <= loaded, "it has not come to the end"
-    assert not loaded & NOT_BEFORE_READY
+    assert {"msgspec", "numpy"} <= loaded, "it has not come to the end"
+    assert not loaded & (NOT_BEFORE_READY | {"zmq"})
+
+
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("door", NOT_BEFORE_READY | {"moderngl", "OpenGL"}),
+        ("keeper", NOT_BEFORE_READY | {"moderngl", "OpenGL", "zmq"}),
+    ],
+)
+def test_what_stands_before_the_frames_is_light(module, heavy):
+    assert not set(_printed(LIGHT.format(module=module))) & heavy
 
 
 def test_what_is_loaded_ahead_is_all_that_frames_need():

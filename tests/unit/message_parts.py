@@ -74,9 +74,11 @@ REPLIES = [
     messages.Progress(1, 2, "psfs", 0.5),
     messages.Ready(1, 2, 10.5, 99, 1.5, (1.0, 1.1), ("a note",)),
     messages.Dropped(4, "superseded"),
+    messages.Dropped(4, "preparing", 100.0),
     messages.ErrorReply("bad_message", "text", "views[0]", "1 to 2", frame_id=3),
     messages.Pong(1.0, 2.0, 50.0, 1, 2, 3, False),
     messages.Alive(),
+    messages.Closing(),
 ]
 
 

@@ -45,7 +45,7 @@ def build_all(stream):
 
 
 def test_credit_counts_unanswered_frames_and_the_newest_waits():
-    session = Session(1, b"a", "", credit=2, eye_filter=None)
+    session = Session(1, b"a", "", credit=2)
     view = (ViewHeader.of(SMALL),)
     frames = [WaitingFrame(Frame(i, view, 4.0, 0.0), 0.0, 0.0) for i in range(3)]
     assert session.take_in(frames[0]) is None

@@ -108,6 +108,8 @@ def quantities(source: str) -> list[tuple[str, str, int]]:
 
 
 def has_unit(name: str) -> bool:
+    if name.endswith("_log_mar"):
+        return True
     last = name.rsplit("_", 1)[-1]
     return name in DIMENSIONLESS or last in KINDS or (last in UNITS and last != name)
 

@@ -1,0 +1,37 @@
+"""The process of the door: ``python -m`` this, with the descriptor of a link."""
+
+from __future__ import annotations
+
+import logging
+import resource
+from contextlib import suppress
+
+from filter_service.service.child import begin
+from filter_service.service.door import Door
+
+MB = 10**6
+
+log = logging.getLogger("ocufilter")
+
+
+def main() -> None:
+    """Serve clients until the keeper says so."""
+    keeper, config, others = begin("door")
+    # Of parts of messages that are not complete yet nothing is seen here.  Beyond the
+    # limit libzmq ends the process, whose memory is then free; sessions go on.
+    limit = config.max_socket_mb * MB
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    try:
+        door = Door(config, keeper)
+    except OSError as error:
+        keeper.send(("failed", str(error)))
+        raise SystemExit(1) from None
+    keeper.send(("ready", door.endpoint))
+    for message, descriptors in others:
+        door.take_control(message, descriptors)
+    door.run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""The keeper: starts the processes of the service, and starts again what dies.
+
+The door owns the socket, the render process the eyes.  Each outlives the other; a new
+one is given a link to the one that is there.  What stands still for long, stopped from
+outside or hung, is ended and started again.  The keeper itself does nothing else, so
+there is little that could end it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from filter_service.building.helper_process import import_path, is_stopped
+from filter_service.service.config import ServiceConfig
+from filter_service.service.link import Link, LinkClosed
+from filter_service.service.render_process import OPEN_WORKSHOP
+
+MODULES = {
+    "door": ("filter_service.service.door_process",),
+    "render": ("filter_service.service.render_process",),
+}
+MAX_RESTARTS = 8
+RESTART_WINDOW_S = 60.0
+CHECK_INTERVAL_S = 0.5
+STOPPED_LIMIT_S = 3.0
+"""Stopped by a signal for longer, a process is taken for one that stays so."""
+
+STOP_GRACE_S = 2.0
+
+log = logging.getLogger("ocufilter")
+
+
+class ServiceFailed(Exception):
+    """A process of the service cannot start, or does not stay."""
+
+
+@dataclass
+class _Child:
+    """A process, the link to it, and when others before it were started."""
+
+    process: subprocess.Popen[bytes] | None = None
+    link: Link | None = None
+    is_ready: bool = False
+    stopped_since_s: float | None = None
+    starts_s: deque[float] = field(default_factory=deque)
+
+
+class Keeper:
+    """Keeps a door and a render process going.
+
+    Parameters
+    ----------
+    config : ServiceConfig
+    open_workshop : str
+        ``module:function``, see `render_process`.
+    when_ready : callable
+        Called with the endpoint once frames may come.
+    """
+
+    def __init__(
+        self,
+        config: ServiceConfig,
+        *,
+        open_workshop: str = OPEN_WORKSHOP,
+        when_ready: Callable[[str], None],
+    ) -> None:
+        self._config = config
+        self._open_workshop = open_workshop
+        self._when_ready: Callable[[str], None] | None = when_ready
+        self._endpoint = ""
+        self._is_stopping = False
+        self._children = {name: _Child() for name in MODULES}
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._wake_reader.setblocking(False)
+        self._wake_writer.setblocking(False)
+
+    @property
+    def wake_file_descriptor(self) -> int:
+        """Return where a byte written ends the wait of the loop."""
+        return self._wake_writer.fileno()
+
+    def stop(self) -> None:
+        """Let `run` return; may be called from a signal handler."""
+        self._is_stopping = True
+
+    def run(self) -> None:
+        """Serve until `stop`.
+
+        Raises
+        ------
+        ServiceFailed
+            A process cannot start, or ends again and again.
+        """
+        try:
+            for name in ("render", "door"):  # the first takes longer
+                self._start(name)
+            self._join()
+            while not self._is_stopping:
+                self._turn()
+        finally:
+            self._end_all()
+
+    def _turn(self) -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._wake_reader, selectors.EVENT_READ)
+            for child in self._children.values():
+                if child.link is not None:
+                    selector.register(child.link, selectors.EVENT_READ)
+            selector.select(CHECK_INTERVAL_S)
+        try:
+            self._wake_reader.recv(4096)
+        except BlockingIOError:
+            pass
+        for name, child in self._children.items():
+            self._listen(name, child)
+            self._check_stopped(name, child)
+
+    def _start(self, name: str) -> None:
+        child = self._children[name]
+        now_s = time.monotonic()
+        child.starts_s.append(now_s)
+        while now_s - child.starts_s[0] > RESTART_WINDOW_S:
+            child.starts_s.popleft()
+        if len(child.starts_s) > MAX_RESTARTS:
+            raise ServiceFailed(
+                f"its {name} process was started {MAX_RESTARTS} times within "
+                f"{RESTART_WINDOW_S:g} s and ended each time"
+            )
+        child.link, theirs = Link.pair()
+        arguments = (str(theirs.fileno()), self._open_workshop)
+        child.process = subprocess.Popen(
+            # Without -P a file of the current folder would come before every module of
+            # its name.
+            [sys.executable, "-P", "-m", *MODULES[name], *arguments],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
+        )
+        theirs.close()
+        child.is_ready, child.stopped_since_s = False, None
+        # A new door listens where the one before it did.
+        bind = self._endpoint or self._config.bind
+        child.link.send(("config", replace(self._config, bind=bind)))
+
+    def _join(self) -> None:
+        """Give both processes the ends of a new link."""
+        ends = socket.socketpair()
+        for child, end in zip(self._children.values(), ends, strict=True):
+            if child.link is not None:
+                child.link.send(("link",), [end.fileno()])
+            end.close()
+
+    def _listen(self, name: str, child: _Child) -> None:
+        try:
+            if child.link is None:
+                return
+            for (kind, *rest), _ in child.link.receive():
+                if kind == "ready":
+                    child.is_ready = True
+                    self._endpoint = rest[0] or self._endpoint
+                    self._tell_ready()
+                elif kind == "failed":
+                    raise ServiceFailed(rest[0])
+                elif kind == "hung":
+                    self._kill("render")
+        except LinkClosed:
+            self._restart(name, child)
+
+    def _tell_ready(self) -> None:
+        if self._when_ready is not None and all(
+            child.is_ready for child in self._children.values()
+        ):
+            self._when_ready(self._endpoint)
+            self._when_ready = None
+
+    def _restart(self, name: str, child: _Child) -> None:
+        how = "gone"
+        if child.process is not None:
+            how = _how_it_ended(_end(child.process, STOP_GRACE_S))
+        if child.link is not None:
+            child.link.close()
+        log.error("the %s process %s; a new one is started", name, how)
+        self._start(name)
+        self._join()
+
+    def _check_stopped(self, name: str, child: _Child) -> None:
+        """End a process that was stopped by a signal and is not let go on."""
+        if child.process is None or not is_stopped(child.process.pid):
+            child.stopped_since_s = None
+            return
+        now_s = time.monotonic()
+        if child.stopped_since_s is None:
+            child.stopped_since_s = now_s
+        elif now_s - child.stopped_since_s > STOPPED_LIMIT_S:
+            log.error("the %s process stands still", name)
+            self._kill(name)
+
+    def _kill(self, name: str) -> None:
+        process = self._children[name].process
+        if process is not None:
+            process.kill()
+
+    def _end_all(self) -> None:
+        """End both processes: asked first, by force where they take long."""
+        for child in self._children.values():
+            if child.link is not None:
+                try:
+                    child.link.send(("stop",))
+                except LinkClosed:
+                    pass
+        for child in self._children.values():
+            if child.process is not None:
+                _end(child.process, STOP_GRACE_S)
+            if child.link is not None:
+                child.link.close()
+        self._wake_reader.close()
+        self._wake_writer.close()
+
+
+def _end(process: subprocess.Popen[bytes], patience_s: float) -> int:
+    """Wait for a process that is to end, then end it by force; return its code."""
+    try:
+        return process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _how_it_ended(code: int) -> str:
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended with code {code}"

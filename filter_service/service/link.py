@@ -1,0 +1,162 @@
+"""Messages between two processes of the service, file descriptors with them.
+
+Neither side ever waits for the other: what the socket does not take stays in a queue.
+The link joins processes of ours, so it may carry pickles; nothing from outside does.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import select
+import socket
+import struct
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Self
+
+HEAD = struct.Struct("<QB")  # length of what follows, number of descriptors
+MAX_DESCRIPTORS = 8
+READ_BYTES = 1 << 18
+
+
+class LinkClosed(Exception):
+    """The other process is gone."""
+
+
+class Link:
+    """One end of a link.
+
+    Parameters
+    ----------
+    end : socket
+        Of a `socket.socketpair`; the link owns it.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        self._socket = end
+        self._unsent: deque[tuple[memoryview, list[int]]] = deque()
+        self._received = bytearray()
+        self._descriptors: deque[int] = deque()
+
+    @classmethod
+    def pair(cls) -> tuple[Self, socket.socket]:
+        """Return our end, and the other as a process that is started is given it."""
+        ours, theirs = socket.socketpair()
+        return cls(ours), theirs
+
+    @classmethod
+    def from_descriptor(cls, descriptor: int) -> Self:
+        """Return the end that a descriptor is, which is now the link's."""
+        return cls(socket.socket(fileno=descriptor))
+
+    def wait(self) -> list[tuple[Any, list[int]]]:
+        """Return the next messages, however long they take to come."""
+        while not (messages := self.receive()):
+            select.select([self._socket], [], [])
+        return messages
+
+    def fileno(self) -> int:
+        """Return what to poll."""
+        return self._socket.fileno()
+
+    @property
+    def has_unsent(self) -> bool:
+        """Return whether `flush` has something to do, once the socket takes more."""
+        return bool(self._unsent)
+
+    def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
+        """Send a message; descriptors stay the caller's.
+
+        Raises
+        ------
+        LinkClosed
+        """
+        body = pickle.dumps(message, protocol=5)
+        head = HEAD.pack(len(body), len(descriptors))
+        copies = [os.dup(descriptor) for descriptor in descriptors]
+        self._unsent.append((memoryview(head + body), copies))
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what the socket takes now.
+
+        Raises
+        ------
+        LinkClosed
+        """
+        while self._unsent:
+            data, descriptors = self._unsent[0]
+            try:
+                if descriptors:
+                    count = socket.send_fds(self._socket, [data], descriptors)
+                else:
+                    count = self._socket.send(data)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise LinkClosed(str(error)) from None
+            for descriptor in descriptors:
+                os.close(descriptor)
+            if count < len(data):
+                self._unsent[0] = (data[count:], [])
+            else:
+                self._unsent.popleft()
+
+    def receive(self) -> list[tuple[Any, list[int]]]:
+        """Return the messages that have come, each with its descriptors, now ours.
+
+        Raises
+        ------
+        LinkClosed
+            Nothing more will come; messages that came before were returned.
+        """
+        is_closed = self._read()
+        messages = self._complete()
+        if is_closed and not messages:
+            raise LinkClosed("the other end is closed")
+        return messages
+
+    def _read(self) -> bool:
+        """Take in what is there; return whether the other end is closed."""
+        while True:
+            try:
+                data, descriptors, _, _ = socket.recv_fds(
+                    self._socket, READ_BYTES, MAX_DESCRIPTORS
+                )
+            except BlockingIOError:
+                return False
+            except OSError:
+                return True
+            self._descriptors += descriptors
+            if not data:
+                return True
+            self._received += data
+
+    def _complete(self) -> list[tuple[Any, list[int]]]:
+        messages = []
+        start, held = 0, memoryview(self._received)
+        while len(held) - start >= HEAD.size:
+            length, count = HEAD.unpack_from(held, start)
+            end = start + HEAD.size + length
+            if len(held) < end:
+                break
+            message = pickle.loads(held[start + HEAD.size : end])
+            descriptors = [self._descriptors.popleft() for _ in range(count)]
+            messages.append((message, descriptors))
+            start = end
+        held.release()
+        del self._received[:start]
+        return messages
+
+    def close(self) -> None:
+        """Close it; what is not sent is lost."""
+        for _, descriptors in self._unsent:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._unsent.clear()
+        self._descriptors.clear()
+        self._socket.close()

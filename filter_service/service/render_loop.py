@@ -1,0 +1,338 @@
+"""The loop that filters frames: one filter for each session, behind a link to the door.
+
+The door owns the socket and the sessions' credit; here are their eyes.  Neither waits
+for the other, and each outlives the other: a new door is told which sessions there are.
+
+From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
+number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
+request)``, ``("frame", number, key, frame, slot, starts, out_slot)``, ``("close",
+key)``.
+To the door: ``("here", server, eyes)`` first, ``("tell", key, reply)``, ``("answer",
+number, reply, starts, started_s, ended_s)`` and ``("state", memory_mb, is_building)``.
+"""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from estimator.profiles.parse import EyeProfile
+from filter_service.errors import FilterError, NoSession
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
+from filter_service.filtering.workshop import Workshop
+from filter_service.messages import (
+    Accepted,
+    ErrorReply,
+    Frame,
+    ProfileRequest,
+    Progress,
+    Ready,
+    Reply,
+    Result,
+)
+from filter_service.service.frame_reply import frame_reply
+from filter_service.service.link import Link, LinkClosed
+from filter_service.service.process_info import package_version, resident_memory_mb
+from filter_service.service.slots import Slot
+from filter_service.wire.images import ViewImages
+
+IDLE_WAIT_S = 0.5
+ATTENTION_WAIT_S = 0.1
+STATE_INTERVAL_S = 0.5
+
+log = logging.getLogger("ocufilter")
+
+
+@dataclass(eq=False)
+class SessionEye:
+    """The filter of one session, and the profile that it was last given."""
+
+    key: str
+    session_id: int
+    eye_filter: EyeFilter
+    profile_id: int | None = None
+    generation: int = 0
+
+
+class RenderLoop:
+    """Filters the frames that come over a link.
+
+    Parameters
+    ----------
+    workshop : Workshop
+        Where all sessions' eyes are made; the loop closes it.
+    read_profile : callable
+        ``read_profile(body)`` gives what the workshop takes, or raises a FilterError.
+    max_cameras : int
+        That one session keeps prepared.
+    """
+
+    def __init__(
+        self,
+        workshop: Workshop,
+        read_profile: Callable[[dict[str, Any]], EyeProfile],
+        *,
+        max_cameras: int,
+    ) -> None:
+        self._workshop = workshop
+        self._read_profile = read_profile
+        self._max_cameras = max_cameras
+        self._eyes: dict[str, SessionEye] = {}
+        self._slots: dict[int, Slot] = {}
+        self._door: Link | None = None
+        self._next_state_s = 0.0
+
+    def run(
+        self, control: Link, take_control: Callable[[Any, list[int]], bool]
+    ) -> None:
+        """Serve until the control link says so, or closes.
+
+        Parameters
+        ----------
+        take_control : callable
+            Handles a message of the control link; returns whether to go on.
+        """
+        selector = selectors.DefaultSelector()
+        selector.register(control, selectors.EVENT_READ)
+        try:
+            self._workshop.worker.start()
+            while True:
+                self._watch(selector, control)
+                selector.select(self._wait_s())
+                for message, descriptors in control.receive():
+                    if not take_control(message, descriptors):
+                        return
+                self._turn()
+        except LinkClosed:
+            log.error("the process that owns this one is gone")
+        finally:
+            self._close()
+
+    def join(self, door: Link) -> None:
+        """Serve a door; one before it is gone."""
+        if self._door is not None:
+            self._door.close()
+        self._door = door
+        self._drop_slots()
+        server = {
+            "name": "ocufilter",
+            "version": package_version(),
+            "engine": self._workshop.engine_name,
+            "renderer": self._workshop.engine.name,
+            "gl_renderer": self._workshop.engine.name,  # what it was called before
+        }
+        eyes = [
+            (eye.key, eye.session_id, eye.profile_id, eye.generation)
+            for eye in self._eyes.values()
+        ]
+        self._send(("here", server, eyes))
+
+    # The loop
+
+    def _watch(self, selector: selectors.BaseSelector, control: Link) -> None:
+        wanted = {control.fileno(): selectors.EVENT_READ}
+        worker = self._workshop.worker.file_descriptor
+        if worker is not None:
+            wanted[worker] = selectors.EVENT_READ
+        if self._door is not None:
+            events = selectors.EVENT_READ
+            if self._door.has_unsent:
+                events |= selectors.EVENT_WRITE
+            wanted[self._door.fileno()] = events
+        known = {key.fd: key for key in selector.get_map().values()}
+        for descriptor in set(known) - set(wanted):
+            selector.unregister(known[descriptor].fileobj)
+        for descriptor, events in wanted.items():
+            if descriptor not in known:
+                selector.register(descriptor, events)
+            elif known[descriptor].events != events:
+                selector.modify(known[descriptor].fileobj, events)
+
+    def _wait_s(self) -> float:
+        if self._workshop.is_loading:
+            return 0.0
+        if self._workshop.worker.needs_attention_soon:
+            return ATTENTION_WAIT_S
+        return IDLE_WAIT_S
+
+    def _turn(self) -> None:
+        if self._door is not None:
+            try:
+                self._door.flush()
+                for message, descriptors in self._door.receive():
+                    self._handle(message, descriptors)
+            except LinkClosed:
+                log.warning("the door is gone; sessions wait for the next one")
+                if self._door is not None:
+                    self._door.close()
+                self._door = None
+        self._workshop.advance()
+        self._tell_state()
+
+    def _tell_state(self, *, is_due: bool = False) -> None:
+        now_s = time.monotonic()
+        if is_due or now_s >= self._next_state_s:
+            self._next_state_s = now_s + STATE_INTERVAL_S
+            is_building = self._workshop.worker.is_busy
+            self._send(("state", resident_memory_mb(), is_building))
+
+    def _send(self, message: tuple[Any, ...]) -> None:
+        if self._door is None:
+            return
+        try:
+            self._door.send(message)
+        except LinkClosed:
+            self._door.close()
+            self._door = None
+
+    def _close(self) -> None:
+        for key in list(self._eyes):
+            self._end_session(key)
+        self._workshop.close()
+        self._drop_slots()
+        if self._door is not None:
+            self._door.close()
+
+    # Messages
+
+    def _handle(self, message: tuple[Any, ...], descriptors: list[int]) -> None:
+        kind, *rest = message
+        if kind == "frame":
+            self._filter(*rest)
+        elif kind == "profile":
+            self._take_profile(*rest)
+        elif kind == "open":
+            self._begin_session(*rest)
+        elif kind == "close":
+            self._end_session(*rest)
+        elif kind == "slot":
+            number, size_bytes = rest
+            self._slots[number] = Slot.received(number, size_bytes, *descriptors)
+        elif kind == "drop_slot":
+            self._slots.pop(rest[0]).close()
+
+    def _drop_slots(self) -> None:
+        for slot in self._slots.values():
+            slot.close()
+        self._slots = {}
+
+    # Sessions
+
+    def _begin_session(self, key: str, session_id: int, first_generation: int) -> None:
+        self._end_session(key)
+        self._eyes[key] = SessionEye(
+            key,
+            session_id,
+            EyeFilter(
+                workshop=self._workshop,
+                max_cameras=self._max_cameras,
+                on_event=partial(self._tell, key),
+                first_generation=first_generation,
+            ),
+        )
+
+    def _end_session(self, key: str) -> None:
+        eye = self._eyes.pop(key, None)
+        if eye is not None:
+            eye.eye_filter.close()
+
+    def _take_profile(self, key: str, request: ProfileRequest) -> None:
+        """Accept a profile; what becomes of it is told as events."""
+        eye = self._eyes.get(key)
+        if eye is None:
+            return
+        reply: Reply
+        try:
+            accepted = eye.eye_filter.set_profile(
+                self._read_profile(request.body),
+                settings=request.settings,
+                cameras=request.views,
+                profile_id=request.profile_id,
+            )
+        except Exception as error:
+            if not isinstance(error, FilterError):
+                log.exception("a profile could not be taken in")
+                error = FilterError(f"{type(error).__name__}: {error}")
+            reply = ErrorReply.from_exception(error, profile_id=request.profile_id)
+        else:
+            eye.profile_id, eye.generation = request.profile_id, accepted.generation
+            reply = Accepted(
+                request.profile_id,
+                accepted.generation,
+                is_building=bool(accepted.wanted),
+                n_cameras=len(accepted.wanted),
+            )
+        self._send(("tell", key, reply))
+        self._tell_state(is_due=True)
+
+    def _tell(self, key: str, event: EyeEvent) -> None:
+        """Tell a session what happens to its profile."""
+        profile_id, generation = event.eye.profile_id, event.eye.generation
+        reply: Reply
+        if isinstance(event, BuildingEye):
+            reply = Progress(profile_id, generation, event.stage, event.fraction)
+        elif isinstance(event, EyeReady):
+            reply = Ready(
+                profile_id,
+                generation,
+                build_ms=event.build_ms,
+                psf_count=event.psf_count,
+                memory_mb=event.memory_mb,
+                pixel_pitch_mrad=event.camera.pixel_pitch_mrad,
+                notes=event.notes,
+                is_complete=event.is_complete,
+            )
+        else:
+            reply = ErrorReply.from_exception(event.error, profile_id=profile_id)
+        self._send(("tell", key, reply))
+
+    # Frames
+
+    def _filter(
+        self,
+        number: int,
+        key: str,
+        frame: Frame,
+        in_slot: int,
+        starts: list[int],
+        out_slot: int,
+    ) -> None:
+        started_s = time.monotonic()
+        eye = self._eyes.get(key)
+        reply: Reply
+        out_starts: list[int] = []
+        if eye is None:
+            error = NoSession("the session has ended")
+            reply = ErrorReply.from_exception(error, frame_id=frame.frame_id)
+        else:
+            frame = replace(frame, images=self._images(frame, in_slot, starts))
+            reply = frame_reply(eye.eye_filter, frame)
+        if isinstance(reply, Result):
+            colors = [np.ascontiguousarray(color) for color in reply.colors]
+            out_starts = self._slots[out_slot].put(colors)
+            reply = replace(reply, colors=())
+        ended_s = time.monotonic()
+        self._send(("answer", number, reply, out_starts, started_s, ended_s))
+
+    def _images(
+        self, frame: Frame, in_slot: int, starts: list[int]
+    ) -> tuple[ViewImages, ...]:
+        """Return arrays over a slot; the frame's images lie there."""
+        slot, waiting = self._slots[in_slot], iter(starts)
+        found = []
+        for view in frame.views:
+            arrays = []
+            for _, shape, dtype in view.images:
+                array = slot.array(next(waiting), shape, np.dtype(dtype))
+                array.flags.writeable = False
+                arrays.append(array)
+            found.append(ViewImages(*arrays))
+        return tuple(found)

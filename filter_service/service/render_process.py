@@ -1,0 +1,88 @@
+"""The process that filters: ``python -m`` this, with a link's descriptor and a name.
+
+The name, ``module:function``, is of what opens the workshop: ``function(config,
+closing)`` returns it, what reads profiles, and what to call once all is ready.  Tests
+have one of their own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from estimator.threads import THREADS_VARIABLE
+from filter_service.building.worker_handle import WorkerHandle
+from filter_service.errors import FilterError
+from filter_service.service.child import begin
+from filter_service.service.config import ServiceConfig
+from filter_service.service.link import Link
+
+if TYPE_CHECKING:
+    from estimator.profiles.parse import EyeProfile
+    from filter_service.filtering.workshop import Workshop
+    from filter_service.service.render_loop import RenderLoop
+
+    ReadProfile = Callable[[dict[str, Any]], EyeProfile]
+    Opened = tuple[Workshop, ReadProfile, Callable[[], None]]
+
+OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
+
+log = logging.getLogger("ocufilter")
+
+
+def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
+    """Return the real engine with the real PSFs."""
+    if config.threads:
+        os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
+    worker = WorkerHandle(
+        niceness=config.build_niceness,
+        cancel_grace_s=config.cancel_grace_s,
+        build_limit_s=config.build_limit_s,
+    )
+    closing.callback(worker.close)
+    worker.start()  # it imports what takes long while this process does the same
+    from filter_service.building.read_profile import read_profile
+    from filter_service.filtering.load_ahead import load_ahead
+    from filter_service.filtering.shared_workshop import open_workshop
+
+    workshop = open_workshop(worker, config.build_limits, closing, engine=config.engine)
+    return workshop, read_profile, load_ahead
+
+
+def main() -> None:
+    """Filter frames until the keeper says so."""
+    keeper, config, others = begin("render")
+    module, _, function = sys.argv[2].partition(":")
+    open_workshop = getattr(importlib.import_module(module), function)
+    with ExitStack() as closing:
+        try:
+            workshop, read_profile, when_ready = open_workshop(config, closing)
+        except (FilterError, ValueError, OSError) as error:
+            keeper.send(("failed", str(error)))
+            raise SystemExit(1) from None
+        from filter_service.service.render_loop import RenderLoop
+
+        loop = RenderLoop(workshop, read_profile, max_cameras=config.max_cameras)
+        keeper.send(("ready", ""))
+        when_ready()
+        for message, descriptors in others:
+            take_control(loop, message, descriptors)
+        loop.run(keeper, lambda *said: take_control(loop, *said))
+
+
+def take_control(
+    loop: RenderLoop, message: tuple[Any, ...], descriptors: list[int]
+) -> bool:
+    """Do what the keeper says; return whether to go on."""
+    if message[0] == "link":
+        loop.join(Link.from_descriptor(descriptors[0]))
+    return bool(message[0] != "stop")
+
+
+if __name__ == "__main__":
+    main()

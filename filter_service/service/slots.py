@@ -1,0 +1,190 @@
+"""Memory that two processes share: images go through it, never over a pipe.
+
+A slot is an anonymous file in memory.  All its pages are there from the start and its
+size is sealed, so that neither a full machine nor the other process can turn an access
+into a bus error; and it is gone with the last process that holds it, however that ends.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.building.shared_buffers import starts_of
+from filter_service.errors import OutOfMemory
+
+PAGE_BYTES = mmap.PAGESIZE
+KEPT_RATIO = 4
+"""A slot is not used for what fills less than a quarter of it."""
+
+
+class Slot:
+    """Shared memory of a fixed size.
+
+    Attributes
+    ----------
+    number : int
+        Both processes know it by that.
+    size_bytes : int
+    descriptor : int
+        Of the file.
+    """
+
+    def __init__(self, number: int, size_bytes: int, descriptor: int) -> None:
+        self.number = number
+        self.size_bytes = size_bytes
+        self.descriptor = descriptor
+        self._memory = memoryview(mmap.mmap(descriptor, size_bytes))
+
+    @classmethod
+    def create(cls, number: int, size_bytes: int) -> Slot:
+        """Return a new slot.
+
+        Raises
+        ------
+        OutOfMemory
+            The system does not give that much.
+        """
+        size_bytes = -(-max(size_bytes, 1) // PAGE_BYTES) * PAGE_BYTES
+        flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
+        descriptor = os.memfd_create("ocufilter-slot", flags)
+        try:
+            os.posix_fallocate(descriptor, 0, size_bytes)
+            fcntl.fcntl(
+                descriptor,
+                fcntl.F_ADD_SEALS,
+                fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL,
+            )
+            return cls(number, size_bytes, descriptor)
+        except OSError as error:
+            os.close(descriptor)
+            raise OutOfMemory(
+                f"{size_bytes / 1e6:.0f} MB of shared memory are not to be had: "
+                f"{error.strerror}"
+            ) from None
+
+    @classmethod
+    def received(cls, number: int, size_bytes: int, descriptor: int) -> Slot:
+        """Return a slot that another process has made.
+
+        Raises
+        ------
+        ValueError
+            The file is no sealed slot of that size.
+        """
+        seals = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS)
+        if not seals & fcntl.F_SEAL_SHRINK:
+            raise ValueError(f"slot {number} is not sealed")
+        if os.fstat(descriptor).st_size != size_bytes:
+            raise ValueError(f"slot {number} has another size than {size_bytes} bytes")
+        return cls(number, size_bytes, descriptor)
+
+    def part(self, start: int, size_bytes: int) -> memoryview:
+        """Return a part of the memory.
+
+        Raises
+        ------
+        ValueError
+            It reaches beyond the slot.
+        """
+        if not 0 <= start <= start + size_bytes <= self.size_bytes:
+            raise ValueError(
+                f"bytes {start} to {start + size_bytes} of a slot of {self.size_bytes}"
+            )
+        return self._memory[start : start + size_bytes]
+
+    def array(
+        self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]
+    ) -> NDArray[Any]:
+        """Return a part of the memory as an array."""
+        size_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+        part = self.part(start, size_bytes)
+        return np.frombuffer(part, dtype=dtype).reshape(shape)
+
+    def put(self, images: Sequence[NDArray[Any]]) -> list[int]:
+        """Copy images in, one after the other; return where each starts."""
+        starts, _ = starts_of([image.nbytes for image in images])
+        for start, image in zip(starts, images, strict=True):
+            np.copyto(self.array(start, image.shape, image.dtype), image)
+        return starts
+
+    def close(self) -> None:
+        """Give up the file; the memory goes when nobody has a part of it any more."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+
+
+def bytes_for(sizes: Sequence[int]) -> int:
+    """Return the size of a slot for images of so many bytes."""
+    return starts_of(sizes)[1]
+
+
+class SlotPool:
+    """Slots that are taken and given back.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Of all slots together.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self._slots: dict[int, Slot] = {}
+        self._free: list[Slot] = []
+        self._next_number = 1
+
+    @property
+    def held_bytes(self) -> int:
+        """Return the size of all slots."""
+        return sum(slot.size_bytes for slot in self._slots.values())
+
+    def take(self, size_bytes: int) -> tuple[Slot, bool]:
+        """Return a slot with so much room, and whether it is new.
+
+        Raises
+        ------
+        OutOfMemory
+        """
+        fitting = [
+            slot
+            for slot in self._free
+            if size_bytes <= slot.size_bytes <= KEPT_RATIO * max(size_bytes, PAGE_BYTES)
+        ]
+        if fitting:
+            slot = min(fitting, key=lambda found: found.size_bytes)
+            self._free.remove(slot)
+            return slot, False
+        if self.held_bytes + size_bytes > self.max_bytes:
+            raise OutOfMemory(
+                f"{size_bytes / 1e6:.0f} MB more than the {self.held_bytes / 1e6:.0f} "
+                "MB in use are asked for",
+                allowed=f"{self.max_bytes / 1e6:.0f} MB for images in all",
+            )
+        slot = Slot.create(self._next_number, size_bytes)
+        self._slots[slot.number] = slot
+        self._next_number += 1
+        return slot, True
+
+    def give_back(self, slot: Slot) -> None:
+        """Take a slot back."""
+        self._free.append(slot)
+
+    def trim(self) -> list[Slot]:
+        """Give up and return all slots that are free."""
+        dropped, self._free = self._free, []
+        for slot in dropped:
+            del self._slots[slot.number]
+            slot.close()
+        return dropped
+
+    def __iter__(self) -> Iterator[Slot]:
+        """Go through all slots."""
+        return iter(list(self._slots.values()))
