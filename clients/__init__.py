@@ -5,6 +5,7 @@ Importing this loads nothing but names.
     filter_client    `FilterClient`: the library
     link             its side of the protocol
     connection       its socket
+    shared_memory    memory that it shares with a service on the same machine
     service_process  a service of one's own
     hello            the smallest client
     pyrender_stream  a scene through a running service

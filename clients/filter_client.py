@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from clients.connection import SendBufferPool
 from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
+from clients.shared_memory import ClientSlot
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import (
@@ -41,12 +43,15 @@ from filter_service.messages import (
     ProfileRequest,
     Progress,
     Ready,
+    SharedPlaces,
     ViewHeader,
     ViewImages,
     Welcome,
     encode,
     tangents_from_fov,
 )
+from filter_service.settings import DepthKind
+from filter_service.slots import starts_of
 
 __all__ = [
     "Event",
@@ -64,6 +69,8 @@ def _floats(pair: tuple[float, float]) -> tuple[float, float]:
     """Return numpy's numbers as Python's; the service refuses what is no pair."""
     return cast("tuple[float, float]", tuple(map(float, pair)))
 
+
+LEND_WAIT_S = 0.1
 
 EXTENDING_S = 0.03
 """Between two tries of a frame whose state is being prepared."""
@@ -84,6 +91,8 @@ class FilterClient:
         default, gives the highest rate.
     client_name : str
         Appears in the service's log.
+    shared_memory : bool
+        Let images lie in memory that both sides share, where both can.
     """
 
     def __init__(
@@ -93,6 +102,7 @@ class FilterClient:
         timeout_s: float = 10.0,
         max_in_flight: int = 1,
         client_name: str = "filter_client",
+        shared_memory: bool = True,
     ) -> None:
         if not timeout_s > 0:
             raise ValueError(f"timeout_s is {timeout_s}; allowed: above 0")
@@ -100,7 +110,7 @@ class FilterClient:
             raise ValueError(f"max_in_flight is {max_in_flight}; allowed: 1 or more")
         self.timeout_s = timeout_s
         self._open_link: ServiceLink | None = ServiceLink(
-            endpoint, max_in_flight, client_name
+            endpoint, max_in_flight, client_name, shared_memory=shared_memory
         )
         self._pool = SendBufferPool(timeout_s)
         self._camera: Camera | None = None
@@ -334,7 +344,8 @@ class FilterClient:
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
 
-        The images are copied, so the caller may reuse its arrays at once.  If the
+        The images are copied, so the caller may reuse its arrays at once, but for those
+        of `lend_view`.  If the
         service is busy the frame waits here, and a frame that already waits is
         dropped for it with the reason ``superseded``.
 
@@ -361,11 +372,6 @@ class FilterClient:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
         items = as_views(color, depth_m, self._camera)
         self._check_limits(items)
-        buffers, images = [], []
-        for item in items:
-            copies = [self._pool.copy_in(image) for image in item.images]
-            buffers += [buffer for buffer, _ in copies]
-            images.append(ViewImages(*(copy for _, copy in copies)))
         frame = Frame(
             frame_id=self._next_frame_id,
             views=tuple(ViewHeader.describing(item) for item in items),
@@ -376,13 +382,99 @@ class FilterClient:
             options=FrameOptions(
                 accumulation, merge, float(render_tolerance), prepared_only
             ),
-            images=tuple(images),
         )
         self._next_frame_id += 1
-        self._link.submit(
-            Outgoing(frame.frame_id, encode(frame), buffers, time.monotonic())
-        )
+        self._link.submit(self._packed(frame, items))
         return frame.frame_id
+
+    def _packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
+        """Copy images to where they travel from: shared memory, or buffers."""
+        now_s = time.monotonic()
+        found = self._in_shared_memory(
+            frame, [i for view in items for i in view.images]
+        )
+        if found is not None:
+            frame, slots = found
+            return Outgoing(frame.frame_id, encode(frame), [], now_s, frame, slots)
+        buffers, images = [], []
+        for item in items:
+            copies = [self._pool.copy_in(image) for image in item.images]
+            buffers += [buffer for buffer, _ in copies]
+            images.append(ViewImages(*(copy for _, copy in copies)))
+        frame = replace(frame, images=tuple(images))
+        return Outgoing(frame.frame_id, encode(frame), buffers, now_s, frame)
+
+    def _in_shared_memory(
+        self, frame: Frame, images: Sequence[NDArray[Any]]
+    ) -> tuple[Frame, list[ClientSlot]] | None:
+        """Return a frame whose images lie in shared memory, and its slots."""
+        memory = self._link.memory
+        if not memory.is_offered:
+            return None
+        starts, n_in = starts_of([image.nbytes for image in images])
+        result_starts, n_out = starts_of(
+            [v.camera.pixel_count * frame.output.bytes_per_pixel for v in frame.views]
+        )
+        slot = memory.holding(images)
+        if slot is not None:
+            slot.n_users += 1
+        else:
+            slot = memory.take(n_in)
+        result_slot = memory.take(n_out)
+        if slot is None or result_slot is None:
+            for taken in (slot, result_slot):
+                if taken is not None:
+                    taken.release()
+            return None
+        slot.slot.put(images, starts)
+        places = SharedPlaces(
+            slot.slot.number,
+            tuple(starts),
+            result_slot.slot.number,
+            tuple(result_starts),
+        )
+        return replace(frame, memory=places), [slot, result_slot]
+
+    def lend_view(
+        self,
+        camera: Camera,
+        *,
+        dtype: str = "uint8",
+        depth_kind: DepthKind = "planar",
+    ) -> RgbdView:
+        """Return an empty view to render into, which `submit` does not have to copy.
+
+        Its arrays lie in memory that the service reads, where that can be had; else
+        they are plain ones.  Leave it alone from `submit` until the frame is answered:
+        a live stream takes two in turn.
+
+        Parameters
+        ----------
+        camera : Camera
+        dtype : "uint8", "float32" or "float16"
+            Of the colour.
+        depth_kind : "planar" or "radial"
+        """
+        shape = (camera.height_px, camera.width_px)
+        shapes = ((*shape, 3), np.dtype(dtype)), (shape, np.dtype(np.float32))
+        starts, size_bytes = starts_of(
+            [int(np.prod(shape)) * kind.itemsize for shape, kind in shapes]
+        )
+        memory = self._link.memory
+        held = memory.take(size_bytes)
+        if held is None and memory.is_offered:
+            self._link.pump(LEND_WAIT_S)
+            held = memory.take(size_bytes)
+        if held is None:
+            arrays = [np.zeros(shape, kind) for shape, kind in shapes]
+        else:
+            arrays = [
+                memory.array(held, start, shape, kind)
+                for start, (shape, kind) in zip(starts, shapes, strict=True)
+            ]
+            held.release()
+        color, depth_m = arrays
+        return RgbdView(color, depth_m, camera.tangents, depth_kind)
 
     def _check_limits(self, views: Sequence[RgbdView]) -> None:
         """Refuse what the service would cut the connection for."""

@@ -13,6 +13,7 @@ import argparse
 import contextlib
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ from filter_service.messages import Dropped, ErrorReply
 
 N_FRAMES = 8  # in the loop that is sent
 VERTICAL_FOV_DEG = 45.0
+TRANSPORTS = ("tcp", "ipc", "shm")
 DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}'
 STRAGGLER_S = 10.0
 STDOUT = "-"
@@ -58,6 +60,7 @@ class Settings:
     focus_dpt: float
     output: str
     max_in_flight: int
+    transport: str = "tcp"
 
     @property
     def case(self) -> str:
@@ -73,7 +76,7 @@ class Settings:
     def setting(self) -> str:
         """Return how it is streamed, in words."""
         schedule = f"{self.rate_hz:g} Hz for {self.duration_s:g} s"
-        return f"{schedule}, {self.max_in_flight} in flight"
+        return f"{schedule}, {self.max_in_flight} in flight, {self.transport}"
 
 
 def make_frames(settings: Settings) -> list[list[RgbdView]]:
@@ -185,18 +188,29 @@ class _Loop:
 
 
 @contextlib.contextmanager
-def connect(endpoint: str | None, max_in_flight: int) -> Iterator[tuple]:
+def connect(
+    endpoint: str | None, max_in_flight: int, transport: str
+) -> Iterator[tuple]:
     """Yield (client, how to read the service's memory); spawn a service if need be."""
     with contextlib.ExitStack() as stack:
         service = None
         if endpoint is None:
-            service = stack.enter_context(ServiceProcess())
+            bind = {}
+            if transport != "tcp":
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                bind = {"bind": f"ipc://{folder}/service"}
+            service = stack.enter_context(ServiceProcess(bind))
             endpoint = service.endpoint
         client = stack.enter_context(
             FilterClient(
-                endpoint, max_in_flight=max_in_flight, client_name="latency benchmark"
+                endpoint,
+                max_in_flight=max_in_flight,
+                client_name="latency benchmark",
+                shared_memory=transport == "shm",
             )
         )
+        if transport == "shm" and "shm" not in client.hello().transports:
+            raise ValueError(f"{endpoint} shares no memory")
         if service is not None:
             yield client, lambda: service.memory_mb
         else:
@@ -232,8 +246,15 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--endpoint", help="a running service")
     where.add_argument("--spawn", action="store_true", help="start a service (default)")
-    parser.add_argument("--size", default="1280x720", help="WxH in px")
+    parser.add_argument(
+        "--transport",
+        choices=TRANSPORTS,
+        default="tcp",
+        help="tcp, ipc, or shared memory beside it; of the service that is started",
+    )
+    parser.add_argument("--size", help="WxH in px (1280x720; stereo 1832x1920)")
     parser.add_argument("--views", type=int, default=1, help="1, or 2 for stereo")
+    parser.add_argument("--stereo", action="store_true", help="2 x 1832x1920")
     parser.add_argument("--rate-hz", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument(
@@ -268,7 +289,8 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
     ValueError
         Names the option.
     """
-    size = "320x180" if arguments.quick else arguments.size
+    usual = "1832x1920" if arguments.stereo else "1280x720"
+    size = "320x180" if arguments.quick else arguments.size or usual
     sides = size.lower().split("x")
     if len(sides) != 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
         raise ValueError(f"--size is {size!r}; allowed: WIDTHxHEIGHT in px")
@@ -279,7 +301,8 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
     return Settings(
         width_px=int(sides[0]),
         height_px=int(sides[1]),
-        n_views=arguments.views,
+        n_views=2 if arguments.stereo else arguments.views,
+        transport=arguments.transport,
         rate_hz=arguments.rate_hz,
         duration_s=3.0 if arguments.quick else arguments.seconds,
         profile=read_profile(arguments.profile),
@@ -296,7 +319,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parse_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         settings = read_settings(parsed)
-        with connect(parsed.endpoint, settings.max_in_flight) as (client, memory):
+        with connect(parsed.endpoint, settings.max_in_flight, settings.transport) as (
+            client,
+            memory,
+        ):
             run = measure(client, settings, memory)
     except ValueError as error:
         print(f"latency: {error}", file=sys.stderr)

@@ -14,7 +14,9 @@ from rich.table import Table
 
 PERCENTILES = (50, 95, 99)
 CLIENT_STAGES = ("client_wait_ms", "wire_and_queue_ms")
-SERVICE_STAGES = ("decode_ms", "queue_ms", "other_ms")  # not the renderer's
+SERVICE_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "other_ms")
+"""Those that are not the renderer's."""
+
 SUMS = ("added_ms", "service_total_ms", "round_trip_ms", "age_ms")
 
 

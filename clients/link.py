@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
 from clients.connection import Connection, SendBuffer
+from clients.shared_memory import ClientSlot, SharedMemory
 from filter_service.errors import FilterError, NoSession, ServiceTimeout
 from filter_service.messages import (
     Accepted,
@@ -22,12 +23,14 @@ from filter_service.messages import (
     Closing,
     Dropped,
     ErrorReply,
+    Frame,
     Hello,
     Pong,
     ProfileRequest,
     Progress,
     Ready,
     Result,
+    Shared,
     Welcome,
     decode_reply,
     encode,
@@ -70,6 +73,8 @@ class Outgoing:
     parts: list[Any]
     buffers: list[SendBuffer]
     submitted_s: float
+    frame: Frame
+    slots: list[ClientSlot] = field(default_factory=list)  # input, result
     sent_s: float = 0.0
 
     def release(self) -> None:
@@ -77,6 +82,13 @@ class Outgoing:
         for buffer in self.buffers:
             buffer.is_held = False
         self.parts, self.buffers = [], []
+
+    def end(self) -> None:
+        """Let go of everything: the frame is answered, or will never be."""
+        self.release()
+        for slot in self.slots:
+            slot.release()
+        self.slots = []
 
 
 class ServiceLink:
@@ -90,9 +102,18 @@ class ServiceLink:
         Frames on their way at once; the service's credit bounds it too.
     client_name : str
         Sent with hello.
+    shared_memory : bool
+        Take it where it is offered.
     """
 
-    def __init__(self, endpoint: str, max_in_flight: int, client_name: str) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        max_in_flight: int,
+        client_name: str,
+        *,
+        shared_memory: bool = True,
+    ) -> None:
         self.welcome: Welcome | None = None
         self.profile: ProfileRequest | None = None
         self.pending: Outgoing | None = None
@@ -103,6 +124,8 @@ class ServiceLink:
         self._client_name = client_name
         self._connection = Connection(endpoint)
         self._session_key = ""
+        self._wants_memory = shared_memory
+        self.memory = SharedMemory(lambda message: self.say(encode(message)))
         self._outbox: list[list[Any]] = []
         self._events: list[Event] = []
         self._refusal: FilterError | None = None
@@ -194,9 +217,13 @@ class ServiceLink:
         for outgoing in self.in_flight.values():
             self._drop(outgoing, "connection_lost")
         self.in_flight.clear()
+        if self.pending is not None and self.pending.frame.memory is not None:
+            self._drop(self.pending, "connection_lost")  # its memory is gone, too
+            self.pending = None
+        self.memory.begin(is_offered=False)
 
     def _drop(self, outgoing: Outgoing, reason: str) -> None:
-        outgoing.release()
+        outgoing.end()
         self._events.append(Dropped(outgoing.frame_id, reason))
 
     def _send_waiting(self) -> None:
@@ -226,6 +253,8 @@ class ServiceLink:
             self._begin(reply)
         elif isinstance(reply, Pong):
             self.pongs.append(reply)
+        elif isinstance(reply, Shared):
+            self.memory.take_in(reply)
         elif not isinstance(reply, Alive | Closing):
             self._events.append(reply)
             self._bound_progress()
@@ -234,6 +263,9 @@ class ServiceLink:
         """Begin or go on with a session; send the profile where it does not have it."""
         self.welcome = welcome
         self._session_key = welcome.session_key
+        if not self.in_flight:
+            is_offered = self._wants_memory and "shm" in welcome.transports
+            self.memory.begin(is_offered=is_offered)
         profile = self.profile
         if profile is not None and welcome.profile_id != profile.profile_id:
             self.say(encode(profile))
@@ -251,17 +283,34 @@ class ServiceLink:
         if outgoing is None:
             return  # reported already, as lost with an earlier connection
         if isinstance(reply, Dropped):
+            outgoing.end()
             self._events.append(reply)
             return
         now_s = time.monotonic()
+        colors = self._colors_in_memory(outgoing) if reply.in_memory else reply.colors
+        outgoing.end()
         self._events.append(
             FilteredFrame(
                 frame_id=reply.frame_id,
-                colors=reply.colors,
+                colors=colors,
                 header=reply,
                 age_ms=1000 * (now_s - outgoing.submitted_s),
                 round_trip_ms=1000 * (now_s - outgoing.sent_s),
             )
+        )
+
+    def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
+        """Return the pictures that the service has put into a slot."""
+        frame, (_, slot) = outgoing.frame, outgoing.slots
+        assert frame.memory is not None
+        return tuple(
+            self.memory.array(
+                slot,
+                start,
+                (view.height_px, view.width_px, 3),
+                frame.output.dtype,
+            )
+            for view, start in zip(frame.views, frame.memory.result_starts, strict=True)
         )
 
     def _handle_error(self, reply: ErrorReply) -> None:
@@ -269,7 +318,9 @@ class ServiceLink:
             self._restart_session(reply)
             return
         if reply.frame_id is not None:
-            self.in_flight.pop(reply.frame_id, None)
+            outgoing = self.in_flight.pop(reply.frame_id, None)
+            if outgoing is not None:
+                outgoing.end()
         elif self.welcome is None and reply.profile_id is None:
             self._refusal = reply.exception()
         self._events.append(reply)
@@ -278,7 +329,6 @@ class ServiceLink:
         """Say hello again: the service ended this session on a live connection."""
         frame_id = reply.frame_id
         if frame_id is not None and frame_id in self.in_flight:
-            del self.in_flight[frame_id]
-            self._events.append(Dropped(frame_id, "connection_lost"))
+            self._drop(self.in_flight.pop(frame_id), "connection_lost")
         if self.welcome is not None:
             self.greet()

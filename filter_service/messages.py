@@ -41,6 +41,7 @@ from filter_service.wire.replies import (
     Ready,
     Result,
     ResultView,
+    Shared,
     Welcome,
 )
 from filter_service.wire.requests import (
@@ -50,6 +51,9 @@ from filter_service.wire.requests import (
     Hello,
     Ping,
     ProfileRequest,
+    Share,
+    SharedPlaces,
+    Unshare,
 )
 from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
@@ -87,6 +91,10 @@ __all__ = [
     "Request",
     "Result",
     "ResultView",
+    "Share",
+    "Shared",
+    "SharedPlaces",
+    "Unshare",
     "ViewHeader",
     "ViewImages",
     "Welcome",
@@ -100,7 +108,7 @@ __all__ = [
 PROTOCOL_VERSION = 1
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
 
-Request = Hello | ProfileRequest | Frame | Ping | Bye
+Request = Hello | ProfileRequest | Frame | Share | Unshare | Ping | Bye
 Reply = (
     Welcome
     | Accepted
@@ -112,16 +120,18 @@ Reply = (
     | Pong
     | Alive
     | Closing
+    | Shared
 )
 
 REQUESTS: dict[str, type[Message]] = {
-    kind.type_name: kind for kind in (Hello, ProfileRequest, Frame, Ping, Bye)
+    kind.type_name: kind
+    for kind in (Hello, ProfileRequest, Frame, Share, Unshare, Ping, Bye)
 }
 REPLIES: dict[str, type[Message]] = {
     kind.type_name: kind
     for kind in (
         *(Welcome, Accepted, Progress, Ready, Result, Dropped),
-        *(ErrorReply, Pong, Alive, Closing),
+        *(ErrorReply, Pong, Alive, Closing, Shared),
     )
 }
 

@@ -12,16 +12,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 
-ALIGNMENT_BYTES = 64
-
-
-def starts_of(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Return where each buffer starts in the file, and the file's size."""
-    starts, end = [], 0
-    for size in sizes:
-        starts.append(end)
-        end += -(-size // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
-    return starts, end
+from filter_service.slots import starts_of
 
 
 def write_shared(buffers: Sequence[memoryview]) -> int:

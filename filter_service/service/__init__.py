@@ -12,7 +12,6 @@ render_process  the process that filters
 render_loop     its loop: one filter for each session
 frame_reply     a frame and its answer
 link            messages between the processes
-slots           images between the processes
 config          the settings file
 process_info    version and memory
 """

@@ -71,6 +71,8 @@ class ServiceConfig:
         it, may take: then it is taken for hung, and started again.
     max_image_mb : int
         Images of all frames and results that the service holds.
+    shared_memory : bool
+        Offer memory that images lie in to clients of this user on this machine.
     max_socket_mb : int
         Memory of the process that owns the socket, incomplete messages included:
         beyond it that process is started again.
@@ -102,6 +104,7 @@ class ServiceConfig:
     session_keep_s: float = 30.0
     frame_limit_s: float = 60.0
     max_image_mb: int = 2000
+    shared_memory: bool = True
     max_socket_mb: int = 2000
     ready_file: Path | None = None
 

@@ -41,18 +41,22 @@ from filter_service.messages import (
     ProfileRequest,
     Reply,
     Result,
+    Share,
+    Shared,
+    SharedPlaces,
+    Unshare,
     Welcome,
     decode_request,
     encode,
     peek_ids,
 )
-from filter_service.service.config import ServiceConfig
+from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.mailbox import Mailbox, Outcome, Tracker
 from filter_service.service.process_info import resident_memory_mb
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.service.slots import Slot, SlotPool, bytes_for
 from filter_service.service.turns import Turns
+from filter_service.slots import Slot, SlotPool, starts_of
 from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep others waiting
@@ -67,6 +71,8 @@ RETRY_AFTER_MS = 100.0
 
 MS_PER_S = 1000.0
 MAX_PARTS_PER_VIEW = 4
+MAX_SHARED_SLOTS = 16
+"""Of one session."""
 
 log = logging.getLogger("ocufilter")
 
@@ -79,8 +85,8 @@ class _Outstanding:
     session: Session
     identity: bytes | None
     waiting: WaitingFrame
-    in_slot: Slot
-    out_slot: Slot
+    places: SharedPlaces
+    own_slots: tuple[Slot, ...]  # not the client's: what is sent, and is given back
     handed_s: float
 
 
@@ -263,8 +269,7 @@ class Door:
         lost, self._outstanding = self._outstanding, None
         if lost is None:
             return
-        self._slots.give_back(lost.in_slot)
-        self._slots.give_back(lost.out_slot)
+        self._give_back(lost)
         error = RenderFailed("the process that filters frames ended; it starts again")
         reply = ErrorReply.from_exception(error, frame_id=lost.waiting.frame.frame_id)
         self._answer_held(lost, reply)
@@ -328,7 +333,7 @@ class Door:
         Answers to frames are sent only afterwards: a client that keeps to its credit
         then never seems to exceed it, however fast it reacts to an answer.
         """
-        answers: list[tuple[Session, Dropped | ErrorReply]] = []
+        answers: list[tuple[Session, Frame, Dropped | ErrorReply]] = []
         for _ in range(MAX_MESSAGES_PER_TURN):
             received = self._mailbox.receive()
             if received is None:
@@ -339,15 +344,15 @@ class Door:
                 self._n_faults += 1
                 log.exception("fault %d: a refusal failed", self._n_faults)
                 self._end_session(received[0])
-        for session, answer in answers:
-            self._answer_frame(session, answer)
+        for session, frame, answer in answers:
+            self._answer_frame(session, frame, answer)
 
     def _take_in(
         self,
         identity: bytes,
         parts: list[memoryview],
         n_left_out: int,
-        answers: list[tuple[Session, Dropped | ErrorReply]],
+        answers: list[tuple[Session, Frame, Dropped | ErrorReply]],
     ) -> None:
         received_s = time.monotonic()
         try:
@@ -379,7 +384,7 @@ class Door:
         identity: bytes,
         request: Message,
         received_s: float,
-        answers: list[tuple[Session, Dropped | ErrorReply]],
+        answers: list[tuple[Session, Frame, Dropped | ErrorReply]],
     ) -> None:
         if isinstance(request, Ping):
             self._send(identity, self._pong(request))
@@ -391,14 +396,20 @@ class Door:
             raise NoSession("hello was not said", allowed="hello before anything else")
         elif isinstance(request, ProfileRequest):
             self._take_profile(self._sessions[identity], request)
+        elif isinstance(request, Share):
+            self._send(identity, self._share(self._sessions[identity], request))
+        elif isinstance(request, Unshare):
+            self._unshare(self._sessions[identity], request)
         elif isinstance(request, Frame):
             session = self._sessions[identity]
+            check_memory(session, request)
             waiting = WaitingFrame(request, received_s, time.monotonic())
             superseded = session.take_in(waiting)
             self._turns.arrive(session.key, waiting.decoded_s)
+            session.lend(request)
             if superseded is not None:
                 reply = Dropped(superseded.frame.frame_id, "superseded")
-                answers.append((session, reply))
+                answers.append((session, superseded.frame, reply))
 
     # Sessions
 
@@ -417,7 +428,9 @@ class Door:
         if session is None:
             resumed = self._resumed(identity, hello)
             session = resumed or self._new_session(identity, hello)
-        transport = self.endpoint.split("://", 1)[0]
+        transports = [self.endpoint.split("://", 1)[0]]
+        if self._may_share:
+            transports.append("shm")
         self._send(
             identity,
             Welcome(
@@ -425,7 +438,7 @@ class Door:
                 self._server,
                 self._limits,
                 session.credit,
-                (transport,),
+                tuple(transports),
                 session_key=session.key,
                 session_keep_s=self.config.session_keep_s,
                 is_resumed=resumed is not None,
@@ -441,6 +454,7 @@ class Door:
             return None
         if session.identity is not None:  # the old connection is not known to be gone
             del self._sessions[session.identity]
+            self._end_sharing(session)
         self._away.pop(key, None)
         session.come_back(identity, hello.client)
         self._sessions[identity] = session
@@ -490,6 +504,55 @@ class Door:
             session.asked_profile = request
             self._tell_render(("profile", session.key, request))
 
+    # Shared memory
+
+    def _share(self, session: Session, request: Share) -> Shared:
+        """Give a client memory for its images, or say why not."""
+        if not self._may_share:
+            return Shared(reason="this service shares no memory over this transport")
+        if len(session.shared) >= MAX_SHARED_SLOTS:
+            return Shared(reason=f"{MAX_SHARED_SLOTS} slots are in use")
+        if request.size_bytes > MAX_PARTS_PER_VIEW * self._limits.max_views * (
+            self._limits.max_part_bytes
+        ):
+            return Shared(
+                reason=f"{request.size_bytes} bytes are more than a frame has"
+            )
+        try:
+            # A new one: in another's lie another client's images.
+            slot = self._slots.create(request.size_bytes)
+        except OutOfMemory as error:
+            return Shared(reason=str(error))
+        session.shared[slot.number] = slot
+        self._send_slot(slot)
+        return Shared(slot.number, slot.size_bytes, slot.path)
+
+    @property
+    def _may_share(self) -> bool:
+        is_local = self.endpoint.startswith("ipc://") or any(
+            self.endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
+        )
+        return self.config.shared_memory and is_local
+
+    def _unshare(self, session: Session, request: Unshare) -> None:
+        if request.slot not in session.shared or request.slot in session.lent:
+            raise BadMessage(
+                f"it is {request.slot}",
+                field="slot",
+                allowed="a slot of this session that no frame uses",
+            )
+        self._drop_slot(session.shared.pop(request.slot))
+
+    def _drop_slot(self, slot: Slot) -> None:
+        self._slots.drop(slot)
+        self._tell_render(("drop_slot", slot.number))
+
+    def _end_sharing(self, session: Session) -> None:
+        """Give up the memory of a client that is gone."""
+        for slot in session.shared.values():
+            self._drop_slot(slot)
+        session.shared, session.lent = {}, set()
+
     def _pong(self, ping: Ping) -> Pong:
         now_s = time.monotonic()
         return Pong(
@@ -528,6 +591,7 @@ class Door:
         if session is None:
             return
         session.leave(time.monotonic())
+        self._end_sharing(session)
         self._leaving += session.unsent
         session.unsent = []
         self._away[session.key] = session
@@ -543,6 +607,7 @@ class Door:
         self._away.pop(session.key, None)
         self._turns.forget(session.key)
         session.identity = None
+        self._end_sharing(session)
         self._leaving += session.unsent
         session.unsent = []
         self._tell_render(("close", session.key))
@@ -551,12 +616,13 @@ class Door:
     # Frames
 
     def _answer_frame(
-        self, session: Session, answer: Result | Dropped | ErrorReply
+        self, session: Session, frame: Frame, answer: Result | Dropped | ErrorReply
     ) -> Tracker | None:
         """Answer a frame that counts against the credit."""
         if session.identity is None:
             return None  # its client is away
         session.n_unanswered = max(0, session.n_unanswered - 1)
+        session.get_back(frame)
         if isinstance(answer, Result):
             self._n_rendered += 1
         else:
@@ -569,7 +635,7 @@ class Door:
         """Answer a frame, if its client is where it was: else it counts it as lost."""
         if held.identity is None or held.session.identity != held.identity:
             return None
-        return self._answer_frame(held.session, answer)
+        return self._answer_frame(held.session, held.waiting.frame, answer)
 
     def _may_hand_over(self) -> bool:
         return self._render is not None and self._server is not None
@@ -616,56 +682,67 @@ class Door:
             return
         frame_id = waiting.frame.frame_id
         if len(session.unsent) >= MAX_UNSENT_RESULTS:
-            self._answer_frame(session, Dropped(frame_id, "slow_consumer"))
+            reply = Dropped(frame_id, "slow_consumer")
+            self._answer_frame(session, waiting.frame, reply)
             return
         try:
             self._hand_over(session, waiting)
         except OutOfMemory as error:
-            reply = ErrorReply.from_exception(error, frame_id=frame_id)
-            self._answer_frame(session, reply)
+            failed = ErrorReply.from_exception(error, frame_id=frame_id)
+            self._answer_frame(session, waiting.frame, failed)
 
     def _hand_over(self, session: Session, waiting: WaitingFrame) -> None:
         frame = waiting.frame
+        own_slots: tuple[Slot, ...] = ()
+        places = frame.memory
+        if places is None:
+            places, own_slots = self._copied_in(frame)
+        self._outstanding = _Outstanding(
+            *(self._next_number, session, session.identity, waiting),
+            *(places, own_slots, time.monotonic()),
+        )
+        self._next_number += 1
+        bare = replace(frame, images=(), memory=None)
+        message = ("frame", self._outstanding.number, session.key, bare, places)
+        self._tell_render(message)
+
+    def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, Slot]]:
+        """Copy the images of a frame to slots of the service."""
         images = [
             image
             for view, found in zip(frame.views, frame.images, strict=True)
             for image in found.parts(view)
         ]
-        in_slot = self._slot_for([image.nbytes for image in images])
+        starts, n_in = starts_of([image.nbytes for image in images])
+        result_starts, n_out = starts_of(
+            [v.camera.pixel_count * frame.output.bytes_per_pixel for v in frame.views]
+        )
+        slot = self._slot_for(n_in)
         try:
-            out_slot = self._slot_for(
-                [
-                    v.camera.pixel_count * frame.output.bytes_per_pixel
-                    for v in frame.views
-                ]
-            )
+            result_slot = self._slot_for(n_out)
         except OutOfMemory:
-            self._slots.give_back(in_slot)
+            self._slots.give_back(slot)
             raise
-        starts = in_slot.put(images)
-        self._outstanding = _Outstanding(
-            *(self._next_number, session, session.identity, waiting),
-            *(in_slot, out_slot, time.monotonic()),
+        slot.put(images, starts)
+        places = SharedPlaces(
+            slot.number, tuple(starts), result_slot.number, tuple(result_starts)
         )
-        self._next_number += 1
-        self._tell_render(
-            (
-                *("frame", self._outstanding.number, session.key),
-                *(replace(frame, images=()), in_slot.number, starts, out_slot.number),
-            )
-        )
+        return places, (slot, result_slot)
 
-    def _slot_for(self, sizes: Sequence[int]) -> Slot:
-        slot, is_new = self._slots.take(bytes_for(sizes))
+    def _slot_for(self, size_bytes: int) -> Slot:
+        slot, is_new = self._slots.take(size_bytes)
         if is_new:
             self._send_slot(slot)
         return slot
+
+    def _give_back(self, held: _Outstanding) -> None:
+        for slot in held.own_slots:
+            self._slots.give_back(slot)
 
     def _take_answer(
         self,
         number: int,
         reply: Result | Dropped | ErrorReply,
-        starts: list[int],
         started_s: float,
         ended_s: float,
     ) -> None:
@@ -673,30 +750,34 @@ class Door:
         if held is None or held.number != number:
             return
         self._outstanding = None
-        self._slots.give_back(held.in_slot)
         self._turns.note(held.session.key, ended_s - started_s, ended_s)
-        if not isinstance(reply, Result):
-            self._slots.give_back(held.out_slot)
-            if isinstance(reply, Dropped):
-                reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
+        if isinstance(reply, Dropped):
+            reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
+        if not isinstance(reply, Result) or not held.own_slots:
+            if isinstance(reply, Result):
+                reply = _timed(replace(reply, in_memory=True), held.waiting, started_s)
+            self._give_back(held)
             self._answer_held(held, reply)
             return
+        slot, result_slot = held.own_slots
+        self._slots.give_back(slot)
+        places = zip(held.places.result_starts, reply.views, strict=True)
         colors = tuple(
-            held.out_slot.array(
+            result_slot.array(
                 start,
                 (view.height_px, view.width_px, 3),
                 np.dtype(view.color.dtype),
             )
-            for start, view in zip(starts, reply.views, strict=True)
+            for start, view in places
         )
         result = _timed(replace(reply, colors=colors), held.waiting, started_s)
         tracker = self._answer_held(held, result)
         if tracker is None:
-            self._slots.give_back(held.out_slot)
+            self._slots.give_back(result_slot)
         elif held.session.identity is None:
-            self._leaving.append((tracker, held.out_slot))
+            self._leaving.append((tracker, result_slot))
         else:
-            held.session.unsent.append((tracker, held.out_slot))
+            held.session.unsent.append((tracker, result_slot))
 
 
 def _timed(result: Result, waiting: WaitingFrame, started_s: float) -> Result:
@@ -709,3 +790,52 @@ def _timed(result: Result, waiting: WaitingFrame, started_s: float) -> Result:
     total_ms = MS_PER_S * (time.monotonic() - waiting.received_s)
     stages_ms["other_ms"] = total_ms - sum(stages_ms.values())
     return replace(result, total_ms=total_ms, stage_times_ms=stages_ms)
+
+
+def check_memory(session: Session, frame: Frame) -> None:
+    """Refuse a frame whose images do not lie in free slots of its session.
+
+    Raises
+    ------
+    BadMessage
+    """
+    places = frame.memory
+    if places is None:
+        return
+    for name, number in (("slot", places.slot), ("result_slot", places.result_slot)):
+        if number not in session.shared or number in session.lent:
+            raise BadMessage(
+                f"it is {number}",
+                field=f"memory.{name}",
+                allowed="a slot of this session that no other frame uses",
+            )
+    if places.slot == places.result_slot:
+        raise BadMessage(
+            f"it is {places.slot}, too",
+            field="memory.result_slot",
+            allowed="another than memory.slot",
+        )
+    sizes = [
+        int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        for view in frame.views
+        for _, shape, dtype in view.images
+    ]
+    _check_room(session.shared[places.slot], places.starts, sizes, "starts")
+    sizes = [v.camera.pixel_count * frame.output.bytes_per_pixel for v in frame.views]
+    slot = session.shared[places.result_slot]
+    _check_room(slot, places.result_starts, sizes, "result_starts")
+
+
+def _check_room(
+    slot: Slot, starts: Sequence[int], sizes: Sequence[int], name: str
+) -> None:
+    """Refuse images that reach beyond a slot or into each other."""
+    end = 0
+    for start, size in sorted(zip(starts, sizes, strict=True)):
+        if start < end or start + size > slot.size_bytes:
+            raise BadMessage(
+                f"{size} bytes from {start}",
+                field=f"memory.{name}",
+                allowed=f"images beside each other within {slot.size_bytes} bytes",
+            )
+        end = start + size

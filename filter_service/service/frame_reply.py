@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import time
 
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.messages import Dropped, ErrorReply, Frame, Result, ResultView
 from filter_service.wire.images import OUTPUT_OF_FORMAT
+
+MS_PER_S = 1000.0
 
 log = logging.getLogger("ocufilter")
 
@@ -18,6 +21,7 @@ def frame_reply(eye_filter: EyeFilter, frame: Frame) -> Result | Dropped | Error
 
     ``total_ms`` is for the caller to say: it knows when the frame came.
     """
+    started_s = time.monotonic()
     try:
         seen = eye_filter.try_filter(
             [
@@ -43,10 +47,13 @@ def frame_reply(eye_filter: EyeFilter, frame: Frame) -> Result | Dropped | Error
     if seen is None:
         reason = "extending" if eye_filter.is_extending else "preparing"
         return Dropped(frame.frame_id, reason)
-    return _result(frame, seen)
+    total_ms = MS_PER_S * (time.monotonic() - started_s)
+    return _result(frame, seen, total_ms)
 
 
-def _result(frame: Frame, seen: Filtered) -> Result:
+def _result(frame: Frame, seen: Filtered, total_ms: float) -> Result:
+    stages_ms = dict(seen.stage_times_ms)
+    stages_ms["filter_other_ms"] = total_ms - sum(stages_ms.values())
     return Result(
         frame_id=frame.frame_id,
         profile_id=seen.profile_id,
@@ -62,7 +69,7 @@ def _result(frame: Frame, seen: Filtered) -> Result:
         gaze_deg=seen.gaze_deg,
         overflow_count=seen.overflow_count,
         total_ms=0.0,
-        stage_times_ms=seen.stage_times_ms,
+        stage_times_ms=stages_ms,
         notes=seen.notes,
         is_complete=seen.is_complete,
         colors=seen.colors,

@@ -5,10 +5,9 @@ for the other, and each outlives the other: a new door is told which sessions th
 
 From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
 number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
-request)``, ``("frame", number, key, frame, slot, starts, out_slot)``, ``("close",
-key)``.
+request)``, ``("frame", number, key, frame, places)``, ``("close", key)``.
 To the door: ``("here", server, eyes)`` first, ``("tell", key, reply)``, ``("answer",
-number, reply, starts, started_s, ended_s)`` and ``("state", memory_mb, is_building)``.
+number, reply, started_s, ended_s)`` and ``("state", memory_mb, is_building)``.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from __future__ import annotations
 import logging
 import selectors
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -37,11 +36,12 @@ from filter_service.messages import (
     Ready,
     Reply,
     Result,
+    SharedPlaces,
 )
 from filter_service.service.frame_reply import frame_reply
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.process_info import package_version, resident_memory_mb
-from filter_service.service.slots import Slot
+from filter_service.slots import Slot
 from filter_service.wire.images import ViewImages
 
 IDLE_WAIT_S = 0.5
@@ -297,42 +297,45 @@ class RenderLoop:
     # Frames
 
     def _filter(
-        self,
-        number: int,
-        key: str,
-        frame: Frame,
-        in_slot: int,
-        starts: list[int],
-        out_slot: int,
+        self, number: int, key: str, frame: Frame, places: SharedPlaces
     ) -> None:
         started_s = time.monotonic()
         eye = self._eyes.get(key)
         reply: Reply
-        out_starts: list[int] = []
         if eye is None:
             error = NoSession("the session has ended")
             reply = ErrorReply.from_exception(error, frame_id=frame.frame_id)
         else:
-            frame = replace(frame, images=self._images(frame, in_slot, starts))
+            slot = self._slots[places.slot]
+            frame = replace(frame, images=images_in(slot, frame, places.starts))
             reply = frame_reply(eye.eye_filter, frame)
         if isinstance(reply, Result):
             colors = [np.ascontiguousarray(color) for color in reply.colors]
-            out_starts = self._slots[out_slot].put(colors)
-            reply = replace(reply, colors=())
-        ended_s = time.monotonic()
-        self._send(("answer", number, reply, out_starts, started_s, ended_s))
+            copied_s = time.monotonic()
+            self._slots[places.result_slot].put(colors, places.result_starts)
+            stages_ms = dict(reply.stage_times_ms)
+            stages_ms["copy_out_ms"] = 1e3 * (time.monotonic() - copied_s)
+            reply = replace(reply, colors=(), stage_times_ms=stages_ms)
+        self._send(("answer", number, reply, started_s, time.monotonic()))
 
-    def _images(
-        self, frame: Frame, in_slot: int, starts: list[int]
-    ) -> tuple[ViewImages, ...]:
-        """Return arrays over a slot; the frame's images lie there."""
-        slot, waiting = self._slots[in_slot], iter(starts)
-        found = []
-        for view in frame.views:
-            arrays = []
-            for _, shape, dtype in view.images:
-                array = slot.array(next(waiting), shape, np.dtype(dtype))
-                array.flags.writeable = False
-                arrays.append(array)
-            found.append(ViewImages(*arrays))
-        return tuple(found)
+
+def images_in(
+    slot: Slot, frame: Frame, starts: Sequence[int]
+) -> tuple[ViewImages, ...]:
+    """Return the images of a frame that lie in a slot.
+
+    Raises
+    ------
+    ValueError
+        They reach beyond it.
+    """
+    waiting = iter(starts)
+    found = []
+    for view in frame.views:
+        arrays = []
+        for _, shape, dtype in view.images:
+            array = slot.array(next(waiting), shape, np.dtype(dtype))
+            array.flags.writeable = False
+            arrays.append(array)
+        found.append(ViewImages(*arrays))
+    return tuple(found)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from filter_service.errors import CreditExceeded
 from filter_service.messages import Frame, ProfileRequest
 from filter_service.service.mailbox import Tracker
-from filter_service.service.slots import Slot
+from filter_service.slots import Slot
 
 KEY_BYTES = 16
 
@@ -56,6 +56,8 @@ class Session:
     waiting: WaitingFrame | None = None
     unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # large replies
     behind_since_s: float | None = None  # too many of them
+    shared: dict[int, Slot] = field(default_factory=dict)  # memory of the client
+    lent: set[int] = field(default_factory=set)  # of those, in use by frames
     away_since_s: float | None = None
     profile: ProfileRequest | None = None  # the last that was accepted
     asked_profile: ProfileRequest | None = None  # on its way
@@ -80,6 +82,16 @@ class Session:
         self.n_unanswered += 1
         superseded, self.waiting = self.waiting, waiting
         return superseded
+
+    def lend(self, frame: Frame) -> None:
+        """Note that a frame uses memory of the client."""
+        if frame.memory is not None:
+            self.lent |= {frame.memory.slot, frame.memory.result_slot}
+
+    def get_back(self, frame: Frame) -> None:
+        """Note that it does not any more."""
+        if frame.memory is not None:
+            self.lent -= {frame.memory.slot, frame.memory.result_slot}
 
     def leave(self, now_s: float) -> None:
         """Note that the client is away; what it waited for it does not wait for."""

@@ -28,6 +28,7 @@ from filter_service.wire.message import (
     Moment,
     Notes,
     Part,
+    Size,
     Text,
     Word,
     clip,
@@ -171,6 +172,7 @@ class Result(Message):
     overflow_count: Count = 0
     notes: Notes = ()
     is_complete: bool = True
+    in_memory: bool = False
     colors: Pictures = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"
@@ -181,12 +183,17 @@ class Result(Message):
         object.__setattr__(self, "notes", clip_notes(self.notes))
 
     def parts(self) -> list[Any]:
-        """Return the images of all views."""
+        """Return the images of all views; none where they lie in shared memory."""
+        if self.in_memory:
+            return []
         pairs = zip(self.colors, self.views, strict=True)
         return [as_sent(color, view.color) for color, view in pairs]
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
         """Return the result with arrays over its parts."""
+        if self.in_memory:
+            expect_parts(parts, 0)
+            return self
         expect_parts(parts, len(self.views))
         return self._with_payload(
             tuple(
@@ -199,6 +206,22 @@ class Result(Message):
                 for i, (view, part) in enumerate(zip(self.views, parts, strict=True))
             )
         )
+
+
+@dataclass(frozen=True)
+class Shared(Message):
+    """Shared memory for a client of the same user and machine, or why there is none.
+
+    ``path`` is opened and mapped like a file; the memory is the session's until it is
+    given back or the connection ends.
+    """
+
+    slot: Id | None = None
+    size_bytes: Size | None = None
+    path: Word = ""
+    reason: Text = ""
+
+    type_name: ClassVar[str] = "shared"
 
 
 @dataclass(frozen=True)

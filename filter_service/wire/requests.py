@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Self
 from msgspec import Meta
 
 from filter_service.camera import Camera
-from filter_service.checked import Record
+from filter_service.checked import Record, show
 from filter_service.errors import BadMessage
 from filter_service.settings import (
     DEFAULTS,
@@ -21,6 +21,7 @@ from filter_service.settings import (
     RenderTolerance,
     VergenceDpt,
 )
+from filter_service.slots import ALIGNMENT_BYTES
 from filter_service.wire.images import (
     SRGB8,
     ImageFormat,
@@ -36,6 +37,7 @@ from filter_service.wire.message import (
     Message,
     Moment,
     Part,
+    Size,
     Word,
     expect_parts,
 )
@@ -90,6 +92,19 @@ class FrameOptions(Record):
 
 
 @dataclass(frozen=True)
+class SharedPlaces(Record):
+    """Where a frame's images lie in shared memory, and where the result shall lie.
+
+    ``starts`` are in the order in which the parts would be, and ``result_starts`` too.
+    """
+
+    slot: Id
+    starts: Annotated[tuple[Id, ...], Meta(max_length=4 * MAX_VIEWS)]
+    result_slot: Id
+    result_starts: Annotated[tuple[Id, ...], Meta(max_length=MAX_VIEWS)]
+
+
+@dataclass(frozen=True)
 class Frame(Message):
     """One RGB-D frame of one or more views, to be seen through the session's eye."""
 
@@ -100,13 +115,16 @@ class Frame(Message):
     gaze_deg: tuple[GazeDeg, GazeDeg] | None = None
     output: ImageFormat = SRGB8
     options: FrameOptions = FrameOptions()
+    memory: SharedPlaces | None = None
     images: Images = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "frame"
     payload: ClassVar[str] = "images"
 
     def parts(self) -> list[Any]:
-        """Return the images of each view in turn."""
+        """Return the images of each view in turn; none where they lie in memory."""
+        if self.memory is not None:
+            return []
         pairs = zip(self.views, self.images, strict=True)
         return [part for view, images in pairs for part in images.parts(view)]
 
@@ -116,7 +134,20 @@ class Frame(Message):
         for i, view in enumerate(self.views):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
-        return self._with_payload(images_from_parts(self.views, parts, limits))
+        if self.memory is None:
+            return self._with_payload(images_from_parts(self.views, parts, limits))
+        expect_parts(parts, 0)
+        for name, starts, count in (
+            ("starts", self.memory.starts, sum(v.part_count for v in self.views)),
+            ("result_starts", self.memory.result_starts, len(self.views)),
+        ):
+            if len(starts) != count or any(start % ALIGNMENT_BYTES for start in starts):
+                raise BadMessage(
+                    f"they are {show(starts)}",
+                    field=f"memory.{name}",
+                    allowed=f"{count} multiples of {ALIGNMENT_BYTES}",
+                )
+        return self
 
 
 def _check_count(views: Sequence[object], limits: Limits) -> None:
@@ -126,6 +157,24 @@ def _check_count(views: Sequence[object], limits: Limits) -> None:
             field="views",
             allowed=f"a list of 1 to {limits.max_views} items",
         )
+
+
+@dataclass(frozen=True)
+class Share(Message):
+    """Asks for shared memory, for images to lie in."""
+
+    size_bytes: Size
+
+    type_name: ClassVar[str] = "share"
+
+
+@dataclass(frozen=True)
+class Unshare(Message):
+    """Gives shared memory back."""
+
+    slot: Id
+
+    type_name: ClassVar[str] = "unshare"
 
 
 @dataclass(frozen=True)

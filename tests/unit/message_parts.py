@@ -79,6 +79,8 @@ REPLIES = [
     messages.Pong(1.0, 2.0, 50.0, 1, 2, 3, False),
     messages.Alive(),
     messages.Closing(),
+    messages.Shared(7, 4096, "/proc/1/fd/9"),
+    messages.Shared(reason="there is none"),
 ]
 
 

@@ -29,6 +29,8 @@ MAY_IMPORT = {
         "filter_service.messages",
         "filter_service.errors",
         "filter_service.progress",  # of long programs
+        "filter_service.slots",  # memory shared with the service
+        "filter_service.settings",
         *FACE,
     ),
 }

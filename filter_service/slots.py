@@ -16,12 +16,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.building.shared_buffers import starts_of
 from filter_service.errors import OutOfMemory
 
 PAGE_BYTES = mmap.PAGESIZE
 KEPT_RATIO = 4
 """A slot is not used for what fills less than a quarter of it."""
+
+
+ALIGNMENT_BYTES = 64
+"""Of each image in a slot."""
+
+
+def starts_of(sizes: Sequence[int]) -> tuple[list[int], int]:
+    """Return where each image starts, and the size of all."""
+    starts, end = [], 0
+    for size in sizes:
+        starts.append(end)
+        end += -(-size // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
+    return starts, end
 
 
 class Slot:
@@ -69,6 +81,11 @@ class Slot:
                 f"{error.strerror}"
             ) from None
 
+    @property
+    def path(self) -> str:
+        """Return where another process of the same user finds the file (Linux)."""
+        return f"/proc/{os.getpid()}/fd/{self.descriptor}"
+
     @classmethod
     def received(cls, number: int, size_bytes: int, descriptor: int) -> Slot:
         """Return a slot that another process has made.
@@ -107,23 +124,18 @@ class Slot:
         part = self.part(start, size_bytes)
         return np.frombuffer(part, dtype=dtype).reshape(shape)
 
-    def put(self, images: Sequence[NDArray[Any]]) -> list[int]:
-        """Copy images in, one after the other; return where each starts."""
-        starts, _ = starts_of([image.nbytes for image in images])
+    def put(self, images: Sequence[NDArray[Any]], starts: Sequence[int]) -> None:
+        """Copy images to their places."""
         for start, image in zip(starts, images, strict=True):
-            np.copyto(self.array(start, image.shape, image.dtype), image)
-        return starts
+            place = self.array(start, image.shape, image.dtype)
+            if place.ctypes.data != image.ctypes.data:  # else it lies there
+                np.copyto(place, image)
 
     def close(self) -> None:
         """Give up the file; the memory goes when nobody has a part of it any more."""
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1
-
-
-def bytes_for(sizes: Sequence[int]) -> int:
-    """Return the size of a slot for images of so many bytes."""
-    return starts_of(sizes)[1]
 
 
 class SlotPool:
@@ -162,6 +174,15 @@ class SlotPool:
             slot = min(fitting, key=lambda found: found.size_bytes)
             self._free.remove(slot)
             return slot, False
+        return self.create(size_bytes), True
+
+    def create(self, size_bytes: int) -> Slot:
+        """Return a slot that nobody had before.
+
+        Raises
+        ------
+        OutOfMemory
+        """
         if self.held_bytes + size_bytes > self.max_bytes:
             raise OutOfMemory(
                 f"{size_bytes / 1e6:.0f} MB more than the {self.held_bytes / 1e6:.0f} "
@@ -171,18 +192,22 @@ class SlotPool:
         slot = Slot.create(self._next_number, size_bytes)
         self._slots[slot.number] = slot
         self._next_number += 1
-        return slot, True
+        return slot
 
     def give_back(self, slot: Slot) -> None:
         """Take a slot back."""
         self._free.append(slot)
 
+    def drop(self, slot: Slot) -> None:
+        """Give up a slot for good."""
+        del self._slots[slot.number]
+        slot.close()
+
     def trim(self) -> list[Slot]:
         """Give up and return all slots that are free."""
         dropped, self._free = self._free, []
         for slot in dropped:
-            del self._slots[slot.number]
-            slot.close()
+            self.drop(slot)
         return dropped
 
     def __iter__(self) -> Iterator[Slot]:

@@ -1,0 +1,130 @@
+"""Images in memory that the service shares with its clients on the same machine.
+
+A client asks for slots as it needs them; until they come, and where they cannot be had,
+its images travel as parts of messages.  What the service puts into a slot is handed out
+as it lies there: the slot is free again when nobody has the array any more.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.messages import Share, Shared, Unshare
+from filter_service.slots import PAGE_BYTES, Slot, starts_of
+
+KEPT_RATIO = 4
+MAX_SLOTS = 12
+MAX_ASKED = 2
+
+log = logging.getLogger("ocufilter")
+
+
+@dataclass(eq=False)
+class ClientSlot:
+    """A slot, and how many users it has: frames on their way, arrays handed out."""
+
+    slot: Slot
+    n_users: int = 0
+
+    def release(self) -> None:
+        """Note that it has one user less."""
+        self.n_users -= 1
+
+
+class SharedMemory:
+    """The slots of one session.
+
+    Parameters
+    ----------
+    say : callable
+        Sends a message to the service.
+    """
+
+    def __init__(self, say: Callable[[Share | Unshare], None]) -> None:
+        self._say = say
+        self._slots: list[ClientSlot] = []
+        self._n_asked = 0
+        self.is_offered = False
+
+    def begin(self, *, is_offered: bool) -> None:
+        """Forget the slots of an earlier connection; arrays in them stay valid."""
+        for held in self._slots:
+            held.slot.close()
+        self._slots, self._n_asked = [], 0
+        self.is_offered = is_offered
+
+    def take_in(self, reply: Shared) -> None:
+        """Map a slot that the service gives."""
+        self._n_asked -= 1
+        if reply.slot is None or reply.size_bytes is None:
+            log.info("no shared memory: %s", reply.reason)
+            self.is_offered = False
+            return
+        try:
+            descriptor = os.open(reply.path, os.O_RDWR | os.O_CLOEXEC)
+            slot = Slot.received(reply.slot, reply.size_bytes, descriptor)
+        except (OSError, ValueError) as error:  # another machine, user or container
+            log.info("no shared memory: %s", error)
+            self.is_offered = False
+            return
+        self._slots.append(ClientSlot(slot))
+
+    def take(self, size_bytes: int) -> ClientSlot | None:
+        """Return a free slot with so much room; ask for one where there is none."""
+        if not self.is_offered:
+            return None
+        most = KEPT_RATIO * max(size_bytes, PAGE_BYTES)
+        fitting = [
+            held
+            for held in self._slots
+            if not held.n_users and size_bytes <= held.slot.size_bytes <= most
+        ]
+        if fitting:
+            smallest = min(fitting, key=lambda held: held.slot.size_bytes)
+            smallest.n_users = 1
+            return smallest
+        if len(self._slots) >= MAX_SLOTS:
+            self._drop_one()
+        if self._n_asked < MAX_ASKED and len(self._slots) < MAX_SLOTS:
+            self._n_asked += 1
+            self._say(Share(size_bytes))
+        return None
+
+    def holding(self, images: Sequence[NDArray[Any]]) -> ClientSlot | None:
+        """Return the slot in which images lie where `places` would put them."""
+        starts, _ = starts_of([image.nbytes for image in images])
+        for held in self._slots:
+            base = held.slot.array(0, (1,), np.dtype(np.uint8)).ctypes.data
+            if all(
+                image.ctypes.data == base + start and image.flags.c_contiguous
+                for image, start in zip(images, starts, strict=True)
+            ):
+                return held
+        return None
+
+    def array(
+        self, held: ClientSlot, start: int, shape: tuple[int, ...], dtype: Any
+    ) -> NDArray[Any]:
+        """Return an array in a slot, which is a user as long as somebody has it."""
+        array = held.slot.array(start, shape, np.dtype(dtype))
+        held.n_users += 1
+        # What views of the array hold on to is its base.
+        weakref.finalize(array.base, held.release)
+        return array
+
+    def _drop_one(self) -> None:
+        """Give the largest free slot back: images have another size now."""
+        free = [held for held in self._slots if not held.n_users]
+        if free:
+            largest = max(free, key=lambda held: held.slot.size_bytes)
+            self._slots.remove(largest)
+            self._say(Unshare(largest.slot.number))
+            largest.slot.close()
