@@ -6,7 +6,10 @@ child           what those processes have in common
 door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
+guests          all sessions, with a client or without
 session         one client: its waiting frame, its credit, its profile
+places          whether a frame's images lie where they may
+render_end      the door's end of what follows
 turns           whose frame is next
 render_process  the process that filters
 render_loop     its loop: one filter for each session

@@ -1,0 +1,72 @@
+"""The sessions of the service: those with a client, and those whose client is away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from filter_service.service.session import Session
+
+
+class Guests:
+    """Sessions by the routing id of their client, and by key while it is away."""
+
+    def __init__(self) -> None:
+        self._present: dict[bytes, Session] = {}
+        self._away: dict[str, Session] = {}
+        self._next_id = 1
+
+    def __len__(self) -> int:
+        """Return the number of sessions, with a client or without."""
+        return len(self._present) + len(self._away)
+
+    def __iter__(self) -> Iterator[Session]:
+        """Go through all sessions."""
+        return iter([*self._present.values(), *self._away.values()])
+
+    @property
+    def present(self) -> list[Session]:
+        """Return the sessions that have a client."""
+        return list(self._present.values())
+
+    @property
+    def away(self) -> list[Session]:
+        """Return the sessions that have none, longest away first."""
+        return sorted(self._away.values(), key=lambda s: s.away_since_s or 0.0)
+
+    def at(self, identity: bytes) -> Session | None:
+        """Return the session of a client."""
+        return self._present.get(identity)
+
+    def by_key(self, key: str) -> Session | None:
+        """Return the session with a key."""
+        return next((session for session in self if session.key == key), None)
+
+    def begin(self, identity: bytes, client: str, credit: int) -> Session:
+        """Return a new session."""
+        session = Session(self._next_id, identity, client, credit)
+        self._next_id += 1
+        self._present[identity] = session
+        return session
+
+    def remember(self, session: Session) -> None:
+        """Take in a session that was there before this process; its client is away."""
+        self._away[session.key] = session
+        self._next_id = max(self._next_id, session.session_id + 1)
+
+    def come_back(self, session: Session, identity: bytes, client: str) -> None:
+        """Give a session to a client that knows its key."""
+        self.remove(session)
+        session.come_back(identity, client)
+        self._present[identity] = session
+
+    def leave(self, session: Session, now_s: float) -> None:
+        """Keep a session whose client is gone."""
+        self.remove(session)
+        session.leave(now_s)
+        self._away[session.key] = session
+
+    def remove(self, session: Session) -> None:
+        """Forget a session."""
+        if session.identity is not None:
+            self._present.pop(session.identity, None)
+        self._away.pop(session.key, None)

@@ -1,0 +1,66 @@
+"""Whether a frame's images lie where they may, in memory that a client shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from filter_service.errors import BadMessage
+from filter_service.messages import Frame
+from filter_service.service.session import Session
+from filter_service.slots import Slot
+
+
+def check_places(session: Session, frame: Frame) -> None:
+    """Refuse a frame whose images do not lie in free slots of its session.
+
+    Raises
+    ------
+    BadMessage
+    """
+    places = frame.memory
+    if places is None:
+        return
+    for name, number in (("slot", places.slot), ("result_slot", places.result_slot)):
+        if number not in session.shared or number in session.lent:
+            raise BadMessage(
+                f"it is {number}",
+                field=f"memory.{name}",
+                allowed="a slot of this session that no other frame uses",
+            )
+    if places.slot == places.result_slot:
+        raise BadMessage(
+            f"it is {places.slot}, too",
+            field="memory.result_slot",
+            allowed="another than memory.slot",
+        )
+    sizes = [
+        int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        for view in frame.views
+        for _, shape, dtype in view.images
+    ]
+    _check_room(session.shared[places.slot], places.starts, sizes, "starts")
+    slot, sizes = session.shared[places.result_slot], result_sizes(frame)
+    _check_room(slot, places.result_starts, sizes, "result_starts")
+
+
+def result_sizes(frame: Frame) -> list[int]:
+    """Return the bytes of each view's picture."""
+    bytes_per_pixel = frame.output.bytes_per_pixel
+    return [view.camera.pixel_count * bytes_per_pixel for view in frame.views]
+
+
+def _check_room(
+    slot: Slot, starts: Sequence[int], sizes: Sequence[int], name: str
+) -> None:
+    """Refuse images that reach beyond a slot or into each other."""
+    end = 0
+    for start, size in sorted(zip(starts, sizes, strict=True)):
+        if start < end or start + size > slot.size_bytes:
+            raise BadMessage(
+                f"{size} bytes from {start}",
+                field=f"memory.{name}",
+                allowed=f"images beside each other within {slot.size_bytes} bytes",
+            )
+        end = start + size

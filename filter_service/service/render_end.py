@@ -1,0 +1,254 @@
+"""The door's end of the render loop: a link that may break, memory, one frame.
+
+What the loop has to say comes from `receive`; whatever is sent while there is no loop
+is lost, and the door says it again to the next one.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.errors import OutOfMemory
+from filter_service.messages import Frame, Result, SharedPlaces
+from filter_service.service.link import Link, LinkClosed
+from filter_service.service.mailbox import Tracker
+from filter_service.service.places import result_sizes
+from filter_service.service.session import Session, WaitingFrame
+from filter_service.slots import Slot, SlotPool, starts_of
+
+MS_PER_S = 1000.0
+
+Unsent = list[tuple[Tracker, Slot]]
+
+
+@dataclass(frozen=True)
+class Held:
+    """The frame that the render loop has."""
+
+    number: int
+    session: Session
+    identity: bytes | None
+    waiting: WaitingFrame
+    places: SharedPlaces
+    own_slots: tuple[Slot, ...]  # not the client's: what is sent, and is given back
+
+
+class RenderEnd:
+    """Where frames, profiles and memory are handed over.
+
+    Parameters
+    ----------
+    max_image_bytes : int
+        Of all slots.
+
+    Attributes
+    ----------
+    held : Held or None
+        The frame that is being filtered.
+    """
+
+    def __init__(self, max_image_bytes: int) -> None:
+        self.held: Held | None = None
+        self._link: Link | None = None
+        self._slots = SlotPool(max_image_bytes)
+        self._next_number = 1
+        self._heard_s = time.monotonic()
+
+    # The link
+
+    @property
+    def is_up(self) -> bool:
+        """Return whether there is a render loop."""
+        return self._link is not None
+
+    @property
+    def silent_s(self) -> float:
+        """Return since when the loop has given no sign of life."""
+        return time.monotonic() - self._heard_s
+
+    def excuse(self) -> None:
+        """Count the silence anew: what was to be done about it is being done."""
+        self._heard_s = time.monotonic()
+
+    def descriptors(self) -> tuple[set[int], set[int]]:
+        """Return what to poll for reading, and for writing."""
+        if self._link is None:
+            return set(), set()
+        found = {self._link.fileno()}
+        return found, found if self._link.has_unsent else set()
+
+    def join(self, link: Link) -> None:
+        """Work with a new render loop, which is told of all memory."""
+        self._link = link
+        self.excuse()
+        for slot in self._slots:
+            self._send_slot(slot)
+
+    def receive(self) -> list[tuple[Any, ...]]:
+        """Return what the loop says.
+
+        Raises
+        ------
+        LinkClosed
+            It is gone; `lose` is to be called.
+        """
+        if self._link is None:
+            return []
+        self._link.flush()
+        messages = [message for message, _ in self._link.receive()]
+        if messages:
+            self.excuse()
+        return messages
+
+    def lose(self) -> Held | None:
+        """Give up the link; return the frame that is lost with it."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+        lost, self.held = self.held, None
+        if lost is not None:
+            self.give_back(*lost.own_slots)
+        return lost
+
+    def tell(self, *message: Any) -> None:
+        """Send a message; one that does not arrive is found out by `receive`."""
+        if self._link is not None:
+            try:
+                self._link.send(message)
+            except LinkClosed:
+                pass
+
+    # Memory
+
+    def share(self, size_bytes: int) -> Slot:
+        """Return memory that no other client has had.
+
+        Raises
+        ------
+        OutOfMemory
+        """
+        slot = self._slots.create(size_bytes)
+        self._send_slot(slot)
+        return slot
+
+    def drop(self, slot: Slot) -> None:
+        """Give up memory for good."""
+        self._slots.drop(slot)
+        self.tell("drop_slot", slot.number)
+
+    def give_back(self, *slots: Slot) -> None:
+        """Take memory back, for other frames."""
+        for slot in slots:
+            self._slots.give_back(slot)
+
+    def trim(self) -> None:
+        """Give up the memory that is free."""
+        for slot in self._slots.trim():
+            self.tell("drop_slot", slot.number)
+
+    def still_unsent(self, unsent: Unsent) -> Unsent:
+        """Return those of which libzmq still reads; the slots of others are free."""
+        left = []
+        for tracker, slot in unsent:
+            if tracker.done:
+                self.give_back(slot)
+            else:
+                left.append((tracker, slot))
+        return left
+
+    def _slot_for(self, size_bytes: int) -> Slot:
+        slot, is_new = self._slots.take(size_bytes)
+        if is_new:
+            self._send_slot(slot)
+        return slot
+
+    def _send_slot(self, slot: Slot) -> None:
+        if self._link is not None:
+            try:
+                message = ("slot", slot.number, slot.size_bytes)
+                self._link.send(message, [slot.descriptor])
+            except LinkClosed:
+                pass
+
+    # Frames
+
+    def hand_over(self, session: Session, waiting: WaitingFrame) -> None:
+        """Have a frame filtered.
+
+        Raises
+        ------
+        OutOfMemory
+        """
+        frame = waiting.frame
+        places = frame.memory
+        own_slots: tuple[Slot, ...] = ()
+        if places is None:
+            places, own_slots = self._copied_in(frame)
+        number, self._next_number = self._next_number, self._next_number + 1
+        self.held = Held(number, session, session.identity, waiting, places, own_slots)
+        bare = replace(frame, images=(), memory=None)
+        self.excuse()
+        self.tell("frame", number, session.key, bare, places)
+
+    def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
+        """Copy the images of a frame to slots of the service."""
+        images = [
+            image
+            for view, found in zip(frame.views, frame.images, strict=True)
+            for image in found.parts(view)
+        ]
+        starts, n_in = starts_of([image.nbytes for image in images])
+        result_starts, n_out = starts_of(result_sizes(frame))
+        slot = self._slot_for(n_in)
+        try:
+            result_slot = self._slot_for(n_out)
+        except OutOfMemory:
+            self.give_back(slot)
+            raise
+        slot.put(images, starts)
+        places = SharedPlaces(
+            slot.number, tuple(starts), result_slot.number, tuple(result_starts)
+        )
+        return places, (slot, result_slot)
+
+    def take_back(self, number: int) -> Held | None:
+        """Return the frame that an answer is to, if it is the one that is awaited."""
+        held = self.held
+        if held is None or held.number != number:
+            return None
+        self.held = None
+        return held
+
+
+def completed(result: Result, held: Held, started_s: float) -> Result:
+    """Return a result with its pictures and with the times that the door knows."""
+    if held.own_slots:
+        _, slot = held.own_slots
+        result = replace(result, colors=_pictures(result, slot, held.places))
+    else:
+        result = replace(result, in_memory=True)
+    waiting = held.waiting
+    stages_ms = {
+        "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
+        "queue_ms": MS_PER_S * (started_s - waiting.decoded_s),
+        **result.stage_times_ms,
+    }
+    total_ms = MS_PER_S * (time.monotonic() - waiting.received_s)
+    stages_ms["other_ms"] = total_ms - sum(stages_ms.values())
+    return replace(result, total_ms=total_ms, stage_times_ms=stages_ms)
+
+
+def _pictures(
+    result: Result, slot: Slot, places: SharedPlaces
+) -> tuple[NDArray[Any], ...]:
+    return tuple(
+        slot.array(
+            start, (view.height_px, view.width_px, 3), np.dtype(view.color.dtype)
+        )
+        for start, view in zip(places.result_starts, result.views, strict=True)
+    )
