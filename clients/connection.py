@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zmq.utils.monitor import recv_monitor_message
 
 from filter_service.errors import ServiceTimeout
+from filter_service.keys import ClientKey
 
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 MAX_BUFFERS_PER_SIZE = 8
@@ -110,10 +111,13 @@ class Connection:
     ----------
     endpoint : str
         As in ``tcp://127.0.0.1:5577`` or ``ipc:///run/user/1000/ocufilter``.
+    key : ClientKey, optional
+        For a service that wants one.
     """
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, key: ClientKey | None = None) -> None:
         self.endpoint = endpoint
+        self.has_failed_handshake = False
         self.is_up = False
         self.state = "not connected yet"
         self.n_connections = 0
@@ -121,6 +125,10 @@ class Connection:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._set_options()
+        if key is not None:
+            self._socket.curve_serverkey = key.server.encode()
+            self._socket.curve_publickey = key.pair.public.encode()
+            self._socket.curve_secretkey = key.pair.secret.encode()
         self._monitor = self._socket.get_monitor_socket(_UP | _DOWN | _HANDSHAKE_FAILED)
         self._monitor.linger = 0
         self._poller = zmq.Poller()
@@ -160,12 +168,14 @@ class Connection:
             kind = event["event"]
             if kind & _UP:
                 self.is_up, self.state = True, "connected"
+                self.has_failed_handshake = False
                 self.n_connections += 1
                 changes.append(True)
             elif kind & _DOWN:
                 self.is_up, self.state = False, "connection lost, trying again"
                 changes.append(False)
             else:
+                self.has_failed_handshake = True
                 self.state = f"the service refused the handshake ({event['value']})"
         return changes
 

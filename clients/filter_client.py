@@ -18,6 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -28,6 +29,7 @@ from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
 from clients.shared_memory import ClientSlot
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
 from filter_service.errors import FilterError, ServiceTimeout
+from filter_service.keys import load_client_key
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
     FORMATS,
@@ -93,6 +95,13 @@ class FilterClient:
         Appears in the service's log.
     shared_memory : bool
         Let images lie in memory that both sides share, where both can.
+    key_file : Path or str, optional
+        What ``ocufilter keys add`` has written, for a service that wants keys.
+
+    Raises
+    ------
+    ValueError
+        An endpoint or a key file that is none.
     """
 
     def __init__(
@@ -103,6 +112,7 @@ class FilterClient:
         max_in_flight: int = 1,
         client_name: str = "filter_client",
         shared_memory: bool = True,
+        key_file: Path | str | None = None,
     ) -> None:
         if not timeout_s > 0:
             raise ValueError(f"timeout_s is {timeout_s}; allowed: above 0")
@@ -110,7 +120,11 @@ class FilterClient:
             raise ValueError(f"max_in_flight is {max_in_flight}; allowed: 1 or more")
         self.timeout_s = timeout_s
         self._open_link: ServiceLink | None = ServiceLink(
-            endpoint, max_in_flight, client_name, shared_memory=shared_memory
+            endpoint,
+            max_in_flight,
+            client_name,
+            shared_memory=shared_memory,
+            key=None if key_file is None else load_client_key(key_file),
         )
         self._pool = SendBufferPool(timeout_s)
         self._camera: Camera | None = None
@@ -135,7 +149,7 @@ class FilterClient:
 
         Raises
         ------
-        ServiceTimeout, TooManySessions, VersionMismatch
+        ServiceTimeout, TooManySessions, VersionMismatch, AuthenticationFailed
         """
         limit_s = self.timeout_s if timeout_s is None else timeout_s
         return self._link.wait_until(

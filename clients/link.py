@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from clients.connection import Connection, SendBuffer
 from clients.shared_memory import ClientSlot, SharedMemory
-from filter_service.errors import FilterError, NoSession, ServiceTimeout
+from filter_service.errors import (
+    AuthenticationFailed,
+    FilterError,
+    NoSession,
+    NotAllowed,
+    ServiceTimeout,
+)
+from filter_service.keys import ClientKey
 from filter_service.messages import (
     Accepted,
     Alive,
@@ -104,6 +111,7 @@ class ServiceLink:
         Sent with hello.
     shared_memory : bool
         Take it where it is offered.
+    key : ClientKey, optional
     """
 
     def __init__(
@@ -113,6 +121,7 @@ class ServiceLink:
         client_name: str,
         *,
         shared_memory: bool = True,
+        key: ClientKey | None = None,
     ) -> None:
         self.welcome: Welcome | None = None
         self.profile: ProfileRequest | None = None
@@ -122,7 +131,7 @@ class ServiceLink:
         self.n_superseded = 0
         self._max_in_flight = max_in_flight
         self._client_name = client_name
-        self._connection = Connection(endpoint)
+        self._connection = Connection(endpoint, key)
         self._session_key = ""
         self._wants_memory = shared_memory
         self.memory = SharedMemory(lambda message: self.say(encode(message)))
@@ -184,6 +193,12 @@ class ServiceLink:
                 f"`ocufilter serve --bind {self._connection.endpoint}` starts it"
             )
         self.pump(min(remaining_s, 0.5))
+        if self._connection.has_failed_handshake:
+            raise AuthenticationFailed(
+                f"{self._connection.endpoint} and this client do not know each other's "
+                "keys: it wants the key file of a client that its owner has added "
+                "(`ocufilter keys add NAME`), and no other"
+            )
         if self._refusal is not None:
             refusal, self._refusal = self._refusal, None
             raise refusal
@@ -316,6 +331,9 @@ class ServiceLink:
     def _handle_error(self, reply: ErrorReply) -> None:
         if reply.code == NoSession.code:
             self._restart_session(reply)
+            return
+        if reply.code == NotAllowed.code:
+            self._refusal = reply.exception()
             return
         if reply.frame_id is not None:
             outgoing = self.in_flight.pop(reply.frame_id, None)

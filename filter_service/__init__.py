@@ -9,6 +9,7 @@ Importing this loads nothing but names: clients stay light.
     messages         the wire protocol's types (PROTOCOL.md)
     protocol_schema  their headers as JSON Schema
     errors           the exceptions
+    keys             who may connect from other machines
     slots            memory that processes share
     checked          values against annotated types
     progress         how far long work is, said on stderr

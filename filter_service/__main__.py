@@ -11,10 +11,12 @@ from filter_service.commands.doctor import doctor
 from filter_service.commands.estimate import estimate
 from filter_service.commands.field import field
 from filter_service.commands.filter_image import filter_image
+from filter_service.commands.keys import keys
 from filter_service.commands.prepare import prepare
 from filter_service.commands.programs import bench, demo
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
+from filter_service.commands.status import status
 from filter_service.commands.wavefront import wavefront
 
 EXIT_FAILURE = 1
@@ -33,6 +35,8 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(serve)
+app.command()(status)
+app.add_typer(keys, name="keys")
 app.command(name="filter")(filter_image)
 app.command()(estimate)
 app.command()(wavefront)

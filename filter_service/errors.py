@@ -10,6 +10,7 @@
     ├── SessionError             the message is fine, this session cannot do it
     │   ├── NoSession            anything before hello, or after the service restarted
     │   ├── TooManySessions      the service serves as many clients as it may
+    │   ├── NotAllowed           the client's key is not on the service's list
     │   ├── NoProfile            a frame before any profile
     │   ├── UnknownProfile       the profile's body is wrong or incomplete
     │   ├── GridTooLarge         the profile needs more PSFs than the service allows
@@ -24,6 +25,7 @@
     │   └── RenderFailed         anything else that went wrong while filtering
     └── TransportError           raised by the client library only
         ├── ServiceTimeout       an answer did not come in time
+        ├── AuthenticationFailed service and client do not know each other's keys
         └── ConnectionLost       the connection broke while an answer was awaited
 
 Each class has a ``code``, the word that travels in an ``error`` message; the client
@@ -111,6 +113,12 @@ class TooManySessions(SessionError):
     code = "too_many_sessions"
 
 
+class NotAllowed(SessionError):
+    """The client's key is not on the service's list."""
+
+    code = "not_allowed"
+
+
 class NoProfile(SessionError):
     """A frame came before any profile."""
 
@@ -193,6 +201,12 @@ class ServiceTimeout(TransportError):
     """An answer of the service did not come in time."""
 
     code = "service_timeout"
+
+
+class AuthenticationFailed(TransportError):
+    """The service and the client do not know each other's keys."""
+
+    code = "authentication_failed"
 
 
 class ConnectionLost(TransportError):

@@ -5,6 +5,8 @@ setting_options  options made from `FilterSettings`
 display_file     a display's measured spectra
 programs         demo and bench: programs of the clients and the checkout
 serve            the service
+status           what a running one says of itself
+keys             who may connect to it
 prepare          loops compiled ahead
 filter_image     one picture
 image_files      pictures and depth in files

@@ -6,6 +6,8 @@ child           what those processes have in common
 door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
+gate            who may connect to it
+asking          a question to a running service
 guests          all sessions, with a client or without
 session         one client: its waiting frame, its credit, its profile
 places          whether a frame's images lie where they may

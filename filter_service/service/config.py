@@ -26,9 +26,10 @@ class ServiceConfig:
     bind : str
         Where to listen: ``tcp://127.0.0.1:5577``, port ``*`` for any free one, or
         ``ipc://`` and a path.
-    allow_remote : bool
-        Listen on other interfaces than loopback.  Nothing is encrypted and anybody
-        who reaches the port can use up the memory: only behind a tunnel.
+    keys_dir : str
+        Folder of keys, as ``ocufilter keys`` makes it: only clients whose keys are in
+        it are let in, and what travels is encrypted.  Needed for any other interface
+        than loopback; with it no memory is shared.
     credit : int
         Unanswered frames a client may have.
     max_sessions : int
@@ -81,7 +82,7 @@ class ServiceConfig:
     """
 
     bind: str = DEFAULT_ENDPOINT
-    allow_remote: bool = False
+    keys_dir: str = ""
     credit: int = 2
     max_sessions: int = 8
     max_width_px: int = 4096
@@ -110,7 +111,7 @@ class ServiceConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot work, naming the setting."""
-        _check_bind(self.bind, self.allow_remote)
+        _check_bind(self.bind, has_keys=bool(self.keys_dir))
         for name, allowed in (("engine", ENGINES), ("psf_engine", PSF_ENGINES)):
             if getattr(self, name) not in allowed:
                 raise ValueError(
@@ -174,7 +175,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 
-def _check_bind(bind: object, allow_remote: bool) -> None:
+def _check_bind(bind: object, *, has_keys: bool) -> None:
     if not isinstance(bind, str) or "://" not in bind:
         raise ValueError(
             f"bind is {bind!r}; allowed: tcp://127.0.0.1:PORT or ipc://PATH"
@@ -190,12 +191,13 @@ def _check_bind(bind: object, allow_remote: bool) -> None:
         raise ValueError(
             f"bind is {bind!r}; allowed: tcp://HOST:PORT, PORT 0 to 65535 or *"
         )
-    if host not in LOOPBACK_HOSTS and not allow_remote:
+    if host not in LOOPBACK_HOSTS and not has_keys:
         raise ValueError(
-            f"bind is {bind!r}, which other machines can reach: nothing is encrypted "
-            "or authenticated, and whoever connects can use up this machine's memory. "
+            f"bind is {bind!r}, which other machines can reach: whoever connects would "
+            "read and use what is not his, and could use up this machine's memory. "
             "Listen on tcp://127.0.0.1:PORT and let clients come through an SSH "
-            "tunnel, or set allow_remote = true in the configuration file"
+            "tunnel, or make keys (`ocufilter keys add NAME`) and set keys_dir in the "
+            "configuration file"
         )
 
 

@@ -20,10 +20,12 @@ from filter_service.errors import (
     BuildCancelled,
     FilterError,
     NoSession,
+    NotAllowed,
     OutOfMemory,
     RenderFailed,
     TooManySessions,
 )
+from filter_service.keys import KeyRing
 from filter_service.messages import (
     Accepted,
     Alive,
@@ -50,7 +52,7 @@ from filter_service.messages import (
 from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
-from filter_service.service.mailbox import Mailbox, Outcome, Tracker
+from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
 from filter_service.service.places import check_places
 from filter_service.service.process_info import resident_memory_mb
 from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
@@ -107,6 +109,7 @@ class Door:
             config.bind,
             config.max_message_part_bytes,
             1 + MAX_PARTS_PER_VIEW * self._limits.max_views,
+            keys=KeyRing(config.keys_dir) if config.keys_dir else None,
         )
         self.endpoint = self._mailbox.endpoint
 
@@ -258,7 +261,11 @@ class Door:
         """
         superseded: list[tuple[Session, Frame]] = []
         for _ in range(MAX_MESSAGES_PER_TURN):
-            received = self._mailbox.receive()
+            try:
+                received = self._mailbox.receive()
+            except Refused as refused:
+                self._turn_out(refused)
+                continue
             if received is None:
                 break
             try:
@@ -321,6 +328,13 @@ class Door:
         elif isinstance(request, Unshare):
             self._unshare(self._session_at(identity), request)
 
+    def _turn_out(self, refused: Refused) -> None:
+        """End the session of a client whose key was taken from the list."""
+        log.warning("a client's key is not allowed any more")
+        self._end_session(refused.identity)
+        error = NotAllowed(str(refused))
+        self._send(refused.identity, ErrorReply.from_exception(error))
+
     def _session_at(self, identity: bytes) -> Session:
         session = self._guests.at(identity)
         if session is None:
@@ -337,6 +351,7 @@ class Door:
             n_rendered=self._n_rendered,
             n_dropped=self._n_dropped,
             is_building=self._is_building or asked,
+            is_ready=self._render.is_up and self._server is not None,
             is_filtering=self._render.held is not None,
             render_silent_s=self._render.silent_s,
         )
@@ -455,7 +470,7 @@ class Door:
         is_local = self.endpoint.startswith("ipc://") or any(
             self.endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
         )
-        return self.config.shared_memory and is_local
+        return self.config.shared_memory and is_local and not self.config.keys_dir
 
     def _share(self, session: Session, request: Share) -> Shared:
         """Give a client memory for its images, or say why not."""

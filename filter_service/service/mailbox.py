@@ -12,6 +12,9 @@ from typing import Any
 
 import zmq
 
+from filter_service.keys import KeyRing
+from filter_service.service.gate import Gate
+
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 # With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
 SEND_HIGH_WATER_MARK = 128
@@ -52,6 +55,14 @@ class Outcome(enum.Enum):
     STALLED = "stalled"  # the client does not read
 
 
+class Refused(Exception):
+    """A message of somebody who is not allowed in any more; the identity is its."""
+
+    def __init__(self, identity: bytes) -> None:
+        super().__init__("the key is not allowed any more")
+        self.identity = identity
+
+
 class Mailbox:
     """A bound ROUTER socket that never blocks and never drops silently.
 
@@ -63,11 +74,21 @@ class Mailbox:
         A client that sends a larger part is cut off.
     max_parts : int
         Of one message, after the identity; more are thrown away unread.
+    keys : KeyRing, optional
+        Only its clients are let in, and what travels is encrypted.
     """
 
-    def __init__(self, bind: str, max_part_bytes: int, max_parts: int) -> None:
+    def __init__(
+        self,
+        bind: str,
+        max_part_bytes: int,
+        max_parts: int,
+        *,
+        keys: KeyRing | None = None,
+    ) -> None:
         self._max_parts = max_parts
         self._context = zmq.Context()
+        self._gate = None if keys is None else Gate(self._context, keys)
         self._socket = self._context.socket(zmq.ROUTER)
         socket = self._socket
         socket.linger = 0
@@ -85,9 +106,11 @@ class Mailbox:
         if bind.startswith("tcp://["):
             socket.ipv6 = 1
         try:
+            if self._gate is not None:
+                self._gate.guard(socket)
             _check_path_is_free(bind)
             socket.bind(bind)
-        except (zmq.ZMQError, OSError) as error:
+        except (zmq.ZMQError, OSError, ValueError) as error:
             self.close()
             raise OSError(f"cannot listen on {bind}: {error}") from None
         self.endpoint = socket.get_string(zmq.LAST_ENDPOINT)
@@ -95,6 +118,8 @@ class Mailbox:
             Path(self.endpoint.removeprefix("ipc://")).chmod(0o600)
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
+        if self._gate is not None:
+            self._poller.register(self._gate.socket, zmq.POLLIN)
         self._watched: set[int] = set()
 
     def watch(self, readable: set[int], writable: set[int]) -> None:
@@ -110,27 +135,42 @@ class Mailbox:
     def wait(self, timeout_s: float) -> None:
         """Return when there is something to read, or in time."""
         self._poller.poll(max(0, round(1000 * timeout_s)))
+        if self._gate is not None:
+            self._gate.answer()
 
     def receive(self) -> tuple[bytes, list[memoryview], int] | None:
         """Return (identity, parts, number left out) of one message, or None.
 
         Nothing is copied.  The whole message is taken off the socket whatever its
         number of parts: what is left of it would be read as the next one.
+
+        Raises
+        ------
+        Refused
+            The sender's key is not allowed any more.
         """
         try:
             frame = self._socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
         identity, left_out = frame.bytes, 0
+        is_allowed = self._gate is None
         parts: list[memoryview] = []
         while frame.more:
             if len(parts) < self._max_parts:
                 frame = self._socket.recv(copy=False)
                 parts.append(frame.buffer)
+                is_allowed = is_allowed or self._is_allowed(frame)
                 continue
             left_out += self._skip()
             break
+        if not is_allowed:
+            raise Refused(identity)
         return identity, parts, left_out
+
+    def _is_allowed(self, frame: zmq.Frame) -> bool:
+        """Return whether the key that a part came with is still allowed."""
+        return self._gate is not None and self._gate.lets_in(str(frame["User-Id"]))
 
     def _skip(self) -> int:
         """Throw away the rest of a message; return how many parts it had."""
@@ -182,6 +222,8 @@ class Mailbox:
         """Close; what is not sent then is lost."""
         endpoint = getattr(self, "endpoint", "")
         self._socket.close(linger=linger_ms)
+        if self._gate is not None:
+            self._gate.close()
         self._context.term()
         if endpoint.startswith("ipc://"):
             Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)

@@ -294,6 +294,7 @@ class Pong(Message):
     n_rendered: Count = 0
     n_dropped: Count = 0
     is_building: bool = False
+    is_ready: bool = True
     is_filtering: bool = False
     render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
 

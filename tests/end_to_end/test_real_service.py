@@ -286,7 +286,7 @@ def test_a_remote_interface_is_refused_by_the_program():
         timeout=60,
     )
     assert finished.returncode == 2
-    assert "allow_remote = true" in finished.stderr
+    assert "ocufilter keys add" in finished.stderr
 
 
 def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(

@@ -29,6 +29,7 @@ MAY_IMPORT = {
         "filter_service.messages",
         "filter_service.errors",
         "filter_service.progress",  # of long programs
+        "filter_service.keys",  # a client's own
         "filter_service.slots",  # memory shared with the service
         "filter_service.settings",
         *FACE,
@@ -90,6 +91,9 @@ HOME = {
     "glfw": ("clients/window.py",),
     "zmq": (
         "filter_service/service/mailbox.py",  # the server's socket and nothing else
+        "filter_service/service/gate.py",  # and who may connect to it
+        "filter_service/service/asking.py",  # one ping
+        "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else
     ),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),

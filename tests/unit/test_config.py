@@ -39,8 +39,8 @@ def test_the_ready_file_becomes_a_path(tmp_path):
 def test_other_interfaces_are_refused_with_the_way_out(bind):
     with pytest.raises(ValueError, match="SSH") as caught:
         ServiceConfig(bind=bind)
-    assert "allow_remote = true" in str(caught.value)
-    assert ServiceConfig(bind=bind, allow_remote=True).bind == bind
+    assert "ocufilter keys add" in str(caught.value)
+    assert ServiceConfig(bind=bind, keys_dir="keys").bind == bind
 
 
 @pytest.mark.parametrize(

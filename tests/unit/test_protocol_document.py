@@ -97,6 +97,7 @@ def test_every_error_code_that_the_service_sends_is_explained():
         errors.TransportError,
         errors.ServiceTimeout,
         errors.ConnectionLost,
+        errors.AuthenticationFailed,
     }
     sent = {
         code

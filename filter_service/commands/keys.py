@@ -1,0 +1,88 @@
+"""`ocufilter keys`: who may connect to a service that other machines reach."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filter_service.commands.console import Json, print_json, say
+
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        "--dir",
+        metavar="DIR",
+        help="Folder of the keys; by default ocufilter/keys in $XDG_CONFIG_HOME.",
+    ),
+]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Of the client.")]
+
+keys = typer.Typer(
+    help="Make and take back keys of clients, for a service beyond this machine.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+def default_folder() -> Path:
+    """Return where keys are kept, unless said otherwise."""
+    home = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
+    return Path(home) / "ocufilter" / "keys"
+
+
+def _ring(folder: Path | None):
+    from filter_service.keys import KeyRing
+
+    return KeyRing(folder or default_folder())
+
+
+@keys.command()
+def add(
+    name: Name,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The client's file; by default NAME.toml."),
+    ] = None,
+    folder: Folder = None,
+    json_output: Json = False,
+) -> None:
+    """Let a client in: writes the file that it connects with.
+
+    Give the file to the client by a safe way, and to nobody else.  A service that runs
+    with this folder (keys_dir in its configuration) notices at once.
+
+    ocufilter keys add lab
+    """
+    ring, file = _ring(folder), out or Path(f"{name}.toml")
+    key = ring.add(name, file)
+    if json_output:
+        print_json({"name": name, "public": key.pair.public, "file": str(file)})
+        return
+    say(f"{name} may connect with {file}; the service needs keys_dir = '{ring.folder}'")
+
+
+@keys.command()
+def remove(name: Name, folder: Folder = None, json_output: Json = False) -> None:
+    """Let a client in no more; one that is connected is turned out.
+
+    ocufilter keys remove lab
+    """
+    _ring(folder).remove(name)
+    if json_output:
+        print_json({"removed": name})
+    else:
+        say(f"{name} may not connect any more")
+
+
+@keys.command(name="list")
+def list_names(folder: Folder = None, json_output: Json = False) -> None:
+    """List the clients that may connect.
+
+    ocufilter keys list
+    """
+    names = _ring(folder).names()
+    if json_output:
+        print_json({"names": names})
+    else:
+        print("\n".join(names) if names else "nobody may connect yet")

@@ -1,0 +1,43 @@
+"""`ocufilter status`: what a running service says of itself."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filter_service.commands.console import Json, print_json
+
+Seconds = Annotated[
+    float, typer.Option("--timeout", metavar="S", help="How long to wait for it.")
+]
+
+
+def status(
+    endpoint: Annotated[
+        str, typer.Argument(metavar="ENDPOINT", help="Where it listens.")
+    ] = "tcp://127.0.0.1:5577",
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The client's key file.")
+    ] = None,
+    timeout_s: Seconds = 3.0,
+    json_output: Json = False,
+) -> None:
+    """Ask a service how it is; the exit code is 0 where it is there and answers.
+
+    Ready is a service that filters; one that is alive and not ready is starting, or is
+    starting the process that filters again.
+
+    ocufilter status tcp://127.0.0.1:5577
+    """
+    from filter_service.service.asking import ask_status
+
+    found = ask_status(endpoint, key_file=key, timeout_s=timeout_s)
+    if json_output:
+        print_json(found)
+        return
+    print(f"{endpoint} is {'ready' if found['is_ready'] else 'alive, not ready'}")
+    for name in ("n_sessions", "n_rendered", "n_dropped", "memory_mb"):
+        print(f"  {name:<16} {found[name]:g}")
+    for name in ("is_filtering", "is_building"):
+        print(f"  {name:<16} {'yes' if found[name] else 'no'}")
+    print(f"  {'render_silent_s':<16} {found['render_silent_s']:.2f}")

@@ -1,0 +1,51 @@
+"""Asks a running service how it is, as anybody may who can connect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from filter_service.errors import ServiceTimeout
+from filter_service.keys import load_client_key
+from filter_service.messages import Ping, Pong, decode_reply, encode
+
+
+def ask_status(
+    endpoint: str, *, key_file: Path | None = None, timeout_s: float = 3.0
+) -> dict[str, Any]:
+    """Return what a service answers to ping.
+
+    Raises
+    ------
+    ServiceTimeout
+        It does not answer.
+    ValueError
+        An endpoint or a key file that is none.
+    """
+    key = None if key_file is None else load_client_key(key_file)
+    context = zmq.Context()
+    socket = context.socket(zmq.DEALER)
+    try:
+        socket.linger = 0
+        if key is not None:
+            socket.curve_serverkey = key.server.encode()
+            socket.curve_publickey = key.pair.public.encode()
+            socket.curve_secretkey = key.pair.secret.encode()
+        socket.rcvtimeo = socket.sndtimeo = round(1000 * timeout_s)
+        socket.connect(endpoint)
+        socket.send_multipart(encode(Ping(0.0)))
+        pong = decode_reply(socket.recv_multipart())
+    except zmq.Again:
+        raise ServiceTimeout(
+            f"no answer from {endpoint} within {timeout_s:g} s"
+        ) from None
+    except zmq.ZMQError as error:
+        raise ValueError(f"endpoint is {endpoint!r}: {error}") from None
+    finally:
+        socket.close(linger=0)
+        context.term()
+    if not isinstance(pong, Pong):
+        raise ValueError(f"{endpoint} answers a ping with {pong.type_name}")
+    return {"endpoint": endpoint, "is_alive": True} | pong.fields()
