@@ -41,6 +41,7 @@ class Bench(StrEnum):
     COST = "cost"
     PEERS = "peers"
     SWITCH = "switch"
+    ABUSE = "abuse"
     ROUNDTRIP = "roundtrip"
 
 
@@ -65,6 +66,7 @@ BENCH_MODULES = {
     Bench.COST: "tests.benchmarks.bench_cost",
     Bench.PEERS: "tests.benchmarks.bench_peers",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
+    Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.ROUNDTRIP: "clients.latency",
 }
 

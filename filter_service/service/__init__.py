@@ -7,6 +7,7 @@ door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
 gate            who may connect to it
+patience        how many wrong messages are answered
 asking          a question to a running service
 guests          all sessions, with a client or without
 session         one client: its waiting frame, its credit, its profile

@@ -53,6 +53,7 @@ from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
+from filter_service.service.patience import Patience
 from filter_service.service.places import check_places
 from filter_service.service.process_info import resident_memory_mb
 from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
@@ -100,6 +101,7 @@ class Door:
         self._greetings: list[tuple[bytes, Hello]] = []  # until the renderer is known
         self._guests = Guests()
         self._turns: Turns[str] = Turns()
+        self._patience = Patience()
         self._leaving: Unsent = []  # results of clients that are gone
         self._n_rendered = self._n_dropped = self._n_faults = 0
         now_s = time.monotonic()
@@ -268,6 +270,8 @@ class Door:
                 continue
             if received is None:
                 break
+            if self._patience.is_over(received[0], time.monotonic()):
+                continue
             try:
                 self._take_in(*received, superseded)
             except Exception:  # whatever it is, other clients shall not notice
@@ -304,6 +308,7 @@ class Door:
 
     def _refuse(self, identity: bytes, parts: Sequence[Part], error: Exception) -> None:
         """Tell a client what is wrong with its message; the service lives on."""
+        self._patience.note(identity)
         if not isinstance(error, FilterError):
             self._n_faults += 1
             log.error("a message could not be handled", exc_info=error)

@@ -286,6 +286,23 @@ def test_deep_headers_are_refused_and_nothing_ends(shared_service, raw_client):
     assert "nobody foresaw" not in shared_service.log
 
 
+def test_who_sends_too_much_that_is_wrong_is_not_heard_for_a_while(
+    start_service, raw_client
+):
+    service = start_service()
+    raw, other = raw_client(service), raw_client(service)
+    for _ in range(500):
+        raw.send([b"\xc1"])
+    assert other.ask(Ping(1.0)).t == 1.0
+    time.sleep(1.5)
+    answers = 0
+    while raw.socket.poll(100):
+        assert raw.receive().code == "bad_message"
+        answers += 1
+    assert 100 <= answers < 500
+    assert raw.ask(Ping(2.0)).t == 2.0
+
+
 def test_a_message_of_very_many_parts_is_thrown_away_unread(start_service, raw_client):
     service = start_service()
     raw, other = raw_client(service), raw_client(service)

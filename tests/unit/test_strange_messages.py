@@ -1,5 +1,7 @@
 """Random messages: refused at worst, each with where it is wrong."""
 
+import random
+
 import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,6 +11,7 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
+from tests.benchmarks.bench_abuse import examples, mutated
 from tests.unit.message_parts import (
     REQUESTS,
     as_bytes,
@@ -80,3 +83,9 @@ def test_a_message_with_one_strange_byte_never_does_more_than_be_refused(message
 @given(st.dictionaries(st.text(max_size=8), json_like, max_size=4))
 def test_strange_profiles_never_do_more_than_be_refused(body):
     decodes_or_is_refused(profile_parts(msgpack.packb(body)))
+
+
+def test_ten_thousand_mutated_messages_never_do_more_than_be_refused():
+    rng, kinds = random.Random(2), examples()
+    for _ in range(10_000):
+        decodes_or_is_refused(mutated(rng, rng.choice(kinds)))
