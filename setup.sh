@@ -2,7 +2,7 @@
 # Makes a bare Debian or Ubuntu machine ready; the Makefile calls it first.
 #
 #   sh setup.sh         the Python environment in .venv and the system libraries
-#   sh setup.sh test    the same, and a virtual screen for the window test
+#   sh setup.sh test    the same, a virtual screen for the window test, and Node
 #   sh setup.sh training  the first, and what training the networks needs (torch)
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
@@ -15,6 +15,7 @@ cd "$(dirname "$0")"
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
+NODE_PACKAGES="nodejs npm"
 # what the modules with compiled loops import
 COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
 # of `make witness`: nothing of the project imports it
@@ -92,6 +93,22 @@ install_test_packages() { # worth having, but the tests run without
         say "without $missing the window test is skipped;" \
             "to run it:  $(install_command "$missing")"
     fi
+}
+
+install_javascript_client() { # its packages, for its test
+    if ! command -v npm >/dev/null; then
+        apt_install $NODE_PACKAGES || true
+    fi
+    if ! command -v npm >/dev/null; then
+        say "without Node the test of the JavaScript client is skipped;" \
+            "to run it:  $(install_command "$NODE_PACKAGES")"
+        return
+    fi
+    stamp=clients/js/node_modules/.ocufilter-installed
+    if cmp -s clients/js/package.json $stamp; then return; fi
+    say "installing the packages of the JavaScript client"
+    (cd clients/js && npm install --no-package-lock --silent --no-fund --no-audit)
+    cp clients/js/package.json $stamp
 }
 
 # --- Python environment ------------------------------------------------------
@@ -176,5 +193,8 @@ install_system_libraries
 install_c_compiler
 install_packages
 if [ "${1:-}" = training ]; then install_training_packages; fi
-if [ "${1:-}" = test ]; then install_test_packages; fi
+if [ "${1:-}" = test ]; then
+    install_test_packages
+    install_javascript_client
+fi
 if [ "${1:-}" = witness ]; then install_witness; fi

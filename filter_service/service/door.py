@@ -211,6 +211,7 @@ class Door:
                 session.profile_id, session.generation = profile_id, generation
                 session.leave(time.monotonic())
                 self._guests.remember(session)
+        self._render.is_ready = True
         for identity, hello in self._greetings:
             try:
                 self._greet(identity, hello)
@@ -356,7 +357,7 @@ class Door:
             n_rendered=self._n_rendered,
             n_dropped=self._n_dropped,
             is_building=self._is_building or asked,
-            is_ready=self._render.is_up and self._server is not None,
+            is_ready=self._render.is_ready,
             is_filtering=self._render.held is not None,
             render_silent_s=self._render.silent_s,
         )
@@ -528,8 +529,7 @@ class Door:
 
     @property
     def _may_hand_over(self) -> bool:
-        is_known = self._render.is_up and self._server is not None
-        return is_known and self._render.held is None
+        return self._render.is_ready and self._render.held is None
 
     def _is_ready(self, session: Session, now_s: float) -> bool:
         """Return whether a session's frame may be handed over, or be given up.

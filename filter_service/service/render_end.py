@@ -50,10 +50,13 @@ class RenderEnd:
     ----------
     held : Held or None
         The frame that is being filtered.
+    is_ready : bool
+        The loop has said which eyes it has, and was told of the others.
     """
 
     def __init__(self, max_image_bytes: int) -> None:
         self.held: Held | None = None
+        self.is_ready = False
         self._link: Link | None = None
         self._slots = SlotPool(max_image_bytes)
         self._next_number = 1
@@ -85,6 +88,7 @@ class RenderEnd:
     def join(self, link: Link) -> None:
         """Work with a new render loop, which is told of all memory."""
         self._link = link
+        self.is_ready = False
         self.excuse()
         for slot in self._slots:
             self._send_slot(slot)
@@ -110,6 +114,7 @@ class RenderEnd:
         if self._link is not None:
             self._link.close()
             self._link = None
+        self.is_ready = False
         lost, self.held = self.held, None
         if lost is not None:
             self.give_back(*lost.own_slots)

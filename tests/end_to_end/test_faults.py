@@ -76,6 +76,27 @@ def test_a_process_that_is_killed_is_started_again_and_the_eye_is_there(
     assert f"the {name} process was killed by SIGKILL" in service.log
 
 
+def test_frames_wait_for_the_eyes_of_a_new_process(start_service, raw_client):
+    """One that comes while the process is started finds its session there."""
+    service = start_service()
+    raw = raw_client(service)
+    raw.begin(mark=7)
+    os.kill(service.pids()["render"], signal.SIGKILL)
+    marks, frame_id = [], 0
+    while not marks:
+        frame_id += 1
+        raw.send(encode(small_frame(frame_id)))
+        answer = raw.receive()
+        while getattr(answer, "frame_id", None) != frame_id:
+            answer = raw.receive()  # of the profile, which is prepared once more
+        kind = getattr(answer, "code", getattr(answer, "reason", "result"))
+        assert kind in ("render_failed", "preparing", "result")
+        if kind == "result":
+            marks.append(answer.colors[0][0, 0, 0])
+        time.sleep(0.01)
+    assert marks == [7]
+
+
 def test_a_frame_that_dies_with_its_process_is_answered(start_service, raw_client):
     service = start_service(filter_ms=2000)
     raw = raw_client(service)
