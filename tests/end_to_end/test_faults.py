@@ -45,7 +45,10 @@ def filtered_again(client, view, *, limit_s=TIMEOUT_S):
 
 
 @pytest.mark.parametrize("name", ["door", "render"])
-@pytest.mark.parametrize("when", ["idle", "in mid-frame", "in mid-build"])
+@pytest.mark.parametrize(
+    "when",
+    [pytest.param("idle", marks=pytest.mark.slow), "in mid-frame", "in mid-build"],
+)
 def test_a_process_that_is_killed_is_started_again_and_the_eye_is_there(
     start_service, name, when
 ):
@@ -108,7 +111,9 @@ def test_a_frame_that_dies_with_its_process_is_answered(start_service, raw_clien
     assert (answer.code, answer.frame_id) == ("render_failed", 1)
 
 
-@pytest.mark.parametrize("name", ["door", "render"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("door", marks=pytest.mark.slow), "render"]
+)
 def test_a_process_that_stands_still_is_ended_and_started_again(start_service, name):
     service = start_service()
     view = make_view()
@@ -221,7 +226,7 @@ def test_the_door_answers_while_a_frame_is_filtered(start_service, raw_client):
     assert other.ask(Hello("other")).type_name == "welcome"
 
 
-@pytest.mark.parametrize("flood", [False, True])
+@pytest.mark.parametrize("flood", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_clients_share_time_whatever_their_frames_take(start_service, flood):
     """One has frames twice as wide; the double takes as long for each view."""
     service = start_service(filter_ms=30)
@@ -380,7 +385,9 @@ def half_a_message(host, port, size_bytes):
     return connection
 
 
-@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+@pytest.mark.parametrize(
+    "transport", ["tcp", pytest.param("ipc", marks=pytest.mark.slow)]
+)
 def test_a_client_that_leaves_with_messages_queued_does_no_harm(
     start_service, tmp_path, transport
 ):
