@@ -57,6 +57,9 @@ class FrameEngine(Protocol):
     def name(self) -> str:
         """What does the work, as replies and `ocufilter doctor` name it."""
 
+    def trim(self) -> None:
+        """Give back memory that frames use again, after a while without any."""
+
     def load_steps(self, store: Any) -> Generator[LoadedStore | None]:
         """Take a store in slices, so that frames go on between.
 

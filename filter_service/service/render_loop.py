@@ -40,13 +40,19 @@ from filter_service.messages import (
 )
 from filter_service.service.frame_reply import frame_reply
 from filter_service.service.link import Link, LinkClosed
-from filter_service.service.process_info import package_version, resident_memory_mb
+from filter_service.service.process_info import (
+    give_memory_back,
+    package_version,
+    resident_memory_mb,
+)
 from filter_service.slots import Slot
 from filter_service.wire.images import ViewImages
 
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
 STATE_INTERVAL_S = 0.5
+TRIM_AFTER_S = 10.0
+"""Without a frame for so long, the memory of frames goes back to the system."""
 
 log = logging.getLogger("ocufilter")
 
@@ -89,6 +95,7 @@ class RenderLoop:
         self._slots: dict[int, Slot] = {}
         self._door: Link | None = None
         self._next_state_s = 0.0
+        self._trim_at_s: float | None = None  # where frames hold memory
 
     def run(
         self, control: Link, take_control: Callable[[Any, list[int]], bool]
@@ -175,6 +182,10 @@ class RenderLoop:
                     self._door.close()
                 self._door = None
         self._workshop.advance()
+        if self._trim_at_s is not None and time.monotonic() > self._trim_at_s:
+            self._trim_at_s = None
+            self._workshop.engine.trim()
+            give_memory_back()
         self._tell_state()
 
     def _tell_state(self, *, is_due: bool = False) -> None:
@@ -316,7 +327,9 @@ class RenderLoop:
             stages_ms = dict(reply.stage_times_ms)
             stages_ms["copy_out_ms"] = 1e3 * (time.monotonic() - copied_s)
             reply = replace(reply, colors=(), stage_times_ms=stages_ms)
-        self._send(("answer", number, reply, started_s, time.monotonic()))
+        ended_s = time.monotonic()
+        self._trim_at_s = ended_s + TRIM_AFTER_S
+        self._send(("answer", number, reply, started_s, ended_s))
 
 
 def images_in(

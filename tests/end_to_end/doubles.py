@@ -52,6 +52,9 @@ class EngineDouble:
     def __init__(self, filter_ms: float):
         self.filter_ms = filter_ms
 
+    def trim(self):
+        """Nothing is held."""
+
     def load_steps(self, store: StoreDouble):
         """Read the ballast in slices, as a copy to a GPU would."""
         for first in range(0, store.ballast.size, SLICE_BYTES):

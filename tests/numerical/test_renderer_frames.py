@@ -77,6 +77,15 @@ def test_same_input_gives_the_same_bytes(bench, view, accumulation):
     assert first.tobytes() == again.tobytes()
 
 
+@pytest.mark.both_engines
+def test_a_frame_after_memory_went_back_is_the_same(bench, view):
+    before = bench.render(view).color
+    bench.renderer.trim()
+    if bench.gpu is None:
+        assert bench.renderer.memory_mb == 0.0
+    assert bench.render(view).color.tobytes() == before.tobytes()
+
+
 def test_a_new_store_is_not_mistaken_for_the_last(engine, rng):
     first = Bench(engine, MYOPIA, **SIZE)
     second = Bench(engine, {"kind": "preset", "name": "cataract"}, **SIZE)

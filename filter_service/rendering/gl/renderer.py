@@ -71,6 +71,9 @@ class FilterRenderer:
         *_, loaded = self.load_steps(store)
         return loaded
 
+    def trim(self) -> None:
+        """Keep what is held: a GPU's buffers are bounded, and dear to make anew."""
+
     def load_steps(
         self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
     ) -> Generator[GlStore | None]:

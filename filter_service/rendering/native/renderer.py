@@ -70,6 +70,14 @@ class NativeRenderer:
         """Memory that frames use again."""
         return self._arrays.memory_mb
 
+    def trim(self) -> None:
+        """Give back the memory that frames use again; the next one takes what it needs.
+
+        A frame of 4096x4096 leaves a gigabyte, which nobody else has use for.
+        """
+        self._arrays = Arrays()
+        self._plan = self._blended = None
+
     def close(self) -> None:
         """End the threads; the renderer is of no use after."""
         self._end()
