@@ -7,6 +7,7 @@ door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
 gate            who may connect to it
+metrics         counters for Prometheus
 patience        how many wrong messages are answered
 asking          a question to a running service
 guests          all sessions, with a client or without
@@ -20,6 +21,8 @@ frame_reply     a frame and its answer
 link            messages between the processes
 config          the settings file
 process_info    version and memory
+
+`ocufilter.service` is a unit for systemd.
 """
 
 import lazy_loader

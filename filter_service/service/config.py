@@ -77,6 +77,8 @@ class ServiceConfig:
     max_socket_mb : int
         Memory of the process that owns the socket, incomplete messages included:
         beyond it that process is started again.
+    metrics_port : int
+        Port of 127.0.0.1 for counters in Prometheus' format; 0 for none.
     ready_file : Path, optional
         Written with the bound endpoint once the service is ready; removed at its end.
     """
@@ -107,6 +109,7 @@ class ServiceConfig:
     max_image_mb: int = 2000
     shared_memory: bool = True
     max_socket_mb: int = 2000
+    metrics_port: int = 0
     ready_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -168,6 +171,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "cancel_grace_s": (0.05, 600.0),
     "build_limit_s": (0.1, 86_400.0),
     "alive_interval_s": (0.05, 600.0),
+    "metrics_port": (0, 65535),
     "session_keep_s": (0.0, 86_400.0),
     "frame_limit_s": (0.1, 3600.0),
     "max_image_mb": (1, 1_000_000),

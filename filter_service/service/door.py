@@ -53,6 +53,7 @@ from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
+from filter_service.service.metrics import serve_metrics
 from filter_service.service.patience import Patience
 from filter_service.service.places import check_places
 from filter_service.service.process_info import resident_memory_mb
@@ -104,6 +105,7 @@ class Door:
         self._patience = Patience()
         self._leaving: Unsent = []  # results of clients that are gone
         self._n_rendered = self._n_dropped = self._n_faults = 0
+        self._filtered_s = 0.0
         now_s = time.monotonic()
         self._next_alive_s = now_s + config.alive_interval_s
         self._next_trim_s = now_s + TRIM_INTERVAL_S
@@ -114,6 +116,23 @@ class Door:
             keys=KeyRing(config.keys_dir) if config.keys_dir else None,
         )
         self.endpoint = self._mailbox.endpoint
+        if config.metrics_port:
+            serve_metrics(config.metrics_port, self.metrics)
+
+    def metrics(self) -> dict[str, float]:
+        """Return the values of `METRICS`; another thread asks."""
+        return {
+            "ocufilter_ready": float(self._render.is_ready),
+            "ocufilter_sessions": len(self._guests.present),
+            "ocufilter_sessions_away": len(self._guests.away),
+            "ocufilter_frames_filtered_total": self._n_rendered,
+            "ocufilter_frames_dropped_total": self._n_dropped,
+            "ocufilter_filter_seconds_total": self._filtered_s,
+            "ocufilter_messages_unheard_total": self._patience.n_unheard,
+            "ocufilter_faults_total": self._n_faults,
+            "ocufilter_memory_bytes": MB * (resident_memory_mb() + self._render_mb),
+            "ocufilter_render_silent_seconds": self._render.silent_s,
+        }
 
     # The loop
 
@@ -578,6 +597,7 @@ class Door:
         if held is None:
             return
         self._turns.note(held.session.key, ended_s - started_s, ended_s)
+        self._filtered_s += ended_s - started_s
         if isinstance(reply, Result):
             reply = completed(reply, held, started_s)
         elif isinstance(reply, Dropped):

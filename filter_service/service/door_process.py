@@ -8,6 +8,7 @@ from contextlib import suppress
 
 from filter_service.service.child import begin
 from filter_service.service.door import Door
+from filter_service.service.metrics import NoMetrics
 
 MB = 10**6
 
@@ -24,7 +25,7 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     try:
         door = Door(config, keeper)
-    except OSError as error:
+    except (OSError, NoMetrics) as error:
         keeper.send(("failed", str(error)))
         raise SystemExit(1) from None
     keeper.send(("ready", door.endpoint))

@@ -35,6 +35,8 @@ def run(config: ServiceConfig, *, open_workshop: str = OPEN_WORKSHOP) -> None:
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: keeper.stop())
+    # Keys are read again as they change; for other settings it is started again.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.set_wakeup_fd(keeper.wake_file_descriptor, warn_on_full_buffer=False)
     try:
         keeper.run()

@@ -96,6 +96,7 @@ HOME = {
         "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else
     ),
+    "prometheus_client": ("filter_service/service/metrics.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
     "msgspec": (
         "filter_service/checked.py",  # values against annotated types

@@ -1,0 +1,72 @@
+"""What runs a service for days: counters, signals, the unit."""
+
+import configparser
+import signal
+import socket
+import time
+import urllib.request
+
+import pytest
+
+from clients.filter_client import FilterClient
+from filter_service.service.metrics import METRICS
+from tests.end_to_end.conftest import TIMEOUT_S, make_view
+from tests.source_tree import ROOT
+
+SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+EYE = {"kind": "double", "mark": 5}
+
+
+@pytest.fixture
+def port():
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        return unused.getsockname()[1]
+
+
+def counters(port):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as answer:
+        lines = answer.read().decode().splitlines()
+    return {
+        name: float(value)
+        for name, value in (line.split() for line in lines if not line.startswith("#"))
+    }
+
+
+def test_counters_count(start_service, port):
+    service = start_service(metrics_port=port)
+    view = make_view()
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        client.set_profile(EYE, views=[view])
+        for _ in range(3):
+            client.filter(view, **SEE)
+        found = counters(port)
+    assert set(found) == set(METRICS)
+    assert found["ocufilter_ready"] == found["ocufilter_sessions"] == 1
+    assert found["ocufilter_frames_filtered_total"] == 3
+    assert found["ocufilter_filter_seconds_total"] > 0.005
+    assert found["ocufilter_memory_bytes"] > 20e6
+
+
+def test_a_port_that_is_taken_is_said(start_service, port):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port))
+        taken.listen()
+        with pytest.raises(RuntimeError, match=f"metrics_port is {port}"):
+            start_service(metrics_port=port)
+
+
+def test_a_closed_terminal_does_not_end_the_service(start_service):
+    service = start_service()
+    service.process.send_signal(signal.SIGHUP)
+    time.sleep(0.3)
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        assert client.ping()[1].is_ready
+
+
+def test_the_unit_starts_the_program():
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str
+    unit.read(ROOT / "filter_service" / "service" / "ocufilter.service")
+    assert " ocufilter serve --config " in unit["Service"]["ExecStart"]
+    assert unit["Service"]["Restart"] == "on-failure"
