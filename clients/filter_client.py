@@ -24,7 +24,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.connection import SendBufferPool
+from clients.connection import SendBuffer, SendBufferPool
 from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
 from clients.shared_memory import ClientSlot
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
@@ -32,9 +32,11 @@ from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
+    DEPTH_ENCODINGS,
     FORMATS,
     Accepted,
     Camera,
+    DepthEncoding,
     Dropped,
     ErrorReply,
     FilterSettings,
@@ -50,6 +52,7 @@ from filter_service.messages import (
     ViewImages,
     Welcome,
     encode,
+    encoded_depth,
     tangents_from_fov,
 )
 from filter_service.settings import DepthKind
@@ -70,6 +73,16 @@ DEFAULT_SETTINGS = FilterSettings()
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
     """Return numpy's numbers as Python's; the service refuses what is no pair."""
     return cast("tuple[float, float]", tuple(map(float, pair)))
+
+
+def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
+    """Return the images of a view, depth as it travels."""
+    if depth_encoding == "float32":
+        return list(view.images)
+    return [
+        encoded_depth(image, depth_encoding) if image.ndim == 2 else image
+        for image in view.images
+    ]
 
 
 LEND_WAIT_S = 0.1
@@ -277,6 +290,7 @@ class FilterClient:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
         render_tolerance: float = 1.0,
+        depth_encoding: DepthEncoding = "float32",
         timeout_s: float | None = None,
     ) -> FilteredFrame:
         """Send one frame and return it filtered; `submit` explains the arguments.
@@ -302,6 +316,7 @@ class FilterClient:
                 merge=merge,
                 render_tolerance=render_tolerance,
                 prepared_only=True,
+                depth_encoding=depth_encoding,
             )
             answer = self._await_frame(frame_id, deadline_s)
             if isinstance(answer, FilteredFrame):
@@ -355,6 +370,7 @@ class FilterClient:
         merge: bool = True,
         render_tolerance: float = 1.0,
         prepared_only: bool = False,
+        depth_encoding: DepthEncoding = "float32",
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
 
@@ -381,14 +397,22 @@ class FilterClient:
         prepared_only : bool
             Dropped with the reason ``extending`` where PSFs for this pupil, focus and
             scene are not there yet, instead of seen through the nearest that are.
+        depth_encoding : {"float32", "float16", "dpt16", "mm16"}
+            How depth travels: metres, or half the bytes, for a thin network: metres or
+            dioptres in half precision, or whole millimetres.
         """
+        if depth_encoding not in DEPTH_ENCODINGS:
+            raise ValueError(
+                f"depth_encoding is {depth_encoding!r}; allowed: "
+                f"{', '.join(DEPTH_ENCODINGS)}"
+            )
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
         items = as_views(color, depth_m, self._camera)
         self._check_limits(items)
         frame = Frame(
             frame_id=self._next_frame_id,
-            views=tuple(ViewHeader.describing(item) for item in items),
+            views=tuple(ViewHeader.describing(i, depth_encoding) for i in items),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
@@ -404,18 +428,22 @@ class FilterClient:
     def _packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
         """Copy images to where they travel from: shared memory, or buffers."""
         now_s = time.monotonic()
-        found = self._in_shared_memory(
-            frame, [i for view in items for i in view.images]
-        )
+        per_view = [
+            _as_sent(item, header.depth.encoding)
+            for item, header in zip(items, frame.views, strict=True)
+        ]
+        images = [image for sent in per_view for image in sent]
+        found = self._in_shared_memory(frame, images)
         if found is not None:
             frame, slots = found
             return Outgoing(frame.frame_id, encode(frame), [], now_s, frame, slots)
-        buffers, images = [], []
-        for item in items:
-            copies = [self._pool.copy_in(image) for image in item.images]
+        buffers: list[SendBuffer] = []
+        kept: list[ViewImages] = []
+        for sent in per_view:
+            copies = [self._pool.copy_in(image) for image in sent]
             buffers += [buffer for buffer, _ in copies]
-            images.append(ViewImages(*(copy for _, copy in copies)))
-        frame = replace(frame, images=tuple(images))
+            kept.append(ViewImages(*(copy for _, copy in copies)))
+        frame = replace(frame, images=tuple(kept))
         return Outgoing(frame.frame_id, encode(frame), buffers, now_s, frame)
 
     def _in_shared_memory(

@@ -19,6 +19,7 @@ from filter_service.camera import Camera, tangents_from_fov
 from filter_service.checked import show
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
 from filter_service.settings import FilterSettings
+from filter_service.wire.depths import DEPTH_ENCODINGS, DepthEncoding, encoded_depth
 from filter_service.wire.images import (
     FORMATS,
     LINEAR,
@@ -59,6 +60,7 @@ from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
 __all__ = [
     "DEFAULT_ENDPOINT",
+    "DEPTH_ENCODINGS",
     "DROP_REASONS",
     "FORMATS",
     "LINEAR",
@@ -73,6 +75,7 @@ __all__ = [
     "Bye",
     "Camera",
     "Closing",
+    "DepthEncoding",
     "Dropped",
     "ErrorReply",
     "FilterSettings",
@@ -101,6 +104,7 @@ __all__ = [
     "decode_reply",
     "decode_request",
     "encode",
+    "encoded_depth",
     "peek_ids",
     "tangents_from_fov",
 ]

@@ -2,6 +2,7 @@
 
 message    what every message has in common
 images     images, formats, views
+depths     depth in fewer bytes
 requests   what a client says
 replies    what the service answers
 unpacking  bounded unpacking of untrusted bytes

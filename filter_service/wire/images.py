@@ -14,6 +14,7 @@ from filter_service.checked import Record
 from filter_service.errors import BadMessage
 from filter_service.rgbd_view import ColorImage, RgbdView
 from filter_service.settings import DepthKind, Output
+from filter_service.wire.depths import WIRE_DTYPES, DepthEncoding, decoded_depth
 from filter_service.wire.message import Limits, Part, expect_parts
 
 DType = Literal["uint8", "float32", "float16"]
@@ -69,9 +70,10 @@ OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
 
 @dataclass(frozen=True)
 class DepthFormat(Record):
-    """What depth means: view-space z or distance."""
+    """What depth means, view-space z or distance, and how it travels."""
 
     kind: DepthKind = "planar"
+    encoding: DepthEncoding = "float32"
 
 
 @dataclass(frozen=True)
@@ -97,28 +99,37 @@ class ViewHeader(Record):
         depth_kind: DepthKind = "planar",
         *,
         has_hidden: bool = False,
+        depth_encoding: DepthEncoding = "float32",
     ) -> ViewHeader:
         """Return the header of a camera's view."""
         size_px = (camera.width_px, camera.height_px)
-        depth = DepthFormat(depth_kind)
+        depth = DepthFormat(depth_kind, depth_encoding)
         return cls(*size_px, camera.tangents, color, depth, has_hidden)
 
     @classmethod
-    def describing(cls, view: RgbdView) -> ViewHeader:
+    def describing(
+        cls, view: RgbdView, depth_encoding: DepthEncoding = "float32"
+    ) -> ViewHeader:
         """Return what a frame's header says about a view."""
-        color = FORMAT_OF_DTYPE[view.color.dtype.name]
-        has_hidden = view.surface_count > 1
-        return cls.of(view.camera, color, view.depth_kind, has_hidden=has_hidden)
+        return cls.of(
+            view.camera,
+            FORMAT_OF_DTYPE[view.color.dtype.name],
+            view.depth_kind,
+            has_hidden=view.surface_count > 1,
+            depth_encoding=depth_encoding,
+        )
 
     def view(self, images: ViewImages) -> RgbdView:
-        """Return the view of these images."""
+        """Return the view of these images, depth in metres."""
+        hidden = images.hidden_depth_m
+        encoding = self.depth.encoding
         return RgbdView(
             images.color,
-            images.depth_m,
+            decoded_depth(images.depth_m, encoding),
             self.tangents,
             self.depth.kind,
             images.hidden_color,
-            images.hidden_depth_m,
+            None if hidden is None else decoded_depth(hidden, encoding),
         )
 
     @property
@@ -130,11 +141,12 @@ class ViewHeader(Record):
     def images(self) -> tuple[tuple[str, tuple[int, ...], str], ...]:
         """Return name, shape and type of each image, in the order of their parts."""
         shape = (self.height_px, self.width_px)
+        depth_dtype = WIRE_DTYPES[self.depth.encoding]
         kinds = (
             ("color", (*shape, 3), self.color.dtype),
-            ("depth", shape, "float32"),
+            ("depth", shape, depth_dtype),
             ("hidden_color", (*shape, 3), self.color.dtype),
-            ("hidden_depth", shape, "float32"),
+            ("hidden_depth", shape, depth_dtype),
         )
         return kinds if self.has_hidden else kinds[:2]
 
@@ -150,7 +162,7 @@ class ViewImages:
 
     color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
         The renderer takes values that are not finite as black, and says so.
-    depth_m : (height, width) float32, metres
+    depth_m : (height, width) float32, metres, or as the header's encoding has it
         0, negative and NaN are missing.
     hidden_color, hidden_depth_m : like color and depth_m, optional
         Depth of 0, negative or NaN: nothing is hidden here.

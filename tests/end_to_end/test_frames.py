@@ -48,6 +48,20 @@ def test_half_floats_go_there_and_back(client):
     np.testing.assert_array_equal(reply.color[1:], expected[1:])
 
 
+@pytest.mark.parametrize("encoding", ["float16", "dpt16", "mm16"])
+def test_depth_in_two_bytes_arrives_as_metres(client, encoding):
+    """Eight frames: the first ones as parts, the others in shared memory."""
+    view = make_view()
+    view.depth_m[0, :3] = (0.0, -1.0, np.nan)
+    client.set_profile(double(7), views=[view])
+    for _ in range(8):
+        reply = client.filter(view, **SEE, depth_encoding=encoding)
+        assert reply.header.missing_depth_count == 3
+        np.testing.assert_array_equal(reply.color[1:], 255 - view.color[1:])
+    with pytest.raises(ValueError, match="depth_encoding is 'png'"):
+        client.submit(view, **SEE, depth_encoding="png")
+
+
 def test_a_result_says_what_it_was_made_with(client):
     view = make_view()
     view.depth_m[0, :3] = (0.0, -1.0, np.nan)

@@ -1,0 +1,62 @@
+"""Depth in fewer bytes, for thin networks: what each encoding keeps, and what it loses.
+
+Depth in a frame is metres in float32; on the wire it may be half as large.  Missing
+depth stays missing and infinity stays infinity in every encoding.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+DepthEncoding = Literal["float32", "float16", "dpt16", "mm16"]
+"""Metres; metres in half precision; dioptres in half precision; whole millimetres."""
+
+DEPTH_ENCODINGS: tuple[str, ...] = get_args(DepthEncoding)
+
+WIRE_DTYPES = {
+    "float32": "float32",
+    "float16": "float16",
+    "dpt16": "float16",
+    "mm16": "uint16",
+}
+
+MM_PER_M = 1000.0
+MISSING_MM, INFINITE_MM = 0, 65535
+"""Of mm16: 1 to 65534 are millimetres."""
+
+
+def encoded_depth(depth_m: NDArray[np.float32], encoding: str) -> NDArray[Any]:
+    """Return depth as it travels.
+
+    Errors: float16 and dpt16 0.05 % of the distance (of dpt16 nothing beyond 16 km or
+    nearer than 0.1 mm is told apart), mm16 half a millimetre up to 65.5 m and infinity
+    beyond.
+    """
+    if encoding == "float32":
+        return np.ascontiguousarray(depth_m, dtype=np.float32)
+    is_missing = ~(depth_m > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if encoding == "float16":
+            return np.where(is_missing, 0.0, depth_m).astype(np.float16)
+        if encoding == "dpt16":
+            return np.where(is_missing, np.nan, 1.0 / depth_m).astype(np.float16)
+        near_mm = np.clip(np.rint(MM_PER_M * depth_m), 1, INFINITE_MM)
+    return np.where(is_missing, MISSING_MM, near_mm).astype(np.uint16)
+
+
+def decoded_depth(sent: NDArray[Any], encoding: str) -> NDArray[np.float32]:
+    """Return depth in metres; 0 is missing."""
+    if encoding == "float32":
+        return sent
+    if encoding == "float16":
+        return sent.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if encoding == "dpt16":
+            found = 1.0 / sent.astype(np.float32)
+            return np.where(sent >= 0.0, found, np.float32(0.0)).astype(np.float32)
+    found = sent.astype(np.float32) / np.float32(MM_PER_M)
+    found[sent == INFINITE_MM] = np.inf
+    return found
