@@ -112,7 +112,7 @@ def test_a_frame_that_dies_with_its_process_is_answered(start_service, raw_clien
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("door", marks=pytest.mark.slow), "render"]
+    "name", [pytest.param(n, marks=pytest.mark.slow) for n in ("door", "render")]
 )
 def test_a_process_that_stands_still_is_ended_and_started_again(start_service, name):
     service = start_service()
@@ -153,6 +153,7 @@ def test_a_frame_without_an_end_is_ended(start_service):
     assert "says nothing for 1 s" in service.log
 
 
+@pytest.mark.slow
 def test_what_never_stays_ends_the_service_with_a_word(start_service):
     service = start_service()
     for _ in range(12):
@@ -386,7 +387,7 @@ def half_a_message(host, port, size_bytes):
 
 
 @pytest.mark.parametrize(
-    "transport", ["tcp", pytest.param("ipc", marks=pytest.mark.slow)]
+    "transport", [pytest.param(t, marks=pytest.mark.slow) for t in ("tcp", "ipc")]
 )
 def test_a_client_that_leaves_with_messages_queued_does_no_harm(
     start_service, tmp_path, transport

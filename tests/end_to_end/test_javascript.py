@@ -21,7 +21,9 @@ needs_node = pytest.mark.skipif(
 
 
 @needs_node
-@pytest.mark.parametrize("name", ["door", "render"])
+@pytest.mark.parametrize(
+    "name", ["door", pytest.param("render", marks=pytest.mark.slow)]
+)
 def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service, name):
     service = start_service()
     profile = json.dumps({"kind": "double", "mark": 5})

@@ -146,7 +146,21 @@ def test_a_client_that_is_killed_leaves_no_session(start_service):
         other.kill()
         wait_until(lambda: client.ping()[1].n_sessions == 1)
         # It might have come back, but not for ever.
-        wait_until(lambda: "session 1 ends: its client did not come" in service.log)
+        wait_until(lambda: "ends: its client did not come back" in service.log)
+
+
+@pytest.mark.slow
+def test_a_client_that_does_not_read_for_long_keeps_its_session(start_service):
+    """With a mark of 64 messages an idle client was gone after 64 signs of life."""
+    service = start_service(alive_interval_s=0.05, session_keep_s=0.0)
+    view = make_view()
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        client.set_profile(EYE, views=[view])
+        session_id = client.hello().session_id
+        time.sleep(12.0)  # 240 of them
+        assert client.filter(view, **SEE).color[0, 0, 0] == 5
+        assert client.hello().session_id == session_id
+    assert "is gone" not in service.log.replace("session 1 ends", "")
 
 
 def test_two_clients_get_their_own_eye_and_a_fair_share(start_service):

@@ -31,10 +31,8 @@ def until_shared(client, view):
 
 
 @pytest.fixture
-def shared_client(start_service):
-    service = start_service()
-    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
-        client.service = service
+def shared_client(shared_service):
+    with FilterClient(shared_service.endpoint, timeout_s=TIMEOUT_S) as client:
         yield client
 
 
@@ -76,7 +74,7 @@ def test_a_result_stays_as_it_is_as_long_as_somebody_has_it(shared_client):
     shared_client.set_profile(EYE, views=[view])
     until_shared(shared_client, view)
     kept = []
-    for value in range(30):
+    for value in range(9):
         view.color[:] = value
         reply = shared_client.filter(view, **SEE)
         kept.append((value, reply.color[5:]))  # a view of it holds it, too

@@ -33,6 +33,7 @@ HELD = (
     "estimator/periphery/population.json",
     "filter_service/PROTOCOL.md",
     "filter_service/protocol.schema.json",
+    "filter_service/service/ocufilter.service",
     "clients/assets/*",
 )
 """Files of the checkout that a wheel holds, and no others."""
