@@ -170,7 +170,7 @@ install_training_packages() { # on top of the others; the service never needs th
 }
 
 has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer
-    ldconfig -p | grep -Eq 'libLLVM(-|\.so\.)(1[6-9]|[2-9][0-9])'
+    PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep -Eq 'libLLVM(-|\.so\.)(1[6-9]|[2-9][0-9])'
 }
 
 install_witness() { # Mitsuba: a path tracer that the frames are compared with

@@ -125,6 +125,7 @@ def test_a_process_that_stands_still_is_ended_and_started_again(start_service, n
     assert f"the {name} process stands still" in service.log
 
 
+@pytest.mark.slow
 def test_a_worker_that_stands_still_is_ended_and_the_next_build_goes_on(start_service):
     service = start_service()
     view = make_view()
