@@ -128,9 +128,7 @@ class Connection:
         self._socket = self._context.socket(zmq.DEALER)
         self._set_options()
         if key is not None:
-            self._socket.curve_serverkey = key.server.encode()
-            self._socket.curve_publickey = key.pair.public.encode()
-            self._socket.curve_secretkey = key.pair.secret.encode()
+            key.use_on(self._socket)
         self._monitor = self._socket.get_monitor_socket(_UP | _DOWN | _HANDSHAKE_FAILED)
         self._monitor.linger = 0
         self._poller = zmq.Poller()

@@ -12,6 +12,7 @@ import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 """32 bytes in Z85 (ZeroMQ RFC 32)."""
@@ -36,6 +37,12 @@ class ClientKey:
     name: str
     pair: KeyPair
     server: str
+
+    def use_on(self, socket: Any) -> None:
+        """Have a ZeroMQ socket connect with this key."""
+        socket.curve_serverkey = self.server.encode()
+        socket.curve_publickey = self.pair.public.encode()
+        socket.curve_secretkey = self.pair.secret.encode()
 
 
 def load_client_key(path: Path | str) -> ClientKey:

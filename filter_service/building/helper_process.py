@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -57,6 +58,25 @@ def start_module(*arguments: str) -> subprocess.Popen[bytes]:
 def import_path() -> list[str]:
     """Return where this process imports from; what is no text it skips, too."""
     return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
+
+
+def end(process: subprocess.Popen[bytes], patience_s: float) -> int:
+    """Wait for a process that is to end, then end it by force; return its code."""
+    try:
+        return process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def how_it_ended(exit_code: int) -> str:
+    """Return what a process's exit code says, in words."""
+    if exit_code >= 0:
+        return f"ended with code {exit_code}"
+    try:
+        return f"was killed by {signal.Signals(-exit_code).name}"
+    except ValueError:
+        return f"was killed by signal {-exit_code}"
 
 
 def is_stopped(pid: int) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-import signal
 import socket
 import subprocess
 import sys
@@ -16,7 +15,12 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from typing import Any
 
-from filter_service.building.helper_process import import_path, is_stopped
+from filter_service.building.helper_process import (
+    end,
+    how_it_ended,
+    import_path,
+    is_stopped,
+)
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.building.shared_buffers import map_shared
 from filter_service.errors import (
@@ -160,7 +164,7 @@ class WorkerHandle:
             return
         self._worker.pipe.close()
         self._worker.process.terminate()
-        _end(self._worker.process)
+        end(self._worker.process, STOP_GRACE_S)
         self._worker = None
 
     @property
@@ -275,7 +279,7 @@ class WorkerHandle:
 
     def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
         """Start a new process; the build that ran is lost, those that wait are not."""
-        how = _how_it_ended(_end(worker.process))
+        how = how_it_ended(end(worker.process, STOP_GRACE_S))
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]
@@ -297,21 +301,3 @@ class WorkerHandle:
         else:
             self.start()
         return [BuildError(ticket, error) for ticket in tickets]
-
-
-def _how_it_ended(exit_code: int | None) -> str:
-    if exit_code is not None and exit_code < 0:
-        try:
-            return f"was killed by {signal.Signals(-exit_code).name}"
-        except ValueError:
-            return f"was killed by signal {-exit_code}"
-    return f"ended with code {exit_code}"
-
-
-def _end(process: subprocess.Popen[bytes]) -> int:
-    """Wait for a process that is to end, then end it by force; return its code."""
-    try:
-        return process.wait(STOP_GRACE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()

@@ -30,9 +30,7 @@ def ask_status(
     try:
         socket.linger = 0
         if key is not None:
-            socket.curve_serverkey = key.server.encode()
-            socket.curve_publickey = key.pair.public.encode()
-            socket.curve_secretkey = key.pair.secret.encode()
+            key.use_on(socket)
         socket.rcvtimeo = socket.sndtimeo = round(1000 * timeout_s)
         socket.connect(endpoint)
         socket.send_multipart(encode(Ping(0.0)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import resource
-from contextlib import suppress
 
 from filter_service.service.child import begin
 from filter_service.service.door import Door
@@ -21,8 +20,10 @@ def main() -> None:
     # Of parts of messages that are not complete yet nothing is seen here.  Beyond the
     # limit libzmq ends the process, whose memory is then free; sessions go on.
     limit = config.max_socket_mb * MB
-    with suppress(OSError, ValueError):
+    try:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    except (OSError, ValueError) as error:
+        log.warning("max_socket_mb is not kept to on this system: %s", error)
     try:
         door = Door(config, keeper)
     except (OSError, NoMetrics) as error:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import os
 import selectors
-import signal
 import socket
 import subprocess
 import sys
@@ -20,7 +19,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from filter_service.building.helper_process import import_path, is_stopped
+from filter_service.building.helper_process import (
+    end,
+    how_it_ended,
+    import_path,
+    is_stopped,
+)
 from filter_service.service.config import ServiceConfig
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.render_process import OPEN_WORKSHOP
@@ -155,10 +159,10 @@ class Keeper:
     def _join(self) -> None:
         """Give both processes the ends of a new link."""
         ends = socket.socketpair()
-        for child, end in zip(self._children.values(), ends, strict=True):
+        for child, theirs in zip(self._children.values(), ends, strict=True):
             if child.link is not None:
-                child.link.send(("link",), [end.fileno()])
-            end.close()
+                child.link.send(("link",), [theirs.fileno()])
+            theirs.close()
 
     def _listen(self, name: str, child: _Child) -> None:
         try:
@@ -186,7 +190,7 @@ class Keeper:
     def _restart(self, name: str, child: _Child) -> None:
         how = "gone"
         if child.process is not None:
-            how = _how_it_ended(_end(child.process, STOP_GRACE_S))
+            how = how_it_ended(end(child.process, STOP_GRACE_S))
         if child.link is not None:
             child.link.close()
         log.error("the %s process %s; a new one is started", name, how)
@@ -220,23 +224,8 @@ class Keeper:
                     pass
         for child in self._children.values():
             if child.process is not None:
-                _end(child.process, STOP_GRACE_S)
+                end(child.process, STOP_GRACE_S)
             if child.link is not None:
                 child.link.close()
         self._wake_reader.close()
         self._wake_writer.close()
-
-
-def _end(process: subprocess.Popen[bytes], patience_s: float) -> int:
-    """Wait for a process that is to end, then end it by force; return its code."""
-    try:
-        return process.wait(patience_s)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
-
-
-def _how_it_ended(code: int) -> str:
-    if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"ended with code {code}"
