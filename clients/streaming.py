@@ -139,6 +139,9 @@ def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
                 raise event.exception()
             if isinstance(event, FilteredFrame | Dropped):
                 return event
+        # A frame that was not on its way yet waits for the next connection.
+        if client.welcome is None:
+            raise ConnectionLost(_LOST)
     raise ServiceTimeout(f"no answer to a frame within {client.timeout_s:g} s")
 
 

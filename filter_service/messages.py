@@ -29,7 +29,13 @@ from filter_service.wire.images import (
     ViewHeader,
     ViewImages,
 )
-from filter_service.wire.message import MAX_ID, Limits, Message, Part
+from filter_service.wire.message import (
+    DEFAULT_ENDPOINT,
+    MAX_ID,
+    Limits,
+    Message,
+    Part,
+)
 from filter_service.wire.replies import (
     DROP_REASONS,
     Accepted,
@@ -110,7 +116,6 @@ __all__ = [
 ]
 
 PROTOCOL_VERSION = 1
-DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
 
 Request = Hello | ProfileRequest | Frame | Share | Unshare | Ping | Bye
 Reply = (

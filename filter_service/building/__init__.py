@@ -1,6 +1,7 @@
 """The worker process: from a profile to its PSF stores.
 
 jobs            what is asked for and what comes back
+limits          what every build keeps to
 used_ranges     the part of an eye that frames use
 read_profile    a profile's body, checked
 from_profile    the work itself

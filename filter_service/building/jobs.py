@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 from estimator.profiles.parse import EyeProfile
+from filter_service.building.limits import BuildLimits
 from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera
 from filter_service.settings import FilterSettings
 
-
-def default_cache_dir() -> str:
-    """Return where finished PSFs are kept if nothing else is said."""
-    own = os.environ.get("OCUFILTER_CACHE_DIR")
-    if own is not None:
-        return own
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(base) / "ocufilter")
+USUAL_LIMITS = BuildLimits()
 
 
 @dataclass(frozen=True)
@@ -29,20 +21,6 @@ class LookAt:
 
     pupil_diameter_mm: float
     focus_dpt: float
-
-
-@dataclass(frozen=True)
-class BuildLimits:
-    """What the service's configuration sets for every build.
-
-    ``store_cache_dir`` is empty where stores are not kept on disk.
-    """
-
-    max_blur_radius_px: int = 255
-    max_store_mb: int = 2000
-    psf_engine: str = "auto"
-    store_cache_dir: str = ""
-    store_cache_max_mb: int = 2000
 
 
 @dataclass(frozen=True)
@@ -56,7 +34,7 @@ class BuildJob:
     profile: EyeProfile
     settings: FilterSettings
     camera: Camera
-    limits: BuildLimits = BuildLimits()
+    limits: BuildLimits = USUAL_LIMITS
     look_at: LookAt | None = None
     ranges: UsedRanges | None = None
     with_preview: bool = True

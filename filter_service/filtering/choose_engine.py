@@ -85,11 +85,11 @@ def _native_or_gl(closing: ExitStack, reason: str, *, warm_up: bool) -> ChosenEn
 
 
 def _native(closing: ExitStack, reason: str) -> ChosenEngine:
-    from filter_service.rendering.native.renderer import NativeRenderer
+    from filter_service.rendering.native.lanes import NativeLanes
 
-    renderer = NativeRenderer()
-    closing.callback(renderer.close)
-    return ChosenEngine("native", renderer, reason)
+    lanes = NativeLanes()
+    closing.callback(lanes.close)
+    return ChosenEngine("native", lanes, reason)
 
 
 def _gl(

@@ -371,10 +371,11 @@ class EyeFilter:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         look_at = LookAt(pupil_diameter_mm, focus_dpt)
         self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
+        workshop = self.workshop  # a service may close the filter in the middle
         plan = self._eyes.plan([view.camera for view in views], look_at)
         if self._shared is not None:  # else its owner advances it
-            self.workshop.advance()
-        self.workshop.free_retired(self._eyes)
+            workshop.advance()
+        workshop.free_retired(self._eyes)
         self.is_extending = plan is not None and prepared_only and not plan.is_prepared
         if plan is None or self.is_extending:
             return None
@@ -382,7 +383,7 @@ class EyeFilter:
         effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
         rendered = [
             render_through_media(
-                self.workshop.engine,
+                workshop.engine,
                 view,
                 store,
                 effects,
@@ -396,7 +397,7 @@ class EyeFilter:
             )
             for view, store in zip(views, plan.stores, strict=True)
         ]
-        self.workshop.frame_s = time.monotonic() - started_s
+        workshop.frame_s = time.monotonic() - started_s
         return _filtered(plan, rendered)
 
 

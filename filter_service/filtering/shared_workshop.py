@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 
-from filter_service.building.jobs import BuildLimits, default_cache_dir
+from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.workshop import Workshop
 

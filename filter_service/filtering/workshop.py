@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.building.jobs import BuildJob, BuildLimits, BuiltStore
+from filter_service.building.jobs import BuildJob, BuiltStore
+from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import (
     BuildDone,
     BuildError,

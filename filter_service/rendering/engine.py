@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -59,6 +59,13 @@ class FrameEngine(Protocol):
 
     def trim(self) -> None:
         """Give back memory that frames use again, after a while without any."""
+
+    def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
+        """Have a function called in the middle of frames, where this engine can.
+
+        Not sooner than ``interval_s`` after the last time.  It must not raise; it may
+        filter another frame, or have a store taken.  Returns whether it is called.
+        """
 
     def load_steps(self, store: Any) -> Generator[LoadedStore | None]:
         """Take a store in slices, so that frames go on between.

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from estimator.threads import MAX_THREADS
-from filter_service.building.jobs import BuildLimits, default_cache_dir
+from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES, PSF_ENGINES
-from filter_service.messages import DEFAULT_ENDPOINT, Limits
+from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
 MB = 10**6

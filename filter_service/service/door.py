@@ -1,9 +1,9 @@
 """The door: the process that owns the socket, the sessions and their credit.
 
 It checks every message, answers what it can by itself, and hands frames and profiles
-to the render loop over a link, one frame at a time: newest frame of each client,
-clients by time used.  Images go through shared memory.  It renders nothing, so that it
-answers while a frame is rendered, however long that takes.
+to the render loop over a link, one at a time, or a small one beside a large one: the
+newest frame of each client, clients by time used.  Images go through shared memory.  It
+renders nothing, so that it answers while a frame is rendered, however long that takes.
 """
 
 from __future__ import annotations
@@ -168,11 +168,11 @@ class Door:
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
-        if self._may_hand_over:
-            if any(self._is_ready(session, now_s) for session in self._guests.present):
-                return 0.0
-            if any(session.waiting for session in self._guests.present):
-                return SOON_S
+        takeable = [s for s in self._guests.present if self._is_takeable(s)]
+        if any(self._is_ready(session, now_s) for session in takeable):
+            return 0.0
+        if takeable:
+            return SOON_S
         due_s = min(self._next_alive_s, self._next_trim_s)
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
@@ -193,11 +193,11 @@ class Door:
         if now_s >= self._next_trim_s:
             self._next_trim_s = now_s + TRIM_INTERVAL_S
             is_idle = not any(session.waiting for session in self._guests.present)
-            if is_idle and self._render.held is None:
+            if is_idle and not self._render.held:
                 self._render.trim()
-        if self._render.is_up and self._render.silent_s > self.config.frame_limit_s:
+        if self._render.is_up and self._render.stuck_s > self.config.frame_limit_s:
             limit_s = self.config.frame_limit_s
-            log.error("the process that filters frames says nothing for %g s", limit_s)
+            log.error("the process that filters frames is stuck for %g s", limit_s)
             self._render.excuse()
             self._keeper.send(("hung",))
 
@@ -217,9 +217,11 @@ class Door:
         except LinkClosed:
             self._lose_render()
 
-    def _begin_with(self, server: dict[str, str], eyes: list[tuple[Any, ...]]) -> None:
+    def _begin_with(
+        self, server: dict[str, str], eyes: list[tuple[Any, ...]], may_rest: bool
+    ) -> None:
         """Learn which eyes there are; bring both sides to the same sessions."""
-        self._server = server
+        self._server, self._render.may_rest = server, may_rest
         known, held = {s.key for s in self._guests}, {key for key, *_ in eyes}
         for session in self._guests:
             if session.key not in held:
@@ -248,9 +250,8 @@ class Door:
             self._render.tell("profile", session.key, profile)
 
     def _lose_render(self) -> None:
-        """Answer the frame that is lost with a render loop."""
-        lost = self._render.lose()
-        if lost is not None:
+        """Answer the frames that are lost with a render loop."""
+        for lost in self._render.lose():
             error = RenderFailed(
                 "the process that filters frames ended; it starts again"
             )
@@ -377,7 +378,7 @@ class Door:
             n_dropped=self._n_dropped,
             is_building=self._is_building or asked,
             is_ready=self._render.is_ready,
-            is_filtering=self._render.held is not None,
+            is_filtering=bool(self._render.held),
             render_silent_s=self._render.silent_s,
         )
 
@@ -546,9 +547,9 @@ class Door:
         self._turns.arrive(session.key, waiting.decoded_s)
         return None if superseded is None else superseded.frame
 
-    @property
-    def _may_hand_over(self) -> bool:
-        return self._render.is_ready and self._render.held is None
+    def _is_takeable(self, session: Session) -> bool:
+        waiting = session.waiting
+        return waiting is not None and self._render.takes(session, waiting.frame)
 
     def _is_ready(self, session: Session, now_s: float) -> bool:
         """Return whether a session's frame may be handed over, or be given up.
@@ -556,8 +557,6 @@ class Door:
         A thread of pyzmq's marks results as sent; it gets a moment before a client is
         said not to read.
         """
-        if session.waiting is None:
-            return False
         session.unsent = self._render.still_unsent(session.unsent)
         if len(session.unsent) < MAX_UNSENT_RESULTS:
             session.behind_since_s = None
@@ -567,10 +566,12 @@ class Door:
         return now_s - session.behind_since_s > MARK_SENT_S
 
     def _hand_over_one_frame(self) -> None:
-        if not self._may_hand_over:
-            return
         now_s = time.monotonic()
-        ready = {s.key: s for s in self._guests.present if self._is_ready(s, now_s)}
+        ready = {
+            s.key: s
+            for s in self._guests.present
+            if self._is_takeable(s) and self._is_ready(s, now_s)
+        }
         key = self._turns.next_of(ready)
         if key is None:
             return
@@ -590,14 +591,19 @@ class Door:
             self._answer_frame(session, frame, failed)
 
     def _take_answer(
-        self, number: int, reply: Answer, started_s: float, ended_s: float
+        self,
+        number: int,
+        reply: Answer,
+        started_s: float,
+        ended_s: float,
+        used_s: float,
     ) -> None:
         """Pass an answer of the render loop on to who asked."""
         held = self._render.take_back(number)
         if held is None:
             return
-        self._turns.note(held.session.key, ended_s - started_s, ended_s)
-        self._filtered_s += ended_s - started_s
+        self._turns.note(held.session.key, used_s, ended_s)
+        self._filtered_s += used_s
         if isinstance(reply, Result):
             reply = completed(reply, held, started_s)
         elif isinstance(reply, Dropped):

@@ -27,12 +27,12 @@ from filter_service.building.helper_process import (
 )
 from filter_service.service.config import ServiceConfig
 from filter_service.service.link import Link, LinkClosed
-from filter_service.service.render_process import OPEN_WORKSHOP
 
 MODULES = {
     "door": ("filter_service.service.door_process",),
     "render": ("filter_service.service.render_process",),
 }
+OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
 MAX_RESTARTS = 8
 RESTART_WINDOW_S = 60.0
 CHECK_INTERVAL_S = 0.5

@@ -8,8 +8,7 @@ from functools import partial
 
 from filter_service.service.child import start_log
 from filter_service.service.config import ServiceConfig
-from filter_service.service.keeper import Keeper, ServiceFailed
-from filter_service.service.render_process import OPEN_WORKSHOP
+from filter_service.service.keeper import OPEN_WORKSHOP, Keeper, ServiceFailed
 
 log = logging.getLogger("ocufilter")
 

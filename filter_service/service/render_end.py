@@ -1,4 +1,4 @@
-"""The door's end of the render loop: a link that may break, memory, one frame.
+"""The door's end of the render loop: a link that may break, memory, frames.
 
 What the loop has to say comes from `receive`; whatever is sent while there is no loop
 is lost, and the door says it again to the next one.
@@ -23,12 +23,15 @@ from filter_service.slots import Slot, SlotPool, starts_of
 
 MS_PER_S = 1000.0
 
+SMALLER_RATIO = 4
+"""A frame may come between the parts of one that has so many times its pixels."""
+
 Unsent = list[tuple[Tracker, Slot]]
 
 
 @dataclass(frozen=True)
 class Held:
-    """The frame that the render loop has."""
+    """A frame that the render loop has."""
 
     number: int
     session: Session
@@ -36,6 +39,7 @@ class Held:
     waiting: WaitingFrame
     places: SharedPlaces
     own_slots: tuple[Slot, ...]  # not the client's: what is sent, and is given back
+    handed_s: float
 
 
 class RenderEnd:
@@ -48,19 +52,23 @@ class RenderEnd:
 
     Attributes
     ----------
-    held : Held or None
-        The frame that is being filtered.
+    held : dict of Held
+        The frames that are being filtered, by number: one, or a large one and a small
+        one that comes between its parts.
+    may_rest : bool
+        The loop can do that.
     is_ready : bool
         The loop has said which eyes it has, and was told of the others.
     """
 
     def __init__(self, max_image_bytes: int) -> None:
-        self.held: Held | None = None
+        self.held: dict[int, Held] = {}
         self.is_ready = False
+        self.may_rest = False
         self._link: Link | None = None
         self._slots = SlotPool(max_image_bytes)
         self._next_number = 1
-        self._heard_s = time.monotonic()
+        self._heard_s = self._excused_s = time.monotonic()
 
     # The link
 
@@ -74,9 +82,15 @@ class RenderEnd:
         """Return since when the loop has given no sign of life."""
         return time.monotonic() - self._heard_s
 
+    @property
+    def stuck_s(self) -> float:
+        """Return for how long it has said nothing, or has had a frame."""
+        begins_s = [self._heard_s, *(held.handed_s for held in self.held.values())]
+        return time.monotonic() - max(min(begins_s), self._excused_s)
+
     def excuse(self) -> None:
-        """Count the silence anew: what was to be done about it is being done."""
-        self._heard_s = time.monotonic()
+        """Count the time anew: what was to be done about it is being done."""
+        self._excused_s = self._heard_s = time.monotonic()
 
     def descriptors(self) -> tuple[set[int], set[int]]:
         """Return what to poll for reading, and for writing."""
@@ -106,18 +120,18 @@ class RenderEnd:
         self._link.flush()
         messages = [message for message, _ in self._link.receive()]
         if messages:
-            self.excuse()
+            self._heard_s = time.monotonic()
         return messages
 
-    def lose(self) -> Held | None:
-        """Give up the link; return the frame that is lost with it."""
+    def lose(self) -> list[Held]:
+        """Give up the link; return the frames that are lost with it."""
         if self._link is not None:
             self._link.close()
             self._link = None
         self.is_ready = False
-        lost, self.held = self.held, None
-        if lost is not None:
-            self.give_back(*lost.own_slots)
+        lost, self.held = list(self.held.values()), {}
+        for held in lost:
+            self.give_back(*held.own_slots)
         return lost
 
     def tell(self, *message: Any) -> None:
@@ -182,6 +196,16 @@ class RenderEnd:
 
     # Frames
 
+    def takes(self, session: Session, frame: Frame) -> bool:
+        """Return whether a frame may be handed over now."""
+        if not self.is_ready or len(self.held) >= (2 if self.may_rest else 1):
+            return False
+        return all(
+            held.session is not session
+            and SMALLER_RATIO * frame.pixel_count <= held.waiting.frame.pixel_count
+            for held in self.held.values()
+        )
+
     def hand_over(self, session: Session, waiting: WaitingFrame) -> None:
         """Have a frame filtered.
 
@@ -195,9 +219,12 @@ class RenderEnd:
         if places is None:
             places, own_slots = self._copied_in(frame)
         number, self._next_number = self._next_number, self._next_number + 1
-        self.held = Held(number, session, session.identity, waiting, places, own_slots)
+        self._heard_s = now_s = time.monotonic()
+        self.held[number] = Held(
+            *(number, session, session.identity, waiting, places, own_slots),
+            handed_s=now_s,
+        )
         bare = replace(frame, images=(), memory=None)
-        self.excuse()
         self.tell("frame", number, session.key, bare, places)
 
     def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
@@ -222,12 +249,8 @@ class RenderEnd:
         return places, (slot, result_slot)
 
     def take_back(self, number: int) -> Held | None:
-        """Return the frame that an answer is to, if it is the one that is awaited."""
-        held = self.held
-        if held is None or held.number != number:
-            return None
-        self.held = None
-        return held
+        """Return the frame that an answer is to, if it is one that is awaited."""
+        return self.held.pop(number, None)
 
 
 def completed(result: Result, held: Held, started_s: float) -> Result:

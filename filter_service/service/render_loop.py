@@ -6,8 +6,9 @@ for the other, and each outlives the other: a new door is told which sessions th
 From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
 number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
 request)``, ``("frame", number, key, frame, places)``, ``("close", key)``.
-To the door: ``("here", server, eyes)`` first, ``("tell", key, reply)``, ``("answer",
-number, reply, started_s, ended_s)`` and ``("state", memory_mb, is_building)``.
+To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, reply)``,
+``("answer", number, reply, started_s, ended_s, used_s)`` and ``("state", memory_mb,
+is_building)``.
 """
 
 from __future__ import annotations
@@ -51,6 +52,10 @@ from filter_service.wire.images import ViewImages
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
 STATE_INTERVAL_S = 0.5
+BETWEEN_S = 0.02
+LONG_FRAME_S = 0.1
+"""A frame that takes longer rests now and then, for what others want meanwhile."""
+
 TRIM_AFTER_S = 10.0
 """Without a frame for so long, the memory of frames goes back to the system."""
 
@@ -96,6 +101,12 @@ class RenderLoop:
         self._door: Link | None = None
         self._next_state_s = 0.0
         self._trim_at_s: float | None = None  # where frames hold memory
+        self._frame_since_s: float | None = None  # the one that is being filtered
+        self._rested_s = 0.0  # of that
+        self._next_rest_s = 0.0
+        self._listen: Callable[[], None] = lambda: None
+        self._is_over = False
+        self._may_rest = workshop.engine.call_between(self._rest, BETWEEN_S)
 
     def run(
         self, control: Link, take_control: Callable[[Any, list[int]], bool]
@@ -109,14 +120,19 @@ class RenderLoop:
         """
         selector = selectors.DefaultSelector()
         selector.register(control, selectors.EVENT_READ)
+
+        def listen() -> None:
+            for message, descriptors in control.receive():
+                if not take_control(message, descriptors):
+                    self._is_over = True
+
+        self._listen = listen
         try:
             self._workshop.worker.start()
-            while True:
+            while not self._is_over:
                 self._watch(selector, control)
                 selector.select(self._wait_s())
-                for message, descriptors in control.receive():
-                    if not take_control(message, descriptors):
-                        return
+                listen()
                 self._turn()
         except LinkClosed:
             log.error("the process that owns this one is gone")
@@ -140,7 +156,7 @@ class RenderLoop:
             (eye.key, eye.session_id, eye.profile_id, eye.generation)
             for eye in self._eyes.values()
         ]
-        self._send(("here", server, eyes))
+        self._send(("here", server, eyes, self._may_rest))
 
     # The loop
 
@@ -182,11 +198,36 @@ class RenderLoop:
                     self._door.close()
                 self._door = None
         self._workshop.advance()
-        if self._trim_at_s is not None and time.monotonic() > self._trim_at_s:
+        if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None
             self._workshop.engine.trim()
             give_memory_back()
         self._tell_state()
+
+    @property
+    def _is_time_to_trim(self) -> bool:
+        return self._trim_at_s is not None and time.monotonic() > self._trim_at_s
+
+    def _rest(self) -> None:
+        """In the middle of a long frame: do what others want, a smaller frame too.
+
+        That takes half of the time at most.  Whatever is asked for meanwhile, what the
+        frame is filtered with stays in memory until it is done.
+        """
+        begin_s = time.monotonic()
+        since_s = self._frame_since_s
+        if since_s is None or begin_s < max(since_s + LONG_FRAME_S, self._next_rest_s):
+            return
+        try:
+            self._listen()
+            self._turn()
+        except LinkClosed:
+            self._is_over = True
+        except Exception:  # it cannot be raised through the compiled loops
+            log.exception("what came between the parts of a frame failed")
+        end_s = time.monotonic()
+        self._rested_s += end_s - begin_s
+        self._next_rest_s = end_s + (end_s - begin_s)
 
     def _tell_state(self, *, is_due: bool = False) -> None:
         now_s = time.monotonic()
@@ -310,26 +351,40 @@ class RenderLoop:
     def _filter(
         self, number: int, key: str, frame: Frame, places: SharedPlaces
     ) -> None:
+        """Filter a frame; one that comes between the parts of another does not rest."""
         started_s = time.monotonic()
-        eye = self._eyes.get(key)
-        reply: Reply
-        if eye is None:
-            error = NoSession("the session has ended")
-            reply = ErrorReply.from_exception(error, frame_id=frame.frame_id)
-        else:
-            slot = self._slots[places.slot]
-            frame = replace(frame, images=images_in(slot, frame, places.starts))
-            reply = frame_reply(eye.eye_filter, frame)
-        if isinstance(reply, Result):
-            colors = [np.ascontiguousarray(color) for color in reply.colors]
-            copied_s = time.monotonic()
-            self._slots[places.result_slot].put(colors, places.result_starts)
-            stages_ms = dict(reply.stage_times_ms)
-            stages_ms["copy_out_ms"] = 1e3 * (time.monotonic() - copied_s)
-            reply = replace(reply, colors=(), stage_times_ms=stages_ms)
+        is_first = self._frame_since_s is None
+        if is_first:
+            self._frame_since_s, self._rested_s = started_s, 0.0
+        try:
+            reply = self._filtered(key, frame, places)
+        finally:
+            rested_s = self._rested_s if is_first else 0.0
+            if is_first:
+                self._frame_since_s = None
         ended_s = time.monotonic()
         self._trim_at_s = ended_s + TRIM_AFTER_S
-        self._send(("answer", number, reply, started_s, ended_s))
+        used_s = ended_s - started_s - rested_s
+        self._send(("answer", number, reply, started_s, ended_s, used_s))
+
+    def _filtered(self, key: str, frame: Frame, places: SharedPlaces) -> Reply:
+        """Return the answer to a frame; its pictures are where they are wanted."""
+        eye = self._eyes.get(key)
+        if eye is None:
+            error = NoSession("the session has ended")
+            return ErrorReply.from_exception(error, frame_id=frame.frame_id)
+        # By the end the door may have given them up.
+        slot, result_slot = self._slots[places.slot], self._slots[places.result_slot]
+        frame = replace(frame, images=images_in(slot, frame, places.starts))
+        reply = frame_reply(eye.eye_filter, frame)
+        if not isinstance(reply, Result):
+            return reply
+        colors = [np.ascontiguousarray(color) for color in reply.colors]
+        copied_s = time.monotonic()
+        result_slot.put(colors, places.result_starts)
+        stages_ms = dict(reply.stage_times_ms)
+        stages_ms["copy_out_ms"] = 1e3 * (time.monotonic() - copied_s)
+        return replace(reply, colors=(), stage_times_ms=stages_ms)
 
 
 def images_in(

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     ReadProfile = Callable[[dict[str, Any]], EyeProfile]
     Opened = tuple[Workshop, ReadProfile, Callable[[], None]]
 
-OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
-
 log = logging.getLogger("ocufilter")
 
 

@@ -11,6 +11,8 @@ from msgspec import Meta
 from filter_service.checked import Record, checked
 from filter_service.errors import BadMessage
 
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
+
 Part = bytes | bytearray | memoryview
 
 MAX_ID = 2**53 - 1  # ids survive a trip through a double, as in JSON or JavaScript

@@ -121,6 +121,11 @@ class Frame(Message):
     type_name: ClassVar[str] = "frame"
     payload: ClassVar[str] = "images"
 
+    @property
+    def pixel_count(self) -> int:
+        """Return the pixels of all views."""
+        return sum(view.camera.pixel_count for view in self.views)
+
     def parts(self) -> list[Any]:
         """Return the images of each view in turn; none where they lie in memory."""
         if self.memory is not None:

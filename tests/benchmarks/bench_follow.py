@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from estimator.profiles.parse import parse_profile
 from filter_service.building.from_profile import build
-from filter_service.building.jobs import BuildJob, BuildLimits
+from filter_service.building.jobs import BuildJob
+from filter_service.building.limits import BuildLimits
 from filter_service.building.used_ranges import UsedRanges
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.accepted_profile import PreparedStore

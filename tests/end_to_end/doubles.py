@@ -55,6 +55,10 @@ class EngineDouble:
     def trim(self):
         """Nothing is held."""
 
+    def call_between(self, function, interval_s):
+        """Frames are not long here."""
+        return False
+
     def load_steps(self, store: StoreDouble):
         """Read the ballast in slices, as a copy to a GPU would."""
         for first in range(0, store.ballast.size, SLICE_BYTES):

@@ -19,7 +19,7 @@ from filter_service import (
     FilterSettings,
     RgbdView,
 )
-from filter_service.building.jobs import BuildLimits
+from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import (
     BadMessage,

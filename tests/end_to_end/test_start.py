@@ -10,13 +10,13 @@ from tests.source_tree import ROOT
 
 UP_TO_READY = """
 import json, sys
-from filter_service.service import render_process
+from filter_service.service import keeper as keeping, render_process
 from filter_service.service.config import load_config
 from filter_service.service.link import Link
 
 keeper, end = Link.pair()
 keeper.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
-sys.argv[1:] = [str(end.detach()), render_process.OPEN_WORKSHOP]
+sys.argv[1:] = [str(end.detach()), keeping.OPEN_WORKSHOP]
 send = Link.send
 
 def report(link, message, descriptors=()):

@@ -6,7 +6,8 @@ import pytest
 from estimator.profiles.parse import parse_profile
 from filter_service.building import from_profile
 from filter_service.building.from_profile import build
-from filter_service.building.jobs import BuildJob, BuildLimits
+from filter_service.building.jobs import BuildJob
+from filter_service.building.limits import BuildLimits
 from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera
 from filter_service.rendering.native.renderer import NativeRenderer

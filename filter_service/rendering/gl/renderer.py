@@ -1,7 +1,7 @@
 """Filters one view: checks, layers, strips that fit the buffers, and the answer."""
 
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from math import ceil
 
@@ -73,6 +73,10 @@ class FilterRenderer:
 
     def trim(self) -> None:
         """Keep what is held: a GPU's buffers are bounded, and dear to make anew."""
+
+    def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
+        """Do without: no frame keeps a GPU for long."""
+        return False
 
     def load_steps(
         self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES

@@ -1,6 +1,7 @@
 """The frame engine of compiled loops, for machines without a GPU.
 
 renderer       the engine: stages, what is kept between frames
+lanes          two renderers, for small frames beside large ones
 native_store   a store with its coarse kernels
 kernel_plan    the kernels that a frame needs
 frame_record   what the loops are told

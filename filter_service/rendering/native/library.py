@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
@@ -14,6 +15,8 @@ from filter_service.rendering.native import records
 FOLDER = Path(__file__).parent
 STEM = "_loops"
 LIBRARY_VARIABLE = "OCUFILTER_NATIVE_LIBRARY"
+Between = ctypes.CFUNCTYPE(None)
+
 STAGES = ("pixels", "merge", "place", "blend", "splat")
 
 REMEDY = (
@@ -53,6 +56,11 @@ class Library:
         self._c.ocu_pool_new.restype = ctypes.c_void_p
         self._c.ocu_pool_free.argtypes = (ctypes.c_void_p,)
         self._c.ocu_pool_size.argtypes = (ctypes.c_void_p,)
+        self._c.ocu_pool_set_between.argtypes = (
+            ctypes.c_void_p,
+            Between,
+            ctypes.c_double,
+        )
         self._check_sizes(path)
         self._own = ctypes.c_void_p(self._c.ocu_loops(int(portable)))
         self.variant = self._c.ocu_name(self._own).decode()
@@ -85,6 +93,20 @@ class Library:
     def thread_count(self, threads: int) -> int:
         """Return how many threads there really are."""
         return int(self._c.ocu_pool_size(threads))
+
+    def call_between(
+        self, threads: int, function: Callable[[], None], interval_s: float
+    ) -> object:
+        """Have a function called in the middle of loops, while the threads rest.
+
+        Returns
+        -------
+        object
+            To be kept for as long as the threads are there.
+        """
+        held = Between(function)
+        self._c.ocu_pool_set_between(threads, held, interval_s)
+        return held
 
     def end_threads(self, threads: int) -> None:
         """End them."""

@@ -2,7 +2,7 @@
 
 import time
 import weakref
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import ceil
@@ -55,6 +55,7 @@ class NativeRenderer:
         self._threads = self._loops.new_threads(n_threads or thread_count())
         self._n_threads = self._loops.thread_count(self._threads)
         self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
+        self._between: object = None
         self._states = FrameStates()
         self._arrays = Arrays()
         self._plan: KernelPlan | None = None
@@ -81,6 +82,13 @@ class NativeRenderer:
     def close(self) -> None:
         """End the threads; the renderer is of no use after."""
         self._end()
+
+    def call_between(self, function: Callable[[], None], interval_s: float) -> None:
+        """Have a function called now and then in the middle of a frame.
+
+        It must neither raise nor use this renderer.
+        """
+        self._between = self._loops.call_between(self._threads, function, interval_s)
 
     def load(self, store: PsfStore) -> NativeStore:
         """Take a store at once."""

@@ -43,6 +43,9 @@ EXPORT void ocu_sizes(int32_t *sizes) {
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }
 EXPORT void ocu_pool_free(pool *p) { pool_free(p); }
+EXPORT void ocu_pool_set_between(pool *p, pool_between between, double interval_s) {
+    pool_set_between(p, between, interval_s);
+}
 EXPORT int ocu_pool_size(const pool *p) { return pool_size(p); }
 
 EXPORT void ocu_pixels(const loops *own, frame *f) { own->pixels(f); }

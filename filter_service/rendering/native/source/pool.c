@@ -3,6 +3,7 @@
 #include <pthread.h>
 #include <stdatomic.h>
 #include <stdlib.h>
+#include <time.h>
 
 struct pool {
     int n_threads;
@@ -17,6 +18,10 @@ struct pool {
     void *job;
     int n_items;
     atomic_int next;
+    pool_between between;
+    double interval_s, due_s;
+    pthread_cond_t resume;
+    atomic_int rests;         /* threads but the caller wait */
 };
 
 typedef struct {
@@ -24,8 +29,35 @@ typedef struct {
     int thread;
 } seat;
 
+static double now_s(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+/* The caller of a loop: does what is to be done in between, if that is due. */
+static void come_between(pool *p) {
+    if (p->between == NULL || now_s() < p->due_s) return;
+    atomic_store(&p->rests, 1);
+    p->between();
+    pthread_mutex_lock(&p->lock);
+    atomic_store(&p->rests, 0);
+    pthread_cond_broadcast(&p->resume);
+    pthread_mutex_unlock(&p->lock);
+    p->due_s = now_s() + p->interval_s;
+}
+
+static void rest(pool *p) {
+    if (!atomic_load_explicit(&p->rests, memory_order_relaxed)) return;
+    pthread_mutex_lock(&p->lock);
+    while (atomic_load(&p->rests)) pthread_cond_wait(&p->resume, &p->lock);
+    pthread_mutex_unlock(&p->lock);
+}
+
 static void take_items(pool *p, int thread) {
     for (;;) {
+        if (thread == 0) come_between(p);
+        else rest(p);
         int item = atomic_fetch_add_explicit(&p->next, 1, memory_order_relaxed);
         if (item >= p->n_items) return;
         p->item(p->job, item, thread);
@@ -59,6 +91,7 @@ pool *pool_new(int n_threads) {
     pthread_mutex_init(&p->lock, NULL);
     pthread_cond_init(&p->begin, NULL);
     pthread_cond_init(&p->end, NULL);
+    pthread_cond_init(&p->resume, NULL);
     p->n_threads = 1;
     for (int thread = 1; p->threads != NULL && thread < n_threads; ++thread) {
         seat *own = malloc(sizeof *own);
@@ -84,9 +117,16 @@ void pool_free(pool *p) {
         pthread_join(p->threads[thread], NULL);
     pthread_cond_destroy(&p->begin);
     pthread_cond_destroy(&p->end);
+    pthread_cond_destroy(&p->resume);
     pthread_mutex_destroy(&p->lock);
     free(p->threads);
     free(p);
+}
+
+void pool_set_between(pool *p, pool_between between, double interval_s) {
+    p->between = between;
+    p->interval_s = interval_s;
+    p->due_s = 0.0;
 }
 
 int pool_size(const pool *p) { return p->n_threads; }

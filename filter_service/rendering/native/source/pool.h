@@ -12,6 +12,11 @@ pool *pool_new(int n_threads);
 void pool_free(pool *p);
 int pool_size(const pool *p);
 
+/* Has something done now and then in the middle of loops, by the caller of the loop, while
+ * its other threads rest; not sooner than interval_s after the last time.  NULL: nothing. */
+typedef void (*pool_between)(void);
+void pool_set_between(pool *p, pool_between between, double interval_s);
+
 /* Runs items 0..n_items-1, the caller takes part; returns when all are done. */
 void pool_run(pool *p, int n_items, pool_item item, void *job);
 
