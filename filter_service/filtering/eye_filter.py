@@ -347,6 +347,7 @@ class EyeFilter:
         merge: bool = True,
         render_tolerance: float = 1.0,
         prepared_only: bool = False,
+        out: Sequence[NDArray[Any] | None] | None = None,
     ) -> Filtered | None:
         """Filter one frame like `filter`; None while its eye is being prepared.
 
@@ -355,6 +356,8 @@ class EyeFilter:
         prepared_only : bool
             None as well, and `is_extending`, while only the state of this frame is not
             prepared; else it is seen through the nearest that is.
+        out : sequence of arrays, optional
+            Memory for the pictures, which may be used; what is returned counts.
 
         Raises
         ------
@@ -379,6 +382,7 @@ class EyeFilter:
         self.is_extending = plan is not None and prepared_only and not plan.is_prepared
         if plan is None or self.is_extending:
             return None
+        rooms = out or [None] * len(views)
         started_s = time.monotonic()
         effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
         rendered = [
@@ -394,8 +398,9 @@ class EyeFilter:
                 render_tolerance=render_tolerance,
                 output=output,
                 gaze_deg=gaze_deg,
+                out=room,
             )
-            for view, store in zip(views, plan.stores, strict=True)
+            for view, store, room in zip(views, plan.stores, rooms, strict=True)
         ]
         workshop.frame_s = time.monotonic() - started_s
         return _filtered(plan, rendered)

@@ -86,6 +86,7 @@ class FrameEngine(Protocol):
         render_tolerance: float = 1.0,
         output: Output = "linear",
         gaze_deg: tuple[float, float] | None = None,
+        out: NDArray[Any] | None = None,
     ) -> Rendered:
         """Filter one view through the eye of a loaded store.
 
@@ -93,6 +94,8 @@ class FrameEngine(Protocol):
         ----------
         render_tolerance : float
             0 is exact, 1 leaves no visible difference, more is faster.
+        out : array, optional
+            Memory of the shape and type of the picture, which an engine may use for it.
 
         Raises
         ------

@@ -78,11 +78,13 @@ def render_through_media(
     effects: MediaEffects | None,
     *,
     output: str,
+    out: NDArray[Any] | None = None,
     **options: Any,
 ) -> FilteredView:
     """Filter a view as `FrameEngine.render` does, with effects that are asked for."""
     if effects is None:
-        return cast(FilteredView, engine.render(view, handle, output=output, **options))
+        found = engine.render(view, handle, output=output, out=out, **options)
+        return cast(FilteredView, found)
     started_s = time.perf_counter()
     if effects.magnification_ratio is not None:
         view = seen_through(view, effects.magnification_ratio)

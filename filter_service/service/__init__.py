@@ -12,6 +12,8 @@ patience        how many wrong messages are answered
 asking          a question to a running service
 guests          all sessions, with a client or without
 session         one client: its waiting frame, its credit, its profile
+sharing         memory that clients share
+frame_desk      frames on their way, and their answers
 places          whether a frame's images lie where they may
 render_end      the door's end of what follows
 turns           whose frame is next

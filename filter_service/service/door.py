@@ -12,7 +12,6 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 from filter_service.errors import (
@@ -21,8 +20,6 @@ from filter_service.errors import (
     FilterError,
     NoSession,
     NotAllowed,
-    OutOfMemory,
-    RenderFailed,
     TooManySessions,
 )
 from filter_service.keys import KeyRing
@@ -40,45 +37,31 @@ from filter_service.messages import (
     Pong,
     ProfileRequest,
     Reply,
-    Result,
     Share,
-    Shared,
     Unshare,
     Welcome,
     decode_request,
     encode,
     peek_ids,
 )
-from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
+from filter_service.service.config import ServiceConfig
+from filter_service.service.frame_desk import FrameDesk
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
 from filter_service.service.metrics import serve_metrics
 from filter_service.service.patience import Patience
-from filter_service.service.places import check_places
 from filter_service.service.process_info import resident_memory_mb
-from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
-from filter_service.service.session import Session, WaitingFrame
-from filter_service.service.turns import Turns
+from filter_service.service.render_end import RenderEnd
+from filter_service.service.session import Session
+from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep others waiting
-MAX_UNSENT_RESULTS = 4  # large replies a client has not taken; bounds memory
-MARK_SENT_S = 0.03  # less than most frames take to filter
 IDLE_WAIT_S = 1.0
-SOON_S = 0.002
 TRIM_INTERVAL_S = 10.0
 CLOSING_LINGER_MS = 200
-RETRY_AFTER_MS = 100.0
-"""A first guess of when a preview is there."""
-
 MB = 10**6
-MAX_PARTS_PER_VIEW = 4
-MAX_SHARED_SLOTS = 16
-"""Of one session."""
-
-Answer = Result | Dropped | ErrorReply
-
 log = logging.getLogger("ocufilter")
 
 
@@ -101,11 +84,9 @@ class Door:
         self._server: dict[str, str] | None = None
         self._greetings: list[tuple[bytes, Hello]] = []  # until the renderer is known
         self._guests = Guests()
-        self._turns: Turns[str] = Turns()
         self._patience = Patience()
-        self._leaving: Unsent = []  # results of clients that are gone
-        self._n_rendered = self._n_dropped = self._n_faults = 0
-        self._filtered_s = 0.0
+        self._frames = FrameDesk(self._guests, self._render, self._send)
+        self._n_faults = 0
         now_s = time.monotonic()
         self._next_alive_s = now_s + config.alive_interval_s
         self._next_trim_s = now_s + TRIM_INTERVAL_S
@@ -116,6 +97,7 @@ class Door:
             keys=KeyRing(config.keys_dir) if config.keys_dir else None,
         )
         self.endpoint = self._mailbox.endpoint
+        self._sharing = Sharing(config, self.endpoint, self._render)
         if config.metrics_port:
             serve_metrics(config.metrics_port, self.metrics)
 
@@ -125,9 +107,9 @@ class Door:
             "ocufilter_ready": float(self._render.is_ready),
             "ocufilter_sessions": len(self._guests.present),
             "ocufilter_sessions_away": len(self._guests.away),
-            "ocufilter_frames_filtered_total": self._n_rendered,
-            "ocufilter_frames_dropped_total": self._n_dropped,
-            "ocufilter_filter_seconds_total": self._filtered_s,
+            "ocufilter_frames_filtered_total": self._frames.n_rendered,
+            "ocufilter_frames_dropped_total": self._frames.n_dropped,
+            "ocufilter_filter_seconds_total": self._frames.filtered_s,
             "ocufilter_messages_unheard_total": self._patience.n_unheard,
             "ocufilter_faults_total": self._n_faults,
             "ocufilter_memory_bytes": MB * (resident_memory_mb() + self._render_mb),
@@ -149,7 +131,7 @@ class Door:
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
         """Do what the keeper says; return whether to go on."""
         if message[0] == "link":
-            self._lose_render()
+            self._frames.lose_held()
             self._render.join(Link.from_descriptor(descriptors[0]))
         return bool(message[0] != "stop")
 
@@ -163,16 +145,14 @@ class Door:
         self._keeper.flush()
         self._listen_to_render()
         self._take_in_messages()
-        self._hand_over_one_frame()
+        self._frames.hand_over_one()
         self._tidy()
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
-        takeable = [s for s in self._guests.present if self._is_takeable(s)]
-        if any(self._is_ready(session, now_s) for session in takeable):
-            return 0.0
-        if takeable:
-            return SOON_S
+        soon_s = self._frames.wait_s(now_s)
+        if soon_s is not None:
+            return soon_s
         due_s = min(self._next_alive_s, self._next_trim_s)
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
@@ -185,15 +165,14 @@ class Door:
     def _tidy(self) -> None:
         """Do what is due now and then."""
         now_s = time.monotonic()
-        self._leaving = self._render.still_unsent(self._leaving)
+        self._frames.tidy()
         self._probe_clients()
         for session in self._guests.away:
             if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
                 self._forget(session, "its client did not come back")
         if now_s >= self._next_trim_s:
             self._next_trim_s = now_s + TRIM_INTERVAL_S
-            is_idle = not any(session.waiting for session in self._guests.present)
-            if is_idle and not self._render.held:
+            if self._frames.is_idle:
                 self._render.trim()
         if self._render.is_up and self._render.stuck_s > self.config.frame_limit_s:
             limit_s = self.config.frame_limit_s
@@ -207,7 +186,7 @@ class Door:
         try:
             for kind, *rest in self._render.receive():
                 if kind == "answer":
-                    self._take_answer(*rest)
+                    self._frames.take_answer(*rest)
                 elif kind == "tell":
                     self._pass_on(*rest)
                 elif kind == "state":
@@ -215,7 +194,7 @@ class Door:
                 elif kind == "here":
                     self._begin_with(*rest)
         except LinkClosed:
-            self._lose_render()
+            self._frames.lose_held()
 
     def _begin_with(
         self, server: dict[str, str], eyes: list[tuple[Any, ...]], may_rest: bool
@@ -248,15 +227,6 @@ class Door:
         if profile is not None:
             session.asked_profile = profile
             self._render.tell("profile", session.key, profile)
-
-    def _lose_render(self) -> None:
-        """Answer the frames that are lost with a render loop."""
-        for lost in self._render.lose():
-            error = RenderFailed(
-                "the process that filters frames ended; it starts again"
-            )
-            frame_id = lost.waiting.frame.frame_id
-            self._answer_held(lost, ErrorReply.from_exception(error, frame_id=frame_id))
 
     def _pass_on(self, key: str, reply: Reply) -> None:
         """Tell a session what the render loop says of its profile."""
@@ -300,7 +270,7 @@ class Door:
                 log.exception("fault %d: a refusal failed", self._n_faults)
                 self._end_session(received[0])
         for session, frame in superseded:
-            self._answer_frame(session, frame, Dropped(frame.frame_id, "superseded"))
+            self._frames.answer(session, frame, Dropped(frame.frame_id, "superseded"))
 
     def _take_in(
         self,
@@ -320,7 +290,7 @@ class Door:
             request = decode_request(parts, self._limits)
             if isinstance(request, Frame):
                 session = self._session_at(identity)
-                older = self._take_frame(session, request, received_s)
+                older = self._frames.take_in(session, request, received_s)
                 superseded += [(session, older)] if older is not None else []
             else:
                 self._handle(identity, request)
@@ -350,9 +320,10 @@ class Door:
         elif isinstance(request, ProfileRequest):
             self._take_profile(self._session_at(identity), request)
         elif isinstance(request, Share):
-            self._send(identity, self._share(self._session_at(identity), request))
+            shared = self._sharing.share(self._session_at(identity), request)
+            self._send(identity, shared)
         elif isinstance(request, Unshare):
-            self._unshare(self._session_at(identity), request)
+            self._sharing.unshare(self._session_at(identity), request)
 
     def _turn_out(self, refused: Refused) -> None:
         """End the session of a client whose key was taken from the list."""
@@ -374,8 +345,8 @@ class Door:
             server_time_s=time.monotonic(),
             memory_mb=resident_memory_mb() + self._render_mb,
             n_sessions=len(self._guests.present),
-            n_rendered=self._n_rendered,
-            n_dropped=self._n_dropped,
+            n_rendered=self._frames.n_rendered,
+            n_dropped=self._frames.n_dropped,
             is_building=self._is_building or asked,
             is_ready=self._render.is_ready,
             is_filtering=bool(self._render.held),
@@ -408,7 +379,7 @@ class Door:
                 self._guests.come_back(session, identity, hello.client)
                 log.info("session %d goes on (%r)", session.session_id, hello.client)
         transports = [self.endpoint.split("://", 1)[0]]
-        if self._may_share:
+        if self._sharing.is_offered:
             transports.append("shm")
         welcome = Welcome(
             session.session_id,
@@ -485,157 +456,11 @@ class Door:
         self._guests.remove(session)
         self._end_sharing(session)
         session.identity = None
-        self._turns.forget(session.key)
+        self._frames.forget(session)
         self._render.tell("close", session.key)
         log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
 
-    # Shared memory
-
-    @property
-    def _may_share(self) -> bool:
-        is_local = self.endpoint.startswith("ipc://") or any(
-            self.endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
-        )
-        return self.config.shared_memory and is_local and not self.config.keys_dir
-
-    def _share(self, session: Session, request: Share) -> Shared:
-        """Give a client memory for its images, or say why not."""
-        limits = self._limits
-        most = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
-        if not self._may_share:
-            return Shared(reason="this service shares no memory over this transport")
-        if len(session.shared) >= MAX_SHARED_SLOTS:
-            return Shared(reason=f"{MAX_SHARED_SLOTS} slots are in use")
-        if request.size_bytes > most:
-            return Shared(
-                reason=f"{request.size_bytes} bytes are more than a frame has"
-            )
-        try:
-            slot = self._render.share(request.size_bytes)
-        except OutOfMemory as error:
-            return Shared(reason=str(error))
-        session.shared[slot.number] = slot
-        return Shared(slot.number, slot.size_bytes, slot.path)
-
-    def _unshare(self, session: Session, request: Unshare) -> None:
-        if request.slot not in session.shared or request.slot in session.lent:
-            raise BadMessage(
-                f"it is {request.slot}",
-                field="slot",
-                allowed="a slot of this session that no frame uses",
-            )
-        self._render.drop(session.shared.pop(request.slot))
-
     def _end_sharing(self, session: Session) -> None:
         """Give up the memory of a client that is gone."""
-        for slot in session.shared.values():
-            self._render.drop(slot)
-        session.shared, session.lent = {}, set()
-        self._leaving += session.unsent
-        session.unsent = []
-
-    # Frames
-
-    def _take_frame(
-        self, session: Session, frame: Frame, received_s: float
-    ) -> Frame | None:
-        """Keep a frame as its client's newest; return the one that it supersedes."""
-        check_places(session, frame)
-        waiting = WaitingFrame(frame, received_s, time.monotonic())
-        superseded = session.take_in(waiting)
-        session.lend(frame)
-        self._turns.arrive(session.key, waiting.decoded_s)
-        return None if superseded is None else superseded.frame
-
-    def _is_takeable(self, session: Session) -> bool:
-        waiting = session.waiting
-        return waiting is not None and self._render.takes(session, waiting.frame)
-
-    def _is_ready(self, session: Session, now_s: float) -> bool:
-        """Return whether a session's frame may be handed over, or be given up.
-
-        A thread of pyzmq's marks results as sent; it gets a moment before a client is
-        said not to read.
-        """
-        session.unsent = self._render.still_unsent(session.unsent)
-        if len(session.unsent) < MAX_UNSENT_RESULTS:
-            session.behind_since_s = None
-            return True
-        if session.behind_since_s is None:
-            session.behind_since_s = now_s
-        return now_s - session.behind_since_s > MARK_SENT_S
-
-    def _hand_over_one_frame(self) -> None:
-        now_s = time.monotonic()
-        ready = {
-            s.key: s
-            for s in self._guests.present
-            if self._is_takeable(s) and self._is_ready(s, now_s)
-        }
-        key = self._turns.next_of(ready)
-        if key is None:
-            return
-        session = ready[key]
-        waiting, session.waiting = session.waiting, None
-        if waiting is None:
-            return
-        frame = waiting.frame
-        if len(session.unsent) >= MAX_UNSENT_RESULTS:
-            dropped = Dropped(frame.frame_id, "slow_consumer")
-            self._answer_frame(session, frame, dropped)
-            return
-        try:
-            self._render.hand_over(session, waiting)
-        except OutOfMemory as error:
-            failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
-            self._answer_frame(session, frame, failed)
-
-    def _take_answer(
-        self,
-        number: int,
-        reply: Answer,
-        started_s: float,
-        ended_s: float,
-        used_s: float,
-    ) -> None:
-        """Pass an answer of the render loop on to who asked."""
-        held = self._render.take_back(number)
-        if held is None:
-            return
-        self._turns.note(held.session.key, used_s, ended_s)
-        self._filtered_s += used_s
-        if isinstance(reply, Result):
-            reply = completed(reply, held, started_s)
-        elif isinstance(reply, Dropped):
-            reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
-        tracker = self._answer_held(held, reply)
-        if not held.own_slots:
-            return
-        slot, result_slot = held.own_slots
-        self._render.give_back(slot)
-        if tracker is None:
-            self._render.give_back(result_slot)
-        elif held.session.identity is None:
-            self._leaving.append((tracker, result_slot))
-        else:
-            held.session.unsent.append((tracker, result_slot))
-
-    def _answer_held(self, held: Held, answer: Answer) -> Tracker | None:
-        """Answer a frame, if its client is where it was: else it counts it as lost."""
-        if held.identity is None or held.session.identity != held.identity:
-            return None
-        return self._answer_frame(held.session, held.waiting.frame, answer)
-
-    def _answer_frame(
-        self, session: Session, frame: Frame, answer: Answer
-    ) -> Tracker | None:
-        """Answer a frame that counts against the credit."""
-        if session.identity is None:
-            return None  # its client is away
-        session.n_unanswered = max(0, session.n_unanswered - 1)
-        session.get_back(frame)
-        if isinstance(answer, Result):
-            self._n_rendered += 1
-        else:
-            self._n_dropped += 1
-        return self._send(session.identity, answer)
+        self._sharing.end(session)
+        self._frames.leave(session)

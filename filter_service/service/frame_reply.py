@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import NDArray
 
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
@@ -16,10 +20,13 @@ MS_PER_S = 1000.0
 log = logging.getLogger("ocufilter")
 
 
-def frame_reply(eye_filter: EyeFilter, frame: Frame) -> Result | Dropped | ErrorReply:
+def frame_reply(
+    eye_filter: EyeFilter, frame: Frame, out: Sequence[NDArray[Any]]
+) -> Result | Dropped | ErrorReply:
     """Return the reply to a frame; anything that goes wrong becomes an error reply.
 
-    ``total_ms`` is for the caller to say: it knows when the frame came.
+    Pictures may lie in ``out`` by then.  ``total_ms`` is for the caller to say: it
+    knows when the frame came.
     """
     started_s = time.monotonic()
     try:
@@ -36,6 +43,7 @@ def frame_reply(eye_filter: EyeFilter, frame: Frame) -> Result | Dropped | Error
             merge=frame.options.merge,
             render_tolerance=frame.options.render_tolerance,
             prepared_only=frame.options.prepared_only,
+            out=out,
         )
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)

@@ -376,7 +376,12 @@ class RenderLoop:
         # By the end the door may have given them up.
         slot, result_slot = self._slots[places.slot], self._slots[places.result_slot]
         frame = replace(frame, images=images_in(slot, frame, places.starts))
-        reply = frame_reply(eye.eye_filter, frame)
+        dtype = np.dtype(frame.output.dtype)
+        rooms = [
+            result_slot.array(start, (view.height_px, view.width_px, 3), dtype)
+            for start, view in zip(places.result_starts, frame.views, strict=True)
+        ]
+        reply = frame_reply(eye.eye_filter, frame, rooms)
         if not isinstance(reply, Result):
             return reply
         colors = [np.ascontiguousarray(color) for color in reply.colors]

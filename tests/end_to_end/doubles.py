@@ -79,6 +79,7 @@ class EngineDouble:
         render_tolerance=1.0,
         output="linear",
         gaze_deg=None,
+        out=None,
     ):
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +119,7 @@ class FilterRenderer:
         render_tolerance: float = 1.0,
         output: str = "linear",
         gaze_deg: tuple[float, float] | None = None,
+        out: NDArray[Any] | None = None,
     ) -> FilteredView:
         """Filter one view through the eye of a loaded store.
 

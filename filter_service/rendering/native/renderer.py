@@ -6,12 +6,13 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.threads import thread_count
-from filter_service.errors import RenderFailed
+from filter_service.errors import BadMessage, RenderFailed
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
@@ -111,6 +112,7 @@ class NativeRenderer:
         render_tolerance: float = 1.0,
         output: str = "linear",
         gaze_deg: tuple[float, float] | None = None,
+        out: NDArray[Any] | None = None,
     ) -> FilteredView:
         """Filter one view through the eye of a loaded store.
 
@@ -121,6 +123,8 @@ class NativeRenderer:
             the store's where it is None.
         render_tolerance : float
             Errors of merging, coarse kernels and layers against the usual; 0 is exact.
+        out : array, optional
+            Memory for the picture, of its shape and type.
 
         Raises
         ------
@@ -147,12 +151,19 @@ class NativeRenderer:
         while True:
             image = self._states.cells(timer, handle, options.gaze_deg)
             try:
-                return self._render(timer, view, handle, layers, image, options)
+                return self._render(timer, view, handle, layers, image, options, out)
             except KernelsTooLarge:
                 self._states.coarsen(image)
 
     def _render(
-        self, timer, view, handle, layers: FrameLayers, image, options: FrameOptions
+        self,
+        timer,
+        view,
+        handle,
+        layers: FrameLayers,
+        image,
+        options: FrameOptions,
+        out,
     ) -> FilteredView:
         frame = FrameRecord.new(self._threads, self._n_threads, self._arrays)
         missing_count, used = self._pixels(timer, frame, view, layers, image)
@@ -170,7 +181,7 @@ class NativeRenderer:
             self._loops.run("merge", frame.c)
         self._blend(timer, frame, plan)
         with timer.wall("splat_ms"):
-            picture = np.empty(view.color.shape, OUTPUT_DTYPES[options.output])
+            picture = _room(view.color.shape, OUTPUT_DTYPES[options.output], out)
             frame.set_picture(picture)
             self._loops.run("splat", frame.c)
         if frame.c.failed:
@@ -239,6 +250,19 @@ class NativeRenderer:
             frame.set_blend_room(sizes)
             self._loops.run("blend", frame.c)
         self._blended = plan, levels.copy(), sizes
+
+
+def _room(shape, dtype, out: NDArray[Any] | None) -> NDArray[Any]:
+    """Return where a picture goes."""
+    if out is None:
+        return np.empty(shape, dtype)
+    if out.shape != shape or out.dtype != dtype or not out.flags.carray:
+        raise BadMessage(
+            f"an array {out.shape} of {out.dtype}",
+            field="out",
+            allowed=f"{shape} of {np.dtype(dtype)}, contiguous and writeable",
+        )
+    return out
 
 
 class StageTimes:
