@@ -1,0 +1,198 @@
+"""Frames on their way: from a client's newest to the render loop, and its answer back.
+
+Every frame is answered once; which is next is a matter of the time that its client has
+used.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from filter_service.errors import OutOfMemory, RenderFailed
+from filter_service.messages import Dropped, ErrorReply, Frame, Reply, Result
+from filter_service.service.guests import Guests
+from filter_service.service.mailbox import Tracker
+from filter_service.service.places import check_places
+from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
+from filter_service.service.session import Session, WaitingFrame
+from filter_service.service.turns import Turns
+
+MAX_UNSENT_RESULTS = 4  # large replies a client has not taken; bounds memory
+MARK_SENT_S = 0.03  # less than most frames take to filter
+SOON_S = 0.002
+RETRY_AFTER_MS = 100.0
+"""A first guess of when a preview is there."""
+
+Answer = Result | Dropped | ErrorReply
+
+
+class FrameDesk:
+    """Takes frames in, hands them over, and passes the answers on.
+
+    Parameters
+    ----------
+    guests : Guests
+    render : RenderEnd
+    send : callable
+        ``send(identity, reply)`` returns what tracks a large one.
+
+    Attributes
+    ----------
+    n_rendered, n_dropped : int
+    filtered_s : float
+        What filtering has taken in all.
+    """
+
+    def __init__(
+        self,
+        guests: Guests,
+        render: RenderEnd,
+        send: Callable[[bytes, Reply], Tracker | None],
+    ) -> None:
+        self.n_rendered = self.n_dropped = 0
+        self.filtered_s = 0.0
+        self._guests = guests
+        self._render = render
+        self._send = send
+        self._turns: Turns[str] = Turns()
+        self._leaving: Unsent = []  # results of clients that are gone
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Return how soon a frame may be handed over; None where none waits."""
+        takeable = [s for s in self._guests.present if self._is_takeable(s)]
+        if any(self._is_ready(session, now_s) for session in takeable):
+            return 0.0
+        return SOON_S if takeable else None
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether no frame waits or is being filtered."""
+        waits = any(session.waiting for session in self._guests.present)
+        return not waits and not self._render.held
+
+    def tidy(self) -> None:
+        """Take the memory back of what is sent by now."""
+        self._leaving = self._render.still_unsent(self._leaving)
+
+    def leave(self, session: Session) -> None:
+        """Note that a client is gone; what it is being sent it may not take."""
+        self._leaving += session.unsent
+        session.unsent = []
+
+    def forget(self, session: Session) -> None:
+        """Forget the time that a session has used."""
+        self._turns.forget(session.key)
+
+    def take_in(
+        self, session: Session, frame: Frame, received_s: float
+    ) -> Frame | None:
+        """Keep a frame as its client's newest; return the one that it supersedes."""
+        check_places(session, frame)
+        waiting = WaitingFrame(frame, received_s, time.monotonic())
+        superseded = session.take_in(waiting)
+        session.lend(frame)
+        self._turns.arrive(session.key, waiting.decoded_s)
+        return None if superseded is None else superseded.frame
+
+    def _is_takeable(self, session: Session) -> bool:
+        waiting = session.waiting
+        return waiting is not None and self._render.takes(session, waiting.frame)
+
+    def _is_ready(self, session: Session, now_s: float) -> bool:
+        """Return whether a session's frame may be handed over, or be given up.
+
+        A thread of pyzmq's marks results as sent; it gets a moment before a client is
+        said not to read.
+        """
+        session.unsent = self._render.still_unsent(session.unsent)
+        if len(session.unsent) < MAX_UNSENT_RESULTS:
+            session.behind_since_s = None
+            return True
+        if session.behind_since_s is None:
+            session.behind_since_s = now_s
+        return now_s - session.behind_since_s > MARK_SENT_S
+
+    def hand_over_one(self) -> None:
+        """Hand over the frame whose turn it is, if one may be handed over."""
+        now_s = time.monotonic()
+        ready = {
+            s.key: s
+            for s in self._guests.present
+            if self._is_takeable(s) and self._is_ready(s, now_s)
+        }
+        key = self._turns.next_of(ready)
+        if key is None:
+            return
+        session = ready[key]
+        waiting, session.waiting = session.waiting, None
+        if waiting is None:
+            return
+        frame = waiting.frame
+        if len(session.unsent) >= MAX_UNSENT_RESULTS:
+            dropped = Dropped(frame.frame_id, "slow_consumer")
+            self.answer(session, frame, dropped)
+            return
+        try:
+            self._render.hand_over(session, waiting)
+        except OutOfMemory as error:
+            failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
+            self.answer(session, frame, failed)
+
+    def take_answer(
+        self,
+        number: int,
+        reply: Answer,
+        started_s: float,
+        ended_s: float,
+        used_s: float,
+    ) -> None:
+        """Pass an answer of the render loop on to who asked."""
+        held = self._render.take_back(number)
+        if held is None:
+            return
+        self._turns.note(held.session.key, used_s, ended_s)
+        self.filtered_s += used_s
+        if isinstance(reply, Result):
+            reply = completed(reply, held, started_s)
+        elif isinstance(reply, Dropped):
+            reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
+        tracker = self._answer_held(held, reply)
+        if not held.own_slots:
+            return
+        slot, result_slot = held.own_slots
+        self._render.give_back(slot)
+        if tracker is None:
+            self._render.give_back(result_slot)
+        elif held.session.identity is None:
+            self._leaving.append((tracker, result_slot))
+        else:
+            held.session.unsent.append((tracker, result_slot))
+
+    def _answer_held(self, held: Held, answer: Answer) -> Tracker | None:
+        """Answer a frame, if its client is where it was: else it counts it as lost."""
+        if held.identity is None or held.session.identity != held.identity:
+            return None
+        return self.answer(held.session, held.waiting.frame, answer)
+
+    def answer(self, session: Session, frame: Frame, answer: Answer) -> Tracker | None:
+        """Answer a frame that counts against the credit."""
+        if session.identity is None:
+            return None  # its client is away
+        session.n_unanswered = max(0, session.n_unanswered - 1)
+        session.get_back(frame)
+        if isinstance(answer, Result):
+            self.n_rendered += 1
+        else:
+            self.n_dropped += 1
+        return self._send(session.identity, answer)
+
+    def lose_held(self) -> None:
+        """Answer the frames that are lost with a render loop."""
+        for lost in self._render.lose():
+            error = RenderFailed(
+                "the process that filters frames ended; it starts again"
+            )
+            frame_id = lost.waiting.frame.frame_id
+            self._answer_held(lost, ErrorReply.from_exception(error, frame_id=frame_id))

@@ -1,0 +1,74 @@
+"""Memory that clients on this machine share with the service for their images."""
+
+from __future__ import annotations
+
+from filter_service.errors import BadMessage, OutOfMemory
+from filter_service.messages import Share, Shared, Unshare
+from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
+from filter_service.service.render_end import RenderEnd
+from filter_service.service.session import Session
+
+MAX_PARTS_PER_VIEW = 4
+MAX_SHARED_SLOTS = 16
+"""Of one session."""
+
+
+class Sharing:
+    """Gives sessions memory, and takes it back.
+
+    Parameters
+    ----------
+    config : ServiceConfig
+    endpoint : str
+        Where clients connect.
+    render : RenderEnd
+        Which owns the memory.
+    """
+
+    def __init__(self, config: ServiceConfig, endpoint: str, render: RenderEnd) -> None:
+        self._render = render
+        self._limits = config.limits
+        is_local = endpoint.startswith("ipc://") or any(
+            endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
+        )
+        self.is_offered = config.shared_memory and is_local and not config.keys_dir
+
+    def share(self, session: Session, request: Share) -> Shared:
+        """Give a client memory for its images, or say why not."""
+        limits = self._limits
+        most = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
+        if not self.is_offered:
+            return Shared(reason="this service shares no memory over this transport")
+        if len(session.shared) >= MAX_SHARED_SLOTS:
+            return Shared(reason=f"{MAX_SHARED_SLOTS} slots are in use")
+        if request.size_bytes > most:
+            return Shared(
+                reason=f"{request.size_bytes} bytes are more than a frame has"
+            )
+        try:
+            slot = self._render.share(request.size_bytes)
+        except OutOfMemory as error:
+            return Shared(reason=str(error))
+        session.shared[slot.number] = slot
+        return Shared(slot.number, slot.size_bytes, slot.path)
+
+    def unshare(self, session: Session, request: Unshare) -> None:
+        """Take memory back that a client does not need any more.
+
+        Raises
+        ------
+        BadMessage
+        """
+        if request.slot not in session.shared or request.slot in session.lent:
+            raise BadMessage(
+                f"it is {request.slot}",
+                field="slot",
+                allowed="a slot of this session that no frame uses",
+            )
+        self._render.drop(session.shared.pop(request.slot))
+
+    def end(self, session: Session) -> None:
+        """Give up the memory of a client that is gone."""
+        for slot in session.shared.values():
+            self._render.drop(slot)
+        session.shared, session.lent = {}, set()
