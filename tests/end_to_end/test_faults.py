@@ -151,7 +151,7 @@ def test_a_frame_without_an_end_is_ended(start_service):
         client.set_profile(EYE, views=[view])
         with pytest.raises(FilterError, match="the process that filters frames ended"):
             client.filter(view, **SEE)
-    assert "says nothing for 1 s" in service.log
+    assert "is stuck for 1 s" in service.log
 
 
 @pytest.mark.slow

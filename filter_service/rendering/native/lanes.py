@@ -48,6 +48,10 @@ class NativeLanes:
         self._main.call_between(function, interval_s)
         return True
 
+    def load(self, store: PsfStore) -> NativeStore:
+        """Take a store at once."""
+        return self._other.load(store)
+
     def load_steps(self, store: PsfStore) -> Generator[NativeStore | None]:
         """Take a store in steps of a few ms, which may come between, too."""
         return self._other.load_steps(store)
