@@ -9,6 +9,7 @@ from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.commands.console import CommandFailed
 from filter_service.commands.doctor import doctor
 from filter_service.commands.estimate import estimate
+from filter_service.commands.eyes import eyes
 from filter_service.commands.field import field
 from filter_service.commands.filter_image import filter_image
 from filter_service.commands.keys import keys
@@ -37,6 +38,7 @@ app.command()(demo)
 app.command()(serve)
 app.command()(status)
 app.add_typer(keys, name="keys")
+app.add_typer(eyes, name="eyes")
 app.command(name="filter")(filter_image)
 app.command()(estimate)
 app.command()(wavefront)

@@ -1,19 +1,12 @@
-"""What every build of a service has to keep to, and where it keeps what it made."""
+"""What every build of a service has to keep to."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
+from filter_service.psfs.cache_folder import default_cache_dir
 
-def default_cache_dir() -> str:
-    """Return where finished PSFs are kept if nothing else is said."""
-    own = os.environ.get("OCUFILTER_CACHE_DIR")
-    if own is not None:
-        return own
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(base) / "ocufilter")
+__all__ = ["BuildLimits", "default_cache_dir"]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ programs         demo and bench: programs of the clients and the checkout
 serve            the service
 status           what a running one says of itself
 keys             who may connect to it
+eyes             whose PSFs are kept on disk
 prepare          loops compiled ahead
 filter_image     one picture
 image_files      pictures and depth in files

@@ -25,6 +25,13 @@ def serve(
             help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
         ),
     ] = None,
+    keep_eyes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Keep finished eyes there, for the next start; see `ocufilter eyes`.",
+        ),
+    ] = None,
     ready_file: Annotated[
         Path | None,
         typer.Option(
@@ -43,4 +50,11 @@ def serve(
 
     if config is not None and not config.is_file():
         raise ValueError(f"--config '{config}': no such file")
-    serving.run(load_config(config, bind=bind, engine=engine, ready_file=ready_file))
+    settings = load_config(
+        config,
+        bind=bind,
+        engine=engine,
+        ready_file=ready_file,
+        store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
+    )
+    serving.run(settings)

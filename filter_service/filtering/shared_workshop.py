@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 
-from filter_service.building.limits import BuildLimits, default_cache_dir
+from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.workshop import Workshop
+from filter_service.psfs.cache_folder import default_cache_dir
 
 
 def open_workshop(

@@ -15,6 +15,8 @@ field_defocus        change of defocus over the field
 read_kernels         which cached kernels a state reads, as plain arrays
 read_loops           the compiled loops that read them
 store_cache          stores kept on disk
+cache_folder         where, if anywhere
+kept_eyes            whose, to be listed and erased
 store_codec          objects as JSON and arrays
 store_file           the file they go to
 picture              a kernel as a picture

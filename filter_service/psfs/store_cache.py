@@ -1,6 +1,6 @@
 """Finished PSF stores on disk, for the next time the same eye is wanted.
 
-A folder of files, each named by a hash of what decides its content: the profile, the
+A folder of files, each named by hashes of what decides its content: the profile; the
 grid and the code.  Several services may share it without a lock: files appear complete
 (see `store_file`), a file that is being read stays whole when another process removes
 it, and those unused for longest are removed beyond a limit.
@@ -26,6 +26,7 @@ import filter_service
 from estimator.profiles.parse import EyeProfile
 from filter_service.gl.shader_source import SHADER_ROOT
 from filter_service.planning.grid import GridSpec
+from filter_service.psfs.cache_folder import check_is_private
 from filter_service.psfs.store_codec import NotStorable, pack
 from filter_service.psfs.store_file import (
     UNFINISHED,
@@ -35,6 +36,8 @@ from filter_service.psfs.store_file import (
 )
 
 SUFFIX = ".psfs"
+BETWEEN = "-"
+KEY_BYTES = 16
 ABANDONED_S = 3600.0
 """A file that has not been finished for so long never will be: its writer is gone."""
 
@@ -78,10 +81,16 @@ def store_key(profile: EyeProfile, spec: GridSpec) -> str:
     spec_tree, _ = pack(spec)
     if not spec.follows_field:
         spec_tree["object"][1]["camera"] = list(spec.pixel_pitch_mrad)
-    profile_tree, arrays = pack(profile)
-    digest = hashlib.blake2b(digest_size=16)
-    text = json.dumps([code_version(), spec_tree, profile_tree], sort_keys=True)
-    digest.update(text.encode())
+    text = json.dumps([code_version(), spec_tree], sort_keys=True)
+    how = hashlib.blake2b(text.encode(), digest_size=KEY_BYTES).hexdigest()
+    return f"{eye_name(profile)}{BETWEEN}{how}"
+
+
+def eye_name(profile: EyeProfile) -> str:
+    """Return what the names of all stores of an eye begin with."""
+    tree, arrays = pack(profile)
+    digest = hashlib.blake2b(digest_size=KEY_BYTES)
+    digest.update(json.dumps(tree, sort_keys=True).encode())
     for array in arrays.values():
         digest.update(array.tobytes())
     return digest.hexdigest()
@@ -135,6 +144,7 @@ class StoreCache:
         started_s = time.monotonic()
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            check_is_private(self._folder)
             n_bytes = write_file(self._path(key), stored)
             self._evict()
         except (OSError, NotStorable) as error:

@@ -49,8 +49,8 @@ class ServiceConfig:
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
-        Where finished PSFs are kept for the next time; ``""`` keeps none.  By default
-        ``$OCUFILTER_CACHE_DIR``, or ``ocufilter`` in ``$XDG_CACHE_HOME`` or ~/.cache.
+        Where finished PSFs are kept for the next time; they tell of a person's eyes.
+        ``""`` keeps none, which is so unless ``$OCUFILTER_CACHE_DIR`` names a folder.
     store_cache_max_mb : int
         What that folder may hold; those unused for longest go.
     threads : int

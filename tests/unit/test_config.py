@@ -85,12 +85,9 @@ def test_wrong_files_are_refused_by_name(tmp_path, text, message):
 
 def test_stores_are_kept_where_the_user_says_and_builds_know_it(monkeypatch):
     monkeypatch.delenv("OCUFILTER_CACHE_DIR")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert default_cache_dir() == "/somewhere/ocufilter"
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
-    assert default_cache_dir().endswith("/.cache/ocufilter")
-    monkeypatch.setenv("OCUFILTER_CACHE_DIR", "")
-    assert default_cache_dir() == ""
+    assert default_cache_dir() == "", "nobody has asked for it"
+    monkeypatch.setenv("OCUFILTER_CACHE_DIR", "/somewhere")
+    assert default_cache_dir() == "/somewhere"
     config = load_config(store_cache_dir="/mine", store_cache_max_mb=7, max_store_mb=9)
     limits = config.build_limits
     assert (limits.store_cache_dir, limits.store_cache_max_mb) == ("/mine", 7)

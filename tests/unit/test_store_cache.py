@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
+from filter_service.__main__ import app
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.psfs import store_cache, store_codec, store_file
 from filter_service.psfs.build_store import build_psf_store
-from filter_service.psfs.store_cache import StoreCache, Stored, store_key
+from filter_service.psfs.store_cache import StoreCache, Stored, eye_name, store_key
 from tests.grid_specs import grid_spec
 
 PROFILE = parse_profile({"kind": "prescription", "sphere_dpt": -1.0})
@@ -299,3 +301,80 @@ def test_what_is_no_data_is_not_stored(cache, stored, caplog):
     assert "methods" in caplog.text
     assert not cache._path(key_of(1)).exists()
     assert list(cache._folder.iterdir()) == []
+
+
+@pytest.fixture
+def kept(tmp_path, stored):
+    """Two stores of one eye and one of another, in a folder of their own."""
+    folder = tmp_path / "kept"
+    cache = StoreCache(str(folder), max_mb=1000)
+    other = parse_profile({"kind": "prescription", "sphere_dpt": -1.25})
+    for profile, spec in (
+        (PROFILE, SPEC),
+        (PROFILE, SPEC.with_settings(tolerance="fine")),
+        (other, SPEC),
+    ):
+        cache.save(store_key(profile, spec), stored)
+    return folder
+
+
+def eyes_command(*arguments):
+    return CliRunner().invoke(app, ["eyes", *map(str, arguments)])
+
+
+def test_kept_eyes_are_listed_without_saying_whose_they_are(kept):
+    said = json.loads(eyes_command("list", "--dir", kept, "--json").stdout)["eyes"]
+    assert sorted(eye["n_files"] for eye in said) == [1, 2]
+    assert eye_name(PROFILE) in [eye["name"] for eye in said]
+    assert sum(eye["size_bytes"] for eye in said) == sum(
+        path.stat().st_size for path in kept.iterdir()
+    )
+    assert not any(b"sphere" in path.read_bytes()[:4096] for path in kept.iterdir())
+    shown = eyes_command("list", "--dir", kept).stdout
+    assert eye_name(PROFILE)[:12] in shown and "2 files" in shown
+
+
+def test_a_person_s_eye_is_erased_and_no_other(kept, tmp_path):
+    profile = tmp_path / "anna.json"
+    profile.write_text(json.dumps({"kind": "prescription", "sphere_dpt": -1.0}))
+    assert "2 files" in eyes_command("erase", profile, "--dir", kept).output
+    (left,) = kept.iterdir()
+    assert not left.name.startswith(eye_name(PROFILE))
+    assert "nothing" in eyes_command("erase", profile, "--dir", kept).output
+    assert (
+        "1 file" in eyes_command("erase", "--name", left.name[:9], "--dir", kept).output
+    )
+    assert "no eye is kept" in eyes_command("list", "--dir", kept).output
+
+
+def test_all_eyes_are_erased_at_once(kept):
+    (kept / "note.txt").write_text("not ours")
+    eyes_command("erase", "--all", "--dir", kept)
+    assert [path.name for path in kept.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["erase"], "one of"),
+        (["erase", "myopia", "--all"], "one of"),
+        (["erase", "--name", "*"], "allowed"),
+        (["erase", "--name", ""], "allowed"),
+        (["list", "--dir", "/no/such/folder"], "no folder"),
+        (["list"], "no folder"),
+    ],
+)
+def test_what_cannot_be_erased_or_listed_is_said(arguments, text, monkeypatch):
+    monkeypatch.setenv("OCUFILTER_CACHE_DIR", "")
+    result = eyes_command(*arguments)
+    assert isinstance(result.exception, ValueError | FileNotFoundError)
+    assert text in str(result.exception)
+
+
+def test_nothing_is_kept_where_others_may_look(tmp_path, stored, caplog):
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o755)
+    StoreCache(str(folder), max_mb=1000).save(key_of(1), stored)
+    assert not list(folder.iterdir())
+    assert f"chmod 700 {folder}" in caplog.text

@@ -1,0 +1,99 @@
+"""`ocufilter eyes`: whose PSFs a service has kept on disk."""
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filter_service.commands.console import Json, print_json, say
+from filter_service.psfs.cache_folder import CACHE_VARIABLE
+
+MB = 1e6
+SHOWN_CHARACTERS = 12
+
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        "--dir",
+        metavar="DIR",
+        help=f"The service's store_cache_dir; by default ${CACHE_VARIABLE}.",
+    ),
+]
+
+eyes = typer.Typer(
+    help="List and erase the eyes that are kept on disk (`serve --keep-eyes DIR`).",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+def _folder(given: Path | None) -> Path:
+    named = given or os.environ.get(CACHE_VARIABLE)
+    if not named:
+        raise ValueError(
+            f"no folder: give --dir DIR or set {CACHE_VARIABLE}; eyes are kept only "
+            "where a service was told to (store_cache_dir, or serve --keep-eyes)"
+        )
+    return Path(named).expanduser()
+
+
+@eyes.command(name="list")
+def list_kept(folder: Folder = None, json_output: Json = False) -> None:
+    """List the kept eyes by a hash of their profiles, the one used last first.
+
+    ocufilter eyes list --dir ~/.cache/ocufilter
+    """
+    from filter_service.psfs.kept_eyes import kept_eyes
+
+    found = kept_eyes(_folder(folder))
+    if json_output:
+        print_json({"eyes": [vars(eye) for eye in found]})
+        return
+    for eye in found:
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(eye.used_s))
+        print(
+            f"{eye.name[:SHOWN_CHARACTERS]}  {eye.n_files:3d} files  "
+            f"{eye.size_bytes / MB:8.1f} MB  used {used}"
+        )
+    if not found:
+        print("no eye is kept")
+
+
+@eyes.command()
+def erase(
+    profile: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[PROFILE]", help="A preset or a file, as for `ocufilter filter`."
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="HASH", help="As `eyes list` names it.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="All of them.")] = False,
+    folder: Folder = None,
+    json_output: Json = False,
+) -> None:
+    """Erase what is kept of a person's eye: of a profile, by its hash, or of all.
+
+    ocufilter eyes erase anna.json --dir ~/.cache/ocufilter
+    """
+    from filter_service.psfs.kept_eyes import erase_eyes
+
+    if (profile is not None) + (name is not None) + every != 1:
+        raise ValueError("whose? one of PROFILE, --name HASH and --all")
+    begin = name or ""
+    if profile is not None:
+        from estimator.profiles.files import load_profile
+        from filter_service.psfs.store_cache import eye_name
+
+        begin = eye_name(load_profile(profile))
+    elif name is not None and (not name or name.strip("0123456789abcdef")):
+        raise ValueError(f"--name is {name!r}; allowed: as `eyes list` prints it")
+    n_files = erase_eyes(_folder(folder), begin)
+    if json_output:
+        print_json({"erased_files": n_files})
+    else:
+        say(f"{n_files} files erased" if n_files else "nothing was kept of it")
