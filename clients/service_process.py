@@ -52,13 +52,13 @@ class ServiceProcess:
         folder = Path(self._folder.name)
         self._ready_file = folder / "ready"
         self._log_file = folder / "log"
-        config_file = folder / "service.toml"
+        self.config_file = folder / "service.toml"
         merged = {"bind": "tcp://127.0.0.1:*"} | dict(settings or {})
         merged["ready_file"] = str(self._ready_file)
-        config_file.write_text(_as_toml(merged), encoding="utf-8")
+        self.config_file.write_text(_as_toml(merged), encoding="utf-8")
         with self._log_file.open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, "--config", str(config_file)],
+                [*command, "--config", str(self.config_file)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -1,5 +1,6 @@
 """`ocufilter serve`: the long-running service."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -42,6 +43,7 @@ def serve(
     """Filter frames for clients until interrupted.
 
     Messages are described in filter_service/PROTOCOL.md; --bind wins over the file.
+    SIGHUP has the file read again, for limits and times; a service listens on.
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
@@ -50,11 +52,12 @@ def serve(
 
     if config is not None and not config.is_file():
         raise ValueError(f"--config '{config}': no such file")
-    settings = load_config(
+    load = partial(
+        load_config,
         config,
         bind=bind,
         engine=engine,
         ready_file=ready_file,
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
-    serving.run(settings)
+    serving.run(load(), read_again=load)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +177,36 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_image_mb": (1, 1_000_000),
     "max_socket_mb": (200, 1_000_000),
 }
+
+
+CHANGEABLE = (
+    *("credit", "max_sessions", "max_width_px", "max_height_px"),
+    *("alive_interval_s", "session_keep_s", "frame_limit_s"),
+)
+"""What a running service takes from the file at SIGHUP; of a session those of its
+beginning hold where it was told of them."""
+
+
+def changed_while_running(
+    config: ServiceConfig, wanted: ServiceConfig
+) -> tuple[ServiceConfig, list[str], list[str]]:
+    """Return the settings with those of others that may change while a service runs.
+
+    Returns
+    -------
+    config : ServiceConfig
+    changed, others : list of str
+        Names of settings that are others now, and of those that would have to be.
+    """
+    differing = [
+        field.name
+        for field in fields(ServiceConfig)
+        if getattr(config, field.name) != getattr(wanted, field.name)
+    ]
+    changed = [name for name in differing if name in CHANGEABLE]
+    others = [name for name in differing if name not in CHANGEABLE]
+    new = replace(config, **{name: getattr(wanted, name) for name in changed})
+    return new, changed, others
 
 
 def _check_bind(bind: object, *, has_keys: bool) -> None:

@@ -133,6 +133,9 @@ class Door:
         if message[0] == "link":
             self._frames.lose_held()
             self._render.join(Link.from_descriptor(descriptors[0]))
+        elif message[0] == "config":
+            self.config = message[1]
+            self._limits = self.config.limits
         return bool(message[0] != "stop")
 
     def _turn(self) -> None:

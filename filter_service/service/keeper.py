@@ -25,7 +25,7 @@ from filter_service.building.helper_process import (
     import_path,
     is_stopped,
 )
-from filter_service.service.config import ServiceConfig
+from filter_service.service.config import ServiceConfig, changed_while_running
 from filter_service.service.link import Link, LinkClosed
 
 MODULES = {
@@ -69,6 +69,8 @@ class Keeper:
         ``module:function``, see `render_process`.
     when_ready : callable
         Called with the endpoint once frames may come.
+    read_again : callable, optional
+        Returns the settings as they are now.
     """
 
     def __init__(
@@ -77,10 +79,13 @@ class Keeper:
         *,
         open_workshop: str = OPEN_WORKSHOP,
         when_ready: Callable[[str], None],
+        read_again: Callable[[], ServiceConfig] | None = None,
     ) -> None:
         self._config = config
         self._open_workshop = open_workshop
         self._when_ready: Callable[[str], None] | None = when_ready
+        self._read_again = read_again
+        self._is_to_read_again = False
         self._endpoint = ""
         self._is_stopping = False
         self._children = {name: _Child() for name in MODULES}
@@ -96,6 +101,10 @@ class Keeper:
     def stop(self) -> None:
         """Let `run` return; may be called from a signal handler."""
         self._is_stopping = True
+
+    def ask_to_read_again(self) -> None:
+        """Have the settings read again; may be called from a signal handler."""
+        self._is_to_read_again = True
 
     def run(self) -> None:
         """Serve until `stop`.
@@ -125,6 +134,9 @@ class Keeper:
             self._wake_reader.recv(4096)
         except BlockingIOError:
             pass
+        if self._is_to_read_again:
+            self._is_to_read_again = False
+            self._change_settings()
         for name, child in self._children.items():
             self._listen(name, child)
             self._check_stopped(name, child)
@@ -155,6 +167,24 @@ class Keeper:
         # A new door listens where the one before it did.
         bind = self._endpoint or self._config.bind
         child.link.send(("config", replace(self._config, bind=bind)))
+
+    def _change_settings(self) -> None:
+        """Take what may change while the service runs; say what may not."""
+        if self._read_again is None:
+            return
+        try:
+            wanted = self._read_again()
+        except (ValueError, OSError) as error:
+            log.error("the settings stay as they are: %s", error)
+            return
+        self._config, changed, others = changed_while_running(self._config, wanted)
+        for name in changed:
+            log.info("%s is %s now", name, getattr(self._config, name))
+        if others:
+            log.warning("for %s the service has to be started again", ", ".join(others))
+        door = self._children["door"].link
+        if changed and door is not None:
+            door.send(("config", self._config))
 
     def _join(self) -> None:
         """Give both processes the ends of a new link."""

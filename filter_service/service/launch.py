@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+from collections.abc import Callable
 from functools import partial
 
 from filter_service.service.child import start_log
@@ -13,7 +14,12 @@ from filter_service.service.keeper import OPEN_WORKSHOP, Keeper, ServiceFailed
 log = logging.getLogger("ocufilter")
 
 
-def run(config: ServiceConfig, *, open_workshop: str = OPEN_WORKSHOP) -> None:
+def run(
+    config: ServiceConfig,
+    *,
+    open_workshop: str = OPEN_WORKSHOP,
+    read_again: Callable[[], ServiceConfig] | None = None,
+) -> None:
     """Serve until SIGINT or SIGTERM; prints one line when ready.
 
     Must run in the main thread.
@@ -22,6 +28,8 @@ def run(config: ServiceConfig, *, open_workshop: str = OPEN_WORKSHOP) -> None:
     ----------
     open_workshop : str
         ``module:function``, see `render_process`.
+    read_again : callable, optional
+        Returns the settings as they are now; called at SIGHUP.
 
     Raises
     ------
@@ -30,12 +38,14 @@ def run(config: ServiceConfig, *, open_workshop: str = OPEN_WORKSHOP) -> None:
     """
     start_log("service")
     keeper = Keeper(
-        config, open_workshop=open_workshop, when_ready=partial(_announce, config)
+        config,
+        open_workshop=open_workshop,
+        when_ready=partial(_announce, config),
+        read_again=read_again,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: keeper.stop())
-    # Keys are read again as they change; for other settings it is started again.
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, lambda *_: keeper.ask_to_read_again())
     signal.set_wakeup_fd(keeper.wake_file_descriptor, warn_on_full_buffer=False)
     try:
         keeper.run()

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from functools import partial
 from pathlib import Path
 
 from filter_service.building.worker_handle import WorkerHandle
@@ -33,9 +34,11 @@ def main():
     parser.add_argument("--filter-ms", type=float, default=0.0)
     arguments = parser.parse_args()
     os.environ[FILTER_MS] = str(arguments.filter_ms)
+    load = partial(load_config, arguments.config)
     run(
-        load_config(arguments.config),
+        load(),
         open_workshop="tests.end_to_end.double_service:open_workshop",
+        read_again=load,
     )
 
 

@@ -9,6 +9,7 @@ import urllib.request
 import pytest
 
 from clients.filter_client import FilterClient
+from filter_service.errors import TooManySessions
 from filter_service.service.metrics import METRICS
 from tests.end_to_end.conftest import TIMEOUT_S, make_view
 from tests.source_tree import ROOT
@@ -60,6 +61,54 @@ def test_a_closed_terminal_does_not_end_the_service(start_service):
     service = start_service()
     service.process.send_signal(signal.SIGHUP)
     time.sleep(0.3)
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        assert client.ping()[1].is_ready
+
+
+def hang_up(service, old, new, said):
+    """Change the file, send SIGHUP and wait for what the service says to it."""
+    file = service.config_file
+    file.write_text(file.read_text().replace(old, new))
+    service.process.send_signal(signal.SIGHUP)
+    end_s = time.monotonic() + TIMEOUT_S
+    while said not in service.log:
+        assert time.monotonic() < end_s, service.log
+        time.sleep(0.05)
+    time.sleep(0.1)  # the door has it from the keeper
+
+
+def test_limits_change_while_clients_are_served(start_service):
+    service = start_service(max_sessions=1, max_width_px=640)
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        view = make_view()
+        client.set_profile(EYE, views=[view])
+        client.filter(view, **SEE)
+        with (
+            pytest.raises(TooManySessions),
+            FilterClient(service.endpoint, timeout_s=TIMEOUT_S),
+        ):
+            pass
+        hang_up(
+            *(service, "max_sessions = 1", "max_sessions = 2"), "max_sessions is 2 now"
+        )
+        with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as other:
+            other.ping()
+            hang_up(service, "width_px = 640", "width_px = 1280", "px is 1280 now")
+        with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as other:
+            assert other.welcome.limits.max_width_px == 1280
+        client.filter(view, **SEE)
+
+
+def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_service):
+    service = start_service(max_sessions=1, threads=1)
+    hang_up(
+        *(service, "threads = 1", "threads = 2"),
+        "for threads the service has to be started again",
+    )
+    hang_up(
+        *(service, "max_sessions = 1", "max_sessions = 1000"),
+        "stay as they are: max_sessions is 1000; allowed: 1 to 64",
+    )
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert client.ping()[1].is_ready
 
