@@ -180,7 +180,7 @@ class OutOfGpuMemory(RenderError):
 
 
 class OutOfMemory(RenderError):
-    """The service has no memory left for the images of a frame."""
+    """The service has no memory left for the images of a frame, or for PSFs."""
 
     code = "out_of_memory"
 

@@ -4,6 +4,7 @@ eye_filter        `EyeFilter`: one stream; the public face
 filtered          a filtered frame, and events on the way
 accepted_profile  one profile and the stores of it
 stream_eyes       which eye serves, and what is to be built
+store_memory      what all stores may take together
 stream_use        what frames used and are about to use
 view_use          what one frame uses
 workshop          one worker and one engine for all streams

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -13,7 +14,7 @@ from filter_service.rendering.engine import LoadedStore
 from filter_service.settings import FilterSettings
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PreparedStore:
     """A loaded store and the camera it was built for.
 
@@ -21,6 +22,7 @@ class PreparedStore:
     ``ranges`` are those of a stream that it was built for, None for all that the
     settings allow; ``failed`` are such that could not be built, with the reason.
     ``behind`` is the complete store that a preview of more stands before.
+    ``used_s`` is when a frame last went through it, or when it was put in place.
     """
 
     camera: Camera
@@ -30,11 +32,18 @@ class PreparedStore:
     build_s: float = 0.0
     failed: dict[UsedRanges, str] = field(default_factory=dict)
     behind: PreparedStore | None = None
+    memory_mb: float = 0.0
+    used_s: float = field(default_factory=time.monotonic)
 
     @property
     def has_complete(self) -> bool:
         """Return whether there is more than a preview."""
         return self.is_complete or self.behind is not None
+
+    @property
+    def whole_mb(self) -> float:
+        """Return what it takes, with what is behind it."""
+        return self.memory_mb + (self.behind.whole_mb if self.behind else 0.0)
 
     @property
     def loaded(self) -> list[LoadedStore]:
@@ -56,6 +65,7 @@ class AcceptedProfile:
     settings: FilterSettings
     wanted: tuple[Camera, ...] = ()
     stores: list[PreparedStore] = field(default_factory=list)
+    was_complete: bool = False  # for some camera, whatever has become of it
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
 
     def is_same(self, first: Camera, second: Camera) -> bool:
@@ -68,6 +78,9 @@ class AcceptedProfile:
 
     def note_use(self, camera: Camera) -> None:
         """Move a camera's store to the end."""
+        found = self.store_for(camera)
+        if found is not None:
+            found.used_s = time.monotonic()
         self.stores.sort(key=lambda prepared: self.is_same(prepared.camera, camera))
 
     def failure_for(self, camera: Camera) -> FilterError | None:

@@ -154,7 +154,7 @@ class StreamEyes:
 
         A preview is not one: the profile may still fail.
         """
-        if not self.eyes or any(s.has_complete for s in self.eyes[0].stores):
+        if not self.eyes or self.eyes[0].was_complete:
             return None
         newest = self.eyes[0]
         return newest if newest.wanted or not newest.failures else None
@@ -244,6 +244,7 @@ class StreamEyes:
         """
         if prepared.is_complete:
             eye.want_no_more(prepared.camera)
+            eye.was_complete = True
         replaced = eye.store_for(prepared.camera)
         if replaced is not None:
             eye.stores.remove(replaced)

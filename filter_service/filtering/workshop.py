@@ -24,9 +24,10 @@ from filter_service.building.worker_handle import (
     WorkerHandle,
 )
 from filter_service.camera import Camera
-from filter_service.errors import BuildCancelled, FilterError, RenderFailed
+from filter_service.errors import BuildCancelled, FilterError, OutOfMemory, RenderFailed
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
+from filter_service.filtering.store_memory import held_mb, make_room
 from filter_service.filtering.stream_eyes import StreamEyes, Wanted
 from filter_service.filtering.upload import Upload
 from filter_service.rendering.engine import FrameEngine, LoadedStore
@@ -80,6 +81,11 @@ class Workshop:
         self._loads: list[_Loading] = []
         self._released: list[Any] = []
         self._going: list[Any] = []
+
+    @property
+    def stores_mb(self) -> float:
+        """Return what the stores of all streams take."""
+        return held_mb(self.streams)
 
     @property
     def is_loading(self) -> bool:
@@ -199,12 +205,31 @@ class Workshop:
                 stage, eye = event.stage, wanted.eye
                 stream.on_event(BuildingEye(eye, event.fraction, stage))
         elif isinstance(event, BuildDone):
+            try:
+                self._make_room(wanted, event.built.memory_mb)
+            except OutOfMemory as error:
+                self._give_up(stream, wanted, error)
+                return
             if event.built.is_complete:
                 stream.ticket = None
             upload = Upload(self.engine.load_steps(event.built.store))
             self._loads.append(_Loading(stream, wanted, event.built, upload))
         elif isinstance(event, BuildError):
             self._fail(stream, wanted, event.error)
+
+    def _make_room(self, wanted: Wanted, size_mb: float) -> None:
+        max_mb = self._limits.max_stores_mb
+        try:
+            make_room(
+                self.streams,
+                wanted,
+                size_mb,
+                max_mb=max_mb,
+                now_s=time.monotonic(),
+            )
+        finally:
+            for stream in self.streams:
+                self.free_retired(stream)
 
     def _loads_of(self, stream: StreamEyes) -> list[_Loading]:
         return [loading for loading in self._loads if loading.stream is stream]
@@ -222,9 +247,7 @@ class Workshop:
                 if not isinstance(error, FilterError):
                     log.exception("a store could not be loaded")
                     error = RenderFailed(f"{type(error).__name__}: {error}")
-                if stream.ticket is not None:
-                    self.worker.cancel(stream.ticket)
-                self._fail(stream, loading.wanted, error)
+                self._give_up(stream, loading.wanted, error)
             else:
                 self._loads.pop(0)
                 self._released.append(loading.built)
@@ -242,6 +265,7 @@ class Workshop:
                 built.is_complete,
                 wanted.ranges if built.is_complete else None,
                 built.build_ms / MS_PER_S,
+                memory_mb=built.memory_mb,
             ),
         )
         self.free_retired(stream)
@@ -258,6 +282,12 @@ class Workshop:
                 is_complete=built.is_complete,
             )
         )
+
+    def _give_up(self, stream: StreamEyes, wanted: Wanted, error: FilterError) -> None:
+        """End the building of a store that the worker may still be busy with."""
+        if stream.ticket is not None:
+            self.worker.cancel(stream.ticket)
+        self._fail(stream, wanted, error)
 
     def _fail(
         self,

@@ -40,6 +40,9 @@ class ServiceConfig:
         A profile that needs a wider kernel is refused.
     max_store_mb : int
         A profile that needs more memory for its PSFs is refused.
+    max_stores_mb : int
+        What the PSFs of all clients may take together: those that no frame has used
+        for longest make room, and are prepared again when they are wanted.
     engine : "auto", "gl" or "native"
         What filters frames and, unless ``psf_engine`` says otherwise, computes PSFs:
         a GPU's compute shaders, or compiled loops on all cores.  "auto" takes gl on a
@@ -94,6 +97,7 @@ class ServiceConfig:
     max_profile_kb: int = 1024
     max_blur_radius_px: int = 255
     max_store_mb: int = 2000
+    max_stores_mb: int = 4000
     engine: str = "auto"
     psf_engine: str = "auto"
     max_cameras: int = 4
@@ -142,6 +146,7 @@ class ServiceConfig:
         return BuildLimits(
             max_blur_radius_px=self.max_blur_radius_px,
             max_store_mb=self.max_store_mb,
+            max_stores_mb=self.max_stores_mb,
             psf_engine=self.psf_engine,
             store_cache_dir=self.store_cache_dir,
             store_cache_max_mb=self.store_cache_max_mb,
@@ -164,6 +169,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_profile_kb": (1, 1024),
     "max_blur_radius_px": (1, 255),
     "max_store_mb": (1, 1_000_000),
+    "max_stores_mb": (1, 1_000_000),
     "max_cameras": (1, 16),
     "store_cache_max_mb": (1, 1_000_000),
     "threads": (0, MAX_THREADS),

@@ -80,7 +80,8 @@ class Door:
         self._limits = config.limits
         self._keeper = keeper
         self._render = RenderEnd(config.max_image_mb * MB)
-        self._render_mb, self._is_building = 0.0, False
+        self._render_mb = self._stores_mb = 0.0
+        self._is_building = False
         self._server: dict[str, str] | None = None
         self._greetings: list[tuple[bytes, Hello]] = []  # until the renderer is known
         self._guests = Guests()
@@ -113,6 +114,7 @@ class Door:
             "ocufilter_messages_unheard_total": self._patience.n_unheard,
             "ocufilter_faults_total": self._n_faults,
             "ocufilter_memory_bytes": MB * (resident_memory_mb() + self._render_mb),
+            "ocufilter_psfs_bytes": MB * self._stores_mb,
             "ocufilter_render_silent_seconds": self._render.silent_s,
         }
 
@@ -193,7 +195,7 @@ class Door:
                 elif kind == "tell":
                     self._pass_on(*rest)
                 elif kind == "state":
-                    self._render_mb, self._is_building = rest
+                    self._render_mb, self._stores_mb, self._is_building = rest
                 elif kind == "here":
                     self._begin_with(*rest)
         except LinkClosed:

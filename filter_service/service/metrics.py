@@ -18,6 +18,7 @@ METRICS = {
     "ocufilter_messages_unheard_total": "messages of clients that sent too many wrong",
     "ocufilter_faults_total": "faults of the service that nobody foresaw",
     "ocufilter_memory_bytes": "memory of the door and the process that filters",
+    "ocufilter_psfs_bytes": "of that, the PSFs of all clients",
     "ocufilter_render_silent_seconds": "since the last sign of life of what filters",
 }
 

@@ -8,7 +8,7 @@ number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
 request)``, ``("frame", number, key, frame, places)``, ``("close", key)``.
 To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, reply)``,
 ``("answer", number, reply, started_s, ended_s, used_s)`` and ``("state", memory_mb,
-is_building)``.
+stores_mb, is_building)``.
 """
 
 from __future__ import annotations
@@ -234,7 +234,8 @@ class RenderLoop:
         if is_due or now_s >= self._next_state_s:
             self._next_state_s = now_s + STATE_INTERVAL_S
             is_building = self._workshop.worker.is_busy
-            self._send(("state", resident_memory_mb(), is_building))
+            stores_mb = self._workshop.stores_mb
+            self._send(("state", resident_memory_mb(), stores_mb, is_building))
 
     def _send(self, message: tuple[Any, ...]) -> None:
         if self._door is None:

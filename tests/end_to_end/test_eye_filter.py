@@ -26,8 +26,10 @@ from filter_service.errors import (
     BuildCancelled,
     BuildFailed,
     NoProfile,
+    OutOfMemory,
     ServiceTimeout,
 )
+from filter_service.filtering import store_memory
 from filter_service.filtering.workshop import Workshop
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
 from tests.end_to_end.printed_script import printed_by
@@ -233,3 +235,60 @@ def test_a_plain_script_gets_the_picture_that_the_service_gives(tmp_path):
         )
     np.testing.assert_array_equal(mine, theirs.color)
     assert len(np.unique(mine[18, :, 1])) > 4, "nothing was blurred"
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A workshop for 10 MB of PSFs, in which a store is idle after 0.2 s."""
+    monkeypatch.setattr(store_memory, "IDLE_S", 0.2)
+    worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+    limits = BuildLimits(max_stores_mb=10)
+    workshop = Workshop(worker, EngineDouble(0.0), limits)
+    yield workshop
+    workshop.close()
+
+
+def seen_through(eye_filter):
+    return mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE, timeout_s=10.0))
+
+
+def test_psfs_unused_for_longest_make_room_and_are_made_again(small):
+    with ExitStack() as closing:
+        made = [
+            closing.enter_context(EyeFilter(None, CAMERA, workshop=small))
+            for _ in range(3)
+        ]
+        for mark, eye_filter in enumerate(made[:2]):
+            eye_filter.set_profile(eye(mark, ballast_mb=4))
+            assert seen_through(eye_filter) == mark
+        time.sleep(0.3)
+        assert seen_through(made[1]) == 1  # so the other is the one that goes
+        made[2].set_profile(eye(2, ballast_mb=4))
+        assert seen_through(made[2]) == 2
+        assert [len(eye_filter.prepared_stores) for eye_filter in made] == [0, 1, 1]
+        assert small.stores_mb == pytest.approx(8)
+        time.sleep(0.3)
+        assert seen_through(made[0]) == 0, "it is prepared again"
+        assert small.stores_mb == pytest.approx(8)
+        made[0].set_profile(eye(7, ballast_mb=4))
+        made[0].wait(10.0)
+        assert seen_through(made[0]) == 7
+
+
+def test_psfs_in_use_stay_and_what_has_no_room_is_said(small, events):
+    with (
+        EyeFilter(None, CAMERA, workshop=small) as first,
+        EyeFilter(None, CAMERA, workshop=small, on_event=events.append) as second,
+    ):
+        first.set_profile(eye(1, ballast_mb=6))
+        second.set_profile(eye(2, ballast_mb=1))
+        assert (seen_through(first), seen_through(second)) == (1, 2)
+        second.set_profile(eye(3, ballast_mb=6))
+        with pytest.raises(OutOfMemory, match=r"6 MB.*max_stores_mb"):
+            while not isinstance(events[-1], EyeFailed):
+                assert (seen_through(first), seen_through(second)) == (1, 2)
+            raise events[-1].error
+        assert (seen_through(first), seen_through(second)) == (1, 2)
+        second.set_profile(eye(4, ballast_mb=2))
+        assert second.wait(10.0).is_complete
+        assert seen_through(second) == 4
