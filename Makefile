@@ -4,7 +4,7 @@
 PYTHON := .venv/bin/python
 ARGS ?=
 RESULTS := tests/benchmarks/results
-BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse roundtrip
+BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload roundtrip
 
 .DEFAULT_GOAL := help
 .PHONY: demo test test-training validate witness check clean help setup setup-test setup-training setup-witness

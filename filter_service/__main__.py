@@ -44,7 +44,9 @@ app.command()(estimate)
 app.command()(wavefront)
 app.command()(field)
 app.command()(psf)
-app.command()(bench)
+app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)(bench)
 app.command()(prepare)
 app.command()(doctor)
 

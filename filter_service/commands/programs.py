@@ -42,6 +42,7 @@ class Bench(StrEnum):
     PEERS = "peers"
     SWITCH = "switch"
     ABUSE = "abuse"
+    OVERLOAD = "overload"
     ROUNDTRIP = "roundtrip"
 
 
@@ -67,6 +68,7 @@ BENCH_MODULES = {
     Bench.PEERS: "tests.benchmarks.bench_peers",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
+    Bench.OVERLOAD: "tests.benchmarks.bench_overload",
     Bench.ROUNDTRIP: "clients.latency",
 }
 
@@ -99,6 +101,7 @@ def demo(
 
 
 def bench(
+    context: typer.Context,
     name: Annotated[Bench, typer.Argument(help="What to time.")],
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer cases and repeats.")
@@ -109,9 +112,11 @@ def bench(
 
     ocufilter bench psf --quick
 
-    ocufilter bench roundtrip --json
+    Other options are the benchmark's own:
+
+    ocufilter bench roundtrip --transport shm --stereo
     """
-    arguments = ["--quick"] if quick else []
+    arguments = [*(["--quick"] if quick else []), *context.args]
     _run_program(BENCH_MODULES[name], arguments, json_output=json_output)
 
 

@@ -52,9 +52,9 @@ from filter_service.wire.images import ViewImages
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
 STATE_INTERVAL_S = 0.5
-BETWEEN_S = 0.02
-LONG_FRAME_S = 0.1
-"""A frame that takes longer rests now and then, for what others want meanwhile."""
+BETWEEN_S = 0.01
+LONG_FRAME_S = 0.2
+"""While a frame takes longer, eyes are prepared in its rests, too."""
 
 TRIM_AFTER_S = 10.0
 """Without a frame for so long, the memory of frames goes back to the system."""
@@ -186,7 +186,7 @@ class RenderLoop:
             return ATTENTION_WAIT_S
         return IDLE_WAIT_S
 
-    def _turn(self) -> None:
+    def _turn(self, *, is_short: bool = False) -> None:
         if self._door is not None:
             try:
                 self._door.flush()
@@ -197,6 +197,8 @@ class RenderLoop:
                 if self._door is not None:
                     self._door.close()
                 self._door = None
+        if is_short:
+            return
         self._workshop.advance()
         if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None
@@ -209,18 +211,18 @@ class RenderLoop:
         return self._trim_at_s is not None and time.monotonic() > self._trim_at_s
 
     def _rest(self) -> None:
-        """In the middle of a long frame: do what others want, a smaller frame too.
+        """In the middle of a frame: do what others want, a smaller frame too.
 
         That takes half of the time at most.  Whatever is asked for meanwhile, what the
         frame is filtered with stays in memory until it is done.
         """
         begin_s = time.monotonic()
         since_s = self._frame_since_s
-        if since_s is None or begin_s < max(since_s + LONG_FRAME_S, self._next_rest_s):
+        if since_s is None or begin_s < self._next_rest_s:
             return
         try:
             self._listen()
-            self._turn()
+            self._turn(is_short=begin_s < since_s + LONG_FRAME_S)
         except LinkClosed:
             self._is_over = True
         except Exception:  # it cannot be raised through the compiled loops

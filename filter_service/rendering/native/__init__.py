@@ -3,6 +3,7 @@
 renderer       the engine: stages, what is kept between frames
 lanes          two renderers, for small frames beside large ones
 native_store   a store with its coarse kernels
+kept_states    what is kept of each eye between frames
 kernel_plan    the kernels that a frame needs
 frame_record   what the loops are told
 records        their records, field by field

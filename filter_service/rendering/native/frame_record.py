@@ -64,12 +64,15 @@ class FrameRecord:
     c: Frame
     n_threads: int
     arrays: Arrays
+    eye_arrays: Arrays  # which the next frame of this eye may find again
     kept: list[NDArray]
 
     @classmethod
-    def new(cls, threads: int, n_threads: int, arrays: Arrays) -> "FrameRecord":
+    def new(
+        cls, threads: int, n_threads: int, arrays: Arrays, eye_arrays: Arrays
+    ) -> "FrameRecord":
         """Return an empty record for loops on these threads."""
-        return cls(Frame(threads=threads), n_threads, arrays, [])
+        return cls(Frame(threads=threads), n_threads, arrays, eye_arrays, [])
 
     def _keep(self, array: NDArray) -> int:
         """Keep an array as long as the record; return where it lies."""
@@ -157,8 +160,10 @@ class FrameRecord:
             setattr(c, name, self._keep(array))
         c.recipe_count = len(plan.kernels.nodes.recipes)
         n_images = RESOLUTIONS * c.recipe_count
-        c.recipe_images = self._room("recipe_images", n_images * RECIPE_IMAGE_BYTES)
-        c.kernels = self._room("kernels", c.kernel_count * KERNEL_IMAGE_BYTES)
+        eye_room = self.eye_arrays.address
+        n_bytes = n_images * RECIPE_IMAGE_BYTES
+        c.recipe_images = eye_room("recipe_images", n_bytes, np.uint8)
+        c.kernels = eye_room("kernels", c.kernel_count * KERNEL_IMAGE_BYTES, np.uint8)
 
     def set_merging(
         self,
@@ -191,12 +196,12 @@ class FrameRecord:
     def set_blend_room(self, sizes: BlendSizes) -> None:
         """Point to kernels, or room for them."""
         c = self.c
-        room = self._room
+        room = self.eye_arrays.address
         c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
         c.kernel_texels = room("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
         c.blend_scratch_floats = sizes.scratch_floats
         n_floats = self.n_threads * sizes.scratch_floats
-        c.blend_scratch = room("blend_scratch", n_floats, np.float32)
+        c.blend_scratch = self._room("blend_scratch", n_floats, np.float32)
 
     def set_picture(self, picture: NDArray) -> None:
         """Point to where the picture goes."""

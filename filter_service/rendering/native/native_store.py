@@ -55,13 +55,17 @@ class NativeStore(FrameStore):
     tables : StoreTables
         The store's, with the number of each kernel in the place of its offset.
     resolutions : tuple of StoredKernels
+    is_released : bool
+        Nothing is to be kept of it.
     """
 
     tables: StoreTables
     resolutions: tuple[StoredKernels, ...]
+    is_released: bool = False
 
     def release(self) -> None:
-        """Nothing is held but memory."""
+        """Let renderers forget it; its memory goes with the last who has it."""
+        object.__setattr__(self, "is_released", True)
 
 
 def load_steps(

@@ -21,11 +21,11 @@ from filter_service.rendering.frame_options import (
     FrameOptions,
     frame_options,
 )
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native import native_store
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
+from filter_service.rendering.native.kept_states import KeptState, KeptStates
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.library import Library, compiled_library
 from filter_service.rendering.native.native_store import NativeStore
@@ -57,10 +57,9 @@ class NativeRenderer:
         self._n_threads = self._loops.thread_count(self._threads)
         self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
         self._between: object = None
-        self._states = FrameStates()
+        self._rested_s = 0.0  # in all
+        self._kept = KeptStates()
         self._arrays = Arrays()
-        self._plan: KernelPlan | None = None
-        self._blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
 
     @property
     def name(self) -> str:
@@ -70,7 +69,7 @@ class NativeRenderer:
     @property
     def memory_mb(self) -> float:
         """Memory that frames use again."""
-        return self._arrays.memory_mb
+        return self._arrays.memory_mb + self._kept.memory_mb
 
     def trim(self) -> None:
         """Give back the memory that frames use again; the next one takes what it needs.
@@ -78,7 +77,7 @@ class NativeRenderer:
         A frame of 4096x4096 leaves a gigabyte, which nobody else has use for.
         """
         self._arrays = Arrays()
-        self._plan = self._blended = None
+        self._kept = KeptStates()
 
     def close(self) -> None:
         """End the threads; the renderer is of no use after."""
@@ -89,7 +88,13 @@ class NativeRenderer:
 
         It must neither raise nor use this renderer.
         """
-        self._between = self._loops.call_between(self._threads, function, interval_s)
+
+        def rest() -> None:
+            started_s = time.perf_counter()
+            function()
+            self._rested_s += time.perf_counter() - started_s
+
+        self._between = self._loops.call_between(self._threads, rest, interval_s)
 
     def load(self, store: PsfStore) -> NativeStore:
         """Take a store at once."""
@@ -144,33 +149,36 @@ class NativeRenderer:
             output=output,
             gaze_deg=gaze_deg,
         )
-        timer = StageTimes()
-        layers = self._states.layers(
+        timer = StageTimes(lambda: self._rested_s)
+        kept = self._kept.of(handle)
+        layers = kept.states.layers(
             timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
         )
         while True:
-            image = self._states.cells(timer, handle, options.gaze_deg)
+            image = kept.states.cells(timer, handle, options.gaze_deg)
             try:
-                return self._render(timer, view, handle, layers, image, options, out)
+                return self._render(timer, view, kept, layers, image, options, out)
             except KernelsTooLarge:
-                self._states.coarsen(image)
+                kept.states.coarsen(image)
 
     def _render(
         self,
         timer,
         view,
-        handle,
+        kept: KeptState,
         layers: FrameLayers,
         image,
         options: FrameOptions,
         out,
     ) -> FilteredView:
-        frame = FrameRecord.new(self._threads, self._n_threads, self._arrays)
-        missing_count, used = self._pixels(timer, frame, view, layers, image)
+        frame = FrameRecord.new(
+            self._threads, self._n_threads, self._arrays, kept.arrays
+        )
+        missing_count, used = self._pixels(timer, frame, view, kept, layers, image)
         with timer.wall("psf_plan_ms"):
-            plan = self._planned(handle, layers, image, used)
+            plan = self._planned(kept, layers, image, used)
             frame.set_kernels(plan)
-            frame.set_store(handle)
+            frame.set_store(kept.handle)
         with timer.wall("merge_ms"):
             frame.set_merging(
                 tolerance=options.tolerance if options.merge else 0.0,
@@ -179,7 +187,7 @@ class NativeRenderer:
                 is_encoded=options.is_encoded,
             )
             self._loops.run("merge", frame.c)
-        self._blend(timer, frame, plan)
+        sizes = self._blend(timer, frame, plan, kept)
         with timer.wall("splat_ms"):
             picture = _room(view.color.shape, OUTPUT_DTYPES[options.output], out)
             frame.set_picture(picture)
@@ -199,7 +207,7 @@ class NativeRenderer:
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
             kernel_count=plan.kernels.count,
-            kernel_texel_count=self._blended[2].kernel_texels,
+            kernel_texel_count=sizes.kernel_texels,
             layer_count=len(layers.layer_dpt),
             notes=[
                 *layers.notes,
@@ -209,7 +217,13 @@ class NativeRenderer:
         )
 
     def _pixels(
-        self, timer, frame: FrameRecord, view, layers, image: ImageCells
+        self,
+        timer,
+        frame: FrameRecord,
+        view,
+        kept: KeptState,
+        layers,
+        image: ImageCells,
     ) -> tuple[int, NDArray[np.bool_]]:
         """Distances, positions and used pairs; pixels whose depth was filled in."""
         with timer.wall("prepare_ms"):
@@ -220,36 +234,39 @@ class NativeRenderer:
             reach = image.maps.largest_stretch_ratio * layers.max_radius_px
             border_px = border_px_of(whole, ceil(reach) + 2)
             whole = extended(whole, border_px)
-        change_dpt = self._states.corner_change_dpt(timer, layers, image)
+        change_dpt = kept.states.corner_change_dpt(timer, layers, image)
         with timer.wall("fragments_ms"):
             frame.set_view(whole, border_px)
             used = frame.set_state(layers, image, change_dpt)
             self._loops.run("pixels", frame.c)
         return missing_count, used
 
-    def _planned(self, handle, layers, image, used) -> KernelPlan:
+    def _planned(self, kept: KeptState, layers, image, used) -> KernelPlan:
         """Plan kernels, or return the last frame's if they serve."""
-        state = (handle, layers, image)
-        if self._plan is None or not self._plan.serves(state, used):
-            self._plan = None  # stays so if what follows fails
-            self._plan = plan_kernels(handle, layers, image, used)
-        return self._plan
+        state = (kept.handle, layers, image)
+        if kept.plan is None or not kept.plan.serves(state, used):
+            kept.plan = None  # stays so if what follows fails
+            kept.plan = plan_kernels(kept.handle, layers, image, used)
+        return kept.plan
 
-    def _blend(self, timer, frame: FrameRecord, plan: KernelPlan) -> None:
+    def _blend(
+        self, timer, frame: FrameRecord, plan: KernelPlan, kept: KeptState
+    ) -> BlendSizes:
         """Make what fragments use of the kernels, unless it is there."""
         levels = plan.shapes["levels_used"]
-        if self._blended is not None:
-            of_plan, made, sizes = self._blended
+        if kept.blended is not None:
+            of_plan, made, sizes = kept.blended
             if of_plan is plan and not np.any(levels & ~made):
                 frame.set_blend_room(sizes)
-                return
-        self._blended = None
+                return sizes
+        kept.blended = None
         with timer.wall("psf_blend_ms"):
             self._loops.run("place", frame.c)
             sizes = BlendSizes.of(frame.c)
             frame.set_blend_room(sizes)
             self._loops.run("blend", frame.c)
-        self._blended = plan, levels.copy(), sizes
+        kept.blended = plan, levels.copy(), sizes
+        return sizes
 
 
 def _room(shape, dtype, out: NDArray[Any] | None) -> NDArray[Any]:
@@ -266,19 +283,22 @@ def _room(shape, dtype, out: NDArray[Any] | None) -> NDArray[Any]:
 
 
 class StageTimes:
-    """Wall times of named stages, ms."""
+    """Wall times of named stages, ms, and of the rests between their parts."""
 
-    def __init__(self) -> None:
+    def __init__(self, rested_s: Callable[[], float]) -> None:
         self._ms: dict[str, float] = {}
+        self._rested_s = rested_s
+        self._before_s = rested_s()
 
     @contextmanager
     def wall(self, name: str):
         """Time a stage; entering a name twice adds up."""
-        started_s = time.perf_counter()
+        started_s = time.perf_counter() - self._rested_s()
         yield
-        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        elapsed_ms = 1e3 * (time.perf_counter() - self._rested_s() - started_s)
         self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
 
     def result_ms(self) -> dict[str, float]:
         """Return times by stage."""
-        return dict(self._ms)
+        rests_ms = 1e3 * (self._rested_s() - self._before_s)
+        return dict(self._ms) | ({"rests_ms": rests_ms} if rests_ms else {})

@@ -1,0 +1,62 @@
+"""What is kept of each eye between frames, so that several take turns without loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.rendering.frame_states import FrameStates
+from filter_service.rendering.native.arrays import Arrays
+from filter_service.rendering.native.frame_record import BlendSizes
+from filter_service.rendering.native.kernel_plan import KernelPlan
+from filter_service.rendering.native.native_store import NativeStore
+
+MAX_KEPT = 4
+"""Eyes: those of a stereo frame, and of clients that stream at the same time."""
+
+
+@dataclass(eq=False)
+class KeptState:
+    """What of an eye's last frame serves the next in the same state.
+
+    Attributes
+    ----------
+    handle : NativeStore
+    states : FrameStates
+    arrays : Arrays
+        Of blended kernels.
+    plan : KernelPlan or None
+    blended : (plan, levels that were made, sizes) or None
+    """
+
+    handle: NativeStore
+    states: FrameStates = field(default_factory=FrameStates)
+    arrays: Arrays = field(default_factory=Arrays)
+    plan: KernelPlan | None = None
+    blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
+
+
+class KeptStates:
+    """States of the eyes used last; those of stores that were released go."""
+
+    def __init__(self) -> None:
+        self._kept: list[KeptState] = []
+
+    def of(self, handle: NativeStore) -> KeptState:
+        """Return the state of an eye, which is now the one used last."""
+        found = next((kept for kept in self._kept if kept.handle is handle), None)
+        others = [
+            kept
+            for kept in self._kept
+            if kept is not found and not kept.handle.is_released
+        ]
+        found = found or KeptState(handle)
+        self._kept = [*others[1 - MAX_KEPT :], found]
+        return found
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory of all blended kernels."""
+        return sum(kept.arrays.memory_mb for kept in self._kept)
