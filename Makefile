@@ -4,6 +4,10 @@
 PYTHON := .venv/bin/python
 ARGS ?=
 RESULTS := tests/benchmarks/results
+USUAL := -m "not slow and not gpu"
+# Services and clients keep time, and need the machine for themselves; others do not.
+BESIDE := -n auto --maxprocesses 4 --dist loadfile
+NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload roundtrip
 
 .DEFAULT_GOAL := help
@@ -13,7 +17,8 @@ demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
 
 test: setup-test  ## all tests but the slow ones and those for a hardware GPU
-	$(PYTHON) -m pytest -m "not slow and not gpu" --ignore tests/training $(ARGS)
+	$(PYTHON) -m pytest $(USUAL) $(BESIDE) tests/unit tests/numerical $(ARGS) || $(NONE)
+	$(PYTHON) -m pytest $(USUAL) tests/end_to_end $(ARGS) || $(NONE)
 
 test-training: setup-training  ## the tests of the training, with torch, and a short run
 	$(PYTHON) -m pytest tests/training $(ARGS)
