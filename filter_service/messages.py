@@ -19,6 +19,7 @@ from filter_service.camera import Camera, tangents_from_fov
 from filter_service.checked import show
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
 from filter_service.settings import FilterSettings
+from filter_service.wire.compression import COMPRESSIONS, Compression
 from filter_service.wire.depths import DEPTH_ENCODINGS, DepthEncoding, encoded_depth
 from filter_service.wire.images import (
     FORMATS,
@@ -65,6 +66,7 @@ from filter_service.wire.requests import (
 from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
 __all__ = [
+    "COMPRESSIONS",
     "DEFAULT_ENDPOINT",
     "DEPTH_ENCODINGS",
     "DROP_REASONS",
@@ -81,6 +83,7 @@ __all__ = [
     "Bye",
     "Camera",
     "Closing",
+    "Compression",
     "DepthEncoding",
     "Dropped",
     "ErrorReply",

@@ -24,6 +24,7 @@ SERVICE_PACKAGES = (
     "pyzmq",
     "msgpack",
     "msgspec",
+    "lz4",
     "lazy-loader",
     "pillow",
     "OpenEXR",

@@ -21,7 +21,7 @@ log = logging.getLogger("ocufilter")
 
 
 def frame_reply(
-    eye_filter: EyeFilter, frame: Frame, out: Sequence[NDArray[Any]]
+    eye_filter: EyeFilter, frame: Frame, out: Sequence[NDArray[Any]] | None
 ) -> Result | Dropped | ErrorReply:
     """Return the reply to a frame; anything that goes wrong becomes an error reply.
 

@@ -10,6 +10,7 @@ from filter_service.errors import BadMessage
 from filter_service.messages import Frame
 from filter_service.service.session import Session
 from filter_service.slots import Slot
+from filter_service.wire.compression import largest_block_bytes
 
 
 def check_places(session: Session, frame: Frame) -> None:
@@ -46,9 +47,12 @@ def check_places(session: Session, frame: Frame) -> None:
 
 
 def result_sizes(frame: Frame) -> list[int]:
-    """Return the bytes of each view's picture."""
+    """Return the most bytes that each view's picture may take."""
     bytes_per_pixel = frame.output.bytes_per_pixel
-    return [view.camera.pixel_count * bytes_per_pixel for view in frame.views]
+    sizes = [view.camera.pixel_count * bytes_per_pixel for view in frame.views]
+    if frame.compression == "none":
+        return sizes
+    return [largest_block_bytes(size) for size in sizes]
 
 
 def _check_room(

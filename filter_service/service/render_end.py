@@ -7,6 +7,7 @@ is lost, and the door says it again to the next one.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -224,16 +225,13 @@ class RenderEnd:
             *(number, session, session.identity, waiting, places, own_slots),
             handed_s=now_s,
         )
+        sizes = [array.nbytes for images in frame.images for array in images.arrays]
         bare = replace(frame, images=(), memory=None)
-        self.tell("frame", number, session.key, bare, places)
+        self.tell("frame", number, session.key, bare, places, sizes)
 
     def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
         """Copy the images of a frame to slots of the service."""
-        images = [
-            image
-            for view, found in zip(frame.views, frame.images, strict=True)
-            for image in found.parts(view)
-        ]
+        images = frame.parts()
         starts, n_in = starts_of([image.nbytes for image in images])
         result_starts, n_out = starts_of(result_sizes(frame))
         slot = self._slot_for(n_in)
@@ -253,11 +251,15 @@ class RenderEnd:
         return self.held.pop(number, None)
 
 
-def completed(result: Result, held: Held, started_s: float) -> Result:
+def completed(
+    result: Result, held: Held, started_s: float, block_sizes: Sequence[int]
+) -> Result:
     """Return a result with its pictures and with the times that the door knows."""
     if held.own_slots:
         _, slot = held.own_slots
-        result = replace(result, colors=_pictures(result, slot, held.places))
+        result = replace(
+            result, colors=_pictures(result, slot, held.places, block_sizes)
+        )
     else:
         result = replace(result, in_memory=True)
     waiting = held.waiting
@@ -272,8 +274,13 @@ def completed(result: Result, held: Held, started_s: float) -> Result:
 
 
 def _pictures(
-    result: Result, slot: Slot, places: SharedPlaces
+    result: Result, slot: Slot, places: SharedPlaces, block_sizes: Sequence[int]
 ) -> tuple[NDArray[Any], ...]:
+    if result.compression != "none":
+        return tuple(
+            slot.array(start, (size,), np.dtype(np.uint8))
+            for start, size in zip(places.result_starts, block_sizes, strict=True)
+        )
     return tuple(
         slot.array(
             start, (view.height_px, view.width_px, 3), np.dtype(view.color.dtype)

@@ -5,10 +5,11 @@ for the other, and each outlives the other: a new door is told which sessions th
 
 From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
 number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
-request)``, ``("frame", number, key, frame, places)``, ``("close", key)``.
+request)``, ``("frame", number, key, frame, places, sizes)``, ``("close",
+key)``.
 To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, reply)``,
-``("answer", number, reply, started_s, ended_s, used_s)`` and ``("state", memory_mb,
-stores_mb, is_building)``.
+``("answer", number, reply, started_s, ended_s, used_s, block_sizes)`` and ``("state",
+memory_mb, stores_mb, is_building)``.  Sizes are of parts that are compressed.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.errors import FilterError, NoSession
+from filter_service.errors import BadMessage, FilterError, NoSession
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
 from filter_service.filtering.workshop import Workshop
@@ -47,7 +49,10 @@ from filter_service.service.process_info import (
     resident_memory_mb,
 )
 from filter_service.slots import Slot
+from filter_service.wire.compression import packed
 from filter_service.wire.images import ViewImages
+
+MS_PER_S = 1e3
 
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
@@ -352,7 +357,12 @@ class RenderLoop:
     # Frames
 
     def _filter(
-        self, number: int, key: str, frame: Frame, places: SharedPlaces
+        self,
+        number: int,
+        key: str,
+        frame: Frame,
+        places: SharedPlaces,
+        sizes: Sequence[int],
     ) -> None:
         """Filter a frame; one that comes between the parts of another does not rest."""
         started_s = time.monotonic()
@@ -360,7 +370,7 @@ class RenderLoop:
         if is_first:
             self._frame_since_s, self._rested_s = started_s, 0.0
         try:
-            reply = self._filtered(key, frame, places)
+            reply, block_sizes = self._filtered(key, frame, places, sizes)
         finally:
             rested_s = self._rested_s if is_first else 0.0
             if is_first:
@@ -368,50 +378,83 @@ class RenderLoop:
         ended_s = time.monotonic()
         self._trim_at_s = ended_s + TRIM_AFTER_S
         used_s = ended_s - started_s - rested_s
-        self._send(("answer", number, reply, started_s, ended_s, used_s))
+        times_s = (started_s, ended_s, used_s)
+        self._send(("answer", number, reply, *times_s, block_sizes))
 
-    def _filtered(self, key: str, frame: Frame, places: SharedPlaces) -> Reply:
-        """Return the answer to a frame; its pictures are where they are wanted."""
+    def _filtered(
+        self, key: str, frame: Frame, places: SharedPlaces, sizes: Sequence[int]
+    ) -> tuple[Reply, list[int]]:
+        """Return the answer to a frame; its pictures are where they are wanted.
+
+        Beside it the sizes of pictures that are compressed.
+        """
         eye = self._eyes.get(key)
         if eye is None:
             error = NoSession("the session has ended")
-            return ErrorReply.from_exception(error, frame_id=frame.frame_id)
+            return ErrorReply.from_exception(error, frame_id=frame.frame_id), []
         # By the end the door may have given them up.
         slot, result_slot = self._slots[places.slot], self._slots[places.result_slot]
-        frame = replace(frame, images=images_in(slot, frame, places.starts))
-        dtype = np.dtype(frame.output.dtype)
-        rooms = [
-            result_slot.array(start, (view.height_px, view.width_px, 3), dtype)
-            for start, view in zip(places.result_starts, frame.views, strict=True)
-        ]
+        unpack_s = time.monotonic()
+        try:
+            frame = with_images(frame, slot, places.starts, sizes)
+        except BadMessage as error:
+            return ErrorReply.from_exception(error, frame_id=frame.frame_id), []
+        unpack_s = time.monotonic() - unpack_s
+        is_packed = frame.compression != "none"
+        rooms = None if is_packed else rooms_in(result_slot, frame, places)
         reply = frame_reply(eye.eye_filter, frame, rooms)
         if not isinstance(reply, Result):
-            return reply
-        colors = [np.ascontiguousarray(color) for color in reply.colors]
+            return reply, []
         copied_s = time.monotonic()
+        colors = [
+            packed(color) if is_packed else np.ascontiguousarray(color)
+            for color in reply.colors
+        ]
         result_slot.put(colors, places.result_starts)
         stages_ms = dict(reply.stage_times_ms)
-        stages_ms["copy_out_ms"] = 1e3 * (time.monotonic() - copied_s)
-        return replace(reply, colors=(), stage_times_ms=stages_ms)
+        stages_ms["copy_out_ms"] = MS_PER_S * (time.monotonic() - copied_s)
+        if is_packed:
+            stages_ms["unpack_ms"] = MS_PER_S * unpack_s
+        reply = replace(
+            reply,
+            colors=(),
+            stage_times_ms=stages_ms,
+            compression=frame.compression,
+        )
+        return reply, [color.nbytes for color in colors]
 
 
-def images_in(
-    slot: Slot, frame: Frame, starts: Sequence[int]
-) -> tuple[ViewImages, ...]:
-    """Return the images of a frame that lie in a slot.
+def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
+    """Return where the pictures of a frame go."""
+    dtype = np.dtype(frame.output.dtype)
+    return [
+        slot.array(start, (view.height_px, view.width_px, 3), dtype)
+        for start, view in zip(places.result_starts, frame.views, strict=True)
+    ]
+
+
+def with_images(
+    frame: Frame, slot: Slot, starts: Sequence[int], sizes: Sequence[int]
+) -> Frame:
+    """Return a frame with its images, which lie in a slot.
 
     Raises
     ------
     ValueError
         They reach beyond it.
+    BadMessage
+        They are compressed, and one of them cannot be unpacked.
     """
-    waiting = iter(starts)
+    waiting = iter(zip(starts, sizes or starts, strict=True))
     found = []
     for view in frame.views:
         arrays = []
         for _, shape, dtype in view.images:
-            array = slot.array(next(waiting), shape, np.dtype(dtype))
+            start, size = next(waiting)
+            if frame.compression != "none":
+                shape, dtype = (size,), "uint8"
+            array = slot.array(start, shape, np.dtype(dtype))
             array.flags.writeable = False
             arrays.append(array)
         found.append(ViewImages(*arrays))
-    return tuple(found)
+    return replace(frame, images=tuple(found)).unpacked()

@@ -14,6 +14,12 @@ from filter_service.checked import Record
 from filter_service.errors import BadMessage
 from filter_service.rgbd_view import ColorImage, RgbdView
 from filter_service.settings import DepthKind, Output
+from filter_service.wire.compression import (
+    Compression,
+    block_from_part,
+    packed,
+    unpacked,
+)
 from filter_service.wire.depths import WIRE_DTYPES, DepthEncoding, decoded_depth
 from filter_service.wire.message import Limits, Part, expect_parts
 
@@ -178,6 +184,12 @@ class ViewImages:
         """Return whether there is a hidden layer."""
         return self.hidden_color is not None and self.hidden_depth_m is not None
 
+    @property
+    def arrays(self) -> list[NDArray[Any]]:
+        """Return all images in the order of their parts."""
+        found = (self.color, self.depth_m, self.hidden_color, self.hidden_depth_m)
+        return [array for array in found if array is not None]
+
     def parts(self, view: ViewHeader) -> list[NDArray[Any]]:
         """Return the images as they are sent.
 
@@ -239,9 +251,15 @@ def image_from_part(
 
 
 def images_from_parts(
-    views: Sequence[ViewHeader], parts: Sequence[Part], limits: Limits
+    views: Sequence[ViewHeader],
+    parts: Sequence[Part],
+    limits: Limits,
+    compression: Compression = "none",
 ) -> tuple[ViewImages, ...]:
-    """Return arrays over the parts of a frame's views; nothing is copied."""
+    """Return arrays over the parts of a frame's views; nothing is copied.
+
+    Where they are compressed the arrays are of bytes, see `unpacked_images`.
+    """
     expect_parts(parts, sum(view.part_count for view in views))
     waiting = iter(parts)
     images = []
@@ -249,11 +267,53 @@ def images_from_parts(
         path = f"views[{i}]"
         check_part_size(view.camera, view.color, path, limits)
         found = [
-            image_from_part(next(waiting), shape, dtype, f"{path}.{name}")
+            _from_part(next(waiting), shape, dtype, f"{path}.{name}", compression)
             for name, shape, dtype in view.images
         ]
         images.append(ViewImages(*found))
     return tuple(images)
+
+
+def _from_part(
+    part: Part, shape: tuple[int, ...], dtype: str, path: str, compression: Compression
+) -> NDArray[Any]:
+    if compression == "none":
+        return image_from_part(part, shape, dtype, path)
+    size_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    return block_from_part(part, size_bytes, path)
+
+
+def packed_images(
+    views: Sequence[ViewHeader], images: Sequence[ViewImages]
+) -> tuple[ViewImages, ...]:
+    """Return the images of a frame's views as blocks."""
+    result = []
+    for view, found in zip(views, images, strict=True):
+        blocks: list[Any] = [packed(part) for part in found.parts(view)]
+        result.append(ViewImages(*blocks))
+    return tuple(result)
+
+
+def unpacked_images(
+    views: Sequence[ViewHeader], images: Sequence[ViewImages]
+) -> tuple[ViewImages, ...]:
+    """Return the images of blocks.
+
+    Raises
+    ------
+    BadMessage
+        Names the one that is none.
+    """
+    result = []
+    for i, (view, found) in enumerate(zip(views, images, strict=True)):
+        arrays = [
+            unpacked(block, shape, dtype, f"views[{i}].{name}")
+            for block, (name, shape, dtype) in zip(
+                found.arrays, view.images, strict=True
+            )
+        ]
+        result.append(ViewImages(*arrays))
+    return tuple(result)
 
 
 def check_camera(camera: Camera, path: str, limits: Limits) -> None:

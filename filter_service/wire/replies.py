@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from filter_service.checked import Record
 from filter_service.errors import FilterError, error_from_code
+from filter_service.wire.compression import Compression, unpacked
 from filter_service.wire.images import (
     SRGB8,
     ImageFormat,
@@ -173,6 +176,7 @@ class Result(Message):
     notes: Notes = ()
     is_complete: bool = True
     in_memory: bool = False
+    compression: Compression = "none"
     colors: Pictures = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"
@@ -186,6 +190,8 @@ class Result(Message):
         """Return the images of all views; none where they lie in shared memory."""
         if self.in_memory:
             return []
+        if self.compression != "none":
+            return list(self.colors)
         pairs = zip(self.colors, self.views, strict=True)
         return [as_sent(color, view.color) for color, view in pairs]
 
@@ -197,15 +203,16 @@ class Result(Message):
         expect_parts(parts, len(self.views))
         return self._with_payload(
             tuple(
-                image_from_part(
-                    part,
-                    (view.height_px, view.width_px, 3),
-                    view.color.dtype,
-                    f"views[{i}].color",
-                )
+                self._picture(view, part, f"views[{i}].color")
                 for i, (view, part) in enumerate(zip(self.views, parts, strict=True))
             )
         )
+
+    def _picture(self, view: ResultView, part: Part, path: str) -> NDArray[Any]:
+        shape, dtype = (view.height_px, view.width_px, 3), view.color.dtype
+        if self.compression == "none":
+            return image_from_part(part, shape, dtype, path)
+        return unpacked(np.frombuffer(part, np.uint8), shape, dtype, path)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 from msgspec import Meta
@@ -22,6 +22,7 @@ from filter_service.settings import (
     VergenceDpt,
 )
 from filter_service.slots import ALIGNMENT_BYTES
+from filter_service.wire.compression import Compression
 from filter_service.wire.images import (
     SRGB8,
     ImageFormat,
@@ -30,6 +31,8 @@ from filter_service.wire.images import (
     check_camera,
     check_part_size,
     images_from_parts,
+    packed_images,
+    unpacked_images,
 )
 from filter_service.wire.message import (
     Id,
@@ -116,6 +119,7 @@ class Frame(Message):
     output: ImageFormat = SRGB8
     options: FrameOptions = FrameOptions()
     memory: SharedPlaces | None = None
+    compression: Compression = "none"
     images: Images = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "frame"
@@ -130,8 +134,28 @@ class Frame(Message):
         """Return the images of each view in turn; none where they lie in memory."""
         if self.memory is not None:
             return []
+        if self.compression != "none":
+            return [block for images in self.images for block in images.arrays]
         pairs = zip(self.views, self.images, strict=True)
         return [part for view, images in pairs for part in images.parts(view)]
+
+    def packed(self, compression: Compression) -> Self:
+        """Return the frame with its images compressed, as it is sent."""
+        if compression == "none":
+            return self
+        images = packed_images(self.views, self.images)
+        return replace(self, images=images, compression=compression)
+
+    def unpacked(self) -> Self:
+        """Return the frame with its images as they are seen; its result may be packed.
+
+        Raises
+        ------
+        BadMessage
+        """
+        if self.compression == "none":
+            return self
+        return replace(self, images=unpacked_images(self.views, self.images))
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
         """Return the frame with arrays over its parts (nothing is copied)."""
@@ -140,8 +164,15 @@ class Frame(Message):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
         if self.memory is None:
-            return self._with_payload(images_from_parts(self.views, parts, limits))
+            images = images_from_parts(self.views, parts, limits, self.compression)
+            return self._with_payload(images)
         expect_parts(parts, 0)
+        if self.compression != "none":
+            raise BadMessage(
+                f"it is {self.compression!r}",
+                field="compression",
+                allowed="none beside memory, where nothing is gained by it",
+            )
         for name, starts, count in (
             ("starts", self.memory.starts, sum(v.part_count for v in self.views)),
             ("result_starts", self.memory.result_starts, len(self.views)),

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import zmq
 
-from clients.filter_client import FilteredFrame, RgbdView
+from clients.filter_client import FilterClient, FilteredFrame, RgbdView
 from filter_service import errors
 from filter_service.messages import Bye, Hello, Ping, encode
+from filter_service.wire.compression import packed
 from tests.end_to_end.conftest import make_view, small_frame
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
@@ -255,3 +256,53 @@ def test_bye_ends_a_session_and_too_many_sessions_are_refused(
     first.send(encode(Bye()))
     assert first.ask(Ping(2.5)).t == 2.5
     assert second.ask(Hello("second")).type_name == "welcome"
+
+
+@pytest.mark.parametrize("encoding", ["float32", "mm16"])
+@pytest.mark.parametrize("output", ["srgb8", "linear"])
+def test_compressed_frames_and_results_are_those_without(
+    shared_service, client, encoding, output
+):
+    view = make_view(96, 64)
+    client.set_profile(double(7), views=[view])
+    how = {**SEE, "output": output, "depth_encoding": encoding}
+    usual = client.filter([view, view], **how)
+    with FilterClient(
+        shared_service.endpoint, shared_memory=False, compression="lz4"
+    ) as thin:
+        thin.set_profile(double(7), views=[view])
+        seen = thin.filter([view, view], **how)
+    assert seen.header.compression == "lz4"
+    for color, other in zip(seen.colors, usual.colors, strict=True):
+        assert color.tobytes() == other.tobytes()
+    stages_ms = seen.header.stage_times_ms
+    assert {"unpack_ms", "copy_out_ms"} <= set(stages_ms)
+    assert sum(stages_ms.values()) == pytest.approx(seen.header.total_ms)
+
+
+def test_parts_that_are_no_blocks_are_refused_by_name(shared_service, raw_client):
+    raw = raw_client(shared_service)
+    raw.begin()
+    frame = small_frame(1).packed("lz4")
+    header, color, depth = encode(frame)
+    depth_m = small_frame(1).images[0].depth_m
+    short, long = packed(depth_m[:-1]), packed(np.concatenate([depth_m, depth_m]))
+    for wrong, allowed in (
+        (b"", "1 to"),
+        (b"\xff" * 40, "512 bytes"),
+        (bytes(5000), "1 to"),
+        (short.tobytes(), "512 bytes"),
+        (long.tobytes(), "512 bytes"),
+    ):
+        raw.send([header, color.tobytes(), wrong])
+        error = raw.receive()
+        assert (error.code, error.field) == ("bad_message", "views[0].depth")
+        assert allowed in error.allowed
+        assert error.frame_id == 1
+    raw.send([header, color.tobytes(), depth.tobytes()])
+    assert raw.receive().type_name == "result", "its credit is as before"
+
+
+def test_an_unknown_compression_is_refused():
+    with pytest.raises(ValueError, match="'zip'; allowed: none, lz4"):
+        FilterClient(compression="zip")

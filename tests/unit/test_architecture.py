@@ -97,6 +97,7 @@ HOME = {
         "clients/connection.py",  # the client's socket and nothing else
     ),
     "prometheus_client": ("filter_service/service/metrics.py",),
+    "lz4": ("filter_service/wire/compression.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
     "msgspec": (
         "filter_service/checked.py",  # values against annotated types

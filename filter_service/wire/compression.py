@@ -1,0 +1,78 @@
+"""Parts in fewer bytes without loss, for thin networks.
+
+Each part is one LZ4 block, without a frame around it: how large the image is the
+header says, so that a block can never fill more memory than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.errors import BadMessage
+
+Compression = Literal["none", "lz4"]
+
+COMPRESSIONS: tuple[str, ...] = get_args(Compression)
+
+
+def largest_block_bytes(size_bytes: int) -> int:
+    """Return the most that a block of so many bytes may have (LZ4's own bound)."""
+    return size_bytes + size_bytes // 255 + 16
+
+
+def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the block of an image."""
+    from lz4 import block
+
+    contiguous = np.ascontiguousarray(image)
+    data = contiguous.reshape(-1).view(np.uint8).data
+    return np.frombuffer(block.compress(data, store_size=False), np.uint8)
+
+
+def unpacked(
+    part: NDArray[np.uint8], shape: Sequence[int], dtype: str, path: str
+) -> NDArray[Any]:
+    """Return the image of a block.
+
+    Raises
+    ------
+    BadMessage
+        It is no block, or that of an image of another size.
+    """
+    from lz4 import block
+
+    wanted = np.dtype(dtype).newbyteorder("<")
+    size_bytes = int(np.prod(shape, dtype=np.int64)) * wanted.itemsize
+    try:
+        data = block.decompress(part.data, uncompressed_size=size_bytes)
+    except block.LZ4BlockError as error:
+        raise BadMessage(
+            f"it is no LZ4 block ({error})", field=path, allowed=f"{size_bytes} bytes"
+        ) from None
+    if len(data) != size_bytes:
+        raise BadMessage(
+            f"the block holds {len(data)} bytes",
+            field=path,
+            allowed=f"{size_bytes} bytes, shape {tuple(shape)} of {dtype}",
+        )
+    return np.frombuffer(data, wanted).reshape(shape)
+
+
+def block_from_part(part: Any, size_bytes: int, path: str) -> NDArray[np.uint8]:
+    """Return an array over a part that may be the block of so many bytes.
+
+    Raises
+    ------
+    BadMessage
+    """
+    most = largest_block_bytes(size_bytes)
+    n_bytes = memoryview(part).nbytes
+    if not 0 < n_bytes <= most:
+        raise BadMessage(
+            f"the part has {n_bytes} bytes", field=path, allowed=f"1 to {most} bytes"
+        )
+    return np.frombuffer(part, np.uint8)
