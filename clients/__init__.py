@@ -11,6 +11,7 @@ Importing this loads nothing but names.
     pyrender_stream  a scene through a running service
     demo             two scenes through six eyes
     latency          how long a frame takes
+    socket_floor     and its bytes alone
     scenes/          two scenes
 """
 

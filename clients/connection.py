@@ -124,6 +124,7 @@ class Connection:
         self.state = "not connected yet"
         self.n_connections = 0
         self.last_message_s: float | None = None
+        self.n_bytes_sent = self.n_bytes_received = 0  # of messages
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._set_options()
@@ -186,6 +187,7 @@ class Connection:
         except zmq.Again:
             return None
         self.last_message_s = time.monotonic()
+        self.n_bytes_received += sum(len(part) for part in parts)
         return parts
 
     def send(self, parts: Sequence[Any], buffers: Sequence[SendBuffer] = ()) -> bool:
@@ -196,7 +198,8 @@ class Connection:
         last = len(parts) - 1
         for i, part in enumerate(parts):
             flags = zmq.NOBLOCK | (zmq.SNDMORE if i < last else 0)
-            is_large = memoryview(part).nbytes >= COPY_BELOW_BYTES
+            n_bytes = memoryview(part).nbytes
+            is_large = n_bytes >= COPY_BELOW_BYTES
             try:
                 tracker = self._socket.send(
                     part, flags, copy=not is_large, track=is_large
@@ -208,6 +211,7 @@ class Connection:
                 # follows up to the last part, so the rest must still be handed over;
                 # the message counts as sent and is lost with the connection.
                 continue
+            self.n_bytes_sent += n_bytes
             if is_large and i > 0 and i - 1 < len(buffers):
                 buffers[i - 1].tracker = tracker
         return True

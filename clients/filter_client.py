@@ -573,6 +573,11 @@ class FilterClient:
         return len(self._link.in_flight) + (self._link.pending is not None)
 
     @property
+    def n_bytes(self) -> tuple[int, int]:
+        """Return the bytes of all messages that were sent, and received."""
+        return self._link.n_bytes
+
+    @property
     def n_superseded(self) -> int:
         """Return how many frames were dropped at the client for a newer one."""
         return self._link.n_superseded

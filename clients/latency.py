@@ -33,13 +33,22 @@ from clients.latency_report import (
     summary,
 )
 from clients.service_process import ServiceProcess
+from clients.socket_floor import socket_floor_ms
 from filter_service import tangents_from_fov
 from filter_service.errors import FilterError
-from filter_service.messages import Dropped, ErrorReply
+from filter_service.keys import KeyRing
+from filter_service.messages import (
+    COMPRESSIONS,
+    DEPTH_ENCODINGS,
+    Compression,
+    DepthEncoding,
+    Dropped,
+    ErrorReply,
+)
 
 N_FRAMES = 8  # in the loop that is sent
 VERTICAL_FOV_DEG = 45.0
-TRANSPORTS = ("tcp", "ipc", "shm")
+TRANSPORTS = ("tcp", "ipc", "shm", "curve")
 DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}'
 STRAGGLER_S = 10.0
 STDOUT = "-"
@@ -61,6 +70,8 @@ class Settings:
     output: str
     max_in_flight: int
     transport: str = "tcp"
+    compression: Compression = "none"
+    depth_encoding: DepthEncoding = "float32"
 
     @property
     def case(self) -> str:
@@ -76,7 +87,12 @@ class Settings:
     def setting(self) -> str:
         """Return how it is streamed, in words."""
         schedule = f"{self.rate_hz:g} Hz for {self.duration_s:g} s"
-        return f"{schedule}, {self.max_in_flight} in flight, {self.transport}"
+        how = [self.transport]
+        if self.compression != "none":
+            how.append(self.compression)
+        if self.depth_encoding != "float32":
+            how.append(f"depth {self.depth_encoding}")
+        return f"{schedule}, {self.max_in_flight} in flight, {', '.join(how)}"
 
 
 def make_frames(settings: Settings) -> list[list[RgbdView]]:
@@ -108,6 +124,7 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
         "pupil_diameter_mm": settings.pupil_diameter_mm,
         "focus_dpt": settings.focus_dpt,
         "output": settings.output,
+        "depth_encoding": settings.depth_encoding,
     }
     client.set_profile(
         settings.profile, settings=settings.profile_settings, views=frames[0]
@@ -116,6 +133,7 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
     welcome = client.hello()
     run = LatencyRun(settings.case, settings.setting, welcome.server["renderer"])
     run.memory_start_mb = read_memory_mb()
+    before = client.n_bytes
     loop = _Loop(client, run, [reply.colors for reply in first_replies])
     start_s = time.monotonic()
     run.n_scheduled = max(1, round(settings.rate_hz * settings.duration_s))
@@ -132,6 +150,8 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
     run.duration_s = time.monotonic() - start_s
     run.due_s = [due_s - start_s for due_s in run.due_s]
     run.memory_end_mb = read_memory_mb()
+    sent, received = client.n_bytes
+    run.n_bytes = sent - before[0], received - before[1]
     return run
 
 
@@ -188,25 +208,29 @@ class _Loop:
 
 
 @contextlib.contextmanager
-def connect(
-    endpoint: str | None, max_in_flight: int, transport: str
-) -> Iterator[tuple]:
+def connect(endpoint: str | None, settings: Settings) -> Iterator[tuple]:
     """Yield (client, how to read the service's memory); spawn a service if need be."""
     with contextlib.ExitStack() as stack:
-        service = None
+        service, key_file, transport = None, None, settings.transport
         if endpoint is None:
-            bind = {}
-            if transport != "tcp":
-                folder = stack.enter_context(tempfile.TemporaryDirectory())
-                bind = {"bind": f"ipc://{folder}/service"}
-            service = stack.enter_context(ServiceProcess(bind))
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            how = {}
+            if transport in ("ipc", "shm"):
+                how = {"bind": f"ipc://{folder}/service"}
+            elif transport == "curve":
+                key_file, keys = folder / "key.toml", KeyRing(folder / "keys")
+                keys.add("benchmark", key_file)
+                how = {"keys_dir": str(keys.folder)}
+            service = stack.enter_context(ServiceProcess(how))
             endpoint = service.endpoint
         client = stack.enter_context(
             FilterClient(
                 endpoint,
-                max_in_flight=max_in_flight,
+                max_in_flight=settings.max_in_flight,
                 client_name="latency benchmark",
                 shared_memory=transport == "shm",
+                key_file=key_file,
+                compression=settings.compression,
             )
         )
         if transport == "shm" and "shm" not in client.hello().transports:
@@ -250,7 +274,14 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         "--transport",
         choices=TRANSPORTS,
         default="tcp",
-        help="tcp, ipc, or shared memory beside it; of the service that is started",
+        help="tcp, ipc, or shared memory beside it, or tcp with encryption; of the "
+        "service that is started",
+    )
+    parser.add_argument(
+        "--compression", choices=COMPRESSIONS, default="none", help="of what is sent"
+    )
+    parser.add_argument(
+        "--depth", choices=DEPTH_ENCODINGS, default="float32", help="as it travels"
     )
     parser.add_argument("--size", help="WxH in px (1280x720; stereo 1832x1920)")
     parser.add_argument("--views", type=int, default=1, help="1, or 2 for stereo")
@@ -303,6 +334,8 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
         height_px=int(sides[1]),
         n_views=2 if arguments.stereo else arguments.views,
         transport=arguments.transport,
+        compression=arguments.compression,
+        depth_encoding=arguments.depth,
         rate_hz=arguments.rate_hz,
         duration_s=3.0 if arguments.quick else arguments.seconds,
         profile=read_profile(arguments.profile),
@@ -319,11 +352,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parse_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         settings = read_settings(parsed)
-        with connect(parsed.endpoint, settings.max_in_flight, settings.transport) as (
-            client,
-            memory,
-        ):
+        with connect(parsed.endpoint, settings) as (client, memory):
             run = measure(client, settings, memory)
+        carrier = "tcp" if settings.transport in ("tcp", "curve") else "ipc"
+        run.floor_ms = socket_floor_ms(carrier, *run.n_bytes_per_frame)
     except ValueError as error:
         print(f"latency: {error}", file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-PERCENTILES = (50, 95, 99)
+PERCENTILES = (50, 95, 99, 99.9)
 CLIENT_STAGES = ("client_wait_ms", "wire_and_queue_ms")
 SERVICE_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "other_ms")
 """Those that are not the renderer's."""
@@ -39,6 +39,10 @@ class LatencyRun:
     max_repeat_difference : float
         Largest difference between two replies to the same frame, in units of the
         output (levels of 255, or linear light): mixed up or torn images would show.
+    n_bytes : (sent, received)
+        Of the messages of the whole run.
+    floor_ms : float
+        What so many bytes take over a bare socket between two processes.
     """
 
     case: str
@@ -52,6 +56,8 @@ class LatencyRun:
     memory_start_mb: float = 0.0
     memory_end_mb: float = 0.0
     max_repeat_difference: float = 0.0
+    n_bytes: tuple[int, int] = (0, 0)
+    floor_ms: float = 0.0
 
     def add(self, due_s: float, times_ms: dict[str, float]) -> None:
         """Add one filtered frame."""
@@ -70,8 +76,15 @@ class LatencyRun:
         ordered = [*CLIENT_STAGES, *inner, *SUMS]
         return [name for name in ordered if name in self.stages_ms]
 
-    def percentiles_ms(self, name: str) -> dict[int, float]:
-        """Return p50, p95 and p99 of one stage."""
+    @property
+    def n_bytes_per_frame(self) -> tuple[int, int]:
+        """Return what one frame takes on its way, and its result."""
+        sent, received = self.n_bytes
+        n_frames = max(1, self.n_filtered)
+        return sent // n_frames, received // n_frames
+
+    def percentiles_ms(self, name: str) -> dict[float, float]:
+        """Return `PERCENTILES` of one stage."""
         values = np.percentile(self.stages_ms[name], PERCENTILES)
         return dict(zip(PERCENTILES, values.tolist(), strict=True))
 
@@ -91,6 +104,7 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
                 "median_ms": p[50],
                 "p95_ms": p[95],
                 "p99_ms": p[99],
+                "p99_9_ms": p[99.9],
                 "memory_mb": run.memory_end_mb,
                 "error_name": "max_abs_repeat_difference",
                 "error": run.max_repeat_difference,
@@ -106,6 +120,9 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
             "filtered": run.n_filtered,
             "dropped": dict(run.drops),
             "filtered_hz": run.n_filtered / run.duration_s,
+            "bytes_sent_per_frame": run.n_bytes_per_frame[0],
+            "bytes_received_per_frame": run.n_bytes_per_frame[1],
+            "bare_socket_ms": run.floor_ms,
         },
         "service_memory_mb": {"start": run.memory_start_mb, "end": run.memory_end_mb},
     }
@@ -116,7 +133,7 @@ def as_table(run: LatencyRun) -> Table:
     table = Table(title=f"{run.case}, {run.setting}", title_justify="left")
     table.add_column("stage")
     for percentile in PERCENTILES:
-        table.add_column(f"p{percentile} [ms]", justify="right")
+        table.add_column(f"p{percentile:g} [ms]", justify="right")
     for name in run.stage_names():
         if name == SUMS[0]:
             table.add_section()
@@ -128,7 +145,10 @@ def as_table(run: LatencyRun) -> Table:
 def summary(run: LatencyRun) -> str:
     """Return the run in one line."""
     dropped = ", ".join(f"{n} {reason}" for reason, n in run.drops.items()) or "none"
+    up_mb, down_mb = (n_bytes / 1e6 for n_bytes in run.n_bytes_per_frame)
     return (
+        f"{up_mb:.2f} MB up and {down_mb:.2f} MB down a frame, "
+        f"{run.floor_ms:.2f} ms over a bare socket; "
         f"{run.n_filtered} of {run.n_scheduled} frames filtered "
         f"({run.n_filtered / run.duration_s:.1f} Hz), dropped: {dropped}; service "
         f"memory {run.memory_start_mb:.0f} to {run.memory_end_mb:.0f} MB; largest "
@@ -153,9 +173,9 @@ def save_plot(run: LatencyRun, path: Path) -> None:
     over_time.legend()
     names = [name for name in run.stage_names() if name not in SUMS][::-1]
     places = np.arange(len(names))
-    for offset, percentile in zip((0.25, 0.0, -0.25), PERCENTILES, strict=True):
+    for offset, percentile in zip((0.3, 0.1, -0.1, -0.3), PERCENTILES, strict=True):
         values = [run.percentiles_ms(name)[percentile] for name in names]
-        by_stage.barh(places + offset, values, height=0.25, label=f"p{percentile}")
+        by_stage.barh(places + offset, values, height=0.2, label=f"p{percentile:g}")
     by_stage.set_yticks(places, [name.removesuffix("_ms") for name in names])
     by_stage.set(xlabel="[ms]", title=run.setting)
     by_stage.legend()

@@ -157,6 +157,11 @@ class ServiceLink:
         self.pending = outgoing
         self.pump(0.0)
 
+    @property
+    def n_bytes(self) -> tuple[int, int]:
+        """Return the bytes of all messages that were sent, and received."""
+        return self._connection.n_bytes_sent, self._connection.n_bytes_received
+
     def take_events(self) -> list[Event]:
         """Return and forget all events, oldest first."""
         taken, self._events = self._events, []

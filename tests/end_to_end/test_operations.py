@@ -1,15 +1,18 @@
 """What runs a service for days: counters, signals, the unit."""
 
 import configparser
+import re
 import signal
 import socket
 import time
+import tomllib
 import urllib.request
 
 import pytest
 
 from clients.filter_client import FilterClient
 from filter_service.errors import TooManySessions
+from filter_service.service.config import load_config
 from filter_service.service.metrics import METRICS
 from tests.end_to_end.conftest import TIMEOUT_S, make_view
 from tests.source_tree import ROOT
@@ -119,3 +122,21 @@ def test_the_unit_starts_the_program():
     unit.read(ROOT / "filter_service" / "service" / "ocufilter.service")
     assert " ocufilter serve --config " in unit["Service"]["ExecStart"]
     assert unit["Service"]["Restart"] == "on-failure"
+
+
+def test_the_container_holds_what_a_machine_needs():
+    """What `make` sets up on a bare machine, the image has; its settings are ours."""
+    lines = (ROOT / "Containerfile").read_text(encoding="utf-8").replace("\\\n", " ")
+    setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
+    for name in ("SYSTEM_PACKAGES", "C_PACKAGES"):
+        for package in re.search(rf'^{name}="(.*)"', setup, re.MULTILINE)[1].split():
+            assert f" {package} " in lines, package
+    copied = set(re.findall(r"^COPY (.*) [\w./]+$", lines, re.MULTILINE))
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    tops = {name.split(".")[0] for name in packages["tool"]["setuptools"]["packages"]}
+    assert tops | {"shaders"} <= copied
+    settings = re.search(r"printf '(.*)' > service.toml", lines)[1]
+    config = tomllib.loads(settings.replace("\\n", "\n"))
+    assert load_config(**config).keys_dir == "/keys"
+    assert 'ENTRYPOINT ["ocufilter", "serve", "--config"' in lines
+    assert "USER ocufilter" in lines
