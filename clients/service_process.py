@@ -81,7 +81,10 @@ class ServiceProcess:
         return self._log_file.read_text(encoding="utf-8", errors="replace")
 
     def pids(self) -> dict[str, int]:
-        """Return the processes of the service by name: keeper, door, render (Linux)."""
+        """Return the processes of the service by name: keeper, door, render (Linux).
+
+        With a second process that filters, the one that stands by is `standby`.
+        """
         keeper = self.process.pid
         found = {"keeper": keeper}
         children = Path(f"/proc/{keeper}/task/{keeper}/children").read_text().split()
@@ -92,6 +95,8 @@ class ServiceProcess:
                 continue
             module = next((w for w in words if w.endswith(b"_process")), b"")
             name = module.decode().rpartition(".")[2].removesuffix("_process")
+            if name in found:
+                name = "standby"  # the older one filters
             if name:
                 found[name] = child
         return found

@@ -73,6 +73,9 @@ class ServiceConfig:
     frame_limit_s : float
         The longest that filtering one frame, or anything else in the process that does
         it, may take: then it is taken for hung, and started again.
+    standby : bool
+        A second process that filters stands by: after a fault of the first, frames go
+        on a second sooner.  It takes some hundred megabytes.
     max_image_mb : int
         Images of all frames and results that the service holds.
     shared_memory : bool
@@ -110,6 +113,7 @@ class ServiceConfig:
     alive_interval_s: float = 5.0
     session_keep_s: float = 30.0
     frame_limit_s: float = 60.0
+    standby: bool = False
     max_image_mb: int = 2000
     shared_memory: bool = True
     max_socket_mb: int = 2000

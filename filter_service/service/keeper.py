@@ -17,7 +17,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from filter_service.building.helper_process import (
     end,
@@ -41,6 +41,10 @@ STOPPED_LIMIT_S = 3.0
 
 STOP_GRACE_S = 2.0
 
+STANDBY_AFTER_S = 5.0
+"""A process that stands by is started so long after the last one that filters: until
+then that one, or its client, needs the processor."""
+
 log = logging.getLogger("ocufilter")
 
 
@@ -50,13 +54,12 @@ class ServiceFailed(Exception):
 
 @dataclass
 class _Child:
-    """A process, the link to it, and when others before it were started."""
+    """A process, and the link to it."""
 
     process: subprocess.Popen[bytes] | None = None
     link: Link | None = None
     is_ready: bool = False
     stopped_since_s: float | None = None
-    starts_s: deque[float] = field(default_factory=deque)
 
 
 class Keeper:
@@ -89,6 +92,9 @@ class Keeper:
         self._endpoint = ""
         self._is_stopping = False
         self._children = {name: _Child() for name in MODULES}
+        self._standby: _Child | None = None
+        self._spawned_s = 0.0  # the last process of all
+        self._starts_s: dict[str, deque[float]] = {name: deque() for name in MODULES}
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
@@ -126,7 +132,7 @@ class Keeper:
     def _turn(self) -> None:
         with selectors.DefaultSelector() as selector:
             selector.register(self._wake_reader, selectors.EVENT_READ)
-            for child in self._children.values():
+            for child in self._all_children:
                 if child.link is not None:
                     selector.register(child.link, selectors.EVENT_READ)
             selector.select(CHECK_INTERVAL_S)
@@ -140,21 +146,35 @@ class Keeper:
         for name, child in self._children.items():
             self._listen(name, child)
             self._check_stopped(name, child)
+        if self._config.standby:
+            self._keep_standby()
+
+    @property
+    def _all_children(self) -> list[_Child]:
+        standby = [] if self._standby is None else [self._standby]
+        return [*self._children.values(), *standby]
 
     def _start(self, name: str) -> None:
-        child = self._children[name]
-        now_s = time.monotonic()
-        child.starts_s.append(now_s)
-        while now_s - child.starts_s[0] > RESTART_WINDOW_S:
-            child.starts_s.popleft()
-        if len(child.starts_s) > MAX_RESTARTS:
+        """Start a process, or let the one that stands by take its place."""
+        starts_s, now_s = self._starts_s[name], time.monotonic()
+        starts_s.append(now_s)
+        while now_s - starts_s[0] > RESTART_WINDOW_S:
+            starts_s.popleft()
+        if len(starts_s) > MAX_RESTARTS:
             raise ServiceFailed(
                 f"its {name} process was started {MAX_RESTARTS} times within "
                 f"{RESTART_WINDOW_S:g} s and ended each time"
             )
-        child.link, theirs = Link.pair()
+        if name == "render" and self._standby is not None:
+            self._children[name], self._standby = self._standby, None
+        else:
+            self._children[name] = self._spawned(name)
+
+    def _spawned(self, name: str) -> _Child:
+        self._spawned_s = time.monotonic()
+        link, theirs = Link.pair()
         arguments = (str(theirs.fileno()), self._open_workshop)
-        child.process = subprocess.Popen(
+        process = subprocess.Popen(
             # Without -P a file of the current folder would come before every module of
             # its name.
             [sys.executable, "-P", "-m", *MODULES[name], *arguments],
@@ -163,10 +183,28 @@ class Keeper:
             env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
         )
         theirs.close()
-        child.is_ready, child.stopped_since_s = False, None
         # A new door listens where the one before it did.
         bind = self._endpoint or self._config.bind
-        child.link.send(("config", replace(self._config, bind=bind)))
+        link.send(("config", replace(self._config, bind=bind)))
+        return _Child(process, link)
+
+    def _keep_standby(self) -> None:
+        """Have a second process ready to filter, with a worker of its own."""
+        standby = self._standby
+        if standby is None:
+            is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
+            if is_quiet and self._children["render"].is_ready:
+                self._standby = self._spawned("render")
+            return
+        try:
+            if standby.link is not None:
+                standby.is_ready |= any(
+                    message[0] == "ready" for message, _ in standby.link.receive()
+                )
+            self._check_stopped("standby", standby)
+        except LinkClosed:
+            self._standby = None
+            self._bury("standby", standby)
 
     def _change_settings(self) -> None:
         """Take what may change while the service runs; say what may not."""
@@ -218,14 +256,20 @@ class Keeper:
             self._when_ready = None
 
     def _restart(self, name: str, child: _Child) -> None:
+        self._bury(name, child)
+        self._start(name)
+        self._join()
+
+    def _bury(self, name: str, child: _Child) -> None:
         how = "gone"
         if child.process is not None:
             how = how_it_ended(end(child.process, STOP_GRACE_S))
         if child.link is not None:
             child.link.close()
-        log.error("the %s process %s; a new one is started", name, how)
-        self._start(name)
-        self._join()
+        following = "a new one is started"
+        if name == "render" and self._standby is not None:
+            following = "the one that stood by takes over"
+        log.error("the %s process %s; %s", name, how, following)
 
     def _check_stopped(self, name: str, child: _Child) -> None:
         """End a process that was stopped by a signal and is not let go on."""
@@ -237,7 +281,7 @@ class Keeper:
             child.stopped_since_s = now_s
         elif now_s - child.stopped_since_s > STOPPED_LIMIT_S:
             log.error("the %s process stands still", name)
-            self._kill(name)
+            child.process.kill()
 
     def _kill(self, name: str) -> None:
         process = self._children[name].process
@@ -246,13 +290,13 @@ class Keeper:
 
     def _end_all(self) -> None:
         """End both processes: asked first, by force where they take long."""
-        for child in self._children.values():
+        for child in self._all_children:
             if child.link is not None:
                 try:
                     child.link.send(("stop",))
                 except LinkClosed:
                     pass
-        for child in self._children.values():
+        for child in self._all_children:
             if child.process is not None:
                 end(child.process, STOP_GRACE_S)
             if child.link is not None:

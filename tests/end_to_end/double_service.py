@@ -7,11 +7,13 @@ from pathlib import Path
 
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.workshop import Workshop
+from filter_service.service import keeper
 from filter_service.service.config import load_config
 from filter_service.service.launch import run
 from tests.end_to_end.doubles import EngineDouble, read_profile
 
 FILTER_MS = "OCUFILTER_TEST_FILTER_MS"
+STANDBY_AFTER_S = "OCUFILTER_TEST_STANDBY_AFTER_S"
 
 
 def open_workshop(config, closing):
@@ -34,6 +36,9 @@ def main():
     parser.add_argument("--filter-ms", type=float, default=0.0)
     arguments = parser.parse_args()
     os.environ[FILTER_MS] = str(arguments.filter_ms)
+    after_s = os.environ.get(STANDBY_AFTER_S)
+    if after_s is not None:
+        keeper.STANDBY_AFTER_S = float(after_s)
     load = partial(load_config, arguments.config)
     run(
         load(),

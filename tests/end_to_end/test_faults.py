@@ -154,6 +154,35 @@ def test_a_frame_without_an_end_is_ended(start_service):
     assert "is stuck for 1 s" in service.log
 
 
+def await_standby(service, other_than=None):
+    end_s = time.monotonic() + TIMEOUT_S
+    while (pid := service.pids().get("standby")) in (None, other_than):
+        assert time.monotonic() < end_s, "nobody stands by"
+        time.sleep(0.05)
+    time.sleep(1.0)  # until it is ready
+    return pid
+
+
+def test_who_stands_by_takes_over_and_another_stands_by(start_service, monkeypatch):
+    monkeypatch.setenv("OCUFILTER_TEST_STANDBY_AFTER_S", "0.5")
+    service = start_service(standby=True)
+    view = make_view()
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        client.set_profile(EYE, views=[view])
+        client.filter(view, **SEE)
+        standby = await_standby(service)
+        os.kill(service.pids()["render"], signal.SIGKILL)
+        wait_until(lambda: "the one that stood by takes over" in service.log)
+        seen = client.filter(view, **SEE)
+        assert seen.color[0, 0, 0] == EYE["mark"]
+        assert service.pids()["render"] == standby
+        newer = await_standby(service, other_than=standby)
+        os.kill(newer, signal.SIGKILL)
+        client.filter(view, **SEE)
+        assert await_standby(service, other_than=newer) != standby
+        assert service.pids()["render"] == standby, "it was not disturbed"
+
+
 @pytest.mark.slow
 def test_what_never_stays_ends_the_service_with_a_word(start_service):
     service = start_service()
