@@ -8,7 +8,7 @@ USUAL := -m "not slow and not gpu"
 # Services and clients keep time, and need the machine for themselves; others do not.
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
-BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload roundtrip
+BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload restart roundtrip
 
 .DEFAULT_GOAL := help
 .PHONY: demo test test-training validate witness check clean help setup setup-test setup-training setup-witness

@@ -43,6 +43,7 @@ class Bench(StrEnum):
     SWITCH = "switch"
     ABUSE = "abuse"
     OVERLOAD = "overload"
+    RESTART = "restart"
     ROUNDTRIP = "roundtrip"
 
 
@@ -69,6 +70,7 @@ BENCH_MODULES = {
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
+    Bench.RESTART: "tests.benchmarks.bench_restart",
     Bench.ROUNDTRIP: "clients.latency",
 }
 

@@ -13,7 +13,7 @@ from filter_service.messages import Accepted, Ready
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
 NARROW = {"pupil_range_mm": (3.9, 4.1), "object_range_dpt": (0, 2)}
 MYOPIA = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -12}
-LONG = (2048, 2048)
+LONG = (3200, 2400)
 SHORT = (320, 180)
 
 
