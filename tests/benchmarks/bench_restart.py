@@ -6,7 +6,8 @@ A client streams 1280x720 at 30 Hz through -2 dpt; the process is killed, and th
 counts from there to the first frame that comes back.  With PSFs on disk, without (then
 the first frame is seen through a preview), and with a second process that stands by.
 Error: of the first frame seen through the whole eye again, against the same frame
-before: the eye is the same, the part of it that was prepared may be another.  Writes results/restart.json.
+before: the eye is the same, the part of it that was prepared may be another.  Writes
+results/restart.json.
 """
 
 import argparse
