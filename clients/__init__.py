@@ -3,6 +3,7 @@
 Importing this loads nothing but names.
 
     filter_client    `FilterClient`: the library
+    frame_packer     a frame on its way out
     link             its side of the protocol
     connection       its socket
     shared_memory    memory that it shares with a service on the same machine

@@ -17,16 +17,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.connection import SendBuffer, SendBufferPool
-from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
-from clients.shared_memory import ClientSlot
+from clients.frame_packer import FramePacker, check_limits
+from clients.link import Event, FilteredFrame, ServiceLink
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
@@ -49,16 +47,12 @@ from filter_service.messages import (
     ProfileRequest,
     Progress,
     Ready,
-    SharedPlaces,
     ViewHeader,
-    ViewImages,
     Welcome,
     encode,
-    encoded_depth,
     tangents_from_fov,
 )
 from filter_service.settings import DepthKind
-from filter_service.slots import starts_of
 
 __all__ = [
     "Event",
@@ -76,18 +70,6 @@ def _floats(pair: tuple[float, float]) -> tuple[float, float]:
     """Return numpy's numbers as Python's; the service refuses what is no pair."""
     return cast("tuple[float, float]", tuple(map(float, pair)))
 
-
-def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
-    """Return the images of a view, depth as it travels."""
-    if depth_encoding == "float32":
-        return list(view.images)
-    return [
-        encoded_depth(image, depth_encoding) if image.ndim == 2 else image
-        for image in view.images
-    ]
-
-
-LEND_WAIT_S = 0.1
 
 EXTENDING_S = 0.03
 """Between two tries of a frame whose state is being prepared."""
@@ -142,15 +124,15 @@ class FilterClient:
                 f"compression is {compression!r}; allowed: {', '.join(COMPRESSIONS)}"
             )
         self.timeout_s = timeout_s
-        self._compression: Compression = compression
-        self._open_link: ServiceLink | None = ServiceLink(
+        link = ServiceLink(
             endpoint,
             max_in_flight,
             client_name,
             shared_memory=shared_memory,
             key=None if key_file is None else load_client_key(key_file),
         )
-        self._pool = SendBufferPool(timeout_s)
+        self._open_link: ServiceLink | None = link
+        self._packer = FramePacker(link, compression, timeout_s)
         self._camera: Camera | None = None
         self._next_frame_id = 0
         self._next_profile_id = 0
@@ -420,7 +402,8 @@ class FilterClient:
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
         items = as_views(color, depth_m, self._camera)
-        self._check_limits(items)
+        if self.welcome is not None:
+            check_limits(items, self.welcome)
         frame = Frame(
             frame_id=self._next_frame_id,
             views=tuple(ViewHeader.describing(i, depth_encoding) for i in items),
@@ -433,64 +416,8 @@ class FilterClient:
             ),
         )
         self._next_frame_id += 1
-        self._link.submit(self._packed(frame, items))
+        self._link.submit(self._packer.packed(frame, items))
         return frame.frame_id
-
-    def _packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
-        """Copy images to where they travel from: shared memory, or buffers."""
-        now_s = time.monotonic()
-        per_view = [
-            _as_sent(item, header.depth.encoding)
-            for item, header in zip(items, frame.views, strict=True)
-        ]
-        images = [image for sent in per_view for image in sent]
-        found = self._in_shared_memory(frame, images)
-        if found is not None:
-            frame, slots = found
-            return Outgoing(frame.frame_id, encode(frame), [], now_s, frame, slots)
-        if self._compression != "none":
-            images_of = tuple(ViewImages(*sent) for sent in per_view)
-            frame = replace(frame, images=images_of).packed(self._compression)
-            return Outgoing(frame.frame_id, encode(frame), [], now_s, frame)
-        buffers: list[SendBuffer] = []
-        kept: list[ViewImages] = []
-        for sent in per_view:
-            copies = [self._pool.copy_in(image) for image in sent]
-            buffers += [buffer for buffer, _ in copies]
-            kept.append(ViewImages(*(copy for _, copy in copies)))
-        frame = replace(frame, images=tuple(kept))
-        return Outgoing(frame.frame_id, encode(frame), buffers, now_s, frame)
-
-    def _in_shared_memory(
-        self, frame: Frame, images: Sequence[NDArray[Any]]
-    ) -> tuple[Frame, list[ClientSlot]] | None:
-        """Return a frame whose images lie in shared memory, and its slots."""
-        memory = self._link.memory
-        if not memory.is_offered:
-            return None
-        starts, n_in = starts_of([image.nbytes for image in images])
-        result_starts, n_out = starts_of(
-            [v.camera.pixel_count * frame.output.bytes_per_pixel for v in frame.views]
-        )
-        slot = memory.holding(images)
-        if slot is not None:
-            slot.n_users += 1
-        else:
-            slot = memory.take(n_in)
-        result_slot = memory.take(n_out)
-        if slot is None or result_slot is None:
-            for taken in (slot, result_slot):
-                if taken is not None:
-                    taken.release()
-            return None
-        slot.slot.put(images, starts)
-        places = SharedPlaces(
-            slot.slot.number,
-            tuple(starts),
-            result_slot.slot.number,
-            tuple(result_starts),
-        )
-        return replace(frame, memory=places), [slot, result_slot]
 
     def lend_view(
         self,
@@ -512,46 +439,8 @@ class FilterClient:
             Of the colour.
         depth_kind : "planar" or "radial"
         """
-        shape = (camera.height_px, camera.width_px)
-        shapes = ((*shape, 3), np.dtype(dtype)), (shape, np.dtype(np.float32))
-        starts, size_bytes = starts_of(
-            [int(np.prod(shape)) * kind.itemsize for shape, kind in shapes]
-        )
-        memory = self._link.memory
-        held = memory.take(size_bytes)
-        if held is None and memory.is_offered:
-            self._link.pump(LEND_WAIT_S)
-            held = memory.take(size_bytes)
-        if held is None:
-            arrays = [np.zeros(shape, kind) for shape, kind in shapes]
-        else:
-            arrays = [
-                memory.array(held, start, shape, kind)
-                for start, (shape, kind) in zip(starts, shapes, strict=True)
-            ]
-            held.release()
-        color, depth_m = arrays
-        return RgbdView(color, depth_m, camera.tangents, depth_kind)
-
-    def _check_limits(self, views: Sequence[RgbdView]) -> None:
-        """Refuse what the service would cut the connection for."""
-        if self.welcome is None:
-            return
-        limits = self.welcome.limits
-        if not 1 <= len(views) <= limits.max_views:
-            raise ValueError(f"{len(views)} views; allowed: 1 to {limits.max_views}")
-        for view in views:
-            camera = view.camera
-            if (
-                camera.width_px > limits.max_width_px
-                or camera.height_px > limits.max_height_px
-                or view.color.nbytes > limits.max_part_bytes
-            ):
-                raise ValueError(
-                    f"a view has {camera.width_px} x {camera.height_px} px and "
-                    f"{view.color.nbytes} bytes; allowed: {limits.max_width_px} x "
-                    f"{limits.max_height_px} px and {limits.max_part_bytes} bytes"
-                )
+        _ = self._link  # raises where this is closed
+        return self._packer.lend_view(camera, dtype=dtype, depth_kind=depth_kind)
 
     def poll(self, timeout_s: float = 0.0) -> list[Event]:
         """Return what has happened; wait up to ``timeout_s`` if nothing has.
