@@ -11,6 +11,7 @@ Importing this loads nothing but names: clients stay light.
     errors           the exceptions
     keys             who may connect from other machines
     slots            memory that processes share
+    log_lines        the service's log
     checked          values against annotated types
     progress         how far long work is, said on stderr
     constants        numbers that Python and GLSL share

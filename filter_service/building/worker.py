@@ -32,6 +32,7 @@ from filter_service.building.head_start import HeadStart
 from filter_service.building.jobs import Build, BuildJob, BuiltStore
 from filter_service.building.shared_buffers import write_shared
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
+from filter_service.log_lines import start_log
 
 PROGRESS_INTERVAL_S = 0.1
 IDLE_S = 3.0
@@ -56,7 +57,7 @@ def serve_builds(
     """Build what is asked for until the pipe closes."""
     # Ctrl-C goes to the whole group; the service ends the worker in its own time.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logging.basicConfig(level=logging.INFO, format="ocufilter worker: %(message)s")
+    start_log("worker")
     try:
         build, head_start = _named(build_name), None
         pipe.send(("ready",))

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import os
 import signal
 import sys
 from typing import Any
 
+from filter_service.log_lines import start_log
 from filter_service.service.config import ServiceConfig
 from filter_service.service.link import Link
 
 PR_SET_PDEATHSIG = 1
-LOG_FORMAT = "%(asctime)s ocufilter %(name)s %(levelname)s: %(message)s"
 
 
 def begin(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
@@ -31,11 +30,6 @@ def begin(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
     kind, config = first
     assert kind == "config"
     return keeper, config, others
-
-
-def start_log(name: str) -> None:
-    """Log to the standard error stream, with time stamps."""
-    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT.replace("%(name)s", name))
 
 
 def _end_with_parent() -> None:

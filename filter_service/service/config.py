@@ -11,6 +11,7 @@ from typing import Any
 from estimator.threads import MAX_THREADS
 from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES, PSF_ENGINES
+from filter_service.log_lines import LOG_FORMATS
 from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
@@ -83,6 +84,8 @@ class ServiceConfig:
     max_socket_mb : int
         Memory of the process that owns the socket, incomplete messages included:
         beyond it that process is started again.
+    log_format : "text" or "json"
+        Lines for people, or one JSON object a line.
     metrics_port : int
         Port of 127.0.0.1 for counters in Prometheus' format; 0 for none.
     ready_file : Path, optional
@@ -117,13 +120,18 @@ class ServiceConfig:
     max_image_mb: int = 2000
     shared_memory: bool = True
     max_socket_mb: int = 2000
+    log_format: str = "text"
     metrics_port: int = 0
     ready_file: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot work, naming the setting."""
         _check_bind(self.bind, has_keys=bool(self.keys_dir))
-        for name, allowed in (("engine", ENGINES), ("psf_engine", PSF_ENGINES)):
+        for name, allowed in (
+            ("engine", ENGINES),
+            ("psf_engine", PSF_ENGINES),
+            ("log_format", LOG_FORMATS),
+        ):
             if getattr(self, name) not in allowed:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}"

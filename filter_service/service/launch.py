@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Callable
 from functools import partial
 
-from filter_service.service.child import start_log
+from filter_service.log_lines import FORMAT_VARIABLE, start_log
 from filter_service.service.config import ServiceConfig
 from filter_service.service.keeper import OPEN_WORKSHOP, Keeper, ServiceFailed
 
@@ -36,6 +37,7 @@ def run(
     OSError
         The service cannot start, or does not stay.
     """
+    os.environ[FORMAT_VARIABLE] = config.log_format  # of all processes
     start_log("service")
     keeper = Keeper(
         config,

@@ -1,6 +1,8 @@
 """What runs a service for days: counters, signals, the unit."""
 
 import configparser
+import json
+import os
 import re
 import signal
 import socket
@@ -114,6 +116,25 @@ def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_servi
     )
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert client.ping()[1].is_ready
+
+
+def test_the_log_is_json_for_programs(start_service):
+    service = start_service(log_format="json")
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S, client_name="x") as client:
+        client.set_profile(EYE, views=[make_view()])
+        client.filter(make_view(), **SEE)
+        os.kill(service.pids()["render"], signal.SIGKILL)
+        end_s = time.monotonic() + TIMEOUT_S
+        while "SIGKILL" not in service.log and time.monotonic() < end_s:
+            time.sleep(0.05)
+    service.process.send_signal(signal.SIGTERM)
+    service.process.wait(TIMEOUT_S)
+    first, *lines = service.log.splitlines()
+    assert first.startswith("ocufilter: serving on")  # not of the log
+    found = [json.loads(line) for line in lines]
+    assert {"time", "process", "pid", "level", "message"} <= set(found[0])
+    assert {line["process"] for line in found} >= {"door", "service"}
+    assert any("SIGKILL" in line["message"] for line in found)
 
 
 def test_the_unit_starts_the_program():
