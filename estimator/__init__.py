@@ -5,6 +5,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     optics/        light and surfaces
     wavefront/     wavefronts of surfaces, traced
     acuity/        what the optics leave of detail, and what is read with it
+    dynamics/      what drives an eye: light, distance, gaze
     media/         light that is scattered or absorbed on the way
     psf/           point-spread functions of wavefronts
     eye/           the 45-parameter model

@@ -393,9 +393,14 @@ def _coefficients(data: Mapping[str, Any], *, path: str = "") -> NDArray[np.floa
         raise ProfileError(path + "zernike_um", "is missing", allowed)
     entries = fields.mapping(data["zernike_um"], path + "zernike_um")
     zernike_um = np.zeros(N_TERMS)
+    named: dict[int, str] = {}
     limit = MAX_COEFFICIENT_UM
     for key in entries:
         j = _term_index(key, allowed, path=path)
+        if j in named:
+            problem = f"names the same term as {named[j]!r}"
+            raise ProfileError(f"{path}zernike_um.{key}", problem, "each term once")
+        named[j] = key
         zernike_um[j] = fields.number(
             entries, key, -limit, limit, path=path + "zernike_um."
         )

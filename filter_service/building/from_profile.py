@@ -84,7 +84,9 @@ def build(
     except ProfileError as error:  # light does not pass a given eye
         raise unknown_profile(error) from error
     except ValueError as error:  # the settings do not suit this eye or camera
-        raise BuildFailed(str(error)) from error
+        named = {name: getattr(error, name, None) for name in ("field", "allowed")}
+        text = getattr(error, "message", str(error))
+        raise BuildFailed(text, **named) from error
 
 
 def _known_eye(

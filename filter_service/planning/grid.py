@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.camera import Camera, is_same_camera
 from filter_service.displays import display_wavelengths_nm, display_widths_nm
+from filter_service.errors import BadMessage
 from filter_service.planning.field_directions import (
     MAX_FIELD_DEG,
     field_range_deg,
@@ -77,7 +78,7 @@ class GridSpec:
 
     Raises
     ------
-    ValueError
+    BadMessage
         Pixels too small or too large, or a gaze that turns the image out of all PSFs.
     """
 
@@ -92,8 +93,10 @@ class GridSpec:
         """Refuse what no cache can be built for."""
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
-                raise ValueError(
-                    f"pixel_pitch_mrad {self.pixel_pitch_mrad}: 0.005 to 100 allowed"
+                raise BadMessage(
+                    f"its pixels are {pitch_mrad:.3g} mrad wide",
+                    field="camera",
+                    allowed="0.005 to 100 mrad for a pixel on the axis",
                 )
         self._check_gaze()
 
@@ -105,9 +108,10 @@ class GridSpec:
         turns_deg = self.settings.gaze_range_deg
         for (low, high), turn in zip(seen_deg, turns_deg, strict=True):
             if turn > 0.0 and max(-low, high) + turn > MAX_FIELD_DEG:
-                raise ValueError(
-                    f"gaze_range_deg {turns_deg}: {turn:g} beside a field of "
-                    f"{low:.3g} to {high:.3g} deg; allowed: {MAX_FIELD_DEG:g} together"
+                raise BadMessage(
+                    f"{turn:g} beside a field of {low:.3g} to {high:.3g} deg",
+                    field="settings.gaze_range_deg",
+                    allowed=f"{MAX_FIELD_DEG:g} together",
                 )
 
     def with_settings(self, **changes: Any) -> "GridSpec":

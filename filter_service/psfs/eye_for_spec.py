@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
+from estimator.field.trace_range import FieldRange
 from estimator.field.traced_eye import MAX_PUPIL_MM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile
@@ -50,7 +51,7 @@ def eye_for_spec(
         pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
         focus_range_dpt=settings.focus_range_dpt,
         wavelengths_nm=spec.traced_wavelengths_nm,
-        field_range_deg=spec.field_range_deg,
+        field_range_deg=_with_axis(spec.field_range_deg),
         eye_model=settings.eye_model,
         accuracy=settings.accuracy,
         progress=report,
@@ -58,3 +59,9 @@ def eye_for_spec(
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
     return eye, notes
+
+
+def _with_axis(ranges_deg: FieldRange) -> FieldRange:
+    """Return field ranges that hold the axis, where eyes focus, wherever they look."""
+    (left, right), (down, up) = ranges_deg
+    return (min(left, 0.0), max(right, 0.0)), (min(down, 0.0), max(up, 0.0))

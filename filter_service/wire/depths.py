@@ -55,8 +55,8 @@ def decoded_depth(sent: NDArray[Any], encoding: str) -> NDArray[np.float32]:
         return sent.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         if encoding == "dpt16":
-            found = 1.0 / sent.astype(np.float32)
-            return np.where(sent >= 0.0, found, np.float32(0.0)).astype(np.float32)
+            near_m = 1.0 / np.abs(sent.astype(np.float32))  # -0 is infinity, too
+            return np.where(sent >= 0.0, near_m, np.float32(0.0)).astype(np.float32)
     found = sent.astype(np.float32) / np.float32(MM_PER_M)
     found[sent == INFINITE_MM] = np.inf
     return found

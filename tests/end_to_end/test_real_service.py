@@ -152,6 +152,32 @@ def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
         )
 
 
+def test_a_gaze_far_to_the_side_is_prepared(real_client):
+    """The axis, on which the eye focuses, is not in the picture then."""
+    view = edge_view()
+    settings = {**NARROW, "gaze_deg": (50.0, 0.0)}
+    ready = real_client.set_profile("myopia", settings=settings, views=[view])
+    assert ready.is_complete
+    seen = real_client.filter(view, **SEE)
+    assert np.isfinite(seen.color).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "settings", "field"),
+    [
+        ((160, 90), {"gaze_range_deg": (60.0, 0.0)}, "settings.gaze_range_deg"),
+        ((1, 1), {}, "camera"),
+    ],
+)
+def test_what_cannot_be_built_as_asked_is_named(real_client, size, settings, field):
+    with pytest.raises(errors.BuildFailed) as caught:
+        real_client.set_profile(
+            PLAIN, settings={**NARROW, **settings}, views=[edge_view(*size)]
+        )
+    assert caught.value.field == field
+    assert caught.value.allowed
+
+
 def test_bright_half_floats_scale_through_the_service(real_client):
     view = edge_view()
     bright = RgbdView(

@@ -44,6 +44,7 @@ EYE_ROOMS = {
     "psf": ("optics",),
     "media": (),
     "acuity": ("optics",),
+    "dynamics": (),
     "eye": ("wavefront", "optics"),
     "profiles": ("eye", "media", "wavefront", "optics"),
     "periphery": ("profiles", "optics"),

@@ -41,6 +41,13 @@ def test_what_is_missing_and_what_is_infinite_stay_so(encoding):
     assert np.all(found[5:] > 60.0)
 
 
+def test_both_zeros_of_dioptres_are_infinity():
+    sent = np.array([0.0, -0.0, -1e-3, np.inf, np.nan], np.float16)
+    found = decoded_depth(sent, "dpt16")
+    assert np.isposinf(found[:2]).all()
+    assert not np.any(found[2:] > 0.0)
+
+
 def test_half_the_bytes():
     for encoding in ("float16", "dpt16", "mm16"):
         assert encoded_depth(DEPTH_M, encoding).nbytes == DEPTH_M.nbytes // 2

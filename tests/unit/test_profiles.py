@@ -30,6 +30,7 @@ GOOD = {
         ({"zernike_um": {"2": 0.1}}, "zernike_um.2"),
         ({"zernike_um": {"2,0": True}}, "zernike_um.2,0"),
         ({"zernike_um": []}, "zernike_um"),
+        ({"zernike_um": {"2,0": 1, "02,0": 2}}, "zernike_um.02,0"),
         ({"frame": "camera"}, "frame"),
         ({"eye_side": "left"}, "eye_side"),
         ({"age_years": -1}, "age_years"),

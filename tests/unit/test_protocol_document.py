@@ -7,7 +7,8 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from estimator.eye.parameters import EyeParameters
+from estimator.eye.checked_fields import ProfileError
+from estimator.eye.parameters import PARAMETERS, EyeParameters, offset_name
 from estimator.profiles.parse import KINDS, parse_profile, preset_names
 from filter_service import errors, messages
 from filter_service import protocol_schema as schema
@@ -139,3 +140,53 @@ def test_every_kind_of_profile_is_shown_and_can_be_read():
 def test_the_presets_are_named():
     for name in preset_names():
         assert f"`{name}`" in PAGE
+
+
+def _rows(title):
+    """The rows of a table of section 10: first cell, last cell."""
+    table = PAGE.split(f"| of {title}")[1].split("\n\n")[0].splitlines()[2:]
+    return [(row.split("|")[1].strip(), row.split("|")[-2].strip()) for row in table]
+
+
+def test_the_parameters_of_an_eye_are_listed_with_their_ranges():
+    found = {}
+    for cell, text in _rows("`parameters`"):
+        low, high = (float(number) for number in text.split(" to "))
+        names = re.findall(r"`(\w+)`", cell)
+        if "..." in cell:
+            first, last = (int(re.search(r"j(\d+)_", name)[1]) for name in names)
+            names = [offset_name(index) for index in range(first, last + 1)]
+        found |= dict.fromkeys(names, (low, high))
+    assert found == {row.name: row.allowed for row in PARAMETERS}
+
+
+BODIES = {
+    "a prescription": {"kind": "prescription", "sphere_dpt": -1, "cylinder_dpt": -1},
+    "a measurement": {
+        "kind": "zernike",
+        "pupil_diameter_mm": 5,
+        "wavelength_nm": 555,
+        "zernike_um": {"2,0": 1},
+    },
+}
+
+
+@pytest.mark.parametrize("title", BODIES)
+def test_the_ranges_of_a_body_s_numbers_are_those_that_are_kept(title):
+    body, n_checked = {"axis_deg": 10, **BODIES[title]}, 0
+    if title == "a measurement":
+        del body["axis_deg"]
+    for cell, text in _rows(title):
+        limits = re.match(r"(-?[\d.]+) to (-?[\d.]+)", text)
+        if limits is None or "zernike" in cell:
+            continue
+        low, high = map(float, limits.groups())
+        for name in re.findall(r"`(\w+)`", cell):
+            for inside in (low, high):
+                parse_profile({**body, name: inside})
+            for outside in (low - 0.01, high + 0.01):
+                with pytest.raises(ProfileError) as caught:
+                    parse_profile({**body, name: outside})
+                assert caught.value.field == name
+            n_checked += 1
+    assert n_checked >= 4

@@ -1,0 +1,65 @@
+"""A value that follows its target after a latency, and exponentially."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+
+class DelayedApproach:
+    """Follows targets exactly, however often it is asked.
+
+    Parameters
+    ----------
+    value : float
+        At the beginning.
+    latency_s : float
+        From a change of the target until anything moves.
+    time_constant_s : callable
+        ``time_constant_s(value, target)`` of a movement, taken when it begins.
+    """
+
+    def __init__(
+        self,
+        value: float,
+        latency_s: float,
+        time_constant_s: Callable[[float, float], float],
+    ) -> None:
+        self._value, self._at_s = value, -math.inf
+        self._latency_s = latency_s
+        self._time_constant_s = time_constant_s
+        self._target, self._tau_s = value, 1.0
+        self._coming: deque[tuple[float, float]] = deque()  # when it acts, target
+
+    def follow(self, target: float, at_s: float) -> float:
+        """Note what the target is from now on; return the value now.
+
+        Times do not run backwards: one before the last is taken as the last.
+        """
+        if not math.isfinite(target) or not math.isfinite(at_s):
+            raise ValueError(f"target {target} at {at_s} s; allowed: finite numbers")
+        at_s = max(at_s, self._at_s)
+        value = self.value_at(at_s)
+        newest = self._coming[-1][1] if self._coming else self._target
+        if target != newest:
+            self._coming.append((at_s + self._latency_s, target))
+            value = self.value_at(at_s)  # where there is no latency
+        return value
+
+    def value_at(self, at_s: float) -> float:
+        """Return the value at a time, not before the last one."""
+        while self._coming and self._coming[0][0] <= at_s:
+            acts_s, target = self._coming.popleft()
+            self._approach(acts_s)
+            self._target = target
+            self._tau_s = self._time_constant_s(self._value, target)
+        self._approach(at_s)
+        return self._value
+
+    def _approach(self, at_s: float) -> None:
+        if at_s > self._at_s:
+            if math.isfinite(self._at_s):
+                share = math.exp(-(at_s - self._at_s) / self._tau_s)
+                self._value = self._target + (self._value - self._target) * share
+            self._at_s = at_s

@@ -1,0 +1,115 @@
+"""Gaze from a tracker: smoothed, its age bounded, straight ahead where it is lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+MIN_CUTOFF_HZ = 2.0
+SPEED_WEIGHT = 0.1
+"""Of the filter, in Hz per deg/s: at rest noise above 2 Hz goes, and in a saccade of
+300 deg/s nothing is held back for longer than 5 ms."""
+
+SPEED_CUTOFF_HZ = 1.0
+BLINK_S = 0.4
+"""A gaze that is not seen for so long is held: a blink takes 0.1 to 0.4 s."""
+
+STRAIGHT_AHEAD_DEG = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Gaze:
+    """Where an eye looks, to the right and up from the camera's axis.
+
+    Attributes
+    ----------
+    h_deg, v_deg : float
+    is_tracked : bool
+        False: nobody knows, and it is straight ahead.
+    age_s : float
+        Of the last sample; infinite before the first.
+    """
+
+    h_deg: float
+    v_deg: float
+    is_tracked: bool
+    age_s: float
+
+
+class GazeFollower:
+    """Smooths gaze with the 1 euro filter.
+
+    Casiez, Roussel & Vogel, CHI 2012: a low pass whose cut-off rises with speed, so
+    that a resting eye does not tremble and a saccade is not held back.
+
+    Parameters
+    ----------
+    min_cutoff_hz : float
+        Of the low pass at rest.
+    speed_weight : float
+        By how many Hz it rises with each deg/s.
+    max_age_s : float
+        Older samples count as lost.
+    """
+
+    def __init__(
+        self,
+        *,
+        min_cutoff_hz: float = MIN_CUTOFF_HZ,
+        speed_weight: float = SPEED_WEIGHT,
+        max_age_s: float = BLINK_S,
+    ) -> None:
+        for name, value in (
+            ("min_cutoff_hz", min_cutoff_hz),
+            ("max_age_s", max_age_s),
+        ):
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value}; allowed: above 0")
+        if not (math.isfinite(speed_weight) and speed_weight >= 0.0):
+            raise ValueError(f"speed_weight is {speed_weight}; allowed: 0 or more")
+        self._min_cutoff_hz = min_cutoff_hz
+        self._speed_weight = speed_weight
+        self._max_age_s = max_age_s
+        self._gaze_deg: tuple[float, float] | None = None
+        self._speed_deg_s = (0.0, 0.0)
+        self._at_s = -math.inf
+
+    def see(self, h_deg: float, v_deg: float, at_s: float) -> None:
+        """Take in a sample; one that is no number, or not newer, is left out."""
+        if not all(map(math.isfinite, (h_deg, v_deg, at_s))) or at_s <= self._at_s:
+            return
+        step_s = at_s - self._at_s
+        before_deg, self._at_s = self._gaze_deg, at_s
+        if before_deg is None or step_s > self._max_age_s:
+            self._gaze_deg, self._speed_deg_s = (h_deg, v_deg), (0.0, 0.0)
+            return
+        share = _share(SPEED_CUTOFF_HZ, step_s)
+        self._speed_deg_s = (
+            _blend(self._speed_deg_s[0], (h_deg - before_deg[0]) / step_s, share),
+            _blend(self._speed_deg_s[1], (v_deg - before_deg[1]) / step_s, share),
+        )
+        # One cut-off for both: else an oblique saccade would take a curved way.
+        cutoff_hz = self._min_cutoff_hz + self._speed_weight * math.hypot(
+            *self._speed_deg_s
+        )
+        share = _share(cutoff_hz, step_s)
+        self._gaze_deg = (
+            _blend(before_deg[0], h_deg, share),
+            _blend(before_deg[1], v_deg, share),
+        )
+
+    def at(self, at_s: float) -> Gaze:
+        """Return the gaze at a time."""
+        age_s = at_s - self._at_s
+        if self._gaze_deg is None or age_s > self._max_age_s:
+            return Gaze(*STRAIGHT_AHEAD_DEG, is_tracked=False, age_s=age_s)
+        return Gaze(*self._gaze_deg, is_tracked=True, age_s=max(0.0, age_s))
+
+
+def _share(cutoff_hz: float, step_s: float) -> float:
+    """Return how much of a new sample a low pass takes."""
+    return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff_hz * step_s))
+
+
+def _blend(before: float, new: float, share: float) -> float:
+    return before + share * (new - before)
