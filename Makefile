@@ -31,6 +31,12 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	    $(PYTHON) -m json.tool --indent 1 out/$$bench.json $(RESULTS)/$$bench.json \
 	    || exit 1; \
 	done
+	for how in ipc shm curve tcp; do for eyes in mono stereo; do \
+	    case $$eyes in mono) many="--rate-hz 10";; stereo) many="--stereo --rate-hz 3";; esac; \
+	    $(PYTHON) -m filter_service bench roundtrip --transport $$how $$many \
+	        --json > out/roundtrip.json && $(PYTHON) -m json.tool --indent 1 \
+	        out/roundtrip.json $(RESULTS)/roundtrip_$${how}_$$eyes.json || exit 1; \
+	done; done
 	$(PYTHON) -m tests.benchmarks.bench_wavefront
 
 witness: setup-witness  ## our frames against a path tracer through the same eyes

@@ -32,10 +32,19 @@ class DelayedApproach:
         self._target, self._tau_s = value, 1.0
         self._coming: deque[tuple[float, float]] = deque()  # when it acts, target
 
-    def follow(self, target: float, at_s: float) -> float:
+    def follow(
+        self, target: float, at_s: float, latency_s: float | None = None
+    ) -> float:
         """Note what the target is from now on; return the value now.
 
-        Times do not run backwards: one before the last is taken as the last.
+        Times do not run backwards: one before the last is taken as the last, and no
+        target overtakes one before it.
+
+        Parameters
+        ----------
+        target, at_s : float
+        latency_s : float, optional
+            Of this change, where it differs.
         """
         if not math.isfinite(target) or not math.isfinite(at_s):
             raise ValueError(f"target {target} at {at_s} s; allowed: finite numbers")
@@ -43,7 +52,10 @@ class DelayedApproach:
         value = self.value_at(at_s)
         newest = self._coming[-1][1] if self._coming else self._target
         if target != newest:
-            self._coming.append((at_s + self._latency_s, target))
+            acts_s = at_s + (self._latency_s if latency_s is None else latency_s)
+            if self._coming:
+                acts_s = max(acts_s, self._coming[-1][0])
+            self._coming.append((acts_s, target))
             value = self.value_at(at_s)  # where there is no latency
         return value
 

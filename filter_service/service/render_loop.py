@@ -410,7 +410,8 @@ class RenderLoop:
             packed(color) if is_packed else np.ascontiguousarray(color)
             for color in reply.colors
         ]
-        result_slot.put(colors, places.result_starts)
+        if rooms is None or any(a is not b for a, b in zip(colors, rooms, strict=True)):
+            result_slot.put(colors, places.result_starts)
         stages_ms = dict(reply.stage_times_ms)
         stages_ms["copy_out_ms"] = MS_PER_S * (time.monotonic() - copied_s)
         if is_packed:

@@ -5,9 +5,16 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
+from estimator.dynamics.accommodation_response import AccommodationResponse
 from estimator.dynamics.delayed_approach import DelayedApproach
 from estimator.dynamics.gaze import GazeFollower
+from estimator.dynamics.pupil_reflex import (
+    LATENCY_RANGE_S,
+    PupilReflex,
+    reflex_latency_s,
+)
 from estimator.dynamics.pupil_size import steady_pupil_mm
 from tests.source_tree import ROOT
 
@@ -125,3 +132,98 @@ def test_samples_that_are_none_or_old_change_nothing():
     for wrong in ({"min_cutoff_hz": 0}, {"speed_weight": -1}, {"max_age_s": math.nan}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             GazeFollower(**wrong)
+
+
+PUPIL_CURVES = json.loads((ROOT / "tests/data/pupil_curves.json").read_text("utf-8"))
+AREA_DEG2 = 2800.0
+
+
+def light_for(pupil_mm, age_years=28.58):
+    """The light in which the formula's pupil is so wide."""
+    return brentq(
+        lambda log: steady_pupil_mm(10**log, AREA_DEG2, age_years) - pupil_mm, -8, 6
+    )
+
+
+def recorded(times_s, *, begin_mm, end_mm, off_s):
+    """A pulse of light that leads a pupil from one size towards another."""
+    dark, bright = 10 ** light_for(begin_mm), 10 ** light_for(end_mm)
+    reflex = PupilReflex(28.58, AREA_DEG2, dark)
+    reflex.follow(dark, -1.0)
+    steps_s = np.arange(0.0, times_s[-1] + 1e-9, 0.01)
+    found = [reflex.follow(bright if t < off_s else dark, t) for t in steps_s]
+    return np.interp(times_s, steps_s, found)
+
+
+@pytest.mark.parametrize("level", range(5))
+def test_the_pupil_follows_pulses_as_recorded(level):
+    pulse = PUPIL_CURVES["pulse"]
+    times_s = np.array(pulse["time_s"])
+    wide_mm = np.array(pulse["pupil_mm"])[:, level]
+    kept = times_s >= 0
+    found = recorded(
+        times_s[kept], begin_mm=wide_mm[0], end_mm=wide_mm.min() - 0.15, off_s=1.0
+    )
+    assert np.sqrt(np.mean((found - wide_mm[kept]) ** 2)) < 0.26
+
+
+def test_the_pupil_follows_a_pulse_that_it_was_not_fitted_to():
+    pulse = PUPIL_CURVES["long_pulse"]
+    times_s, wide_mm = np.array(pulse["time_s"]), np.array(pulse["pupil_mm"])
+    found = recorded(
+        times_s, begin_mm=pulse["begin_mm"], end_mm=wide_mm.min(), off_s=2.4
+    )
+    assert np.sqrt(np.mean((found - wide_mm) ** 2)) < 0.6  # of 3 mm; another machine
+
+
+def test_the_pupil_waits_less_in_more_light():
+    """34 ms less for each log unit (Myers & Stark 1993), about 0.2 to 0.3 s."""
+    lights = (0.1, 1.0, 10.0, 100.0)
+    latencies_s = [reflex_latency_s(light) for light in lights]
+    np.testing.assert_allclose(np.diff(latencies_s), -0.034, atol=1e-12)
+    assert 0.2 <= min(latencies_s) and max(latencies_s) <= 0.31
+    assert reflex_latency_s(0.0) == LATENCY_RANGE_S[1]
+
+
+def steps_response(begin_dpt, end_dpt, **settings):
+    response = AccommodationResponse(0.0, 7.0, **settings)
+    response.follow(begin_dpt, 0.0)
+    response.follow(begin_dpt, 20.0)
+    times_s = np.arange(0.0, 6.0, 0.001)
+    return times_s, np.array([response.follow(end_dpt, 20.0 + t) for t in times_s])
+
+
+@pytest.mark.parametrize(("cue", "per_dpt"), [("blur", 7.10), ("both", 3.56)])
+@pytest.mark.parametrize("size_dpt", [1.0, 2.0, 3.0])
+def test_accommodation_is_as_fast_as_measured(cue, per_dpt, size_dpt):
+    """Peak speed, dpt/s, of young adults; lens and muscle are 0.156 s at their best."""
+    times_s, found_dpt = steps_response(0.0, size_dpt, cue=cue)
+    peak_dpt_s = np.diff(found_dpt).max() / 0.001
+    allowed = 2.64 if cue == "blur" else 0.95  # the standard deviation among people
+    assert abs(peak_dpt_s - per_dpt * size_dpt) < allowed * size_dpt
+    begins_s = times_s[np.argmax(found_dpt > 0.0)]
+    assert 0.30 <= begins_s <= 0.40  # Campbell & Westheimer 1960: 0.36 s
+    assert found_dpt[-1] == pytest.approx(size_dpt, abs=1e-3)
+
+
+@pytest.mark.parametrize("begin_dpt", [2.0, 3.0, 4.0])
+@pytest.mark.parametrize("size_dpt", [1.0, 2.0])
+def test_relaxation_is_as_fast_as_its_beginning_says(begin_dpt, size_dpt):
+    """1.39 x beginning + 1.12 dpt/s whatever its size, Bharadwaj & Schor 2006."""
+    _, found_dpt = steps_response(begin_dpt, begin_dpt - size_dpt)
+    peak_dpt_s = -np.diff(found_dpt).min() / 0.001
+    assert peak_dpt_s == pytest.approx(1.39 * begin_dpt + 1.12, rel=0.1)
+
+
+def test_an_eye_does_what_it_can():
+    old = AccommodationResponse(0.0, 0.5)
+    old.follow(0.0, 0.0)
+    old.follow(3.0, 1.0)
+    assert old.follow(3.0, 9.0) == pytest.approx(0.5, abs=1e-6)
+    myope = AccommodationResponse(2.0, 9.0)
+    assert myope.follow(0.0, 0.0) == 2.0, "it cannot see farther"
+    with pytest.raises(ValueError, match="cue is 'prism'"):
+        AccommodationResponse(0.0, 5.0, cue="prism")
+    for near_dpt in (-1.0, math.nan):
+        with pytest.raises(ValueError, match="near_dpt is"):
+            AccommodationResponse(0.0, near_dpt)
