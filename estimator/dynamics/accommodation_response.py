@@ -57,7 +57,7 @@ class AccommodationResponse:
     ----------
     far_dpt, near_dpt : float
         What the eye can focus on, with what the person wears; as of
-        `EyeOptics.focus_limits_dpt`.
+        `Focusing.focus_limits_dpt`.
     cue : "both" or "blur"
         Both eyes, whose vergence leads, or blur alone.
     """

@@ -16,8 +16,9 @@ is that of Link & Stark's formula for a single step."""
 FAST_SHARE = 0.4
 CONSTRICTING_S = (0.28, 0.28)
 DILATING_S = (0.9, 2.9)
-"""Of the fast part and the slow one: redilation has both.  Fitted, to 0.14 mm, to pulses
-of 1 s at five powers of light, as recorded by Martin, Pinto, Bulte & Spitschan (2021)."""
+"""Of the fast part and the slow one: redilation has both.  Fitted, to 0.14 mm, to
+pulses of 1 s at five powers of light (recorded by Martin, Pinto, Bulte & Spitschan,
+2021)."""
 
 
 def reflex_latency_s(luminance_cd_m2: float) -> float:
