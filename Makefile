@@ -4,8 +4,9 @@
 PYTHON := .venv/bin/python
 ARGS ?=
 RESULTS := tests/benchmarks/results
-USUAL := -m "not slow and not gpu"
-# Services and clients keep time, and need the machine for themselves; others do not.
+# Those that keep time need the machine for themselves; the others share it.
+USUAL := -m "not clock and not slow and not gpu"
+ALONE := -m "clock and not slow and not gpu"
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload restart roundtrip
@@ -18,7 +19,8 @@ demo: setup  ## stream two scenes through six eyes; writes out/demo/
 
 test: setup-test  ## all tests but the slow ones and those for a hardware GPU
 	$(PYTHON) -m pytest $(USUAL) $(BESIDE) tests/unit tests/numerical $(ARGS) || $(NONE)
-	$(PYTHON) -m pytest $(USUAL) tests/end_to_end $(ARGS) || $(NONE)
+	$(PYTHON) -m pytest $(USUAL) $(BESIDE) tests/end_to_end $(ARGS) || $(NONE)
+	$(PYTHON) -m pytest $(ALONE) tests/end_to_end $(ARGS) || $(NONE)
 
 test-training: setup-training  ## the tests of the training, with torch, and a short run
 	$(PYTHON) -m pytest tests/training $(ARGS)

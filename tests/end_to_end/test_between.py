@@ -10,6 +10,8 @@ from clients.service_process import ServiceProcess
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Accepted, Ready
 
+pytestmark = pytest.mark.clock
+
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
 NARROW = {"pupil_range_mm": (3.9, 4.1), "object_range_dpt": (0, 2)}
 MYOPIA = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -12}

@@ -20,6 +20,8 @@ from clients.service_process import CHECKOUT, ServiceProcess
 from clients.streaming import FrameLog, percentiles
 from filter_service.progress import INTERVAL_S
 
+pytestmark = pytest.mark.clock
+
 N_FRAMES = 4
 SIZE_PX = (160, 90)
 

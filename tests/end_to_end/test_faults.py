@@ -19,6 +19,8 @@ from filter_service.messages import Hello, Ping, ProfileRequest, encode
 from tests.end_to_end.conftest import TIMEOUT_S, RawClient, make_view, small_frame
 from tests.end_to_end.test_lifecycle import children_of, wait_until
 
+pytestmark = pytest.mark.clock
+
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 EYE = {"kind": "double", "mark": 5}
 

@@ -16,6 +16,8 @@ from filter_service.errors import ServiceTimeout
 from filter_service.messages import Ping
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 
+pytestmark = pytest.mark.clock
+
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 EYE = {"kind": "double", "mark": 5}
 

@@ -9,6 +9,8 @@ from clients.filter_client import Dropped, FilterClient, FilteredFrame
 from filter_service.messages import Ping, encode
 from tests.end_to_end.conftest import make_view, small_frame
 
+pytestmark = pytest.mark.clock
+
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 EYE = {"kind": "double", "mark": 5}
 FILTER_MS = 40.0

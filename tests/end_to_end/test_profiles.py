@@ -18,6 +18,8 @@ from filter_service.messages import (
 )
 from tests.end_to_end.conftest import make_view, small_frame
 
+pytestmark = pytest.mark.clock
+
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from clients.service_process import CHECKOUT, ServiceProcess
 
+pytestmark = pytest.mark.clock
+
 SHOW_AND_READ_BACK = """
 import glfw, numpy as np
 from clients.scene_renderer import SceneRenderer

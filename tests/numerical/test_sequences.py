@@ -96,16 +96,21 @@ def check_steady(bench, motion, count):
     assert found.step_rms.min() > 0.0
 
 
-@pytest.mark.parametrize("motion", ["camera", "pupil", "focus"])
+@pytest.mark.parametrize(
+    "motion", [pytest.param("camera", marks=pytest.mark.slow), "pupil", "focus"]
+)
 def test_errors_change_steadily_along_a_path(sequence_bench, motion):
     check_steady(sequence_bench("on-axis", motion), motion, FRAMES)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", ["camera", "pupil", "focus"])
+@pytest.mark.parametrize(
+    "motion", [pytest.param("camera", marks=pytest.mark.slow), "pupil", "focus"]
+)
 def test_errors_change_steadily_over_the_field(sequence_bench, motion):
     check_steady(sequence_bench("dynamic", motion), motion, FRAMES)
 
 
+@pytest.mark.slow
 def test_errors_change_steadily_while_the_gaze_turns(sequence_bench):
     check_steady(sequence_bench("dynamic", "gaze"), "gaze", 4)
