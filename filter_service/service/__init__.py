@@ -20,6 +20,7 @@ turns           whose frame is next
 render_process  the process that filters
 render_loop     its loop: one filter for each session
 frame_reply     a frame and its answer
+frame_in_slots  with its images in shared memory
 link            messages between the processes
 config          the settings file
 process_info    version and memory

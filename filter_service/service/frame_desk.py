@@ -147,7 +147,7 @@ class FrameDesk:
         started_s: float,
         ended_s: float,
         used_s: float,
-        block_sizes: Sequence[int],
+        blocks_bytes: Sequence[int],
     ) -> None:
         """Pass an answer of the render loop on to who asked."""
         held = self._render.take_back(number)
@@ -156,7 +156,7 @@ class FrameDesk:
         self._turns.note(held.session.key, used_s, ended_s)
         self.filtered_s += used_s
         if isinstance(reply, Result):
-            reply = completed(reply, held, started_s, block_sizes)
+            reply = completed(reply, held, started_s, blocks_bytes)
         elif isinstance(reply, Dropped):
             reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
         tracker = self._answer_held(held, reply)

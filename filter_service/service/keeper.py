@@ -16,7 +16,8 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from filter_service.building.helper_process import (
@@ -60,6 +61,12 @@ class _Child:
     link: Link | None = None
     is_ready: bool = False
     stopped_since_s: float | None = None
+
+    def tell(self, message: object, descriptors: Sequence[int] = ()) -> None:
+        """Send a message; that a process is gone is found out by listening to it."""
+        if self.link is not None:
+            with suppress(LinkClosed):
+                self.link.send(message, descriptors)
 
 
 class Keeper:
@@ -185,8 +192,9 @@ class Keeper:
         theirs.close()
         # A new door listens where the one before it did.
         bind = self._endpoint or self._config.bind
-        link.send(("config", replace(self._config, bind=bind)))
-        return _Child(process, link)
+        child = _Child(process, link)
+        child.tell(("config", replace(self._config, bind=bind)))
+        return child
 
     def _keep_standby(self) -> None:
         """Have a second process ready to filter, with a worker of its own."""
@@ -220,16 +228,14 @@ class Keeper:
             log.info("%s is %s now", name, getattr(self._config, name))
         if others:
             log.warning("for %s the service has to be started again", ", ".join(others))
-        door = self._children["door"].link
-        if changed and door is not None:
-            door.send(("config", self._config))
+        if changed:
+            self._children["door"].tell(("config", self._config))
 
     def _join(self) -> None:
         """Give both processes the ends of a new link."""
         ends = socket.socketpair()
         for child, theirs in zip(self._children.values(), ends, strict=True):
-            if child.link is not None:
-                child.link.send(("link",), [theirs.fileno()])
+            child.tell(("link",), [theirs.fileno()])
             theirs.close()
 
     def _listen(self, name: str, child: _Child) -> None:
@@ -291,11 +297,7 @@ class Keeper:
     def _end_all(self) -> None:
         """End both processes: asked first, by force where they take long."""
         for child in self._all_children:
-            if child.link is not None:
-                try:
-                    child.link.send(("stop",))
-                except LinkClosed:
-                    pass
+            child.tell(("stop",))
         for child in self._all_children:
             if child.process is not None:
                 end(child.process, STOP_GRACE_S)

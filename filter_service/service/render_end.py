@@ -225,9 +225,10 @@ class RenderEnd:
             *(number, session, session.identity, waiting, places, own_slots),
             handed_s=now_s,
         )
-        sizes = [array.nbytes for images in frame.images for array in images.arrays]
+        arrays = [array for images in frame.images for array in images.arrays]
+        sizes_bytes = [array.nbytes for array in arrays]
         bare = replace(frame, images=(), memory=None)
-        self.tell("frame", number, session.key, bare, places, sizes)
+        self.tell("frame", number, session.key, bare, places, sizes_bytes)
 
     def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
         """Copy the images of a frame to slots of the service."""
@@ -252,13 +253,13 @@ class RenderEnd:
 
 
 def completed(
-    result: Result, held: Held, started_s: float, block_sizes: Sequence[int]
+    result: Result, held: Held, started_s: float, blocks_bytes: Sequence[int]
 ) -> Result:
     """Return a result with its pictures and with the times that the door knows."""
     if held.own_slots:
         _, slot = held.own_slots
         result = replace(
-            result, colors=_pictures(result, slot, held.places, block_sizes)
+            result, colors=_pictures(result, slot, held.places, blocks_bytes)
         )
     else:
         result = replace(result, in_memory=True)
@@ -274,12 +275,12 @@ def completed(
 
 
 def _pictures(
-    result: Result, slot: Slot, places: SharedPlaces, block_sizes: Sequence[int]
+    result: Result, slot: Slot, places: SharedPlaces, blocks_bytes: Sequence[int]
 ) -> tuple[NDArray[Any], ...]:
     if result.compression != "none":
         return tuple(
             slot.array(start, (size,), np.dtype(np.uint8))
-            for start, size in zip(places.result_starts, block_sizes, strict=True)
+            for start, size in zip(places.result_starts, blocks_bytes, strict=True)
         )
     return tuple(
         slot.array(

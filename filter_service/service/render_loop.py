@@ -8,25 +8,24 @@ number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
 request)``, ``("frame", number, key, frame, places, sizes)``, ``("close",
 key)``.
 To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, reply)``,
-``("answer", number, reply, started_s, ended_s, used_s, block_sizes)`` and ``("state",
+``("answer", number, reply, started_s, ended_s, used_s, blocks_bytes)`` and ``("state",
 memory_mb, stores_mb, is_building)``.  Sizes are of parts that are compressed.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import selectors
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from estimator.profiles.parse import EyeProfile
-from filter_service.errors import BadMessage, FilterError, NoSession
+from filter_service.errors import FilterError, NoSession, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
 from filter_service.filtering.workshop import Workshop
@@ -38,10 +37,9 @@ from filter_service.messages import (
     Progress,
     Ready,
     Reply,
-    Result,
     SharedPlaces,
 )
-from filter_service.service.frame_reply import frame_reply
+from filter_service.service.frame_in_slots import reply_in_slots
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.process_info import (
     give_memory_back,
@@ -49,10 +47,6 @@ from filter_service.service.process_info import (
     resident_memory_mb,
 )
 from filter_service.slots import Slot
-from filter_service.wire.compression import packed
-from filter_service.wire.images import ViewImages
-
-MS_PER_S = 1e3
 
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
@@ -104,6 +98,7 @@ class RenderLoop:
         self._eyes: dict[str, SessionEye] = {}
         self._slots: dict[int, Slot] = {}
         self._door: Link | None = None
+        self._inbox: deque[tuple[Any, list[int]]] = deque()
         self._next_state_s = 0.0
         self._trim_at_s: float | None = None  # where frames hold memory
         self._frame_since_s: float | None = None  # the one that is being filtered
@@ -150,6 +145,9 @@ class RenderLoop:
             self._door.close()
         self._door = door
         self._drop_slots()
+        while self._inbox:  # of the door before
+            for descriptor in self._inbox.popleft()[1]:
+                os.close(descriptor)
         server = {
             "name": "ocufilter",
             "version": package_version(),
@@ -195,8 +193,10 @@ class RenderLoop:
         if self._door is not None:
             try:
                 self._door.flush()
-                for message, descriptors in self._door.receive():
-                    self._handle(message, descriptors)
+                # What comes in a rest may not overtake what came with the frame.
+                self._inbox.extend(self._door.receive())
+                while self._inbox:
+                    self._handle(*self._inbox.popleft())
             except LinkClosed:
                 log.warning("the door is gone; sessions wait for the next one")
                 if self._door is not None:
@@ -362,7 +362,7 @@ class RenderLoop:
         key: str,
         frame: Frame,
         places: SharedPlaces,
-        sizes: Sequence[int],
+        sizes_bytes: Sequence[int],
     ) -> None:
         """Filter a frame; one that comes between the parts of another does not rest."""
         started_s = time.monotonic()
@@ -370,7 +370,7 @@ class RenderLoop:
         if is_first:
             self._frame_since_s, self._rested_s = started_s, 0.0
         try:
-            reply, block_sizes = self._filtered(key, frame, places, sizes)
+            reply, blocks_bytes = self._answer_to(key, frame, places, sizes_bytes)
         finally:
             rested_s = self._rested_s if is_first else 0.0
             if is_first:
@@ -379,83 +379,21 @@ class RenderLoop:
         self._trim_at_s = ended_s + TRIM_AFTER_S
         used_s = ended_s - started_s - rested_s
         times_s = (started_s, ended_s, used_s)
-        self._send(("answer", number, reply, *times_s, block_sizes))
+        self._send(("answer", number, reply, *times_s, blocks_bytes))
 
-    def _filtered(
-        self, key: str, frame: Frame, places: SharedPlaces, sizes: Sequence[int]
+    def _answer_to(
+        self, key: str, frame: Frame, places: SharedPlaces, sizes_bytes: Sequence[int]
     ) -> tuple[Reply, list[int]]:
-        """Return the answer to a frame; its pictures are where they are wanted.
-
-        Beside it the sizes of pictures that are compressed.
-        """
-        eye = self._eyes.get(key)
-        if eye is None:
-            error = NoSession("the session has ended")
-            return ErrorReply.from_exception(error, frame_id=frame.frame_id), []
-        # By the end the door may have given them up.
-        slot, result_slot = self._slots[places.slot], self._slots[places.result_slot]
-        unpack_s = time.monotonic()
+        """Return the answer to a frame; whatever goes wrong is an answer, too."""
         try:
-            frame = with_images(frame, slot, places.starts, sizes)
-        except BadMessage as error:
+            eye = self._eyes.get(key)
+            if eye is None:
+                raise NoSession("the session has ended")
+            # By the end the door may have given them up.
+            slots = self._slots[places.slot], self._slots[places.result_slot]
+            return reply_in_slots(eye.eye_filter, frame, slots, places, sizes_bytes)
+        except Exception as error:
+            if not isinstance(error, FilterError):
+                log.exception("a frame could not be answered")
+                error = RenderFailed(f"{type(error).__name__}: {error}")
             return ErrorReply.from_exception(error, frame_id=frame.frame_id), []
-        unpack_s = time.monotonic() - unpack_s
-        is_packed = frame.compression != "none"
-        rooms = None if is_packed else rooms_in(result_slot, frame, places)
-        reply = frame_reply(eye.eye_filter, frame, rooms)
-        if not isinstance(reply, Result):
-            return reply, []
-        copied_s = time.monotonic()
-        colors = [
-            packed(color) if is_packed else np.ascontiguousarray(color)
-            for color in reply.colors
-        ]
-        if rooms is None or any(a is not b for a, b in zip(colors, rooms, strict=True)):
-            result_slot.put(colors, places.result_starts)
-        stages_ms = dict(reply.stage_times_ms)
-        stages_ms["copy_out_ms"] = MS_PER_S * (time.monotonic() - copied_s)
-        if is_packed:
-            stages_ms["unpack_ms"] = MS_PER_S * unpack_s
-        reply = replace(
-            reply,
-            colors=(),
-            stage_times_ms=stages_ms,
-            compression=frame.compression,
-        )
-        return reply, [color.nbytes for color in colors]
-
-
-def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
-    """Return where the pictures of a frame go."""
-    dtype = np.dtype(frame.output.dtype)
-    return [
-        slot.array(start, (view.height_px, view.width_px, 3), dtype)
-        for start, view in zip(places.result_starts, frame.views, strict=True)
-    ]
-
-
-def with_images(
-    frame: Frame, slot: Slot, starts: Sequence[int], sizes: Sequence[int]
-) -> Frame:
-    """Return a frame with its images, which lie in a slot.
-
-    Raises
-    ------
-    ValueError
-        They reach beyond it.
-    BadMessage
-        They are compressed, and one of them cannot be unpacked.
-    """
-    waiting = iter(zip(starts, sizes or starts, strict=True))
-    found = []
-    for view in frame.views:
-        arrays = []
-        for _, shape, dtype in view.images:
-            start, size = next(waiting)
-            if frame.compression != "none":
-                shape, dtype = (size,), "uint8"
-            array = slot.array(start, shape, np.dtype(dtype))
-            array.flags.writeable = False
-            arrays.append(array)
-        found.append(ViewImages(*arrays))
-    return replace(frame, images=tuple(found)).unpacked()

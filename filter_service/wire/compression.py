@@ -25,7 +25,7 @@ def largest_block_bytes(size_bytes: int) -> int:
 
 
 def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the block of an image."""
+    """Return the block (n_bytes,) of an image of any shape and type."""
     from lz4 import block
 
     contiguous = np.ascontiguousarray(image)
@@ -36,7 +36,7 @@ def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
 def unpacked(
     part: NDArray[np.uint8], shape: Sequence[int], dtype: str, path: str
 ) -> NDArray[Any]:
-    """Return the image of a block.
+    """Return the image of a block (n_bytes,), of a shape and type.
 
     Raises
     ------

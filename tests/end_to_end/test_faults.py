@@ -156,6 +156,21 @@ def test_a_frame_without_an_end_is_ended(start_service):
     assert "is stuck for 1 s" in service.log
 
 
+def test_both_processes_killed_at_once_are_both_started_again(start_service):
+    service = start_service()
+    view = make_view()
+    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+        client.set_profile(EYE, views=[view])
+        for n_killed in range(1, 4):
+            pids = service.pids()
+            for name in ("render", "door"):
+                os.kill(pids[name], signal.SIGKILL)
+            wait_until(lambda n=n_killed: service.log.count("SIGKILL") >= 2 * n)
+            seen = client.filter(view, **SEE)
+            assert seen.color[0, 0, 0] == EYE["mark"]
+    assert service.process.poll() is None
+
+
 def await_standby(service, other_than=None):
     end_s = time.monotonic() + TIMEOUT_S
     while (pid := service.pids().get("standby")) in (None, other_than):

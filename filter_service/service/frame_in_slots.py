@@ -1,0 +1,101 @@
+"""A frame whose images lie in shared memory, and its pictures where they are wanted."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.messages import Frame, Reply, Result, SharedPlaces
+from filter_service.service.frame_reply import frame_reply
+from filter_service.slots import Slot
+from filter_service.wire.compression import packed
+from filter_service.wire.images import ViewImages
+
+MS_PER_S = 1e3
+
+
+def reply_in_slots(
+    eye_filter: EyeFilter,
+    frame: Frame,
+    slots: tuple[Slot, Slot],
+    places: SharedPlaces,
+    sizes_bytes: Sequence[int],
+) -> tuple[Reply, list[int]]:
+    """Filter a frame; return the reply and the bytes of each picture.
+
+    Parameters
+    ----------
+    frame : Frame
+        Without its images.
+    slots : (Slot, Slot)
+        Where the images lie, and where the pictures go.
+    places : SharedPlaces
+        Where in them.
+    sizes_bytes : sequence of int
+        Of the images where they are compressed.
+
+    Raises
+    ------
+    ValueError
+        Images reach beyond their slot.
+    BadMessage
+        They are compressed, and one of them cannot be unpacked.
+    """
+    slot, result_slot = slots
+    begin_s = time.monotonic()
+    frame = with_images(frame, slot, places.starts, sizes_bytes)
+    unpack_ms = MS_PER_S * (time.monotonic() - begin_s)
+    is_packed = frame.compression != "none"
+    rooms = None if is_packed else rooms_in(result_slot, frame, places)
+    reply = frame_reply(eye_filter, frame, rooms)
+    if not isinstance(reply, Result):
+        return reply, []
+    begin_s = time.monotonic()
+    if is_packed:
+        colors = [packed(color) for color in reply.colors]
+    else:
+        colors = [np.ascontiguousarray(color) for color in reply.colors]
+    if rooms is None or any(a is not b for a, b in zip(colors, rooms, strict=True)):
+        result_slot.put(colors, places.result_starts)
+    stages_ms = dict(reply.stage_times_ms)
+    stages_ms["copy_out_ms"] = MS_PER_S * (time.monotonic() - begin_s)
+    if is_packed:
+        stages_ms["unpack_ms"] = unpack_ms
+    reply = replace(
+        reply, colors=(), stage_times_ms=stages_ms, compression=frame.compression
+    )
+    return reply, [color.nbytes for color in colors]
+
+
+def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
+    """Return where the pictures of a frame go, (height, width, 3) each."""
+    dtype = np.dtype(frame.output.dtype)
+    return [
+        slot.array(start, (view.height_px, view.width_px, 3), dtype)
+        for start, view in zip(places.result_starts, frame.views, strict=True)
+    ]
+
+
+def with_images(
+    frame: Frame, slot: Slot, starts: Sequence[int], sizes_bytes: Sequence[int]
+) -> Frame:
+    """Return a frame with its images, which lie in a slot; see `reply_in_slots`."""
+    waiting = iter(zip(starts, sizes_bytes or starts, strict=True))
+    found = []
+    for view in frame.views:
+        arrays = []
+        for _, shape, dtype in view.images:
+            start, size_bytes = next(waiting)
+            if frame.compression != "none":
+                shape, dtype = (size_bytes,), "uint8"
+            array = slot.array(start, shape, np.dtype(dtype))
+            array.flags.writeable = False
+            arrays.append(array)
+        found.append(ViewImages(*arrays))
+    return replace(frame, images=tuple(found)).unpacked()

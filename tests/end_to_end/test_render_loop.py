@@ -1,0 +1,126 @@
+"""The loop that filters, on a link of the test's own: order, and faults."""
+
+import pickle
+import threading
+import time
+
+import pytest
+
+from filter_service.building.limits import BuildLimits
+from filter_service.building.worker_handle import WorkerHandle
+from filter_service.filtering.workshop import Workshop
+from filter_service.messages import ProfileRequest, SharedPlaces
+from filter_service.service.link import HEAD, Link
+from filter_service.service.render_loop import RenderLoop
+from filter_service.slots import Slot
+from tests.end_to_end.conftest import TIMEOUT_S, small_frame
+from tests.end_to_end.doubles import EngineDouble, read_profile
+
+PLACES = SharedPlaces(1, (0, 512), 2, (0,))
+
+
+class RestingEngine(EngineDouble):
+    """Does what a test wants in the middle of its first frame, then rests."""
+
+    def __init__(self):
+        super().__init__(0.0)
+        self.in_the_middle = None
+
+    def call_between(self, function, interval_s):
+        self.between = function
+        return True
+
+    def render(self, *arguments, **options):
+        job, self.in_the_middle = self.in_the_middle, None
+        if job is not None:
+            job()
+            time.sleep(0.05)
+            self.between()
+        return super().render(*arguments, **options)
+
+
+class Door:
+    """The door's end of a link, and what the loop has said."""
+
+    def __init__(self, engine):
+        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+        workshop = Workshop(worker, engine, BuildLimits())
+        loop = RenderLoop(workshop, read_profile, max_cameras=4)
+        self.link, theirs = Link.pair()
+        self.control, control = Link.pair()
+        self.theirs = Link(theirs), Link(control)
+        loop.join(self.theirs[0])
+        self.said = []
+        self.thread = threading.Thread(
+            target=loop.run, args=(self.theirs[1], lambda message, _: False)
+        )
+        self.thread.start()
+        for number in (1, 2):
+            slot = Slot.create(number, 4096)
+            self.tell("slot", number, slot.size_bytes, descriptors=[slot.descriptor])
+
+    def tell(self, *message, descriptors=()):
+        self.link.send(message, descriptors)
+
+    def await_one(self, is_wanted):
+        end_s = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < end_s:
+            self.said += [message for message, _ in self.link.receive()]
+            for message in self.said:
+                if is_wanted(message):
+                    return message
+            time.sleep(0.01)
+        raise AssertionError(f"waited in vain among {[m[0] for m in self.said]}")
+
+    def answer_to(self, number):
+        return self.await_one(lambda m: m[0] == "answer" and m[1] == number)[2]
+
+    def frame(self, number, key, places=PLACES):
+        self.tell("frame", number, key, small_frame(number, images=()), places, ())
+
+    def tell_at_once(self, *messages):
+        """Send messages in one piece, so that the loop reads them together."""
+        bodies = [pickle.dumps(message, protocol=5) for message in messages]
+        pieces = [HEAD.pack(len(body), 0) + body for body in bodies]
+        self.link._socket.sendall(b"".join(pieces))
+
+    def stop(self):
+        self.control.send(("stop",))
+        self.thread.join(TIMEOUT_S)
+        assert not self.thread.is_alive()
+        for link in (self.link, self.control, *self.theirs):
+            link.close()
+
+
+@pytest.fixture
+def resting():
+    return RestingEngine()
+
+
+@pytest.fixture
+def door(resting):
+    door = Door(resting)
+    door.tell("open", "a", 1, 1)
+    camera = small_frame(0).views[0].camera
+    body = {"kind": "double", "mark": 3}
+    door.tell("profile", "a", ProfileRequest(0, body, views=(camera,)))
+    door.await_one(lambda m: m[0] == "tell" and m[2].type_name == "ready")
+    yield door
+    door.stop()
+
+
+def test_what_comes_in_a_rest_does_not_overtake_what_came_before(door, resting):
+    """The frame of `b` comes in the rest; `b` was opened before, in the same batch."""
+    resting.in_the_middle = lambda: door.frame(2, "b")
+    frame = ("frame", 1, "a", small_frame(1, images=()), PLACES, ())
+    door.tell_at_once(frame, ("open", "b", 2, 1))
+    assert door.answer_to(2).code == "no_profile", "not no_session: it was open"
+    assert door.answer_to(1).type_name == "result"
+
+
+def test_a_frame_that_cannot_be_answered_is_answered(door):
+    """A slot that the door has given up, say: nothing waits for a time limit."""
+    door.frame(5, "a", SharedPlaces(9, (0, 512), 2, (0,)))
+    assert door.answer_to(5).code == "render_failed"
+    door.frame(6, "a")
+    assert door.answer_to(6).type_name == "result"
