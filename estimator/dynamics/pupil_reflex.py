@@ -37,6 +37,8 @@ class PupilReflex:
         As of `steady_pupil_mm`, where the pupil goes.
     luminance_cd_m2 : float
         At the beginning, in which the pupil is steady.
+    latency_s : float, optional
+        As measured of this person; else as the light has it, `reflex_latency_s`.
     """
 
     def __init__(
@@ -46,8 +48,10 @@ class PupilReflex:
         luminance_cd_m2: float,
         *,
         n_eyes: int = 2,
+        latency_s: float | None = None,
     ) -> None:
         self._how = field_area_deg2, age_years, n_eyes
+        self._latency_s = latency_s
         begin_mm = self._steady_mm(luminance_cd_m2)
         self._parts = tuple(
             DelayedApproach(
@@ -69,7 +73,9 @@ class PupilReflex:
     def follow(self, luminance_cd_m2: float, at_s: float) -> float:
         """See this light from now on; return the pupil's diameter now, mm."""
         target_mm = self._steady_mm(luminance_cd_m2)
-        latency_s = reflex_latency_s(luminance_cd_m2)
+        latency_s = self._latency_s
+        if latency_s is None:
+            latency_s = reflex_latency_s(luminance_cd_m2)
         fast_mm, slow_mm = (
             part.follow(target_mm, at_s, latency_s) for part in self._parts
         )

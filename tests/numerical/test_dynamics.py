@@ -145,35 +145,54 @@ def light_for(pupil_mm, age_years=28.58):
     )
 
 
-def recorded(times_s, *, begin_mm, end_mm, off_s):
+def recorded(times_s, *, begin_mm, end_mm, off_s, latency_s=None):
     """A pulse of light that leads a pupil from one size towards another."""
     dark, bright = 10 ** light_for(begin_mm), 10 ** light_for(end_mm)
-    reflex = PupilReflex(28.58, AREA_DEG2, dark)
+    reflex = PupilReflex(28.58, AREA_DEG2, dark, latency_s=latency_s)
     reflex.follow(dark, -1.0)
     steps_s = np.arange(0.0, times_s[-1] + 1e-9, 0.01)
     found = [reflex.follow(bright if t < off_s else dark, t) for t in steps_s]
     return np.interp(times_s, steps_s, found)
 
 
+RECORDED_LATENCY_S = 0.25
+"""At which all recorded pupils begin; the light's own formula says 0.20 s, and then the
+errors below are 0.15 to 0.26 mm and 0.59 mm."""
+
+
 @pytest.mark.parametrize("level", range(5))
 def test_the_pupil_follows_pulses_as_recorded(level):
+    """Those it was fitted to: 0.06 to 0.23 mm of a change of 2.3 to 2.7 mm."""
     pulse = PUPIL_CURVES["pulse"]
     times_s = np.array(pulse["time_s"])
     wide_mm = np.array(pulse["pupil_mm"])[:, level]
     kept = times_s >= 0
-    found = recorded(
-        times_s[kept], begin_mm=wide_mm[0], end_mm=wide_mm.min() - 0.15, off_s=1.0
+    found_mm = recorded(
+        times_s[kept],
+        begin_mm=wide_mm[0],
+        end_mm=wide_mm.min() - 0.15,  # a second of light is not the end of it
+        off_s=1.0,
+        latency_s=RECORDED_LATENCY_S,
     )
-    assert np.sqrt(np.mean((found - wide_mm[kept]) ** 2)) < 0.26
+    assert np.sqrt(np.mean((found_mm - wide_mm[kept]) ** 2)) < 0.25
 
 
 def test_the_pupil_follows_a_pulse_that_it_was_not_fitted_to():
+    """Coarsely: 0.50 mm of a change of 3 mm.
+
+    Another instrument and unknown light: this pupil closes half as fast, and opens
+    slower in the end.
+    """
     pulse = PUPIL_CURVES["long_pulse"]
     times_s, wide_mm = np.array(pulse["time_s"]), np.array(pulse["pupil_mm"])
-    found = recorded(
-        times_s, begin_mm=pulse["begin_mm"], end_mm=wide_mm.min(), off_s=2.4
+    found_mm = recorded(
+        times_s,
+        begin_mm=pulse["begin_mm"],
+        end_mm=wide_mm.min(),
+        off_s=2.4,
+        latency_s=RECORDED_LATENCY_S,
     )
-    assert np.sqrt(np.mean((found - wide_mm) ** 2)) < 0.6  # of 3 mm; another machine
+    assert np.sqrt(np.mean((found_mm - wide_mm) ** 2)) < 0.55
 
 
 def test_the_pupil_waits_less_in_more_light():
