@@ -32,6 +32,7 @@ from filter_service.messages import (
     COMPRESSIONS,
     DEFAULT_ENDPOINT,
     DEPTH_ENCODINGS,
+    EYE_NAMES,
     FORMATS,
     Accepted,
     Camera,
@@ -39,6 +40,7 @@ from filter_service.messages import (
     DepthEncoding,
     Dropped,
     ErrorReply,
+    EyeName,
     FilterSettings,
     Frame,
     FrameOptions,
@@ -48,7 +50,9 @@ from filter_service.messages import (
     Progress,
     Ready,
     ViewHeader,
+    ViewState,
     Welcome,
+    check_states,
     encode,
     tangents_from_fov,
 )
@@ -59,6 +63,7 @@ __all__ = [
     "FilterClient",
     "FilteredFrame",
     "RgbdView",
+    "ViewState",
     "tangents_from_fov",
 ]
 
@@ -185,6 +190,7 @@ class FilterClient:
         self,
         body: Mapping[str, Any] | str,
         *,
+        eye: EyeName = "both",
         settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
         views: Sequence[Camera | RgbdView] = (),
         wait: bool | str = True,
@@ -198,6 +204,9 @@ class FilterClient:
         body : mapping or str
             The profile, as in ``{"kind": "prescription", "sphere_dpt": -6}``, or a
             preset's name.
+        eye : "both", "left" or "right"
+            Which of the session's eyes changes: the one that sees all views unless
+            their `ViewState` says otherwise, or the left or the right one.
         settings : FilterSettings or mapping, optional
             Or its fields that differ from the defaults.
         views : sequence, optional
@@ -223,18 +232,26 @@ class FilterClient:
             body = {"kind": "preset", "name": body}
         if not isinstance(settings, FilterSettings):
             settings = FilterSettings(**settings)
-        request = ProfileRequest(self._next_profile_id, dict(body), settings, cameras)
+        if eye not in EYE_NAMES:
+            raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
+        request = ProfileRequest(
+            self._next_profile_id, dict(body), settings, cameras, eye
+        )
         self._camera = next(iter(cameras), self._camera)
         parts = encode(request)  # before any state changes: it may refuse the body
         self.hello()
         self._next_profile_id += 1
-        previous, self._link.profile = self._link.profile, request
+        previous = self._link.profiles.get(eye)
+        self._link.profiles[eye] = request
         self._link.say(parts)
         try:
             return self._await_profile(request, wait, on_progress, timeout_s)
         except FilterError:
             # After a restart of the service the last good profile is sent again.
-            self._link.profile = previous
+            if previous is None:
+                self._link.profiles.pop(eye, None)
+            else:
+                self._link.profiles[eye] = previous
             raise
 
     def _await_profile(
@@ -284,6 +301,8 @@ class FilterClient:
         merge: bool = True,
         render_tolerance: float = 1.0,
         depth_encoding: DepthEncoding = "float32",
+        states: Sequence[ViewState] = (),
+        display_time_ns: int | None = None,
         timeout_s: float | None = None,
     ) -> FilteredFrame:
         """Send one frame and return it filtered; `submit` explains the arguments.
@@ -310,6 +329,8 @@ class FilterClient:
                 render_tolerance=render_tolerance,
                 prepared_only=True,
                 depth_encoding=depth_encoding,
+                states=states,
+                display_time_ns=display_time_ns,
             )
             answer = self._await_frame(frame_id, deadline_s)
             if isinstance(answer, FilteredFrame):
@@ -335,13 +356,12 @@ class FilterClient:
             self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
 
     def _await_ready(self, deadline_s: float) -> None:
-        """Wait for the eye that is being prepared; a failed build raises."""
-        profile = self._link.profile
-        profile_id = None if profile is None else profile.profile_id
+        """Wait for an eye that is being prepared; a failed build raises."""
+        profile_ids = {p.profile_id for p in self._link.profiles.values()}
         while True:
             event = self._link.take_event(
                 lambda e: (
-                    isinstance(e, Ready | ErrorReply) and e.profile_id == profile_id
+                    isinstance(e, Ready | ErrorReply) and e.profile_id in profile_ids
                 )
             )
             if isinstance(event, ErrorReply):
@@ -364,6 +384,8 @@ class FilterClient:
         render_tolerance: float = 1.0,
         prepared_only: bool = False,
         depth_encoding: DepthEncoding = "float32",
+        states: Sequence[ViewState] = (),
+        display_time_ns: int | None = None,
     ) -> int:
         """Hand over a frame without waiting; return its frame_id.
 
@@ -393,6 +415,11 @@ class FilterClient:
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
             How depth travels: metres, or half the bytes, for a thin network: metres or
             dioptres in half precision, or whole millimetres.
+        states : sequence of ViewState, optional
+            One for each view: through whose eye it is seen, and what differs from the
+            frame's pupil, focus and gaze; its pose comes back with the picture.
+        display_time_ns : int, optional
+            Comes back with the frame.
         """
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
@@ -402,11 +429,18 @@ class FilterClient:
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
         items = as_views(color, depth_m, self._camera)
+        states = tuple(states) or (ViewState(),) * len(items)
+        if len(states) != len(items):
+            raise ValueError(f"{len(states)} states; allowed: {len(items)}, as views")
+        check_states(states)
         if self.welcome is not None:
             check_limits(items, self.welcome)
         frame = Frame(
             frame_id=self._next_frame_id,
-            views=tuple(ViewHeader.describing(i, depth_encoding) for i in items),
+            views=tuple(
+                ViewHeader.describing(item, depth_encoding, state)
+                for item, state in zip(items, states, strict=True)
+            ),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
@@ -414,6 +448,7 @@ class FilterClient:
             options=FrameOptions(
                 accumulation, merge, float(render_tolerance), prepared_only
             ),
+            display_time_ns=display_time_ns,
         )
         self._next_frame_id += 1
         self._link.submit(self._packer.packed(frame, items))

@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,12 +45,22 @@ from filter_service.messages import (
     DepthEncoding,
     Dropped,
     ErrorReply,
+    EyeName,
+    ViewState,
 )
 
 N_FRAMES = 8  # in the loop that is sent
 VERTICAL_FOV_DEG = 45.0
 TRANSPORTS = ("tcp", "ipc", "shm", "curve")
-DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}'
+DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OS", "sphere_dpt": -2}'
+DEFAULT_RIGHT_PROFILE = (
+    '{"kind": "prescription", "eye_side": "OD", "sphere_dpt": -3, "cylinder_dpt": -1, '
+    '"axis_deg": 20}'
+)
+HEADSET_EDGES_DEG = (-52.0, 42.0, 43.0, -53.0)
+"""Left, right, up and down of a headset's left view; the right one's is mirrored."""
+
+EYES: tuple[EyeName, ...] = ("left", "right")
 STRAGGLER_S = 10.0
 STDOUT = "-"
 
@@ -72,12 +83,33 @@ class Settings:
     transport: str = "tcp"
     compression: Compression = "none"
     depth_encoding: DepthEncoding = "float32"
+    right_profile: dict[str, Any] | None = None  # then `profile` is the left eye's
+
+    @property
+    def tangents(self) -> list[tuple[float, float, float, float]]:
+        """Return those of each view: a headset's where there are two eyes."""
+        if self.right_profile is None:
+            usual = tangents_from_fov(VERTICAL_FOV_DEG, self.width_px, self.height_px)
+            return [usual] * self.n_views
+        left, right, up, down = (
+            math.tan(math.radians(edge_deg)) for edge_deg in HEADSET_EDGES_DEG
+        )
+        return [(left, right, up, down), (-right, -left, up, down)]
+
+    @property
+    def states(self) -> list[ViewState]:
+        """Return through whose eye each view is seen."""
+        if self.right_profile is None:
+            return [ViewState()] * self.n_views
+        return [ViewState(eye) for eye in EYES]
 
     @property
     def case(self) -> str:
         """Return what is streamed, in words."""
         views = "" if self.n_views == 1 else f"{self.n_views} x "
-        eye = self.profile.get("name", self.profile.get("kind", "profile"))
+        eye = _name_of(self.profile)
+        if self.right_profile is not None:
+            eye = f"left {eye}, right {_name_of(self.right_profile)}"
         return (
             f"{views}{self.width_px}x{self.height_px} {self.output}, {eye}, "
             f"{self.pupil_diameter_mm:g} mm, {self.focus_dpt:g} dpt"
@@ -95,10 +127,13 @@ class Settings:
         return f"{schedule}, {self.max_in_flight} in flight, {', '.join(how)}"
 
 
+def _name_of(profile: Mapping[str, Any]) -> str:
+    return str(profile.get("name", profile.get("kind", "profile")))
+
+
 def make_frames(settings: Settings) -> list[list[RgbdView]]:
     """Return a loop of frames: a slanted checkered floor and a near disc that moves."""
     width_px, height_px = settings.width_px, settings.height_px
-    tangents = tangents_from_fov(VERTICAL_FOV_DEG, width_px, height_px)
     x, y = np.meshgrid(np.arange(width_px), np.arange(height_px))
     cell_px = max(height_px // 24, 2)
     checks = ((x // cell_px + y // cell_px) % 2).astype(np.float32)
@@ -113,7 +148,7 @@ def make_frames(settings: Settings) -> list[list[RgbdView]]:
         depth = np.where(near, np.float32(0.5), depth_m)
         if settings.output == "linear":
             image = (color.astype(np.float32)) ** np.float32(2.2)
-        frames.append([RgbdView(image, depth, tangents)] * settings.n_views)
+        frames.append([RgbdView(image, depth, edges) for edges in settings.tangents])
     return frames
 
 
@@ -125,10 +160,9 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
         "focus_dpt": settings.focus_dpt,
         "output": settings.output,
         "depth_encoding": settings.depth_encoding,
+        "states": settings.states,
     }
-    client.set_profile(
-        settings.profile, settings=settings.profile_settings, views=frames[0]
-    )
+    _set_profiles(client, settings, frames[0])
     first_replies = [client.filter(frame, **look, timeout_s=60) for frame in frames]
     welcome = client.hello()
     run = LatencyRun(settings.case, settings.setting, welcome.server["renderer"])
@@ -153,6 +187,18 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
     sent, received = client.n_bytes
     run.n_bytes = sent - before[0], received - before[1]
     return run
+
+
+def _set_profiles(
+    client: FilterClient, settings: Settings, views: Sequence[RgbdView]
+) -> None:
+    how = settings.profile_settings
+    if settings.right_profile is None:
+        client.set_profile(settings.profile, settings=how, views=views)
+        return
+    profiles = settings.profile, settings.right_profile
+    for eye, profile, view in zip(EYES, profiles, views, strict=True):
+        client.set_profile(profile, eye=eye, settings=how, views=[view])
 
 
 class _Loop:
@@ -285,11 +331,20 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--size", help="WxH in px (1280x720; stereo 1832x1920)")
     parser.add_argument("--views", type=int, default=1, help="1, or 2 for stereo")
-    parser.add_argument("--stereo", action="store_true", help="2 x 1832x1920")
+    parser.add_argument(
+        "--stereo",
+        action="store_true",
+        help="a headset: 2 x 1832x1920, asymmetric, each eye with a profile of its own",
+    )
     parser.add_argument("--rate-hz", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument(
         "--profile", default=DEFAULT_PROFILE, help="preset, JSON text or .json file"
+    )
+    parser.add_argument(
+        "--right-profile",
+        default=DEFAULT_RIGHT_PROFILE,
+        help="of the right eye with --stereo; --profile is then the left one's",
     )
     parser.add_argument(
         "--settings",
@@ -339,6 +394,9 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
         rate_hz=arguments.rate_hz,
         duration_s=3.0 if arguments.quick else arguments.seconds,
         profile=read_profile(arguments.profile),
+        right_profile=(
+            read_profile(arguments.right_profile) if arguments.stereo else None
+        ),
         profile_settings=read_object("--settings", arguments.settings),
         pupil_diameter_mm=arguments.pupil_mm,
         focus_dpt=arguments.focus_dpt,

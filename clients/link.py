@@ -30,6 +30,7 @@ from filter_service.messages import (
     Closing,
     Dropped,
     ErrorReply,
+    EyeName,
     Frame,
     Hello,
     Pong,
@@ -124,7 +125,7 @@ class ServiceLink:
         key: ClientKey | None = None,
     ) -> None:
         self.welcome: Welcome | None = None
-        self.profile: ProfileRequest | None = None
+        self.profiles: dict[EyeName, ProfileRequest] = {}
         self.pending: Outgoing | None = None
         self.in_flight: dict[int, Outgoing] = {}
         self.pongs: list[Pong] = []
@@ -280,15 +281,17 @@ class ServiceLink:
             self._bound_progress()
 
     def _begin(self, welcome: Welcome) -> None:
-        """Begin or go on with a session; send the profile where it does not have it."""
+        """Begin or go on with a session; send the profiles that it does not have."""
         self.welcome = welcome
         self._session_key = welcome.session_key
         if not self.in_flight:
             is_offered = self._wants_memory and "shm" in welcome.transports
             self.memory.begin(is_offered=is_offered)
-        profile = self.profile
-        if profile is not None and welcome.profile_id != profile.profile_id:
-            self.say(encode(profile))
+        known: dict[EyeName, int | None] = {"both": welcome.profile_id}
+        known |= welcome.profile_ids
+        for eye, profile in self.profiles.items():
+            if known.get(eye) != profile.profile_id:
+                self.say(encode(profile))
 
     def _bound_progress(self) -> None:
         """Forget the oldest progress of a program that never polls for it."""

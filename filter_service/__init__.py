@@ -6,6 +6,7 @@ Importing this loads nothing but names: clients stay light.
     displays         the wavelengths of red, green and blue
     camera           a pinhole, and which cameras share PSFs
     rgbd_view        colour, depth and camera of one view
+    view_state       through whose eye it is seen
     messages         the wire protocol's types (PROTOCOL.md)
     protocol_schema  their headers as JSON Schema
     errors           the exceptions

@@ -7,9 +7,11 @@ from .filtering.filtered import BuildingEye as BuildingEye
 from .filtering.filtered import EyeFailed as EyeFailed
 from .filtering.filtered import EyeReady as EyeReady
 from .filtering.filtered import Filtered as Filtered
+from .filtering.several_eyes import plan_views as plan_views
 from .rgbd_view import ColorImage as ColorImage
 from .rgbd_view import RgbdView as RgbdView
 from .rgbd_view import as_views as as_views
 from .settings import Accumulation as Accumulation
 from .settings import FilterSettings as FilterSettings
 from .settings import Output as Output
+from .view_state import ViewState as ViewState

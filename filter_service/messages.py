@@ -19,6 +19,13 @@ from filter_service.camera import Camera, tangents_from_fov
 from filter_service.checked import show
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
 from filter_service.settings import FilterSettings
+from filter_service.view_state import (
+    EYE_NAMES,
+    EyeName,
+    Pose,
+    ViewState,
+    check_states,
+)
 from filter_service.wire.compression import COMPRESSIONS, Compression
 from filter_service.wire.depths import DEPTH_ENCODINGS, DepthEncoding, encoded_depth
 from filter_service.wire.images import (
@@ -70,6 +77,7 @@ __all__ = [
     "DEFAULT_ENDPOINT",
     "DEPTH_ENCODINGS",
     "DROP_REASONS",
+    "EYE_NAMES",
     "FORMATS",
     "LINEAR",
     "LINEAR16",
@@ -87,6 +95,7 @@ __all__ = [
     "DepthEncoding",
     "Dropped",
     "ErrorReply",
+    "EyeName",
     "FilterSettings",
     "Frame",
     "FrameOptions",
@@ -96,6 +105,7 @@ __all__ = [
     "Part",
     "Ping",
     "Pong",
+    "Pose",
     "ProfileRequest",
     "Progress",
     "Ready",
@@ -109,7 +119,9 @@ __all__ = [
     "Unshare",
     "ViewHeader",
     "ViewImages",
+    "ViewState",
     "Welcome",
+    "check_states",
     "decode_reply",
     "decode_request",
     "encode",

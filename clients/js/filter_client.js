@@ -8,7 +8,9 @@
 //
 // A camera is { widthPx, heightPx, tangents: [left, right, up, down] }; a view is one with
 // color, a Uint8Array of sRGB or a Float32Array of linear light, and depthM, a
-// Float32Array of metres.  One call of `filter` at a time.
+// Float32Array of metres.  A view may name the eye that sees it, "left" or "right", with
+// eye, and what is that eye's own: pupilMm, focusDpt, gazeDeg; pose, seven numbers, comes
+// back with the picture.  One call of `filter` at a time.
 
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
@@ -34,7 +36,7 @@ export class FilterClient {
     this.timeoutMs = timeoutMs;
     this.name = name;
     this.welcome = null;
-    this.profile = null; // the last request, to be sent again to a new session
+    this.profiles = new Map(); // of each eye the last request, for a new session
     this.nextFrameId = 0;
     this.nextProfileId = 0;
     this.waiting = []; // { accepts, resolve, reject, timer }
@@ -63,24 +65,25 @@ export class FilterClient {
   }
 
   // Resolves when the eye is ready for all cameras; rejects with the service's error.
-  async setProfile(body, { settings = {}, views = [] } = {}) {
+  async setProfile(body, { settings = {}, views = [], eye = "both" } = {}) {
     const header = {
       type: "profile",
       version: VERSION,
       profile_id: this.nextProfileId++,
+      eye,
       settings,
       views: views.map(camera),
     };
     await this.hello();
-    this.profile = [encode(header), Buffer.from(JSON.stringify(body))];
-    this.profile.id = header.profile_id;
+    const request = [encode(header), Buffer.from(JSON.stringify(body))];
+    this.profiles.set(eye, { id: header.profile_id, request });
     const ours = (reply) => reply.profile_id === header.profile_id;
     const accepted = this.await_(
       (reply) => ours(reply) && reply.type === "accepted",
       "the profile to be accepted",
       ours,
     );
-    await this.send(this.profile);
+    await this.send(request);
     let missing = (await accepted).n_cameras;
     let ready = null;
     while (missing > 0) {
@@ -96,7 +99,8 @@ export class FilterClient {
   }
 
   // Resolves with the result's header and its pictures, `colors`, one for each view.
-  async filter(views, { pupilMm, focusDpt, gazeDeg, output = "uint8", options = {} }) {
+  async filter(views, look) {
+    const { pupilMm, focusDpt, gazeDeg, displayTimeNs, output = "uint8", options = {} } = look;
     const end = Date.now() + this.timeoutMs;
     for (;;) {
       await this.hello();
@@ -109,6 +113,7 @@ export class FilterClient {
         pupil_diameter_mm: pupilMm,
         focus_dpt: focusDpt,
         ...(gazeDeg && { gaze_deg: gazeDeg }),
+        ...(displayTimeNs !== undefined && { display_time_ns: displayTimeNs }),
         output: formatOf(output),
         options,
       };
@@ -184,8 +189,10 @@ export class FilterClient {
   async begin(welcome) {
     this.welcome = welcome;
     this.key = welcome.session_key;
-    const profile = this.profile;
-    if (profile && welcome.profile_id !== profile.id) await this.send(profile);
+    const known = { both: welcome.profile_id, ...welcome.profile_ids };
+    for (const [eye, { id, request }] of this.profiles) {
+      if (known[eye] !== id) await this.send(request);
+    }
   }
 
   await_(accepts, what, concerns = () => false, timeoutMs = this.timeoutMs) {
@@ -237,6 +244,11 @@ function described(view) {
     color: formatOf(dtype),
     depth: { kind: view.depthKind ?? "planar" },
     has_hidden: view.hiddenColor !== undefined,
+    ...(view.eye && { eye: view.eye }),
+    ...(view.pupilMm !== undefined && { pupil_diameter_mm: view.pupilMm }),
+    ...(view.focusDpt !== undefined && { focus_dpt: view.focusDpt }),
+    ...(view.gazeDeg && { gaze_deg: view.gazeDeg }),
+    ...(view.pose && { pose: view.pose }),
   };
 }
 

@@ -1,6 +1,8 @@
 """Streams of frames through eyes that may change on the way.
 
 eye_filter        `EyeFilter`: one stream; the public face
+planned_frame     a frame whose eye is prepared
+several_eyes      a frame whose views have eyes of their own
 filtered          a filtered frame, and events on the way
 accepted_profile  one profile and the stores of it
 stream_eyes       which eye serves, and what is to be built

@@ -25,12 +25,11 @@ from filter_service.checked import checked
 from filter_service.errors import BadMessage, ServiceTimeout
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
+from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.shared_workshop import shared
-from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.stream_eyes import StreamEyes
 from filter_service.filtering.view_use import frame_use
 from filter_service.filtering.workshop import Workshop
-from filter_service.rendering.engine import Rendered
-from filter_service.rendering.media_effects import MediaEffects, render_through_media
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -368,13 +367,43 @@ class EyeFilter:
         RenderError
             The engine failed.
         """
-        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
-        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
+        planned = self.plan(
+            views,
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            prepared_only=prepared_only,
+        )
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
+        if planned is None:
+            return None
+        return planned.render(
+            gazes_deg=[gaze_deg] * len(views),
+            output=output,
+            accumulation=accumulation,
+            merge=merge,
+            render_tolerance=render_tolerance,
+            out=out,
+        )
+
+    def plan(
+        self,
+        views: Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        prepared_only: bool = False,
+    ) -> PlannedFrame | None:
+        """Return a frame ready to be rendered, before this filter is asked again.
+
+        None, and what it raises: as of `try_filter`.  The frames of a person's two eyes
+        are both planned before one is rendered, so that both are being prepared.
+        """
+        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
+        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
         look_at = LookAt(pupil_diameter_mm, focus_dpt)
         self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
-        workshop = self.workshop  # a service may close the filter in the middle
+        workshop = self.workshop
         plan = self._eyes.plan([view.camera for view in views], look_at)
         if self._shared is not None:  # else its owner advances it
             workshop.advance()
@@ -382,52 +411,4 @@ class EyeFilter:
         self.is_extending = plan is not None and prepared_only and not plan.is_prepared
         if plan is None or self.is_extending:
             return None
-        rooms = out or [None] * len(views)
-        started_s = time.monotonic()
-        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
-        rendered = [
-            render_through_media(
-                workshop.engine,
-                view,
-                store,
-                effects,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
-                output=output,
-                gaze_deg=gaze_deg,
-                out=room,
-            )
-            for view, store, room in zip(views, plan.stores, rooms, strict=True)
-        ]
-        workshop.frame_s = time.monotonic() - started_s
-        return _filtered(plan, rendered)
-
-
-def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:
-    first = rendered[0]
-    stages_ms: dict[str, float] = {}
-    for view in rendered:
-        for name, value_ms in view.stage_times_ms.items():
-            stages_ms[name] = stages_ms.get(name, 0.0) + float(value_ms)
-    h_deg, v_deg = first.gaze_deg
-    return Filtered(
-        colors=tuple(view.color for view in rendered),
-        profile_id=plan.eye.profile_id,
-        generation=plan.eye.generation,
-        is_complete=plan.is_complete,
-        pupil_diameter_mm=float(first.pupil_diameter_mm),
-        focus_dpt=float(first.focus_dpt),
-        gaze_deg=(float(h_deg), float(v_deg)),
-        missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
-        clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
-        overflow_count=sum(int(v.overflow_count) for v in rendered),
-        notes=tuple(
-            dict.fromkeys(
-                [*plan.notes, *(note for view in rendered for note in view.notes)]
-            )
-        ),
-        stage_times_ms=stages_ms,
-    )
+        return PlannedFrame(workshop, plan, tuple(views), pupil_diameter_mm, focus_dpt)

@@ -26,8 +26,10 @@ class Filtered:
         Counts the profiles that the filter was given.
     is_complete : bool
         False where it was seen through a preview, which the whole will replace.
-    pupil_diameter_mm, focus_dpt, gaze_deg
+    pupil_diameter_mm, focus_dpt
         As used: a profile may cap the pupil, and an eye can only add power.
+    gazes_deg : tuple of (h, v)
+        As used, one for each view.
     missing_depth_count, clamped_depth_count, overflow_count : int
         Pixels whose depth was filled in or lay outside of the prepared distances;
         shares of light that found no room.
@@ -43,7 +45,7 @@ class Filtered:
     is_complete: bool
     pupil_diameter_mm: float
     focus_dpt: float
-    gaze_deg: tuple[float, float]
+    gazes_deg: tuple[tuple[float, float], ...]
     missing_depth_count: int
     clamped_depth_count: int
     overflow_count: int
@@ -54,6 +56,11 @@ class Filtered:
     def color(self) -> NDArray[Any]:
         """Return the first view's picture, (height, width, 3)."""
         return self.colors[0]
+
+    @property
+    def gaze_deg(self) -> tuple[float, float]:
+        """Return the first view's gaze."""
+        return self.gazes_deg[0]
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,15 @@ metrics         counters for Prometheus
 patience        how many wrong messages are answered
 asking          a question to a running service
 guests          all sessions, with a client or without
-session         one client: its waiting frame, its credit, its profile
+session         one client: its waiting frame, its credit, its profiles
 sharing         memory that clients share
 frame_desk      frames on their way, and their answers
 places          whether a frame's images lie where they may
 render_end      the door's end of what follows
 turns           whose frame is next
 render_process  the process that filters
-render_loop     its loop: one filter for each session
+render_loop     its loop
+session_eyes    a filter for each eye of a session
 frame_reply     a frame and its answer
 frame_in_slots  with its images in shared memory
 link            messages between the processes

@@ -30,6 +30,7 @@ from filter_service.messages import (
     Closing,
     Dropped,
     ErrorReply,
+    EyeName,
     Frame,
     Hello,
     Part,
@@ -53,7 +54,7 @@ from filter_service.service.metrics import serve_metrics
 from filter_service.service.patience import Patience
 from filter_service.service.process_info import resident_memory_mb
 from filter_service.service.render_end import RenderEnd
-from filter_service.service.session import Session
+from filter_service.service.session import EyeProfiles, Session
 from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
@@ -210,10 +211,12 @@ class Door:
         for session in self._guests:
             if session.key not in held:
                 self._open(session)
-        for key, session_id, profile_id, generation in eyes:
+        for key, session_id, profiles in eyes:
             if key not in known:  # a door before this one knew its client
                 session = Session(session_id, None, "", self.config.credit, key=key)
-                session.profile_id, session.generation = profile_id, generation
+                for name, (profile_id, generation) in profiles.items():
+                    eye = session.eye(name)
+                    eye.profile_id, eye.generation = profile_id, generation
                 session.leave(time.monotonic())
                 self._guests.remember(session)
         self._render.is_ready = True
@@ -225,27 +228,29 @@ class Door:
         self._greetings = []
 
     def _open(self, session: Session) -> None:
-        """Have the render loop hold an eye for a session, with its profile if any."""
-        first_generation = session.generation + 1
-        self._render.tell("open", session.key, session.session_id, first_generation)
-        profile = session.asked_profile or session.profile
-        if profile is not None:
-            session.asked_profile = profile
-            self._render.tell("profile", session.key, profile)
+        """Have the render loop hold the eyes of a session, with their profiles."""
+        generations = {name: eye.generation for name, eye in session.eyes.items()}
+        self._render.tell("open", session.key, session.session_id, generations)
+        for eye in session.eyes.values():
+            profile = eye.asked_profile or eye.profile
+            if profile is not None:
+                eye.asked_profile = profile
+                self._render.tell("profile", session.key, profile)
 
-    def _pass_on(self, key: str, reply: Reply) -> None:
-        """Tell a session what the render loop says of its profile."""
+    def _pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
+        """Tell a session what the render loop says of the profile of an eye."""
         session = self._guests.by_key(key)
         if session is None:
             return
-        asked = session.asked_profile
+        eye = session.eye(name)
+        asked = eye.asked_profile
         if asked is not None and isinstance(reply, Accepted | ErrorReply):
             if isinstance(reply, Accepted):
-                session.profile, session.profile_id = asked, reply.profile_id
-                session.generation = reply.generation
+                eye.profile, eye.profile_id = asked, reply.profile_id
+                eye.generation = reply.generation
             if reply.profile_id == asked.profile_id:
-                session.asked_profile = None
-                self._ask_next_profile(session)
+                eye.asked_profile = None
+                self._ask_next_profile(session, eye)
         if session.identity is not None:
             self._send(session.identity, reply)
 
@@ -344,7 +349,7 @@ class Door:
         return session
 
     def _pong(self, ping: Ping) -> Pong:
-        asked = any(session.asked_profile for session in self._guests.present)
+        asked = any(session.asks for session in self._guests.present)
         return Pong(
             t=ping.t,
             server_time_s=time.monotonic(),
@@ -395,7 +400,8 @@ class Door:
             session_key=session.key,
             session_keep_s=self.config.session_keep_s,
             is_resumed=is_resumed,
-            profile_id=session.profile_id if is_resumed else None,
+            profile_id=session.profile_ids.get("both") if is_resumed else None,
+            profile_ids=session.profile_ids if is_resumed else {},
         )
         self._send(identity, welcome)
 
@@ -417,7 +423,8 @@ class Door:
 
     def _take_profile(self, session: Session, request: ProfileRequest) -> None:
         """Ask for a profile; of several that wait for their turn the newest counts."""
-        replaced, session.next_profile = session.next_profile, request
+        eye = session.eye(request.eye)
+        replaced, eye.next_profile = eye.next_profile, request
         if replaced is not None and session.identity is not None:
             error = BuildCancelled(
                 f"profile {request.profile_id} took the place of profile "
@@ -425,13 +432,13 @@ class Door:
             )
             reply = ErrorReply.from_exception(error, profile_id=replaced.profile_id)
             self._send(session.identity, reply)
-        if session.asked_profile is None:
-            self._ask_next_profile(session)
+        if eye.asked_profile is None:
+            self._ask_next_profile(session, eye)
 
-    def _ask_next_profile(self, session: Session) -> None:
-        request, session.next_profile = session.next_profile, None
+    def _ask_next_profile(self, session: Session, eye: EyeProfiles) -> None:
+        request, eye.next_profile = eye.next_profile, None
         if request is not None:
-            session.asked_profile = request
+            eye.asked_profile = request
             self._render.tell("profile", session.key, request)
 
     def _probe_clients(self, *, is_due: bool = False) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.messages import Frame, Reply, Result, SharedPlaces
+from filter_service.messages import EyeName, Frame, Reply, Result, SharedPlaces
 from filter_service.service.frame_reply import frame_reply
 from filter_service.slots import Slot
 from filter_service.wire.compression import packed
@@ -21,7 +21,7 @@ MS_PER_S = 1e3
 
 
 def reply_in_slots(
-    eye_filter: EyeFilter,
+    filter_of: Callable[[EyeName], EyeFilter],
     frame: Frame,
     slots: tuple[Slot, Slot],
     places: SharedPlaces,
@@ -31,6 +31,8 @@ def reply_in_slots(
 
     Parameters
     ----------
+    filter_of : callable
+        Gives the filter of an eye.
     frame : Frame
         Without its images.
     slots : (Slot, Slot)
@@ -53,7 +55,7 @@ def reply_in_slots(
     unpack_ms = MS_PER_S * (time.monotonic() - begin_s)
     is_packed = frame.compression != "none"
     rooms = None if is_packed else rooms_in(result_slot, frame, places)
-    reply = frame_reply(eye_filter, frame, rooms)
+    reply = frame_reply(filter_of, frame, rooms)
     if not isinstance(reply, Result):
         return reply, []
     begin_s = time.monotonic()

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
-from filter_service.messages import Dropped, ErrorReply, Frame, Result, ResultView
+from filter_service.filtering.several_eyes import SeenViews, plan_views
+from filter_service.messages import (
+    Dropped,
+    ErrorReply,
+    EyeName,
+    Frame,
+    Result,
+    ResultView,
+)
 from filter_service.wire.images import OUTPUT_OF_FORMAT
 
 MS_PER_S = 1000.0
@@ -21,7 +28,9 @@ log = logging.getLogger("ocufilter")
 
 
 def frame_reply(
-    eye_filter: EyeFilter, frame: Frame, out: Sequence[NDArray[Any]] | None
+    filter_of: Callable[[EyeName], EyeFilter],
+    frame: Frame,
+    out: Sequence[NDArray[Any]] | None,
 ) -> Result | Dropped | ErrorReply:
     """Return the reply to a frame; anything that goes wrong becomes an error reply.
 
@@ -30,19 +39,25 @@ def frame_reply(
     """
     started_s = time.monotonic()
     try:
-        seen = eye_filter.try_filter(
+        planned = plan_views(
+            filter_of,
             [
                 view.view(images)
                 for view, images in zip(frame.views, frame.images, strict=True)
             ],
+            [view.state for view in frame.views],
             pupil_diameter_mm=frame.pupil_diameter_mm,
             focus_dpt=frame.focus_dpt,
             gaze_deg=frame.gaze_deg,
+            prepared_only=frame.options.prepared_only,
+        )
+        if isinstance(planned, str):
+            return Dropped(frame.frame_id, planned)
+        seen = planned.render(
             output=OUTPUT_OF_FORMAT[frame.output],
             accumulation=frame.options.accumulation,
             merge=frame.options.merge,
             render_tolerance=frame.options.render_tolerance,
-            prepared_only=frame.options.prepared_only,
             out=out,
         )
     except FilterError as error:
@@ -52,33 +67,48 @@ def frame_reply(
         log.exception("frame %d could not be filtered", frame.frame_id)
         failure = RenderFailed(f"{type(error).__name__}: {error}")
         return ErrorReply.from_exception(failure, frame_id=frame.frame_id)
-    if seen is None:
-        reason = "extending" if eye_filter.is_extending else "preparing"
-        return Dropped(frame.frame_id, reason)
     total_ms = MS_PER_S * (time.monotonic() - started_s)
     return _result(frame, seen, total_ms)
 
 
-def _result(frame: Frame, seen: Filtered, total_ms: float) -> Result:
-    stages_ms = dict(seen.stage_times_ms)
+def _result(frame: Frame, seen: SeenViews, total_ms: float) -> Result:
+    stages_ms = seen.stage_times_ms
     stages_ms["filter_other_ms"] = total_ms - sum(stages_ms.values())
+    first = seen.views[0]
     return Result(
         frame_id=frame.frame_id,
-        profile_id=seen.profile_id,
-        generation=seen.generation,
-        views=tuple(
-            ResultView(view.width_px, view.height_px, frame.output)
-            for view in frame.views
-        ),
-        pupil_diameter_mm=seen.pupil_diameter_mm,
-        focus_dpt=seen.focus_dpt,
-        missing_depth_count=seen.missing_depth_count,
-        clamped_depth_count=seen.clamped_depth_count,
-        gaze_deg=seen.gaze_deg,
-        overflow_count=seen.overflow_count,
+        profile_id=first.seen.profile_id,
+        generation=first.seen.generation,
+        views=_result_views(frame, seen),
+        pupil_diameter_mm=first.seen.pupil_diameter_mm,
+        focus_dpt=first.seen.focus_dpt,
+        missing_depth_count=seen.total("missing_depth_count"),
+        clamped_depth_count=seen.total("clamped_depth_count"),
+        gaze_deg=first.gaze_deg,
+        overflow_count=seen.total("overflow_count"),
         total_ms=0.0,
         stage_times_ms=stages_ms,
         notes=seen.notes,
         is_complete=seen.is_complete,
-        colors=seen.colors,
+        display_time_ns=frame.display_time_ns,
+        colors=tuple(view.color for view in seen.views),
+    )
+
+
+def _result_views(frame: Frame, seen: SeenViews) -> tuple[ResultView, ...]:
+    return tuple(
+        ResultView(
+            asked.width_px,
+            asked.height_px,
+            frame.output,
+            asked.eye,
+            profile_id=found.seen.profile_id,
+            generation=found.seen.generation,
+            is_complete=found.seen.is_complete,
+            pupil_diameter_mm=found.seen.pupil_diameter_mm,
+            focus_dpt=found.seen.focus_dpt,
+            gaze_deg=found.gaze_deg,
+            pose=asked.pose,
+        )
+        for asked, found in zip(frame.views, seen.views, strict=True)
     )

@@ -1,13 +1,13 @@
-"""The loop that filters frames: one filter for each session, behind a link to the door.
+"""The loop that filters frames: a filter for each eye, behind a link to the door.
 
 The door owns the socket and the sessions' credit; here are their eyes.  Neither waits
 for the other, and each outlives the other: a new door is told which sessions there are.
 
 From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
-number)``, ``("open", key, session_id, first_generation)``, ``("profile", key,
+number)``, ``("open", key, session_id, generations)`` of eyes, ``("profile", key,
 request)``, ``("frame", number, key, frame, places, sizes)``, ``("close",
 key)``.
-To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, reply)``,
+To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, eye, reply)``,
 ``("answer", number, reply, started_s, ended_s, used_s, blocks_bytes)`` and ``("state",
 memory_mb, stores_mb, is_building)``.  Sizes are of parts that are compressed.
 """
@@ -20,22 +20,17 @@ import selectors
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession, RenderFailed
-from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
 from filter_service.filtering.workshop import Workshop
 from filter_service.messages import (
-    Accepted,
     ErrorReply,
+    EyeName,
     Frame,
     ProfileRequest,
-    Progress,
-    Ready,
     Reply,
     SharedPlaces,
 )
@@ -46,6 +41,7 @@ from filter_service.service.process_info import (
     package_version,
     resident_memory_mb,
 )
+from filter_service.service.session_eyes import SessionEyes
 from filter_service.slots import Slot
 
 IDLE_WAIT_S = 0.5
@@ -59,17 +55,6 @@ TRIM_AFTER_S = 10.0
 """Without a frame for so long, the memory of frames goes back to the system."""
 
 log = logging.getLogger("ocufilter")
-
-
-@dataclass(eq=False)
-class SessionEye:
-    """The filter of one session, and the profile that it was last given."""
-
-    key: str
-    session_id: int
-    eye_filter: EyeFilter
-    profile_id: int | None = None
-    generation: int = 0
 
 
 class RenderLoop:
@@ -95,7 +80,7 @@ class RenderLoop:
         self._workshop = workshop
         self._read_profile = read_profile
         self._max_cameras = max_cameras
-        self._eyes: dict[str, SessionEye] = {}
+        self._sessions: dict[str, SessionEyes] = {}
         self._slots: dict[int, Slot] = {}
         self._door: Link | None = None
         self._inbox: deque[tuple[Any, list[int]]] = deque()
@@ -156,8 +141,8 @@ class RenderLoop:
             "gl_renderer": self._workshop.engine.name,  # what it was called before
         }
         eyes = [
-            (eye.key, eye.session_id, eye.profile_id, eye.generation)
-            for eye in self._eyes.values()
+            (key, session.session_id, session.profiles)
+            for key, session in self._sessions.items()
         ]
         self._send(("here", server, eyes, self._may_rest))
 
@@ -254,7 +239,7 @@ class RenderLoop:
             self._door = None
 
     def _close(self) -> None:
-        for key in list(self._eyes):
+        for key in list(self._sessions):
             self._end_session(key)
         self._workshop.close()
         self._drop_slots()
@@ -286,73 +271,32 @@ class RenderLoop:
 
     # Sessions
 
-    def _begin_session(self, key: str, session_id: int, first_generation: int) -> None:
+    def _begin_session(
+        self, key: str, session_id: int, generations: dict[EyeName, int]
+    ) -> None:
         self._end_session(key)
-        self._eyes[key] = SessionEye(
-            key,
+        self._sessions[key] = SessionEyes(
             session_id,
-            EyeFilter(
-                workshop=self._workshop,
-                max_cameras=self._max_cameras,
-                on_event=partial(self._tell, key),
-                first_generation=first_generation,
-            ),
+            self._workshop,
+            partial(self._tell, key),
+            max_cameras=self._max_cameras,
+            generations=generations,
         )
 
     def _end_session(self, key: str) -> None:
-        eye = self._eyes.pop(key, None)
-        if eye is not None:
-            eye.eye_filter.close()
+        session = self._sessions.pop(key, None)
+        if session is not None:
+            session.close()
 
     def _take_profile(self, key: str, request: ProfileRequest) -> None:
         """Accept a profile; what becomes of it is told as events."""
-        eye = self._eyes.get(key)
-        if eye is None:
-            return
-        reply: Reply
-        try:
-            accepted = eye.eye_filter.set_profile(
-                self._read_profile(request.body),
-                settings=request.settings,
-                cameras=request.views,
-                profile_id=request.profile_id,
-            )
-        except Exception as error:
-            if not isinstance(error, FilterError):
-                log.exception("a profile could not be taken in")
-                error = FilterError(f"{type(error).__name__}: {error}")
-            reply = ErrorReply.from_exception(error, profile_id=request.profile_id)
-        else:
-            eye.profile_id, eye.generation = request.profile_id, accepted.generation
-            reply = Accepted(
-                request.profile_id,
-                accepted.generation,
-                is_building=bool(accepted.wanted),
-                n_cameras=len(accepted.wanted),
-            )
-        self._send(("tell", key, reply))
-        self._tell_state(is_due=True)
+        session = self._sessions.get(key)
+        if session is not None:
+            self._tell(key, request.eye, session.take(request, self._read_profile))
+            self._tell_state(is_due=True)
 
-    def _tell(self, key: str, event: EyeEvent) -> None:
-        """Tell a session what happens to its profile."""
-        profile_id, generation = event.eye.profile_id, event.eye.generation
-        reply: Reply
-        if isinstance(event, BuildingEye):
-            reply = Progress(profile_id, generation, event.stage, event.fraction)
-        elif isinstance(event, EyeReady):
-            reply = Ready(
-                profile_id,
-                generation,
-                build_ms=event.build_ms,
-                psf_count=event.psf_count,
-                memory_mb=event.memory_mb,
-                pixel_pitch_mrad=event.camera.pixel_pitch_mrad,
-                notes=event.notes,
-                is_complete=event.is_complete,
-            )
-        else:
-            reply = ErrorReply.from_exception(event.error, profile_id=profile_id)
-        self._send(("tell", key, reply))
+    def _tell(self, key: str, eye: EyeName, reply: Reply) -> None:
+        self._send(("tell", key, eye, reply))
 
     # Frames
 
@@ -386,12 +330,12 @@ class RenderLoop:
     ) -> tuple[Reply, list[int]]:
         """Return the answer to a frame; whatever goes wrong is an answer, too."""
         try:
-            eye = self._eyes.get(key)
-            if eye is None:
+            session = self._sessions.get(key)
+            if session is None:
                 raise NoSession("the session has ended")
             # By the end the door may have given them up.
             slots = self._slots[places.slot], self._slots[places.result_slot]
-            return reply_in_slots(eye.eye_filter, frame, slots, places, sizes_bytes)
+            return reply_in_slots(session.filter_of, frame, slots, places, sizes_bytes)
         except Exception as error:
             if not isinstance(error, FilterError):
                 log.exception("a frame could not be answered")

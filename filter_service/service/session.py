@@ -1,4 +1,4 @@
-"""One client's session: its waiting frame, its credit, its profile.
+"""One client's session: its waiting frame, its credit, the profiles of its eyes.
 
 State only: no sockets.  `door` acts on what it says.
 """
@@ -9,7 +9,7 @@ import secrets
 from dataclasses import dataclass, field
 
 from filter_service.errors import CreditExceeded
-from filter_service.messages import Frame, ProfileRequest
+from filter_service.messages import EyeName, Frame, ProfileRequest
 from filter_service.service.mailbox import Tracker
 from filter_service.slots import Slot
 
@@ -28,6 +28,17 @@ class WaitingFrame:
 def new_key() -> str:
     """Return a key that nobody guesses."""
     return secrets.token_hex(KEY_BYTES)
+
+
+@dataclass
+class EyeProfiles:
+    """The profiles of one eye: the last that was accepted, and those to come."""
+
+    profile: ProfileRequest | None = None  # the last that was accepted
+    asked_profile: ProfileRequest | None = None  # on its way
+    next_profile: ProfileRequest | None = None  # waits for the one on its way
+    profile_id: int | None = None
+    generation: int = 0
 
 
 @dataclass(eq=False)
@@ -59,11 +70,25 @@ class Session:
     shared: dict[int, Slot] = field(default_factory=dict)  # memory of the client
     lent: set[int] = field(default_factory=set)  # of those, in use by frames
     away_since_s: float | None = None
-    profile: ProfileRequest | None = None  # the last that was accepted
-    asked_profile: ProfileRequest | None = None  # on its way
-    next_profile: ProfileRequest | None = None  # waits for the one on its way
-    profile_id: int | None = None
-    generation: int = 0
+    eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
+
+    def eye(self, name: EyeName) -> EyeProfiles:
+        """Return the profiles of an eye."""
+        return self.eyes.setdefault(name, EyeProfiles())
+
+    @property
+    def profile_ids(self) -> dict[EyeName, int]:
+        """Return the last accepted profile of each eye."""
+        return {
+            name: eye.profile_id
+            for name, eye in self.eyes.items()
+            if eye.profile_id is not None
+        }
+
+    @property
+    def asks(self) -> bool:
+        """Return whether a profile is on its way."""
+        return any(eye.asked_profile is not None for eye in self.eyes.values())
 
     def take_in(self, waiting: WaitingFrame) -> WaitingFrame | None:
         """Keep a frame as the newest; return the one that it supersedes.

@@ -13,7 +13,8 @@ from filter_service.camera import Camera, SidePx, Tangents
 from filter_service.checked import Record
 from filter_service.errors import BadMessage
 from filter_service.rgbd_view import ColorImage, RgbdView
-from filter_service.settings import DepthKind, Output
+from filter_service.settings import DepthKind, GazeDeg, Output, PupilMm, VergenceDpt
+from filter_service.view_state import EyeName, Pose, ViewState
 from filter_service.wire.compression import (
     Compression,
     block_from_part,
@@ -22,6 +23,8 @@ from filter_service.wire.compression import (
 )
 from filter_service.wire.depths import WIRE_DTYPES, DepthEncoding, decoded_depth
 from filter_service.wire.message import Limits, Part, expect_parts
+
+USUAL_STATE = ViewState()
 
 DType = Literal["uint8", "float32", "float16"]
 Space = Literal["srgb", "linear"]
@@ -92,6 +95,11 @@ class ViewHeader(Record):
     color: ImageFormat
     depth: DepthFormat = DepthFormat()
     has_hidden: bool = False
+    eye: EyeName = "both"
+    pupil_diameter_mm: PupilMm | None = None
+    focus_dpt: VergenceDpt | None = None
+    gaze_deg: tuple[GazeDeg, GazeDeg] | None = None
+    pose: Pose | None = None
 
     def __post_init__(self) -> None:
         """Refuse a camera that is none."""
@@ -106,15 +114,19 @@ class ViewHeader(Record):
         *,
         has_hidden: bool = False,
         depth_encoding: DepthEncoding = "float32",
+        state: ViewState = USUAL_STATE,
     ) -> ViewHeader:
         """Return the header of a camera's view."""
         size_px = (camera.width_px, camera.height_px)
         depth = DepthFormat(depth_kind, depth_encoding)
-        return cls(*size_px, camera.tangents, color, depth, has_hidden)
+        return cls(*size_px, camera.tangents, color, depth, has_hidden, **vars(state))
 
     @classmethod
     def describing(
-        cls, view: RgbdView, depth_encoding: DepthEncoding = "float32"
+        cls,
+        view: RgbdView,
+        depth_encoding: DepthEncoding = "float32",
+        state: ViewState = USUAL_STATE,
     ) -> ViewHeader:
         """Return what a frame's header says about a view."""
         return cls.of(
@@ -123,6 +135,7 @@ class ViewHeader(Record):
             view.depth_kind,
             has_hidden=view.surface_count > 1,
             depth_encoding=depth_encoding,
+            state=state,
         )
 
     def view(self, images: ViewImages) -> RgbdView:
@@ -136,6 +149,13 @@ class ViewHeader(Record):
             self.depth.kind,
             images.hidden_color,
             None if hidden is None else decoded_depth(hidden, encoding),
+        )
+
+    @property
+    def state(self) -> ViewState:
+        """Return through whose eye the view is seen, and in which state."""
+        return ViewState(
+            self.eye, self.pupil_diameter_mm, self.focus_dpt, self.gaze_deg, self.pose
         )
 
     @property

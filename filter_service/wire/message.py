@@ -116,6 +116,6 @@ def clip(text: str, max_bytes: int) -> str:
     return encoded[: max_bytes - 3].decode("utf-8", "ignore") + "..."
 
 
-def clip_notes(notes: Sequence[str]) -> tuple[str, ...]:
+def clip_notes(notes: Sequence[str], most: int = MAX_NOTES) -> tuple[str, ...]:
     """Return the notes that fit into a header."""
-    return tuple(clip(note, MAX_NOTE_BYTES) for note in notes[:MAX_NOTES])
+    return tuple(clip(note, MAX_NOTE_BYTES) for note in notes[:most])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from filter_service.checked import Record
 from filter_service.errors import FilterError, error_from_code
+from filter_service.view_state import EyeName, Pose
 from filter_service.wire.compression import Compression, unpacked
 from filter_service.wire.images import (
     SRGB8,
@@ -22,6 +23,7 @@ from filter_service.wire.images import (
 )
 from filter_service.wire.message import (
     MAX_NOTE_BYTES,
+    MAX_NOTES,
     Count,
     Id,
     Limits,
@@ -65,7 +67,8 @@ def _clipped(reply: Message, /, **limits: int) -> None:
 class Welcome(Message):
     """The answer to hello: who serves, what it accepts, how many frames may wait.
 
-    With ``is_resumed`` the session of the key goes on with the profile named.
+    With ``is_resumed`` the session of the key goes on with the profiles named: that of
+    the eye ``both`` alone, and those of all eyes.
     """
 
     session_id: Id
@@ -77,6 +80,7 @@ class Welcome(Message):
     session_keep_s: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
     is_resumed: bool = False
     profile_id: Id | None = None
+    profile_ids: dict[EyeName, Id] = field(default_factory=dict)
 
     type_name: ClassVar[str] = "welcome"
 
@@ -99,6 +103,7 @@ class Accepted(Message):
     generation: Id
     is_building: bool = True
     n_cameras: Annotated[int, Meta(ge=0, le=1000)] = 1
+    eye: EyeName = "both"
 
     type_name: ClassVar[str] = "accepted"
 
@@ -111,6 +116,7 @@ class Progress(Message):
     generation: Id
     stage: Word
     fraction: Annotated[float, Meta(ge=0.0, le=1.0)]
+    eye: EyeName = "both"
 
     type_name: ClassVar[str] = "progress"
 
@@ -137,6 +143,7 @@ class Ready(Message):
     ]
     notes: Notes = ()
     is_complete: bool = True
+    eye: EyeName = "both"
 
     type_name: ClassVar[str] = "ready"
 
@@ -145,28 +152,42 @@ class Ready(Message):
         object.__setattr__(self, "notes", clip_notes(self.notes))
 
 
+Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
+UsedPupil = Annotated[float, Meta(ge=0.0, le=100.0)]
+UsedFocus = Annotated[float, Meta(ge=-100.0, le=100.0)]
+
+
 @dataclass(frozen=True)
 class ResultView(Record):
-    """Size and format of one filtered view."""
+    """Size and format of one filtered view, and the eye that it was seen through."""
 
     width_px: Annotated[int, Meta(ge=1, le=2**20)]
     height_px: Annotated[int, Meta(ge=1, le=2**20)]
     color: ImageFormat = SRGB8
-
-
-Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
+    eye: EyeName = "both"
+    profile_id: Id | None = None
+    generation: Id | None = None
+    is_complete: bool | None = None
+    pupil_diameter_mm: UsedPupil | None = None
+    focus_dpt: UsedFocus | None = None
+    gaze_deg: tuple[Angle, Angle] | None = None
+    pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class Result(Message):
-    """A filtered frame, with everything that decided how it looks."""
+    """A filtered frame, with everything that decided how it looks.
+
+    What a view says of itself stands here too, of the first one; ``is_complete`` is so
+    where all are.
+    """
 
     frame_id: Id
     profile_id: Id
     generation: Id
     views: Annotated[tuple[ResultView, ...], Meta(min_length=1, max_length=16)]
-    pupil_diameter_mm: Annotated[float, Meta(ge=0.0, le=100.0)]
-    focus_dpt: Annotated[float, Meta(ge=-100.0, le=100.0)]
+    pupil_diameter_mm: UsedPupil
+    focus_dpt: UsedFocus
     missing_depth_count: Count
     clamped_depth_count: Count
     total_ms: Milliseconds
@@ -177,14 +198,16 @@ class Result(Message):
     is_complete: bool = True
     in_memory: bool = False
     compression: Compression = "none"
+    display_time_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
     colors: Pictures = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"
     payload: ClassVar[str] = "colors"
 
     def __post_init__(self) -> None:
-        """Keep the notes that fit into a header."""
-        object.__setattr__(self, "notes", clip_notes(self.notes))
+        """Keep the notes that fit into a header, of which views beyond two take."""
+        most = MAX_NOTES - max(0, len(self.views) - 2)
+        object.__setattr__(self, "notes", clip_notes(self.notes, max(1, most)))
 
     def parts(self) -> list[Any]:
         """Return the images of all views; none where they lie in shared memory."""

@@ -22,6 +22,7 @@ from filter_service.settings import (
     VergenceDpt,
 )
 from filter_service.slots import ALIGNMENT_BYTES
+from filter_service.view_state import EyeName, check_states
 from filter_service.wire.compression import Compression
 from filter_service.wire.images import (
     SRGB8,
@@ -48,6 +49,8 @@ from filter_service.wire.unpacking import unpack_profile
 
 MAX_VIEWS = 8
 
+Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+
 
 @dataclass(frozen=True)
 class Hello(Message):
@@ -61,12 +64,16 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class ProfileRequest(Message):
-    """A new eye: its body is a part of its own; ``views`` are cameras to prepare."""
+    """A new eye: its body is a part of its own; ``views`` are cameras to prepare.
+
+    ``eye`` is which one of the session's; views of a frame name theirs.
+    """
 
     profile_id: Id
     body: dict[str, Any] = field(default_factory=dict)
     settings: FilterSettings = DEFAULTS
     views: Annotated[tuple[Camera, ...], Meta(max_length=MAX_VIEWS)] = ()
+    eye: EyeName = "both"
 
     type_name: ClassVar[str] = "profile"
     payload: ClassVar[str] = "body"
@@ -120,6 +127,7 @@ class Frame(Message):
     options: FrameOptions = FrameOptions()
     memory: SharedPlaces | None = None
     compression: Compression = "none"
+    display_time_ns: Nanoseconds | None = None
     images: Images = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "frame"
@@ -163,6 +171,7 @@ class Frame(Message):
         for i, view in enumerate(self.views):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
+        check_states([view.state for view in self.views])
         if self.memory is None:
             images = images_from_parts(self.views, parts, limits, self.compression)
             return self._with_payload(images)

@@ -48,6 +48,14 @@ def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service,
     pixels = 32 * 18 * 3
     assert found["mono"] == [1, pixels, 5, 245]
     assert found["stereo"] == [235, 225]
+    pose = [0.25, 1.5, -3, 0, 0.5, 0, 0.5]
+    assert found["eyes"] == [
+        ["left", 7, 4, 0.5, [0, 0], pose],
+        ["right", 8, 5, 1, [1, -2], None],
+    ]
+    assert found["time"] == 123
+    assert found["eyesAgain"] == [7, 8]
+    assert found["twoPupils"] == ["bad_message", "views[1].pupil_diameter_mm"]
     assert found["linear"] == 0.75
     assert found["pupil"] == ["bad_message", "pupil_diameter_mm"]
     assert found["profile"] == ["profile_invalid", "kind"]

@@ -15,7 +15,7 @@ import pytest
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
 from clients.service_process import CHECKOUT, ServiceProcess
 from estimator.networks.card import INPUTS, read_card
-from filter_service import errors
+from filter_service import EyeFilter, FilterSettings, ViewState, errors
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Camera, Dropped
 
@@ -124,6 +124,42 @@ def test_one_profile_sent_twice_and_two_views_work(real_client):
         colors += reply.colors
     for color in colors[1:]:
         np.testing.assert_array_equal(color, colors[0])
+
+
+def test_two_eyes_see_what_each_sees_alone_in_this_process(real_client):
+    """An asymmetric pair through two profiles, two pupils and two gazes."""
+    left_tangents, right_tangents = (-0.5, 0.3, 0.3, -0.4), (-0.3, 0.5, 0.3, -0.4)
+    view = edge_view(120, 100)
+    left = replace(view, tangents=left_tangents)
+    right = replace(view, tangents=right_tangents, color=view.color[:, ::-1].copy())
+    settings = {
+        "pupil_range_mm": (3.0, 4.0),
+        "focus_range_dpt": (0, 0),
+        "object_range_dpt": (0, 1),
+        "gaze_range_deg": (4.0, 0.0),
+        "prepare": "ranges",
+        "tolerance": "loose",
+    }
+    states = (ViewState("left", 3.0, None, (3.0, 0.0)), ViewState("right"))
+    profiles = {"left": MYOPIA, "right": {"kind": "preset", "name": "keratoconus"}}
+    see = SEE | {"gaze_deg": (-3.0, 0.0)}
+    for state, seen in zip(states, (left, right), strict=True):
+        real_client.set_profile(
+            profiles[state.eye], eye=state.eye, settings=settings, views=[seen]
+        )
+    reply = real_client.filter([left, right], **see, states=states)
+    for state, seen, color in zip(states, (left, right), reply.colors, strict=True):
+        own = {
+            "pupil_diameter_mm": state.pupil_diameter_mm or SEE["pupil_diameter_mm"],
+            "gaze_deg": state.gaze_deg or see["gaze_deg"],
+        }
+        with EyeFilter(
+            profiles[state.eye], seen.camera, FilterSettings(**settings)
+        ) as alone:
+            alone.wait()
+            wanted = alone.filter(seen, **(see | own)).color
+        np.testing.assert_allclose(color, wanted, atol=2e-6)
+    assert edge_width_px(reply.colors[0]) != edge_width_px(reply.colors[1])
 
 
 def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):

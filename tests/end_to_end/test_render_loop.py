@@ -100,11 +100,11 @@ def resting():
 @pytest.fixture
 def door(resting):
     door = Door(resting)
-    door.tell("open", "a", 1, 1)
+    door.tell("open", "a", 1, {})
     camera = small_frame(0).views[0].camera
     body = {"kind": "double", "mark": 3}
     door.tell("profile", "a", ProfileRequest(0, body, views=(camera,)))
-    door.await_one(lambda m: m[0] == "tell" and m[2].type_name == "ready")
+    door.await_one(lambda m: m[0] == "tell" and m[3].type_name == "ready")
     yield door
     door.stop()
 
@@ -113,7 +113,7 @@ def test_what_comes_in_a_rest_does_not_overtake_what_came_before(door, resting):
     """The frame of `b` comes in the rest; `b` was opened before, in the same batch."""
     resting.in_the_middle = lambda: door.frame(2, "b")
     frame = ("frame", 1, "a", small_frame(1, images=()), PLACES, ())
-    door.tell_at_once(frame, ("open", "b", 2, 1))
+    door.tell_at_once(frame, ("open", "b", 2, {}))
     assert door.answer_to(2).code == "no_profile", "not no_session: it was open"
     assert door.answer_to(1).type_name == "result"
 

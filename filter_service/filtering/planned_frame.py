@@ -1,0 +1,109 @@
+"""A frame whose eye is prepared: what it is rendered with, and how."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.stream_eyes import RenderPlan
+from filter_service.filtering.workshop import Workshop
+from filter_service.rendering.engine import Rendered
+from filter_service.rendering.media_effects import MediaEffects, render_through_media
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import Accumulation, Output
+
+GazeDegrees = tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class PlannedFrame:
+    """Views that one eye sees, in one state of it, and what is prepared for them."""
+
+    workshop: Workshop  # a service may close the filter in the middle
+    plan: RenderPlan
+    views: tuple[RgbdView, ...]
+    pupil_diameter_mm: float
+    focus_dpt: float
+
+    def render(
+        self,
+        *,
+        gazes_deg: Sequence[GazeDegrees],
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
+        merge: bool = True,
+        render_tolerance: float = 1.0,
+        out: Sequence[NDArray[Any] | None] | None = None,
+    ) -> Filtered:
+        """Filter the frame; `EyeFilter.filter` explains the arguments.
+
+        Parameters
+        ----------
+        gazes_deg : one (h, v) for each view, or None
+        out : sequence of arrays, optional
+            Memory for the pictures, which may be used; what is returned counts.
+
+        Raises
+        ------
+        RenderError
+            The engine failed.
+        """
+        plan = self.plan
+        rooms = out or [None] * len(self.views)
+        started_s = time.monotonic()
+        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
+        rendered = [
+            render_through_media(
+                self.workshop.engine,
+                view,
+                store,
+                effects,
+                pupil_diameter_mm=self.pupil_diameter_mm,
+                focus_dpt=self.focus_dpt,
+                accumulation=accumulation,
+                merge=merge,
+                render_tolerance=render_tolerance,
+                output=output,
+                gaze_deg=gaze_deg,
+                out=room,
+            )
+            for view, store, gaze_deg, room in zip(
+                self.views, plan.stores, gazes_deg, rooms, strict=True
+            )
+        ]
+        self.workshop.frame_s = time.monotonic() - started_s
+        return _filtered(plan, rendered)
+
+
+def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:
+    first = rendered[0]
+    stages_ms: dict[str, float] = {}
+    for view in rendered:
+        for name, value_ms in view.stage_times_ms.items():
+            stages_ms[name] = stages_ms.get(name, 0.0) + float(value_ms)
+    return Filtered(
+        colors=tuple(view.color for view in rendered),
+        profile_id=plan.eye.profile_id,
+        generation=plan.eye.generation,
+        is_complete=plan.is_complete,
+        pupil_diameter_mm=float(first.pupil_diameter_mm),
+        focus_dpt=float(first.focus_dpt),
+        gazes_deg=tuple(
+            (float(h_deg), float(v_deg))
+            for h_deg, v_deg in (view.gaze_deg for view in rendered)
+        ),
+        missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
+        clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
+        overflow_count=sum(int(v.overflow_count) for v in rendered),
+        notes=tuple(
+            dict.fromkeys(
+                [*plan.notes, *(note for view in rendered for note in view.notes)]
+            )
+        ),
+        stage_times_ms=stages_ms,
+    )

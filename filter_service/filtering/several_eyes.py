@@ -1,0 +1,187 @@
+"""One frame through several eyes: each view through the eye that it names.
+
+eyes = {"left": EyeFilter("myopia", left_camera),
+"right": EyeFilter("keratoconus", right_camera)}
+states = [ViewState("left"), ViewState("right", gaze_deg=(3.0, 0.0))]
+planned = plan_views(eyes.__getitem__, [left, right], states, ...)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from numpy.typing import NDArray
+
+from filter_service.checked import checked
+from filter_service.errors import NoProfile
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import Accumulation, GazeDeg, Output
+from filter_service.view_state import EyeName, ViewState, check_states
+
+Wait = Literal["preparing", "extending"]
+
+
+@dataclass(frozen=True)
+class SeenView:
+    """One picture and the eye that it was seen through."""
+
+    color: NDArray[Any]
+    gaze_deg: tuple[float, float]
+    seen: Filtered  # with the other views of that eye
+
+
+@dataclass(frozen=True)
+class SeenViews:
+    """A frame through several eyes; `views` are in the order of the frame."""
+
+    views: tuple[SeenView, ...]
+    by_eye: Mapping[EyeName, Filtered]
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether nothing was seen through a preview."""
+        return all(seen.is_complete for seen in self.by_eye.values())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return the notes of all eyes; those of one of two say which."""
+        return tuple(
+            note if eye == "both" else f"{eye} eye: {note}"
+            for eye, seen in self.by_eye.items()
+            for note in seen.notes
+        )
+
+    @property
+    def stage_times_ms(self) -> dict[str, float]:
+        """Return the time of each stage, of all eyes together."""
+        stages_ms: dict[str, float] = {}
+        for seen in self.by_eye.values():
+            for name, value_ms in seen.stage_times_ms.items():
+                stages_ms[name] = stages_ms.get(name, 0.0) + value_ms
+        return stages_ms
+
+    def total(self, counter: str) -> int:
+        """Return the sum of a counter of `Filtered` over the eyes."""
+        return sum(int(getattr(seen, counter)) for seen in self.by_eye.values())
+
+
+@dataclass(frozen=True)
+class PlannedViews:
+    """A frame of which every eye is prepared."""
+
+    by_eye: Mapping[EyeName, PlannedFrame]
+    indices: Mapping[EyeName, tuple[int, ...]]  # of their views
+    gazes_deg: tuple[GazeDegrees, ...]
+
+    def render(
+        self,
+        *,
+        output: Output = "srgb8",
+        accumulation: Accumulation = "coverage",
+        merge: bool = True,
+        render_tolerance: float = 1.0,
+        out: Sequence[NDArray[Any] | None] | None = None,
+    ) -> SeenViews:
+        """Filter the frame, one eye after the other; see `EyeFilter.filter`."""
+        found: dict[EyeName, Filtered] = {}
+        views: dict[int, SeenView] = {}
+        for eye, planned in self.by_eye.items():
+            indices = self.indices[eye]
+            found[eye] = seen = planned.render(
+                gazes_deg=[self.gazes_deg[i] for i in indices],
+                output=output,
+                accumulation=accumulation,
+                merge=merge,
+                render_tolerance=render_tolerance,
+                out=None if out is None else [out[i] for i in indices],
+            )
+            for i, color, gaze_deg in zip(
+                indices, seen.colors, seen.gazes_deg, strict=True
+            ):
+                views[i] = SeenView(color, gaze_deg, seen)
+        return SeenViews(tuple(views[i] for i in sorted(views)), found)
+
+
+def plan_views(
+    filter_of: Callable[[EyeName], EyeFilter],
+    views: Sequence[RgbdView],
+    states: Sequence[ViewState],
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    gaze_deg: tuple[float, float] | None = None,
+    prepared_only: bool = False,
+) -> PlannedViews | Wait:
+    """Plan a frame through the eyes that its views name, or say what it waits for.
+
+    Every eye is told of the frame, so that all of them are being prepared.
+
+    Parameters
+    ----------
+    filter_of : callable
+        Gives the filter of an eye.
+    views : sequence of RgbdView
+    states : sequence of ViewState, one for each view
+        Where a value is None there, that of the frame counts.
+    pupil_diameter_mm, focus_dpt, gaze_deg, prepared_only
+        Of the frame, as of `EyeFilter.try_filter`.
+
+    Returns
+    -------
+    PlannedViews, "preparing" or "extending"
+        An eye is being prepared; or all are, only not for their state in this frame.
+
+    Raises
+    ------
+    BadMessage
+        An argument out of range, or an eye with two pupils.
+    SessionError
+        An eye has no profile (field ``views[i].eye``), or its build failed.
+    """
+    check_states(states)
+    indices: dict[EyeName, tuple[int, ...]] = {}
+    for i, state in enumerate(states):
+        indices[state.eye] = (*indices.get(state.eye, ()), i)
+    planned: dict[EyeName, PlannedFrame] = {}
+    waits: list[Wait] = []
+    for eye, own in indices.items():
+        state = states[own[0]]
+        eye_filter = filter_of(eye)
+        try:
+            frame = eye_filter.plan(
+                [views[i] for i in own],
+                pupil_diameter_mm=_first(state.pupil_diameter_mm, pupil_diameter_mm),
+                focus_dpt=_first(state.focus_dpt, focus_dpt),
+                prepared_only=prepared_only,
+            )
+        except NoProfile as error:
+            if eye == "both":
+                raise
+            raise NoProfile(
+                f"the {eye} eye has no profile",
+                field=f"views[{own[0]}].eye",
+                allowed=error.allowed,
+            ) from None
+        if frame is not None:
+            planned[eye] = frame
+        else:
+            waits.append("extending" if eye_filter.is_extending else "preparing")
+    gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
+    if waits:
+        return "preparing" if "preparing" in waits else "extending"
+    return PlannedViews(planned, indices, gazes_deg)
+
+
+def _first(own: float | None, of_frame: float) -> float:
+    return of_frame if own is None else own
+
+
+def _gaze(gaze_deg: tuple[float, float] | None) -> GazeDegrees:
+    if gaze_deg is None:
+        return None
+    return checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")

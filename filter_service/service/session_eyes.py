@@ -1,0 +1,157 @@
+"""The eyes of one session: a filter for each, made when it is first spoken of."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from estimator.profiles.parse import EyeProfile
+from filter_service.errors import FilterError, NoSession
+from filter_service.filtering.eye_filter import EyeFilter
+from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
+from filter_service.filtering.workshop import Workshop
+from filter_service.messages import (
+    Accepted,
+    ErrorReply,
+    EyeName,
+    ProfileRequest,
+    Progress,
+    Ready,
+    Reply,
+)
+
+log = logging.getLogger("ocufilter")
+
+
+@dataclass(eq=False)
+class _Eye:
+    """The filter of one eye, and the profile that it was last given."""
+
+    eye_filter: EyeFilter
+    profile_id: int | None = None
+    generation: int = 0
+
+
+class SessionEyes:
+    """The filters of one session.
+
+    Parameters
+    ----------
+    session_id : int
+    workshop : Workshop
+        Where all eyes are made.
+    tell : callable
+        ``tell(eye, reply)``: what happens to the profile of an eye.
+    max_cameras : int
+        That each eye keeps prepared.
+    generations : mapping
+        How many profiles each eye has had before.
+    """
+
+    def __init__(
+        self,
+        session_id: int,
+        workshop: Workshop,
+        tell: Callable[[EyeName, Reply], None],
+        *,
+        max_cameras: int,
+        generations: Mapping[EyeName, int],
+    ) -> None:
+        self.session_id = session_id
+        self._workshop = workshop
+        self._tell = tell
+        self._max_cameras = max_cameras
+        self._generations = generations
+        self._eyes: dict[EyeName, _Eye] = {}
+        self._is_over = False
+
+    @property
+    def profiles(self) -> dict[EyeName, tuple[int | None, int]]:
+        """Return profile_id and generation of each eye."""
+        return {
+            name: (eye.profile_id, eye.generation) for name, eye in self._eyes.items()
+        }
+
+    def close(self) -> None:
+        """Give up all eyes."""
+        self._is_over = True
+        for eye in self._eyes.values():
+            eye.eye_filter.close()
+
+    def filter_of(self, name: EyeName) -> EyeFilter:
+        """Return the filter of an eye.
+
+        Raises
+        ------
+        NoSession
+            The session has ended meanwhile.
+        """
+        return self._eye(name).eye_filter
+
+    def _eye(self, name: EyeName) -> _Eye:
+        if self._is_over:
+            raise NoSession("the session has ended")
+        if name not in self._eyes:
+            eye_filter = EyeFilter(
+                workshop=self._workshop,
+                max_cameras=self._max_cameras,
+                on_event=partial(self._tell_event, name),
+                first_generation=self._generations.get(name, 0) + 1,
+            )
+            self._eyes[name] = _Eye(eye_filter)
+        return self._eyes[name]
+
+    def take(
+        self,
+        request: ProfileRequest,
+        read_profile: Callable[[dict[str, Any]], EyeProfile],
+    ) -> Reply:
+        """Accept a profile, or say what is wrong with it."""
+        try:
+            eye = self._eye(request.eye)
+            accepted = eye.eye_filter.set_profile(
+                read_profile(request.body),
+                settings=request.settings,
+                cameras=request.views,
+                profile_id=request.profile_id,
+            )
+        except Exception as error:
+            if not isinstance(error, FilterError):
+                log.exception("a profile could not be taken in")
+                error = FilterError(f"{type(error).__name__}: {error}")
+            return ErrorReply.from_exception(error, profile_id=request.profile_id)
+        eye.profile_id, eye.generation = request.profile_id, accepted.generation
+        return Accepted(
+            request.profile_id,
+            accepted.generation,
+            is_building=bool(accepted.wanted),
+            n_cameras=len(accepted.wanted),
+            eye=request.eye,
+        )
+
+    def _tell_event(self, name: EyeName, event: EyeEvent) -> None:
+        """Tell what happens to a profile."""
+        profile_id, generation = event.eye.profile_id, event.eye.generation
+        reply: Reply
+        if isinstance(event, BuildingEye):
+            reply = Progress(
+                profile_id, generation, event.stage, event.fraction, eye=name
+            )
+        elif isinstance(event, EyeReady):
+            reply = Ready(
+                profile_id,
+                generation,
+                build_ms=event.build_ms,
+                psf_count=event.psf_count,
+                memory_mb=event.memory_mb,
+                pixel_pitch_mrad=event.camera.pixel_pitch_mrad,
+                notes=event.notes,
+                is_complete=event.is_complete,
+                eye=name,
+            )
+        else:
+            reply = ErrorReply.from_exception(event.error, profile_id=profile_id)
+        self._tell(name, reply)

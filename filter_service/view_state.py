@@ -1,0 +1,73 @@
+"""Through whose eye a view is seen, and in which state that eye is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
+
+from msgspec import Meta
+
+from filter_service.checked import Record
+from filter_service.errors import BadMessage
+from filter_service.settings import GazeDeg, PupilMm, VergenceDpt
+
+EyeName = Literal["both", "left", "right"]
+EYE_NAMES: tuple[EyeName, ...] = get_args(EyeName)
+"""`both` is one eye for all views; `left` and `right` have profiles of their own."""
+
+PoseNumber = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Pose = tuple[
+    PoseNumber,
+    PoseNumber,
+    PoseNumber,
+    PoseNumber,
+    PoseNumber,
+    PoseNumber,
+    PoseNumber,
+]
+"""Position x, y, z in metres and orientation x, y, z, w, as OpenXR has them."""
+
+
+@dataclass(frozen=True)
+class ViewState(Record):
+    """How one view of a frame differs from the others.
+
+    Attributes
+    ----------
+    eye : "both", "left" or "right"
+        Whose profile it is seen through.
+    pupil_diameter_mm, focus_dpt : float, optional
+        Of that eye: the same for all its views; as the frame's where it is None.
+    gaze_deg : (h, v), optional
+        Where the eye looks in this view; as the frame's where it is None.
+    pose : seven floats, optional
+        Of the camera: it comes back with the picture.
+    """
+
+    eye: EyeName = "both"
+    pupil_diameter_mm: PupilMm | None = None
+    focus_dpt: VergenceDpt | None = None
+    gaze_deg: tuple[GazeDeg, GazeDeg] | None = None
+    pose: Pose | None = None
+
+
+def check_states(states: Sequence[ViewState]) -> None:
+    """Refuse two pupils, or two focuses, for one eye.
+
+    Raises
+    ------
+    BadMessage
+        Names the view.
+    """
+    first_of: dict[EyeName, ViewState] = {}
+    for i, state in enumerate(states):
+        first = first_of.setdefault(state.eye, state)
+        for name in ("pupil_diameter_mm", "focus_dpt"):
+            wanted, found = getattr(first, name), getattr(state, name)
+            if found != wanted:
+                raise BadMessage(
+                    f"it is {found}",
+                    field=f"views[{i}].{name}",
+                    allowed=f"{wanted}, as in the first view of the eye {state.eye}",
+                )
