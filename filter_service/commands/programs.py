@@ -102,6 +102,22 @@ def demo(
     _run_program("clients.demo", arguments, json_output=json_output)
 
 
+def headset(context: typer.Context) -> None:
+    """Show a scene in an OpenXR headset, each eye through its own profile.
+
+    Its options: `ocufilter headset --help`.
+
+    ocufilter headset --left myopia --right keratoconus
+    """
+    program = "clients.headset.program"
+    if {"-h", "--help"} & set(context.args):
+        command = [sys.executable, "-m", program, "--help"]
+        folder = _folder_to_start_in(program)
+        say(subprocess.check_output(command, cwd=folder, text=True).rstrip())
+    else:
+        _run_program(program, context.args, json_output=False)
+
+
 def bench(
     context: typer.Context,
     name: Annotated[Bench, typer.Argument(help="What to time.")],

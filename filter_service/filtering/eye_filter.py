@@ -205,6 +205,11 @@ class EyeFilter:
         )
         return self._newest
 
+    def keep_going(self) -> None:
+        """Let builds go on where the workshop has no owner who does that."""
+        if self._shared is not None:
+            self.workshop.advance()
+
     def advance(self) -> None:
         """Let builds go on where no frames come, or where the workshop is another's."""
         self.workshop.advance()
@@ -367,6 +372,7 @@ class EyeFilter:
         RenderError
             The engine failed.
         """
+        self.keep_going()
         planned = self.plan(
             views,
             pupil_diameter_mm=pupil_diameter_mm,
@@ -394,10 +400,11 @@ class EyeFilter:
         focus_dpt: float,
         prepared_only: bool = False,
     ) -> PlannedFrame | None:
-        """Return a frame ready to be rendered, before this filter is asked again.
+        """Return a frame ready to be rendered, before anything else is asked for.
 
         None, and what it raises: as of `try_filter`.  The frames of a person's two eyes
-        are both planned before one is rendered, so that both are being prepared.
+        are both planned before one is rendered, so that both are being prepared; what
+        `keep_going` puts in place may free what was planned with.
         """
         pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
         focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
@@ -405,8 +412,6 @@ class EyeFilter:
         self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
         workshop = self.workshop
         plan = self._eyes.plan([view.camera for view in views], look_at)
-        if self._shared is not None:  # else its owner advances it
-            workshop.advance()
         workshop.free_retired(self._eyes)
         self.is_extending = plan is not None and prepared_only and not plan.is_prepared
         if plan is None or self.is_extending:

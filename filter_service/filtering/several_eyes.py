@@ -147,6 +147,8 @@ def plan_views(
     indices: dict[EyeName, tuple[int, ...]] = {}
     for i, state in enumerate(states):
         indices[state.eye] = (*indices.get(state.eye, ()), i)
+    for eye in indices:
+        filter_of(eye).keep_going()
     planned: dict[EyeName, PlannedFrame] = {}
     waits: list[Wait] = []
     for eye, own in indices.items():

@@ -17,11 +17,12 @@ def test_the_examples_run_and_print_what_they_say(tmp_path):
     assert lines[0].startswith("(90, 160, 3) 1 ")
     assert lines[1] in ("1", "2")
     assert lines[3] in GUIDE, "the error that the page shows is another"
-    assert lines[4].startswith("(90, 160, 3) ")
-    eye_length_mm, error_um = map(float, lines[5].split())
+    assert lines[4] == "[(90, 160, 3), (90, 160, 3)]"
+    assert lines[5].startswith("(90, 160, 3) ")
+    eye_length_mm, error_um = map(float, lines[6].split())
     assert 20.0 < eye_length_mm < 30.0
     assert error_um < 1e-3
-    assert len(eval(lines[6])) == 2
+    assert len(eval(lines[7])) == 2
 
 
 def test_the_page_names_every_call_and_answer():
