@@ -37,10 +37,11 @@ from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
 
 try:
+    from clients.frame_log import FrameLog
     from clients.pyrender_stream import parse_size, path_settings
     from clients.scene_renderer import SceneFrame, scene_frames
     from clients.scenes.catalogue import build_scene
-    from clients.streaming import FrameLog, change_eye, filter_in_order
+    from clients.streaming import change_eye, filter_in_order
     from clients.video import write_video
 except ModuleNotFoundError as error:
     if __name__ != "__main__":

@@ -33,6 +33,7 @@ from clients.latency_report import (
     save_plot,
     summary,
 )
+from clients.profile_arguments import read_object, read_profile
 from clients.service_process import ServiceProcess
 from clients.socket_floor import socket_floor_ms
 from filter_service import tangents_from_fov
@@ -285,27 +286,6 @@ def connect(endpoint: str | None, settings: Settings) -> Iterator[tuple]:
             yield client, lambda: service.memory_mb
         else:
             yield client, lambda: client.ping(timeout_s=30)[1].memory_mb
-
-
-def read_profile(text: str) -> dict[str, Any]:
-    """Return a profile from JSON text, a JSON file, or the name of a preset."""
-    if not text.lstrip().startswith("{"):
-        path = Path(text)
-        if path.suffix != ".json":
-            return {"kind": "preset", "name": text}
-        text = path.read_text(encoding="utf-8")
-    return read_object("--profile", text)
-
-
-def read_object(option: str, text: str) -> dict[str, Any]:
-    """Return a JSON object from the command line."""
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{option} is no JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"{option} is {value!r}; allowed: a JSON object")
-    return value
 
 
 def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:

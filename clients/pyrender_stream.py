@@ -27,6 +27,7 @@ from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import DEFAULT_ENDPOINT, Dropped, ErrorReply
 
 try:
+    from clients.frame_log import FrameLog
     from clients.scene_renderer import (
         SceneFrame,
         SceneRenderer,
@@ -36,7 +37,7 @@ try:
     from clients.scenes.catalogue import SCENE_BUILDERS, build_scene
     from clients.scenes.paths import PATHS, path_moments
     from clients.scenes.scene import Scene
-    from clients.streaming import FrameLog, view_of
+    from clients.streaming import view_of
     from clients.window import LiveWindow, NoDisplay
 except ModuleNotFoundError as error:
     if __name__ != "__main__":

@@ -5,15 +5,13 @@ Between the scenes' frames and the client library; `pyrender_stream` and `demo` 
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.frame_log import FrameLog
 from clients.scene_renderer import SceneFrame
 from filter_service.errors import ConnectionLost, ServiceTimeout
 from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Ready
@@ -23,61 +21,6 @@ from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Rea
 _PREVIEW_HZ = 4.0
 _BUILD_LIMIT_S = 180.0
 _LOST = "the connection to the service broke off"
-_NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
-
-
-@dataclass
-class FrameLog:
-    """What became of the frames sent through one eye."""
-
-    ages_ms: list[float] = field(default_factory=list)
-    round_trips_ms: list[float] = field(default_factory=list)
-    stages_ms: dict[str, list[float]] = field(default_factory=dict)
-    drops: dict[str, int] = field(default_factory=dict)
-    notes: dict[str, tuple[int, str]] = field(default_factory=dict)
-
-    def add(self, answer: FilteredFrame) -> None:
-        """Note a frame that came back filtered."""
-        self.ages_ms.append(answer.age_ms)
-        self.round_trips_ms.append(answer.round_trip_ms)
-        for stage, time_ms in answer.header.stage_times_ms.items():
-            self.stages_ms.setdefault(stage, []).append(time_ms)
-        for note in answer.header.notes:
-            # A note's numbers change with every frame; its kind is worth counting.
-            kind = _NUMBER.sub("#", note)
-            count, example = self.notes.get(kind, (0, note))
-            self.notes[kind] = (count + 1, example)
-
-    def add_drop(self, reason: str) -> None:
-        """Note a frame that was dropped."""
-        self.drops[reason] = self.drops.get(reason, 0) + 1
-
-    def summary(self) -> dict[str, Any]:
-        """Return counts and p50, p95, p99 of every stage, age and round trip."""
-        return {
-            "frames": len(self.ages_ms),
-            "drops": dict(self.drops),
-            "frame_age_ms": percentiles(self.ages_ms),
-            "round_trip_ms": percentiles(self.round_trips_ms),
-            "stages_ms": {
-                stage: percentiles(times) for stage, times in self.stages_ms.items()
-            },
-            "notes": [
-                {"frames": count, "example": example}
-                for count, example in self.notes.values()
-            ],
-        }
-
-
-def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p95 and p99, rounded to a microsecond; None without values."""
-    names = {"p50": 50, "p95": 95, "p99": 99}
-    if not values_ms:
-        return dict.fromkeys(names)
-    return {
-        name: round(float(np.percentile(values_ms, percent)), 3)
-        for name, percent in names.items()
-    }
 
 
 def view_of(frame: SceneFrame) -> RgbdView:

@@ -14,10 +14,10 @@ from PIL import Image
 
 from clients import demo, pyrender_stream, sheet, video
 from clients.demo_eyes import EYES
+from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import parse_size, path_settings, profile_body
 from clients.scenes.catalogue import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
-from clients.streaming import FrameLog, percentiles
 from filter_service.progress import INTERVAL_S
 
 pytestmark = pytest.mark.clock
