@@ -12,7 +12,7 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity displays networks plan psf build layers render live follow field occlusion sequence cost peers switch abuse overload restart roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training validate witness check clean help setup setup-test setup-training setup-witness
+.PHONY: demo test test-training test-headset validate witness check clean help setup setup-test setup-training setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -24,6 +24,10 @@ test: setup-test  ## all tests but the slow ones and those for a hardware GPU
 
 test-training: setup-training  ## the tests of the training, with torch, and a short run
 	$(PYTHON) -m pytest tests/training $(ARGS)
+
+test-headset:  ## `ocufilter headset` against a real OpenXR runtime, in a root of its own
+	@sh tests/headset/setup_root.sh
+	sh tests/headset/run_in_root.sh python -m pytest tests/headset $(ARGS)
 
 validate: setup-test  ## the slow tests, and every benchmark table as JSON
 	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)
@@ -50,7 +54,7 @@ check: setup  ## lint, formatting and types
 	$(PYTHON) -m mypy
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv .witness out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list

@@ -9,6 +9,10 @@ Importing this loads nothing but names.
     shared_memory    memory that it shares with a service on the same machine
     service_process  a service of one's own
     hello            the smallest client
+    headset/         a scene in an OpenXR headset, each eye with its own profile
+    natural          an eye that follows light and distance
+    frame_log        what became of a stream's frames
+    profile_arguments  profiles on a command line
     pyrender_stream  a scene through a running service
     demo             two scenes through six eyes
     latency          how long a frame takes

@@ -7,3 +7,6 @@ INSTALL = "pip install 'ocufilter[clients]' && pip install --no-deps pyrender==0
 def what_to_install(error: ModuleNotFoundError) -> str:
     """Say in one line which package is missing and how to get all of them."""
     return f"the package {error.name} is not installed; to render scenes: {INSTALL}"
+
+
+HEADSET_INSTALL = "pip install 'ocufilter[headset]'"

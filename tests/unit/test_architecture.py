@@ -32,6 +32,7 @@ MAY_IMPORT = {
         "filter_service.keys",  # a client's own
         "filter_service.slots",  # memory shared with the service
         "filter_service.settings",
+        "estimator.dynamics",  # of an eye that looks
         *FACE,
     ),
 }
@@ -88,8 +89,10 @@ HOME = {
         "filter_service/gl/gpu.py",  # one owner of the context
         "filter_service/gl/staging.py",  # names its types
         "clients/window.py",  # shows frames in a window of its own
+        "clients/headset/*",  # renders for both eyes of a headset
     ),
     "glfw": ("clients/window.py",),
+    "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
         "filter_service/service/mailbox.py",  # the server's socket and nothing else
         "filter_service/service/gate.py",  # and who may connect to it
@@ -104,6 +107,7 @@ HOME = {
         "filter_service/checked.py",  # values against annotated types
         "filter_service/settings.py",  # their limits
         "filter_service/camera.py",
+        "filter_service/view_state.py",
         "filter_service/protocol_schema.py",
         "filter_service/wire/*",
     ),

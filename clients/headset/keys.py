@@ -1,0 +1,46 @@
+"""Single keys from a terminal, without waiting for them."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+
+try:  # not on every system
+    import termios
+    import tty
+except ImportError:
+    termios = tty = None
+
+
+class TerminalKeys:
+    """What is pressed while this is open; nothing where stdin is no terminal."""
+
+    def __init__(self) -> None:
+        self._before = None
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> TerminalKeys:
+        """Take keys one by one."""
+        if termios is not None and sys.stdin is not None and sys.stdin.isatty():
+            self._descriptor = sys.stdin.fileno()
+            self._before = termios.tcgetattr(self._descriptor)
+            tty.setcbreak(self._descriptor)
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Leave the terminal as it was."""
+        if self._before is not None and termios is not None:
+            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+
+    def pressed(self) -> str:
+        """Return what was pressed since the last call."""
+        if self._descriptor is None:
+            return ""
+        keys = b""
+        while select.select([self._descriptor], [], [], 0.0)[0]:
+            got = os.read(self._descriptor, 64)
+            if not got:
+                break
+            keys += got
+        return keys.decode("utf-8", "ignore")

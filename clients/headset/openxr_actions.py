@@ -1,0 +1,127 @@
+"""What a controller's trigger and an eye tracker say, as OpenXR actions."""
+
+from __future__ import annotations
+
+import ctypes
+
+import xr
+
+from clients.headset.openxr_swapchains import pose_of
+from clients.headset.poses import angles_of, matrix_of
+from clients.headset.runtime import GazeSample
+
+EYE_GAZE = "XR_EXT_eye_gaze_interaction"
+_BUTTONS = {
+    # name: where it is on the plain controller that every runtime knows
+    "next_eye": "/user/hand/right/input/select/click",
+    "on_off": "/user/hand/left/input/select/click",
+}
+_CONTROLLER = "/interaction_profiles/khr/simple_controller"
+_TRACKER = "/interaction_profiles/ext/eye_gaze_interaction"
+_GAZE = "/user/eyes_ext/input/gaze_ext/pose"
+
+
+class Actions:
+    """The actions of one session; they are attached when it is made.
+
+    Parameters
+    ----------
+    instance, session : of OpenXR
+    with_gaze : bool
+        The system tracks eyes, and the extension is on.
+    """
+
+    def __init__(self, instance, session, *, with_gaze: bool) -> None:
+        self._session = session
+        self._set = xr.create_action_set(
+            instance, xr.ActionSetCreateInfo("viewer", "Viewer", 0)
+        )
+        self._buttons = {
+            name: self._action(name, xr.ActionType.BOOLEAN_INPUT) for name in _BUTTONS
+        }
+        bound = [(self._buttons[name], path) for name, path in _BUTTONS.items()]
+        _suggest(instance, _CONTROLLER, bound)
+        self._gaze = self._gaze_space = None
+        if with_gaze:
+            self._gaze = self._action("gaze", xr.ActionType.POSE_INPUT)
+            _suggest(instance, _TRACKER, [(self._gaze, _GAZE)])
+        xr.attach_session_action_sets(
+            session, xr.SessionActionSetsAttachInfo(action_sets=[self._set])
+        )
+        if self._gaze is not None:
+            self._gaze_space = xr.create_action_space(
+                session, xr.ActionSpaceCreateInfo(action=self._gaze)
+            )
+
+    def _action(self, name: str, kind):
+        info = xr.ActionCreateInfo(
+            action_name=name,
+            action_type=kind,
+            localized_action_name=name.replace("_", " "),
+        )
+        return xr.create_action(self._set, info)
+
+    def sync(self) -> tuple[str, ...]:
+        """Take in what has happened; return what was pressed since."""
+        active = xr.ActiveActionSet(self._set, xr.NULL_PATH)
+        try:
+            xr.sync_actions(
+                self._session, xr.ActionsSyncInfo(active_action_sets=[active])
+            )
+        except xr.SessionNotFocused:
+            return ()
+        pressed = []
+        for name, action in self._buttons.items():
+            state = xr.get_action_state_boolean(
+                self._session, xr.ActionStateGetInfo(action)
+            )
+            if state.is_active and state.changed_since_last_sync:
+                if state.current_state:
+                    pressed.append(name)
+        return tuple(pressed)
+
+    def gaze(self, head_space, time_ns: int) -> GazeSample | None:
+        """Return where the eyes look, as seen from the head; None while unknown."""
+        if self._gaze_space is None:
+            return None
+        state = xr.get_action_state_pose(
+            self._session, xr.ActionStateGetInfo(self._gaze)
+        )
+        if not state.is_active:
+            return None
+        sampled = xr.EyeGazeSampleTimeEXT()
+        chained = ctypes.cast(ctypes.pointer(sampled), ctypes.c_void_p)
+        found = xr.SpaceLocation(next=chained)
+        # pyopenxr's own call has no room for the time of the sample.
+        raise_failure(
+            xr.raw_functions.xrLocateSpace(
+                self._gaze_space, head_space, time_ns, ctypes.byref(found)
+            )
+        )
+        if not found.location_flags & xr.SpaceLocationFlags.ORIENTATION_VALID_BIT:
+            return None
+        # A gaze looks along -z of its pose.
+        h_deg, v_deg = angles_of(-matrix_of(pose_of(found.pose))[:3, 2])
+        at_ns = int(sampled.time) or time_ns
+        return GazeSample(h_deg, v_deg, 1e-9 * at_ns)
+
+
+def _suggest(instance, profile: str, bound: list) -> None:
+    bindings = [
+        xr.ActionSuggestedBinding(action, xr.string_to_path(instance, path))
+        for action, path in bound
+    ]
+    xr.suggest_interaction_profile_bindings(
+        instance,
+        xr.InteractionProfileSuggestedBinding(
+            interaction_profile=xr.string_to_path(instance, profile),
+            suggested_bindings=bindings,
+        ),
+    )
+
+
+def raise_failure(result) -> None:
+    """Raise what a raw call of OpenXR has returned, where it is a failure."""
+    found = xr.exception.check_result(xr.Result(result))
+    if found.is_exception():
+        raise found

@@ -1,0 +1,339 @@
+"""A real headset, or Monado's simulated one, through OpenXR.
+
+Import this only where nothing else needs PyOpenGL: pyopenxr makes it use GLX.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import wraps
+from typing import Any
+
+import moderngl
+import xr
+
+from clients.headset.openxr_actions import EYE_GAZE, Actions, raise_failure
+from clients.headset.openxr_gl import egl_binding
+from clients.headset.openxr_swapchains import StereoImages, pose_of, tangents_of
+from clients.headset.runtime import (
+    EYES,
+    DueFrame,
+    EyeView,
+    NoRuntime,
+    SessionLost,
+    ShownView,
+)
+
+_OPENGL, _EGL, _HEADLESS = (
+    "XR_KHR_opengl_enable",
+    "XR_MNDX_egl_enable",
+    "XR_MND_headless",
+)
+_DEPTH = "XR_KHR_composition_layer_depth"
+_STEREO = xr.ViewConfigurationType.PRIMARY_STEREO
+_BLEND = xr.EnvironmentBlendMode.OPAQUE
+_IDLE_S = 0.02
+_END_S = 3.0
+_TRACKED = (
+    xr.ViewStateFlags.POSITION_VALID_BIT | xr.ViewStateFlags.ORIENTATION_VALID_BIT
+)
+_WORDS = {
+    xr.SessionState.FOCUSED: "the headset shows this program",
+    xr.SessionState.VISIBLE: "the headset shows this program, another has the input",
+    xr.SessionState.SYNCHRONIZED: "nobody looks: the headset is taken off or covered",
+    xr.SessionState.STOPPING: "the headset's session stops",
+}
+
+log = logging.getLogger("ocufilter.headset")
+
+
+def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Say `SessionLost` where OpenXR says that the runtime is gone."""
+
+    @wraps(method)
+    def wrapped(self, *arguments):
+        try:
+            return method(self, *arguments)
+        except (xr.InstanceLostError, xr.SessionLostError, xr.SessionLossPending):
+            raise SessionLost("the OpenXR runtime is gone") from None
+        except xr.RuntimeFailureError as error:
+            raise SessionLost(f"the OpenXR runtime failed: {error}") from None
+
+    return wrapped
+
+
+class OpenXrRuntime:
+    """One session with the runtime that the system's OpenXR loader finds.
+
+    Parameters
+    ----------
+    context : moderngl.Context, optional
+        An EGL context of its own, which what is shown is drawn in.  Without one the
+        session is headless: poses, and no pictures.
+    layers : sequence of str
+        OpenXR API layers to load, as ``XR_APILAYER_LUNARG_core_validation``.
+    scale : float
+        Of the picture size that the runtime recommends.
+
+    Raises
+    ------
+    NoRuntime
+        None is installed, it does not run, or it lacks what is needed.
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context | None,
+        *,
+        layers: Sequence[str] = (),
+        scale: float = 1.0,
+    ) -> None:
+        self._context = context
+        self._scale = scale
+        self._is_running = False
+        self._is_over = False
+        self._closing = ExitStack()
+        try:
+            self._open(layers)
+        except xr.XrException as error:
+            self.close()
+            raise NoRuntime(_explained(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    # Opening
+
+    def _open(self, layers: Sequence[str]) -> None:
+        offered = {
+            properties.extension_name.decode()
+            for properties in xr.enumerate_instance_extension_properties()
+        }
+        needed = [_HEADLESS] if self._context is None else [_OPENGL, _EGL]
+        missing = [name for name in needed if name not in offered]
+        if missing:
+            raise NoRuntime(f"the OpenXR runtime does not offer {', '.join(missing)}")
+        optional = [name for name in (_DEPTH, EYE_GAZE) if name in offered]
+        self._instance = xr.create_instance(
+            xr.InstanceCreateInfo(
+                application_info=xr.ApplicationInfo(
+                    application_name="ocufilter", api_version=xr.Version(1, 0, 34)
+                ),
+                enabled_extension_names=[*needed, *optional],
+                enabled_api_layer_names=list(layers),
+            )
+        )
+        self._closing.callback(_quietly, xr.destroy_instance, self._instance)
+        properties = xr.get_instance_properties(self._instance)
+        self.name = properties.runtime_name.decode()
+        self._system = xr.get_system(
+            self._instance, xr.SystemGetInfo(xr.FormFactor.HEAD_MOUNTED_DISPLAY)
+        )
+        view = xr.enumerate_view_configuration_views(
+            self._instance, self._system, _STEREO
+        )[0]
+        self.size_px = (
+            round(self._scale * view.recommended_image_rect_width),
+            round(self._scale * view.recommended_image_rect_height),
+        )
+        self._session = self._new_session()
+        self._closing.callback(_quietly, xr.destroy_session, self._session)
+        self._room = self._space(xr.ReferenceSpaceType.LOCAL)
+        self._head = self._space(xr.ReferenceSpaceType.VIEW)
+        has_gaze = EYE_GAZE in optional and self._tracks_eyes()
+        self._actions = Actions(self._instance, self._session, with_gaze=has_gaze)
+        self.notes = [] if has_gaze else ["no eye tracker: gaze is straight ahead"]
+        self._images = None
+        if self._context is not None:
+            with self._context:
+                self._images = StereoImages(
+                    self._session,
+                    self._context,
+                    self.size_px,
+                    with_depth=_DEPTH in optional,
+                )
+            self._closing.callback(self._release_images)
+
+    def _new_session(self):
+        info = xr.SessionCreateInfo(system_id=self._system)
+        if self._context is None:
+            return xr.create_session(self._instance, info)
+        # The standard asks for this call, whatever its answer.
+        ask = ctypes.cast(
+            xr.get_instance_proc_addr(
+                self._instance, "xrGetOpenGLGraphicsRequirementsKHR"
+            ),
+            xr.PFN_xrGetOpenGLGraphicsRequirementsKHR,
+        )
+        wanted = xr.GraphicsRequirementsOpenGLKHR()
+        ask(self._instance, self._system, ctypes.byref(wanted))
+        with self._context:
+            binding = egl_binding()
+            info = xr.SessionCreateInfo(
+                system_id=self._system,
+                next=ctypes.cast(ctypes.pointer(binding), ctypes.c_void_p),
+            )
+            return xr.create_session(self._instance, info)
+
+    def _space(self, kind):
+        space = xr.create_reference_space(
+            self._session, xr.ReferenceSpaceCreateInfo(reference_space_type=kind)
+        )
+        self._closing.callback(_quietly, xr.destroy_space, space)
+        return space
+
+    def _tracks_eyes(self) -> bool:
+        eyes = xr.SystemEyeGazeInteractionPropertiesEXT()
+        chained = ctypes.cast(ctypes.pointer(eyes), ctypes.c_void_p)
+        properties = xr.SystemProperties(next=chained)
+        raise_failure(
+            xr.raw_functions.xrGetSystemProperties(
+                self._instance, self._system, ctypes.byref(properties)
+            )
+        )
+        return bool(eyes.supports_eye_gaze_interaction)
+
+    @property
+    def has_depth(self) -> bool:
+        """Return whether depth is handed to the compositor."""
+        return self._images is not None and self._images.has_depth
+
+    # Frames
+
+    @_or_lost
+    def begin_frame(self) -> DueFrame | None:
+        """Wait for the next frame; None where there is none for the moment."""
+        with self._current():
+            self._take_events()
+            if self._is_over:
+                raise SessionLost("the headset's session has ended")
+            if not self._is_running:
+                time.sleep(_IDLE_S)
+                return None
+            state = xr.wait_frame(self._session, xr.FrameWaitInfo())
+            xr.begin_frame(self._session, xr.FrameBeginInfo())
+            self._time_ns = time_ns = int(state.predicted_display_time)
+            pressed = self._actions.sync()
+            views = self._views(time_ns)
+            return DueFrame(
+                time_ns,
+                bool(state.should_render) and bool(views),
+                views,
+                self._head_pose(time_ns),
+                self._actions.gaze(self._head, time_ns),
+                pressed,
+            )
+
+    @_or_lost
+    def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
+        """Show a frame; nothing where ``shown`` is empty."""
+        with self._current():
+            layers, kept = [], []
+            if shown and self._images is not None:
+                layer, kept = self._images.layer(self._room, shown)
+                layers = [ctypes.byref(layer)]
+            info = xr.FrameEndInfo(due.display_time_ns, _BLEND, layers=layers)
+            xr.end_frame(self._session, info)
+            del kept  # until here the layer pointed to it
+
+    def _current(self):
+        return ExitStack() if self._context is None else self._context
+
+    def _views(self, time_ns: int) -> tuple[EyeView, ...]:
+        state, views = xr.locate_views(
+            self._session, xr.ViewLocateInfo(_STEREO, time_ns, self._room)
+        )
+        if int(state.view_state_flags) & int(_TRACKED) != int(_TRACKED):
+            return ()
+        return tuple(
+            EyeView(eye, pose_of(view.pose), tangents_of(view.fov))
+            for eye, view in zip(EYES, views, strict=True)
+        )
+
+    def _head_pose(self, time_ns: int):
+        location = xr.locate_space(self._head, self._room, time_ns)
+        flags = xr.SpaceLocationFlags
+        wanted = int(flags.POSITION_VALID_BIT | flags.ORIENTATION_VALID_BIT)
+        if int(location.location_flags) & wanted != wanted:
+            return None
+        return pose_of(location.pose)
+
+    # Events
+
+    def _take_events(self) -> None:
+        while True:
+            try:
+                event = xr.poll_event(self._instance)
+            except xr.EventUnavailable:
+                return
+            kind = xr.StructureType(event.type)
+            if kind == xr.StructureType.EVENT_DATA_INSTANCE_LOSS_PENDING:
+                raise SessionLost("the OpenXR runtime is about to end")
+            if kind == xr.StructureType.EVENT_DATA_SESSION_STATE_CHANGED:
+                changed = ctypes.cast(
+                    ctypes.byref(event), ctypes.POINTER(xr.EventDataSessionStateChanged)
+                )
+                self._enter(xr.SessionState(changed.contents.state))
+
+    def _enter(self, state) -> None:
+        self.state = state.name
+        if state in _WORDS:
+            log.info("%s (%s)", _WORDS[state], state.name)
+        if state == xr.SessionState.READY:
+            xr.begin_session(self._session, xr.SessionBeginInfo(_STEREO))
+            self._is_running = True
+        elif state == xr.SessionState.STOPPING:
+            xr.end_session(self._session)
+            self._is_running = False
+        elif state in (xr.SessionState.EXITING, xr.SessionState.LOSS_PENDING):
+            self._is_over, self._is_running = True, False
+
+    # Closing
+
+    def close(self) -> None:
+        """End the session as the runtime wants it ended, if it is still there."""
+        if self._is_running and not self._is_over:
+            try:
+                self._leave()
+            except (xr.XrException, SessionLost):
+                pass  # gone is gone
+        self._is_running = False
+        self._closing.close()
+
+    def _leave(self) -> None:
+        xr.request_exit_session(self._session)
+        end_s = time.monotonic() + _END_S
+        while not self._is_over and time.monotonic() < end_s:
+            due = self.begin_frame()
+            if due is not None:
+                self.end_frame(due, ())
+
+    def _release_images(self) -> None:
+        if self._images is not None and self._context is not None:
+            with self._context:
+                _quietly(self._images.release)
+
+
+def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
+    """Give something up that may be gone already."""
+    try:
+        release(*arguments)
+    except xr.XrException as error:
+        log.debug("%s: %s", getattr(release, "__name__", release), error)
+
+
+def _explained(error: Exception) -> str:
+    if isinstance(error, xr.RuntimeUnavailableError):
+        return (
+            "no OpenXR runtime is set up here: install one (Monado, SteamVR), or name "
+            "its file in XR_RUNTIME_JSON"
+        )
+    if isinstance(error, xr.RuntimeFailureError):
+        return "the OpenXR runtime does not answer: is its service running?"
+    if isinstance(error, xr.FormFactorUnavailableError):
+        return "the OpenXR runtime has no headset: is it plugged in and on?"
+    return f"{type(error).__name__}: {error}"

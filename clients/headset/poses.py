@@ -1,0 +1,74 @@
+"""Poses as OpenXR has them: x, y, z in metres, then the quaternion x, y, z, w."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.messages import Pose
+
+Array = NDArray[np.float64]
+
+
+def matrix_of(pose: Pose) -> Array:
+    """Return the matrix (4, 4) from the pose's frame to the one that it is given in.
+
+    Raises
+    ------
+    ValueError
+        A quaternion of no length.
+    """
+    x, y, z, w = _unit(pose[3:])
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = pose[:3]
+    return matrix
+
+
+def _unit(quaternion) -> Array:
+    values = np.asarray(quaternion, float)
+    length = float(np.linalg.norm(values))
+    if not 0.5 < length < 2.0:
+        raise ValueError(f"the orientation {tuple(values)} is no unit quaternion")
+    return values / length
+
+
+def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, ...]:
+    """Return the quaternion of a head that turns left by yaw, then up by pitch."""
+    yaw, pitch = np.radians(yaw_deg) / 2, np.radians(pitch_deg) / 2
+    # q = q_yaw q_pitch
+    return (
+        float(np.cos(yaw) * np.sin(pitch)),
+        float(np.sin(yaw) * np.cos(pitch)),
+        float(-np.sin(yaw) * np.sin(pitch)),
+        float(np.cos(yaw) * np.cos(pitch)),
+    )
+
+
+def direction_of(h_deg: float, v_deg: float) -> Array:
+    """Return the unit vector of a direction to the right and up, (3,)."""
+    h, v = np.radians(h_deg), np.radians(v_deg)
+    return np.array([np.sin(h) * np.cos(v), np.sin(v), -np.cos(h) * np.cos(v)])
+
+
+def angles_of(direction: Array) -> tuple[float, float]:
+    """Return (h, v) in degrees of a vector in front of the viewer."""
+    x, y, z = direction
+    h = np.degrees(np.arctan2(x, -z))
+    return float(h), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
+
+
+def upright(pose: Array) -> Array:
+    """Return a pose (4, 4) at the same place that looks the same way, on the level."""
+    ahead = -pose[:3, 2]
+    h = np.arctan2(ahead[0], -ahead[2])
+    level = np.eye(4)
+    level[:3, :3] = [
+        [np.cos(h), 0.0, -np.sin(h)],
+        [0.0, 1.0, 0.0],
+        [np.sin(h), 0.0, np.cos(h)],
+    ]
+    level[:3, 3] = pose[:3, 3]
+    return level

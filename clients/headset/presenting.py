@@ -1,0 +1,64 @@
+"""Pictures from memory into a headset's images, with OpenGL."""
+
+from pathlib import Path
+
+import moderngl
+import numpy as np
+
+from clients.headset.runtime import ShownView
+
+NEAR_M = 0.05
+"""What is nearer counts as being there."""
+
+_ASSETS = Path(__file__).resolve().parents[1] / "assets"
+
+
+class Presenter:
+    """Draws pictures of one size into framebuffers of the caller's.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+        It must be current for everything here.
+    size_px : (width, height)
+    """
+
+    def __init__(self, context: moderngl.Context, size_px: tuple[int, int]) -> None:
+        self._context = context
+        self._size_px = size_px
+        names = ("resolve.vert", "present.frag")
+        vertex, fragment = ((_ASSETS / name).read_text("utf-8") for name in names)
+        self._program = context.program(vertex_shader=vertex, fragment_shader=fragment)
+        self._triangle = context.vertex_array(self._program, [])
+        self._seen = context.texture(size_px, 3, alignment=1)
+        self._plain = context.texture(size_px, 3, alignment=1)
+        self._depth_m = context.texture(size_px, 1, dtype="f4")
+        for unit, name in enumerate(("seen", "plain", "depth_m")):
+            self._program[name].value = unit
+        self._program["near_m"].value = NEAR_M
+        self._program["size_px"].value = size_px
+
+    def release(self) -> None:
+        """Free everything."""
+        for made in (
+            *(self._triangle, self._program),
+            *(self._seen, self._plain, self._depth_m),
+        ):
+            made.release()
+
+    def draw(self, shown: ShownView, target: moderngl.Framebuffer) -> None:
+        """Fill colour and depth of a framebuffer."""
+        self._seen.write(np.ascontiguousarray(shown.color), alignment=1)
+        self._depth_m.write(np.ascontiguousarray(shown.depth_m))
+        ratio = 0.0 if shown.plain is None else shown.plain_ratio
+        if shown.plain is not None and ratio > 0.0:
+            self._plain.write(np.ascontiguousarray(shown.plain), alignment=1)
+        self._program["plain_ratio"].value = ratio
+        context = self._context
+        with context.scope(target, moderngl.DEPTH_TEST):
+            context.depth_func = "1"  # always: depth is written only where it is tested
+            for unit, texture in enumerate((self._seen, self._plain, self._depth_m)):
+                texture.use(unit)
+            target.viewport = (0, 0, *self._size_px)
+            self._triangle.render(moderngl.TRIANGLES, vertices=3)
+            context.depth_func = "<"

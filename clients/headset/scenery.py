@@ -1,0 +1,70 @@
+"""A scene around a headset: both eyes' pictures, in one OpenGL context."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import moderngl
+import numpy as np
+
+from clients.headset.look import RgbdPicture
+from clients.headset.poses import matrix_of
+from clients.headset.runtime import EyeView
+from clients.headset.scene_view import SceneView
+from clients.scenes.geometry import Array
+from clients.scenes.scene import Scene
+
+
+class SceneScenery:
+    """Renders a scene for both eyes.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+    scene : Scene
+    stand : (4, 4)
+        Where the room's origin, at the height of the eyes, is in the scene.
+    supersampling : int
+        Samples per pixel and axis.
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        scene: Scene,
+        stand: Array,
+        *,
+        supersampling: int = 2,
+    ) -> None:
+        self._context, self._scene = context, scene
+        self._stand = np.asarray(stand, float)
+        self._supersampling = supersampling
+        self._view: SceneView | None = None
+
+    def pictures(
+        self, views: Sequence[EyeView], size_px: tuple[int, int]
+    ) -> tuple[RgbdPicture, ...]:
+        """Return what each eye is shown."""
+        found = []
+        for view in views:
+            pose = self._stand @ matrix_of(view.pose)
+            color, depth_m = self._view_of(size_px).render(pose, view.tangents)
+            found.append(RgbdPicture(view, color, depth_m))
+        return tuple(found)
+
+    def _view_of(self, size_px: tuple[int, int]) -> SceneView:
+        if self._view is None or self._view.size_px != size_px:
+            self.close()
+            self._view = SceneView(
+                self._context,
+                self._scene,
+                size_px,
+                supersampling=self._supersampling,
+            )
+        return self._view
+
+    def close(self) -> None:
+        """Free what lies in the context."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None

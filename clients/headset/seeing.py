@@ -1,0 +1,286 @@
+"""From what a headset shows to what this person sees of it: here, or by a service."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.filter_client import FilterClient, FilteredFrame
+from clients.headset.look import LookingEye, RgbdPicture
+from clients.headset.runtime import EYES, DueFrame, Eye, EyeView
+from filter_service import EyeFilter, FilterSettings, RgbdView, plan_views
+from filter_service.errors import FilterError
+from filter_service.messages import Dropped, ErrorReply, Ready, ViewState
+
+PROFILE_WAIT_S = 2.0
+MS_PER_S = 1e3
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """One frame on its way to a person's eyes."""
+
+    due: DueFrame
+    pictures: tuple[RgbdPicture, ...]
+    eyes: tuple[LookingEye, ...]
+    begun_s: float
+
+    @property
+    def views(self) -> list[RgbdView]:
+        """Return what is filtered."""
+        return [RgbdView(p.color, p.depth_m, p.view.tangents) for p in self.pictures]
+
+    @property
+    def states(self) -> tuple[ViewState, ...]:
+        """Return through whose eyes, in which state, from where."""
+        return tuple(
+            ViewState(
+                picture.view.eye,
+                eye.state.pupil_diameter_mm,
+                eye.state.focus_dpt,
+                eye.gaze_deg,
+                picture.view.pose,
+            )
+            for picture, eye in zip(self.pictures, self.eyes, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame as it is seen, with the views that it was rendered for.
+
+    Attributes
+    ----------
+    frame : LookedAt
+        What went in.
+    views : EyeView of each picture, with the pose that came back with it
+    colors : (h, w, 3) uint8 of each eye
+    used_focus_dpt : of each eye
+    stages_ms : times of the filter, and of the way to it and back
+    """
+
+    frame: LookedAt
+    views: tuple[EyeView, ...]
+    colors: tuple[NDArray[np.uint8], ...]
+    used_focus_dpt: tuple[float, ...]
+    is_complete: bool
+    notes: tuple[str, ...]
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+
+
+class Seeing(Protocol):
+    """Filters frames, each eye through its own profile."""
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Ask for another eye; frames go on through the one before."""
+
+    def see(self, frame: LookedAt) -> Seen | None:
+        """Hand a frame over; return the newest that is seen, None while none is."""
+
+    def close(self) -> None:
+        """Let go of everything."""
+
+
+class SeeingHere:
+    """Filters in this process; each frame is seen at once.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+    say : callable
+        Told in a line what happens to the eyes.
+    """
+
+    def __init__(self, settings: FilterSettings, say: Say) -> None:
+        self._say = say
+        self._filters = {
+            eye: EyeFilter(
+                settings=settings,
+                on_event=lambda event, eye=eye: (
+                    say(_event_line(eye, event)) if _event_line(eye, event) else None
+                ),
+            )
+            for eye in EYES
+        }
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Ask for another eye; frames go on through the one before."""
+        self._filters[eye].set_profile(dict(profile))
+
+    def see(self, frame: LookedAt) -> Seen | None:
+        """Filter a frame; None while an eye is being prepared for it."""
+        begin_s = time.monotonic()
+        planned = plan_views(
+            self._filters.__getitem__,
+            frame.views,
+            frame.states,
+            pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+            focus_dpt=frame.eyes[0].state.focus_dpt,
+        )
+        if isinstance(planned, str):
+            return None
+        seen = planned.render()
+        stages_ms = seen.stage_times_ms
+        whole_ms = MS_PER_S * (time.monotonic() - begin_s)
+        return Seen(
+            frame,
+            tuple(picture.view for picture in frame.pictures),
+            tuple(view.color for view in seen.views),
+            tuple(view.seen.focus_dpt for view in seen.views),
+            seen.is_complete,
+            seen.notes,
+            {
+                "filter_ms": sum(stages_ms.values()),
+                "around_ms": whole_ms - sum(stages_ms.values()),
+            },
+        )
+
+    def close(self) -> None:
+        """End what filters."""
+        for eye_filter in self._filters.values():
+            eye_filter.close()
+
+
+class SeeingByService:
+    """Filters through a service: what is seen is the newest that has come back.
+
+    Parameters
+    ----------
+    endpoint : str
+    settings : FilterSettings
+    say : callable
+        Told in a line what happens.
+    """
+
+    def __init__(self, endpoint: str, settings: FilterSettings, say: Say) -> None:
+        self._say = say
+        self._settings = settings
+        self._client = FilterClient(endpoint, client_name="headset", timeout_s=5.0)
+        self._wanted: dict[Eye, dict[str, Any]] = {}
+        self._on_way: dict[int, LookedAt] = {}
+        self._newest: Seen | None = None
+        self._is_there = True
+        self.n_dropped: dict[str, int] = {}
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Ask for another eye, as soon as there is a service."""
+        self._wanted[eye] = dict(profile)
+
+    def see(self, frame: LookedAt) -> Seen | None:
+        """Send a frame, the newest counts; return the newest that has come back.
+
+        None while there is none, or none of the service that is there now.
+        """
+        client = self._client
+        self._take_events()
+        if client.welcome is None:
+            if self._is_there:
+                self._say("no filter service: the scene is shown as it is; trying on")
+            self._is_there, self._newest = False, None
+            return None
+        if not self._is_there:
+            self._say("the filter service is there")
+            self._is_there = True
+        self._send_profiles(frame)
+        try:
+            frame_id = client.submit(
+                frame.views,
+                pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+                focus_dpt=frame.eyes[0].state.focus_dpt,
+                states=frame.states,
+                display_time_ns=frame.due.display_time_ns,
+            )
+            self._on_way[frame_id] = frame
+        except FilterError as error:
+            self._say(f"a frame was not sent: {error}")
+        self._take_events()
+        return self._newest
+
+    def _send_profiles(self, frame: LookedAt) -> None:
+        for picture in frame.pictures:
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            try:
+                self._client.set_profile(
+                    profile,
+                    eye=eye,
+                    settings=self._settings,
+                    views=[picture.camera],
+                    wait=False,
+                    timeout_s=PROFILE_WAIT_S,
+                )
+            except FilterError as error:
+                self._say(f"{eye} eye: {error}")
+
+    def _take_events(self) -> None:
+        for event in self._client.poll(0.0):
+            if isinstance(event, FilteredFrame):
+                self._take(event)
+            elif isinstance(event, Dropped):
+                self._on_way.pop(event.frame_id, None)
+                reason = event.reason
+                self.n_dropped[reason] = self.n_dropped.get(reason, 0) + 1
+            elif isinstance(event, ErrorReply):
+                self._on_way.pop(event.frame_id, None)
+                if event.code != "build_cancelled":
+                    self._say(str(event.exception()))
+            elif isinstance(event, Ready) and event.is_complete:
+                self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
+
+    def _take(self, answer: FilteredFrame) -> None:
+        frame = self._on_way.pop(answer.frame_id, None)
+        if frame is None:
+            return
+        header = answer.header
+        views = tuple(
+            EyeView(
+                picture.view.eye, view.pose or picture.view.pose, picture.view.tangents
+            )
+            for picture, view in zip(frame.pictures, header.views, strict=True)
+        )
+        filter_ms = header.total_ms
+        self._newest = Seen(
+            frame,
+            views,
+            answer.colors,
+            tuple(float(view.focus_dpt or 0.0) for view in header.views),
+            header.is_complete,
+            header.notes,
+            {
+                "filter_ms": filter_ms - _added_ms(header.stage_times_ms),
+                "service_ms": _added_ms(header.stage_times_ms),
+                "wire_ms": answer.round_trip_ms - filter_ms,
+                "wait_ms": answer.age_ms - answer.round_trip_ms,
+            },
+        )
+
+    def close(self) -> None:
+        """End the session."""
+        self._client.close()
+
+
+_OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
+
+
+def _added_ms(stages_ms: Mapping[str, float]) -> float:
+    """Return what the service's own stages took, beside the filter."""
+    return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)
+
+
+def _event_line(eye: Eye, event) -> str:
+    """Return what to say of what happens to an eye; empty for nothing."""
+    kind = type(event).__name__
+    if kind == "EyeReady" and event.is_complete:
+        return f"{eye} eye: ready after {event.build_ms:.0f} ms"
+    if kind == "EyeFailed":
+        return f"{eye} eye: {event.error}"
+    return ""

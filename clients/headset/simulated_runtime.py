@@ -1,0 +1,177 @@
+"""A headset that is not there: a head that moves as told, and pictures that are kept.
+
+For tests, and to see what a headset would show.  It keeps what OpenXR's runtimes keep
+of the rules: frames begin and end in turn, and what it shows has a pose.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from clients.headset.poses import matrix_of, turned
+from clients.headset.runtime import (
+    EYES,
+    DueFrame,
+    EyeView,
+    GazeSample,
+    SessionLost,
+    ShownView,
+)
+from filter_service.messages import Pose
+
+EYE_DISTANCE_M = 0.063
+EYE_LEVEL_M = 0.0
+LEFT_EDGES_DEG = (-50.0, 42.0, 43.0, -48.0)
+"""Of the left eye's display: left, right, up, down; the right one's is mirrored."""
+
+NS_PER_S = 1e9
+
+
+def swaying(at_s: float) -> Pose:
+    """Return a standing person's head that looks a little around."""
+    yaw_deg = 8.0 * math.sin(2.0 * math.pi * at_s / 6.0)
+    pitch_deg = 3.0 * math.sin(2.0 * math.pi * at_s / 4.0)
+    side_m = 0.03 * math.sin(2.0 * math.pi * at_s / 5.0)
+    return (side_m, EYE_LEVEL_M, 0.0, *turned(yaw_deg, pitch_deg))
+
+
+def still(at_s: float) -> Pose:
+    """Return a head that does not move."""
+    return (0.0, EYE_LEVEL_M, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass
+class Happening:
+    """What goes on beside the head's motion; a test changes it as it goes.
+
+    Attributes
+    ----------
+    should_render : bool
+        False: the headset is taken off.
+    is_lost : bool
+        The next call says that the session is lost.
+    is_paused : bool
+        No frames for the moment.
+    gaze_deg : (h, v), optional
+        What a tracker sees; None is no tracker.
+    pressed : names that come with the next frame
+    """
+
+    should_render: bool = True
+    is_lost: bool = False
+    is_paused: bool = False
+    gaze_deg: tuple[float, float] | None = None
+    pressed: list[str] = field(default_factory=list)
+
+
+class SimulatedRuntime:
+    """A headset's runtime without a headset.
+
+    Parameters
+    ----------
+    size_px : (width, height) of each eye's picture
+    rate_hz : float
+        Frames a second, at most.
+    head_at : callable
+        ``head_at(seconds)`` gives the head's pose.
+    happening : Happening
+    on_shown : callable, optional
+        ``on_shown(due, shown)`` is given each frame that ends.
+    """
+
+    name = "simulated headset"
+    notes: Sequence[str] = ()
+    has_depth = True
+
+    def __init__(
+        self,
+        size_px: tuple[int, int] = (448, 504),
+        *,
+        rate_hz: float = 72.0,
+        head_at: Callable[[float], Pose] = swaying,
+        happening: Happening | None = None,
+        on_shown: Callable[[DueFrame, Sequence[ShownView]], None] | None = None,
+    ) -> None:
+        if not 0.0 < rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz is {rate_hz}; allowed: above 0, up to 1000")
+        if min(size_px) < 1:
+            raise ValueError(f"size_px is {size_px}; allowed: 1 px or more")
+        self.size_px = size_px
+        self.happening = happening or Happening()
+        self._period_s = 1.0 / rate_hz
+        self._head_at = head_at
+        self._on_shown = on_shown
+        self._start_s = time.monotonic()
+        self._next_s = 0.0
+        self._begun: DueFrame | None = None
+
+    def begin_frame(self) -> DueFrame | None:
+        """Wait for the next frame."""
+        happening = self.happening
+        if happening.is_lost:
+            raise SessionLost("the simulated session is lost")
+        if self._begun is not None:
+            raise RuntimeError("a frame begins before the last one has ended")
+        if happening.is_paused:
+            time.sleep(self._period_s)
+            return None
+        self._wait()
+        at_s = self._next_s
+        head = self._head_at(at_s)
+        gaze = happening.gaze_deg
+        pressed, happening.pressed = tuple(happening.pressed), []
+        self._begun = DueFrame(
+            int(NS_PER_S * at_s),
+            happening.should_render,
+            eye_views(head),
+            head,
+            None if gaze is None else GazeSample(*gaze, at_s=at_s),
+            pressed,
+        )
+        return self._begun
+
+    def _wait(self) -> None:
+        """Sleep until the next frame of the display that is still to come."""
+        now_s = time.monotonic() - self._start_s
+        missed = math.floor((now_s - self._next_s) / self._period_s)
+        self._next_s += self._period_s * (1 + max(0, missed))
+        time.sleep(max(0.0, self._next_s - now_s))
+
+    def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
+        """Show a frame."""
+        if due is not self._begun:
+            raise RuntimeError("a frame ends that was not begun")
+        self._begun = None
+        if self.happening.is_lost:
+            raise SessionLost("the simulated session is lost")
+        for view in shown:
+            width, height = self.size_px
+            if view.color.shape != (height, width, 3):
+                raise ValueError(f"a picture of shape {view.color.shape}")
+            if view.depth_m.shape != (height, width):
+                raise ValueError(f"depth of shape {view.depth_m.shape}")
+        if self._on_shown is not None:
+            self._on_shown(due, shown)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def eye_views(head: Pose) -> tuple[EyeView, EyeView]:
+    """Return both eyes' views of a head's pose."""
+    matrix = matrix_of(head)
+    left, right, up, down = (math.tan(math.radians(e)) for e in LEFT_EDGES_DEG)
+    found = []
+    for eye, side, tangents in zip(
+        EYES,
+        (-0.5, 0.5),
+        ((left, right, up, down), (-right, -left, up, down)),
+        strict=True,
+    ):
+        place = matrix[:3, 3] + matrix[:3, 0] * side * EYE_DISTANCE_M
+        x, y, z = (float(value) for value in place)
+        found.append(EyeView(eye, (x, y, z, *head[3:]), tangents))
+    return found[0], found[1]

@@ -1,0 +1,252 @@
+"""The viewer's loop: render, look, filter, show, whatever the headset does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from clients.frame_log import percentiles
+from clients.headset.controls import Controls
+from clients.headset.look import RgbdPicture, StereoLook
+from clients.headset.runtime import (
+    EYES,
+    DueFrame,
+    EyeView,
+    NoRuntime,
+    Runtime,
+    SessionLost,
+    ShownView,
+)
+from clients.headset.seeing import LookedAt, Seeing, Seen
+
+MS_PER_S = 1e3
+STALE_S = 1.0
+"""A picture begun so long ago is not shown any more: the scene is, as it is."""
+
+RETRY_S = 1.0
+SPLIT_RATIO = 0.5
+
+
+class Scenery(Protocol):
+    """What renders both eyes' pictures."""
+
+    def pictures(
+        self, views: Sequence[EyeView], size_px: tuple[int, int]
+    ) -> tuple[RgbdPicture, ...]:
+        """Return what each eye is shown."""
+
+
+@dataclass
+class ViewerLog:
+    """What became of the frames.
+
+    Attributes
+    ----------
+    shown : frames that were shown filtered, plain, or were not to be rendered
+    stages_ms : times of each stage of filtered frames
+    """
+
+    n_filtered: int = 0
+    n_repeated: int = 0  # filtered pictures that were shown once more
+    n_plain: int = 0
+    n_hidden: int = 0
+    n_sessions: int = 0
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+    notes: dict[str, int] = field(default_factory=dict)
+
+    def add(self, **times_ms: float) -> None:
+        """Note a filtered frame's times."""
+        self.n_filtered += 1
+        for name, value_ms in times_ms.items():
+            self.stages_ms.setdefault(name, []).append(value_ms)
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts and percentiles."""
+        return {
+            "sessions": self.n_sessions,
+            "filtered": self.n_filtered,
+            "repeated": self.n_repeated,
+            "plain": self.n_plain,
+            "not_rendered": self.n_hidden,
+            "stages_ms": {
+                name: percentiles(values) for name, values in self.stages_ms.items()
+            },
+            "notes": self.notes,
+        }
+
+
+class Viewer:
+    """Shows a scene as two eyes see it.
+
+    Parameters
+    ----------
+    open_runtime : callable
+        Gives the headset's runtime; called again after a session is lost.
+    scenery : Scenery
+    seeing : Seeing
+    look : StereoLook
+    controls : Controls
+    read_keys : callable
+        Gives the keys that were pressed.
+    say : callable
+        Told in a line what the user should know.
+    """
+
+    def __init__(
+        self,
+        open_runtime: Callable[[], Runtime],
+        scenery: Scenery,
+        seeing: Seeing,
+        look: StereoLook,
+        controls: Controls,
+        *,
+        read_keys: Callable[[], str] = str,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        self._open_runtime = open_runtime
+        self._scenery = scenery
+        self._seeing = seeing
+        self._look = look
+        self._controls = controls
+        self._read_keys = read_keys
+        self._say = say
+        self._last: Seen | None = None
+        self._was_tracked: bool | None = None
+        self._was_stale = False
+        self.log = ViewerLog()
+
+    def run(self, *, max_frames: int | None = None, limit_s: float | None = None):
+        """Show frames until the user ends it; a headset that goes away is waited for.
+
+        Parameters
+        ----------
+        max_frames : int, optional
+            Filtered frames after which it ends.
+        limit_s : float, optional
+            Time after which it ends.
+        """
+        end_s = None if limit_s is None else time.monotonic() + limit_s
+
+        def is_done() -> bool:
+            if max_frames is not None and self.log.n_filtered >= max_frames:
+                return True
+            if end_s is not None and time.monotonic() >= end_s:
+                return True
+            return self._controls.is_over
+
+        said = ""
+        while not is_done():
+            try:
+                runtime = self._open_runtime()
+            except NoRuntime as error:
+                if str(error) != said:
+                    said = str(error)
+                    self._say(f"{said}; trying again every {RETRY_S:g} s")
+                self._controls.press(self._read_keys())
+                time.sleep(RETRY_S)
+                continue
+            said = ""
+            self.log.n_sessions += 1
+            self._say(f"{runtime.name}: {runtime.size_px[0]}x{runtime.size_px[1]} px")
+            try:
+                self._run_session(runtime, is_done)
+            except SessionLost as error:
+                self._say(f"{error}; trying again")
+                self._last = None
+                time.sleep(RETRY_S)
+            finally:
+                runtime.close()
+        return self.log
+
+    def _run_session(self, runtime: Runtime, is_done: Callable[[], bool]) -> None:
+        while not is_done():
+            due = runtime.begin_frame()
+            begun_s = time.monotonic()
+            self._controls.press(self._read_keys(), () if due is None else due.pressed)
+            if due is None:
+                continue
+            if not due.should_render:
+                self.log.n_hidden += 1
+                runtime.end_frame(due, ())
+                continue
+            shown: Sequence[ShownView] = ()
+            try:
+                frame, shown, seen = self._frame(due, begun_s, runtime.size_px)
+            except BaseException:
+                # A frame that was begun is to be ended, whatever happened to it.
+                runtime.end_frame(due, ())
+                raise
+            show_s = time.monotonic()
+            runtime.end_frame(due, shown)
+            self._note(frame, seen, show_s)
+
+    def _frame(self, due: DueFrame, begun_s: float, size_px: tuple[int, int]):
+        pictures = self._scenery.pictures(due.views, size_px)
+        self._scene_ms = MS_PER_S * (time.monotonic() - begun_s)
+        look_s = time.monotonic()
+        eyes = self._look.follow(due, pictures)
+        self._look_ms = MS_PER_S * (time.monotonic() - look_s)
+        self._tell_tracking()
+        frame = LookedAt(due, pictures, eyes, begun_s)
+        seen = self._seeing.see(frame)
+        if seen is not None and begun_s - seen.frame.begun_s > STALE_S:
+            if not self._was_stale:
+                self._say("the filter is late: the scene is shown as it is")
+            self._was_stale, seen = True, None
+        elif seen is not None:
+            self._was_stale = False
+        return frame, self._shown(frame, seen), seen
+
+    def _shown(self, frame: LookedAt, seen: Seen | None) -> tuple[ShownView, ...]:
+        """Return what is shown: a picture always with the view that it is of."""
+        if seen is None or not self._controls.is_on:
+            return tuple(
+                ShownView(picture.view, picture.color, picture.depth_m)
+                for picture in frame.pictures
+            )
+        ratio = SPLIT_RATIO if self._controls.is_split else 0.0
+        return tuple(
+            ShownView(view, color, picture.depth_m, picture.color, ratio)
+            for view, color, picture in zip(
+                seen.views, seen.colors, seen.frame.pictures, strict=True
+            )
+        )
+
+    def _note(self, frame: LookedAt, seen: Seen | None, show_s: float) -> None:
+        now_s = time.monotonic()
+        if seen is None:
+            self.log.n_plain += 1
+            return
+        if seen is self._last:
+            self.log.n_repeated += 1
+            return
+        self._last = seen
+        if seen.is_complete:  # a preview's focus tells nothing of the eye
+            asked = [eye.state.focus_dpt for eye in seen.frame.eyes]
+            self._look.learn(
+                dict(zip(EYES, asked, strict=True)),
+                dict(zip(EYES, seen.used_focus_dpt, strict=True)),
+            )
+        for note in seen.notes:
+            if note not in self.log.notes and len(self.log.notes) < 100:
+                self.log.notes[note] = 0
+            if note in self.log.notes:
+                self.log.notes[note] += 1
+        self.log.add(
+            scene_ms=self._scene_ms,
+            look_ms=self._look_ms,
+            **seen.stages_ms,
+            show_ms=MS_PER_S * (now_s - show_s),
+            age_ms=MS_PER_S * (now_s - seen.frame.begun_s),
+        )
+
+    def _tell_tracking(self) -> None:
+        is_tracked = self._look.is_tracked
+        if is_tracked != self._was_tracked:
+            before, self._was_tracked = self._was_tracked, is_tracked
+            if is_tracked:
+                self._say("eyes are tracked")
+            elif before:
+                self._say("the eye tracker lost the eyes: gaze is straight ahead")

@@ -1,0 +1,197 @@
+"""An eye that follows what it sees: its pupil the light, its focus what it looks at.
+
+    eye = NaturalEye(age_years=35)
+    pupil_diameter_mm, focus_dpt = eye.look(luminance_cd_m2, distance_dpt, at_s)
+
+The dynamics are the estimator's (`estimator.dynamics` has their sources).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.dynamics import AccommodationResponse, PupilReflex
+from filter_service.messages import Camera
+
+MAX_VERGENCE_DPT = 20.0
+USUAL_WHITE_CD_M2 = 100.0
+"""Of a headset's display that shows white."""
+
+USUAL_AGE_YEARS = 35.0
+PUPIL_RANGE_MM = (0.5, 9.0)
+WINDOW_DEG = 0.5
+"""Half of what the fovea's centre covers: what is looked at lies in it."""
+
+LIMIT_STEP_DPT = 0.01
+_STRIDE = 8
+_LINEAR_OF_SRGB8 = np.array(
+    [
+        v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
+        for v in np.arange(256) / 255.0
+    ],
+    np.float32,
+)
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of sRGB's primaries
+
+
+@dataclass(frozen=True)
+class EyeState:
+    """What a frame is told of an eye."""
+
+    pupil_diameter_mm: float
+    focus_dpt: float
+
+
+class NaturalEye:
+    """Pupil and focus of a person who looks at a display.
+
+    Parameters
+    ----------
+    age_years : float
+        Of the person: the pupil is smaller with age.
+    field_area_deg2 : float
+        What the display covers.
+    pupil_diameter_mm : float, optional
+        Fixed, instead of following the light.
+
+    Raises
+    ------
+    ValueError
+    """
+
+    def __init__(
+        self,
+        *,
+        age_years: float = USUAL_AGE_YEARS,
+        field_area_deg2: float = 2827.0,
+        pupil_diameter_mm: float | None = None,
+    ) -> None:
+        if not 3.0 <= age_years <= 120.0:
+            raise ValueError(f"age_years is {age_years}; allowed: 3 to 120")
+        low_mm, high_mm = PUPIL_RANGE_MM
+        if pupil_diameter_mm is not None and not (
+            low_mm <= pupil_diameter_mm <= high_mm
+        ):
+            raise ValueError(
+                f"pupil_diameter_mm is {pupil_diameter_mm}; allowed: {low_mm:g} to "
+                f"{high_mm:g}"
+            )
+        self._age_years = age_years
+        self._field_area_deg2 = field_area_deg2
+        self._fixed_mm = pupil_diameter_mm
+        self._pupil: PupilReflex | None = None
+        self._focus = AccommodationResponse(0.0, MAX_VERGENCE_DPT)
+
+    def look(
+        self, luminance_cd_m2: float, distance_dpt: float, at_s: float
+    ) -> EyeState:
+        """See this light and look at this distance from now on; return the eye now."""
+        if self._fixed_mm is not None:
+            pupil_mm = self._fixed_mm
+        else:
+            if self._pupil is None:  # steady in what it sees first
+                self._pupil = PupilReflex(
+                    self._age_years, self._field_area_deg2, luminance_cd_m2
+                )
+            pupil_mm = self._pupil.follow(luminance_cd_m2, at_s)
+        low_mm, high_mm = PUPIL_RANGE_MM
+        wanted_dpt = min(max(distance_dpt, 0.0), MAX_VERGENCE_DPT)
+        return EyeState(
+            min(max(pupil_mm, low_mm), high_mm), self._focus.follow(wanted_dpt, at_s)
+        )
+
+    def learn(self, asked_dpt: float, used_dpt: float) -> None:
+        """Take in what a filter made of a focus: where this eye cannot follow.
+
+        Farther than its far point, or nearer than its near point, the eye does not
+        move; its way back begins there.
+        """
+        focus = self._focus
+        if used_dpt > asked_dpt + LIMIT_STEP_DPT:
+            if abs(used_dpt - focus.far_dpt) > LIMIT_STEP_DPT:
+                near_dpt = max(focus.near_dpt, used_dpt)
+                self._focus = AccommodationResponse(used_dpt, near_dpt)
+        elif used_dpt < asked_dpt - LIMIT_STEP_DPT:
+            focus.near_dpt = max(used_dpt, focus.far_dpt)
+
+    def change(self) -> None:
+        """Become another eye, whose far and near point are not known yet."""
+        self._focus = AccommodationResponse(0.0, MAX_VERGENCE_DPT)
+
+
+def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:
+    """Return the mean luminance of a picture on a display.
+
+    Parameters
+    ----------
+    color : (h, w, 3) uint8 sRGB
+    white_cd_m2 : float
+        The display's white.
+    """
+    light = _LINEAR_OF_SRGB8[color[::_STRIDE, ::_STRIDE]]
+    return white_cd_m2 * float((light @ _LUMINANCE).mean())
+
+
+def field_area_deg2(camera: Camera) -> float:
+    """Return the area of what a camera sees, as the product of its two angles."""
+    left, right, up, down = (math.degrees(math.atan(t)) for t in camera.tangents)
+    return (right - left) * (up - down)
+
+
+def distance_at(
+    depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
+) -> float | None:
+    """Return how far what is looked at is, in metres along the ray; None if unknown.
+
+    See `planar_depth_at`.
+    """
+    middle_m = planar_depth_at(depth_m, camera, gaze_deg)
+    if middle_m is None:
+        return None
+    x, y = _on_image(gaze_deg)
+    return middle_m * math.sqrt(1.0 + x * x + y * y)
+
+
+def _on_image(gaze_deg: tuple[float, float]) -> tuple[float, float]:
+    """Return the tangents of a direction, to the right and up."""
+    h, v = (math.radians(angle_deg) for angle_deg in gaze_deg)
+    return math.tan(h), math.tan(v) / math.cos(h)
+
+
+def planar_depth_at(
+    depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
+) -> float | None:
+    """Return the depth of what is looked at, in metres; None if unknown.
+
+    The median over `WINDOW_DEG` to every side: one thin thing in front, or a pixel
+    without depth, does not change it.
+
+    Parameters
+    ----------
+    depth_m : (h, w) float32, planar
+    gaze_deg : (h, v)
+        To the right and up from the camera's axis.
+    """
+    x, y = _on_image(gaze_deg)
+    left, right, up, down = camera.tangents
+    height_px, width_px = depth_m.shape
+    column = (x - left) / (right - left) * width_px
+    row = (up - y) / (up - down) * height_px
+    if not (0 <= column < width_px and 0 <= row < height_px):
+        return None
+    reach = math.tan(math.radians(WINDOW_DEG))
+    across = max(1, round(reach / (right - left) * width_px))
+    along = max(1, round(reach / (up - down) * height_px))
+    i, j = int(row), int(column)
+    window = depth_m[
+        max(0, i - along) : i + along + 1, max(0, j - across) : j + across + 1
+    ]
+    seen = window[window > 0]  # what is missing is not
+    if seen.size == 0:
+        return None
+    # Of the nearer one of two in the middle: a mean would lie between two things.
+    return float(np.partition(seen, (seen.size - 1) // 2)[(seen.size - 1) // 2])
