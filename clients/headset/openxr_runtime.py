@@ -226,6 +226,7 @@ class OpenXrRuntime:
                 self._head_pose(time_ns),
                 self._actions.gaze(self._head, time_ns),
                 pressed,
+                1e-9 * int(state.predicted_display_period),
             )
 
     @_or_lost

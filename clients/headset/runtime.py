@@ -65,6 +65,8 @@ class DueFrame:
     head : the pose between the eyes, where it is known
     gaze : GazeSample, optional
     pressed : names of what was pressed on a controller since the last frame
+    period_s : float
+        From one frame to the next, where the runtime says so; else 0.
     """
 
     display_time_ns: int
@@ -73,6 +75,7 @@ class DueFrame:
     head: Pose | None = None
     gaze: GazeSample | None = None
     pressed: tuple[str, ...] = ()
+    period_s: float = 0.0
 
     @property
     def now_s(self) -> float:

@@ -18,12 +18,16 @@ from filter_service.errors import FilterError
 from filter_service.messages import Dropped, ErrorReply, Ready, ViewState
 
 PROFILE_WAIT_S = 2.0
+WAIT_SHARE = 0.6
+"""Of a frame's period: so long the answer to the newest frame is waited for, so that a
+quick filter's picture is shown in the frame that it was rendered for."""
+
 MS_PER_S = 1e3
 
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LookedAt:
     """One frame on its way to a person's eyes."""
 
@@ -200,7 +204,13 @@ class SeeingByService:
             self._on_way[frame_id] = frame
         except FilterError as error:
             self._say(f"a frame was not sent: {error}")
+        end_s = frame.begun_s + WAIT_SHARE * frame.due.period_s
         self._take_events()
+        while self._newest is None or self._newest.frame is not frame:
+            wait_s = end_s - time.monotonic()
+            if wait_s <= 0.0 or frame not in self._on_way.values():
+                break
+            self._take_events(wait_s)
         return self._newest
 
     def _send_profiles(self, frame: LookedAt) -> None:
@@ -221,8 +231,8 @@ class SeeingByService:
             except FilterError as error:
                 self._say(f"{eye} eye: {error}")
 
-    def _take_events(self) -> None:
-        for event in self._client.poll(0.0):
+    def _take_events(self, wait_s: float = 0.0) -> None:
+        for event in self._client.poll(wait_s):
             if isinstance(event, FilteredFrame):
                 self._take(event)
             elif isinstance(event, Dropped):

@@ -130,6 +130,7 @@ class SimulatedRuntime:
             head,
             None if gaze is None else GazeSample(*gaze, at_s=at_s),
             pressed,
+            self._period_s,
         )
         return self._begun
 

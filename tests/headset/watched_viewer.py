@@ -1,0 +1,54 @@
+"""`ocufilter headset` as it is, with a line of JSON for each frame that it shows.
+
+    python -m tests.headset.watched_viewer --scene room.glb --frames 300
+
+Its arguments are the command's.  Lines: ``{"session": ...}`` where one begins,
+``{"frame": ...}`` with the views that the runtime asked for and those that were shown,
+``{"report": ...}`` at the end.  What the command says goes to stderr.
+"""
+
+import json
+import sys
+
+from clients.headset import openxr_runtime, program
+
+
+def tell(**what) -> None:
+    print(json.dumps(what), flush=True)
+
+
+class WatchedRuntime(openxr_runtime.OpenXrRuntime):
+    """Tells of every frame."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        tell(session={"size_px": self.size_px, "has_depth": self.has_depth})
+
+    def end_frame(self, due, shown):
+        super().end_frame(due, shown)
+        tell(
+            frame={
+                "state": self.state,
+                "asked": [as_json(view) for view in due.views],
+                "shown": [as_json(view.view) for view in shown],
+                # of the middle row, which tells how sharp it is
+                "rows": [
+                    view.color[len(view.color) // 2, :, 1].tolist() for view in shown
+                ],
+            }
+        )
+
+
+def as_json(view):
+    return {"eye": view.eye, "pose": view.pose, "tangents": view.tangents}
+
+
+def main() -> int:
+    openxr_runtime.OpenXrRuntime = WatchedRuntime
+    options = program.arguments_of(sys.argv[1:])
+    tell(report=program.run(options))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
