@@ -12,7 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import chain
@@ -23,8 +24,15 @@ import numpy as np
 
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
+from clients.natural import (
+    USUAL_AGE_YEARS,
+    USUAL_WHITE_CD_M2,
+    NaturalEye,
+    distance_at,
+    luminance_cd_m2,
+)
 from filter_service.errors import FilterError, ServiceTimeout
-from filter_service.messages import DEFAULT_ENDPOINT, Dropped, ErrorReply
+from filter_service.messages import DEFAULT_ENDPOINT, Camera, Dropped, ErrorReply
 
 try:
     from clients.frame_log import FrameLog
@@ -46,6 +54,8 @@ except ModuleNotFoundError as error:
 
 FRAMES_PER_ROUND = 60
 MAX_LOOK_AROUND_DEG = 30.0
+STRAIGHT_AHEAD = (0.0, 0.0)
+NATURAL_RANGES = {"pupil_range_mm": (2.0, 8.0), "focus_range_dpt": (0.0, 8.5)}
 
 
 def profile_body(name_or_file: str) -> dict[str, Any]:
@@ -117,14 +127,43 @@ def looking_around(
         yield replace(frame, gaze_deg=(float(h_deg), float(v_deg)))
 
 
+def looking_naturally(
+    frames: Iterator[SceneFrame],
+    eye: NaturalEye,
+    *,
+    white_cd_m2: float = USUAL_WHITE_CD_M2,
+    clock: Callable[[], float] = time.monotonic,
+) -> Iterator[SceneFrame]:
+    """Let focus follow what is looked at, and the pupil the light, as they do."""
+    for frame in frames:
+        height_px, width_px = frame.depth_m.shape
+        camera = Camera(width_px, height_px, frame.tangents)
+        distance_m = distance_at(
+            frame.depth_m, camera, frame.gaze_deg or STRAIGHT_AHEAD
+        )
+        light_cd_m2 = luminance_cd_m2(frame.color, white_cd_m2)
+        vergence_dpt = 0.0 if distance_m is None else 1.0 / distance_m
+        state = eye.look(light_cd_m2, vergence_dpt, clock())
+        yield replace(
+            frame,
+            pupil_diameter_mm=state.pupil_diameter_mm,
+            focus_dpt=state.focus_dpt,
+        )
+
+
 def stream(
-    client: FilterClient, frames: Iterator[SceneFrame], log: FrameLog, show=None
+    client: FilterClient,
+    frames: Iterator[SceneFrame],
+    log: FrameLog,
+    show=None,
+    learn: Callable[[float, float], None] = lambda asked_dpt, used_dpt: None,
 ) -> int:
     """Submit frames as they are rendered until they end or the window closes.
 
     Parameters
     ----------
     show : called with (input, filtered, title) for each answer; false ends the stream.
+    learn : called with the focus that a frame asked for, and the one that was used.
 
     Returns
     -------
@@ -145,15 +184,16 @@ def stream(
             gaze_deg=frame.gaze_deg,
         )
         sent[frame_id], n_sent = frame, n_sent + 1
-        if not _take_answers(client, sent, log, show, timeout_s=0.0):
+        if not _take_answers(client, sent, log, show, learn, timeout_s=0.0):
             return n_sent
     go_on = True
     while go_on and client.n_unanswered:
-        go_on = _take_answers(client, sent, log, show, timeout_s=client.timeout_s)
+        timeout_s = client.timeout_s
+        go_on = _take_answers(client, sent, log, show, learn, timeout_s=timeout_s)
     return n_sent
 
 
-def _take_answers(client, sent, log, show, *, timeout_s: float) -> bool:
+def _take_answers(client, sent, log, show, learn, *, timeout_s: float) -> bool:
     """Handle what has come back; return whether to go on."""
     events = client.poll(timeout_s)
     if not events and timeout_s:
@@ -168,6 +208,8 @@ def _take_answers(client, sent, log, show, *, timeout_s: float) -> bool:
         elif isinstance(event, FilteredFrame):
             log.add(event)
             frame = sent.pop(event.frame_id)
+            if event.header.is_complete:  # a preview's focus tells nothing of the eye
+                learn(frame.focus_dpt, event.header.focus_dpt)
             if show is not None:
                 go_on = show(frame.color, event.color, _title(event)) and go_on
     return go_on
@@ -209,6 +251,19 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         metavar="DEG",
         help=f"how far the gaze goes round the image, 0 to {MAX_LOOK_AROUND_DEG:g}",
     )
+    parser.add_argument(
+        "--natural",
+        action="store_true",
+        help="focus follows what is looked at, and the pupil the light, as people's "
+        "do; else both are the path's own",
+    )
+    parser.add_argument(
+        "--age",
+        default=USUAL_AGE_YEARS,
+        type=float,
+        metavar="YEARS",
+        help=f"of the person, with --natural (default: {USUAL_AGE_YEARS:g})",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser.parse_args(argv)
 
@@ -242,6 +297,12 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         if reach_deg:
             frames = looking_around(frames, reach_deg)
             settings["gaze_range_deg"] = (reach_deg, 0.5 * reach_deg)
+        learn = {}
+        if options.natural:
+            eye = NaturalEye(age_years=options.age)
+            frames = looking_naturally(frames, eye)
+            settings |= NATURAL_RANGES
+            learn = {"learn": eye.learn}
         first = next(frames)
         if show is not None:
             show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
@@ -250,7 +311,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             settings=settings,
             views=[view_of(first)],
         )
-        n_sent = stream(client, chain([first], frames), log, show)
+        n_sent = stream(client, chain([first], frames), log, show, **learn)
     return {"sent": n_sent, **log.summary()}
 
 

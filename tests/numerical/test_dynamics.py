@@ -5,17 +5,21 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 from estimator.dynamics.accommodation_response import AccommodationResponse
 from estimator.dynamics.delayed_approach import DelayedApproach
 from estimator.dynamics.gaze import GazeFollower
 from estimator.dynamics.pupil_reflex import (
     LATENCY_RANGE_S,
-    PupilReflex,
     reflex_latency_s,
 )
 from estimator.dynamics.pupil_size import steady_pupil_mm
+from tests.numerical.moving_eyes import (
+    PUPIL_CURVES,
+    RECORDED_LATENCY_S,
+    pupil_of_a_pulse,
+    steps_response,
+)
 from tests.source_tree import ROOT
 
 REFERENCE = json.loads((ROOT / "tests/data/eye_reference.json").read_text("utf-8"))
@@ -134,40 +138,14 @@ def test_samples_that_are_none_or_old_change_nothing():
             GazeFollower(**wrong)
 
 
-PUPIL_CURVES = json.loads((ROOT / "tests/data/pupil_curves.json").read_text("utf-8"))
-AREA_DEG2 = 2800.0
-
-
-def light_for(pupil_mm, age_years=28.58):
-    """The light in which the formula's pupil is so wide."""
-    return brentq(
-        lambda log: steady_pupil_mm(10**log, AREA_DEG2, age_years) - pupil_mm, -8, 6
-    )
-
-
-def recorded(times_s, *, begin_mm, end_mm, off_s, latency_s=None):
-    """A pulse of light that leads a pupil from one size towards another."""
-    dark, bright = 10 ** light_for(begin_mm), 10 ** light_for(end_mm)
-    reflex = PupilReflex(28.58, AREA_DEG2, dark, latency_s=latency_s)
-    reflex.follow(dark, -1.0)
-    steps_s = np.arange(0.0, times_s[-1] + 1e-9, 0.01)
-    found = [reflex.follow(bright if t < off_s else dark, t) for t in steps_s]
-    return np.interp(times_s, steps_s, found)
-
-
-RECORDED_LATENCY_S = 0.25
-"""At which all recorded pupils begin; the light's own formula says 0.20 s, and then the
-errors below are 0.15 to 0.26 mm and 0.59 mm."""
-
-
 @pytest.mark.parametrize("level", range(5))
-def test_the_pupil_follows_pulses_as_recorded(level):
+def test_the_pupil_follows_pulses_as_pupil_of_a_pulse(level):
     """Those it was fitted to: 0.06 to 0.23 mm of a change of 2.3 to 2.7 mm."""
     pulse = PUPIL_CURVES["pulse"]
     times_s = np.array(pulse["time_s"])
     wide_mm = np.array(pulse["pupil_mm"])[:, level]
     kept = times_s >= 0
-    found_mm = recorded(
+    found_mm = pupil_of_a_pulse(
         times_s[kept],
         begin_mm=wide_mm[0],
         end_mm=wide_mm.min() - 0.15,  # a second of light is not the end of it
@@ -185,7 +163,7 @@ def test_the_pupil_follows_a_pulse_that_it_was_not_fitted_to():
     """
     pulse = PUPIL_CURVES["long_pulse"]
     times_s, wide_mm = np.array(pulse["time_s"]), np.array(pulse["pupil_mm"])
-    found_mm = recorded(
+    found_mm = pupil_of_a_pulse(
         times_s,
         begin_mm=pulse["begin_mm"],
         end_mm=wide_mm.min(),
@@ -202,14 +180,6 @@ def test_the_pupil_waits_less_in_more_light():
     np.testing.assert_allclose(np.diff(latencies_s), -0.034, atol=1e-12)
     assert 0.2 <= min(latencies_s) and max(latencies_s) <= 0.31
     assert reflex_latency_s(0.0) == LATENCY_RANGE_S[1]
-
-
-def steps_response(begin_dpt, end_dpt, **settings):
-    response = AccommodationResponse(0.0, 7.0, **settings)
-    response.follow(begin_dpt, 0.0)
-    response.follow(begin_dpt, 20.0)
-    times_s = np.arange(0.0, 6.0, 0.001)
-    return times_s, np.array([response.follow(end_dpt, 20.0 + t) for t in times_s])
 
 
 @pytest.mark.parametrize(("cue", "per_dpt"), [("blur", 7.10), ("both", 3.56)])
