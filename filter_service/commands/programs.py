@@ -26,6 +26,7 @@ class Bench(StrEnum):
     PEOPLE = "people"
     MEDIA = "media"
     ACUITY = "acuity"
+    DYNAMICS = "dynamics"
     DISPLAYS = "displays"
     NETWORKS = "networks"
     PLAN = "plan"
@@ -53,6 +54,7 @@ BENCH_MODULES = {
     Bench.PEOPLE: "tests.benchmarks.bench_people",
     Bench.MEDIA: "tests.benchmarks.bench_media",
     Bench.ACUITY: "tests.benchmarks.bench_acuity",
+    Bench.DYNAMICS: "tests.benchmarks.bench_dynamics",
     Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",

@@ -177,7 +177,7 @@ def draw(path) -> None:
     speeds.set(
         xticks=[],
         ylabel="peak speed, dpt/s",
-        title="Main sequences: published with spread among people, ours (crosses)",
+        title="Peak speeds: published, with spread among people; ours (x)",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
