@@ -19,6 +19,7 @@ FRAMES = (
     "tests/numerical/test_renderer_frames.py",
     "tests/numerical/test_renderer_hidden.py",
     "tests/numerical/test_renderer_hdr.py",
+    "tests/numerical/test_renderer_wide.py",
     "tests/numerical/test_native_random.py",
     "tests/numerical/test_field_layers.py",
 )

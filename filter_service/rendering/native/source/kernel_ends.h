@@ -44,7 +44,7 @@ static reach mapped_reach(const double *map, reach stored) {
 }
 
 /* Where the pixels of a row read along one axis: first texel, and shares of so many. */
-#define MOST_TAPS 8
+#define MOST_TAPS PAD_TEXELS
 #define LONGEST_ROW (2 * LONGEST_REACH_PX + 1)
 
 typedef struct {
@@ -74,7 +74,7 @@ INLINE void find_covered(float start, float step, float half, int count, int n_t
 }
 
 /* Adds a mapped part: each pixel takes the light of the stored ones that its sides
- * cover.  n_taps is 2 or 3 for nearly all; the compiler makes a loop for each. */
+ * cover.  n_taps is 2 or 3; the compiler makes a loop for each. */
 INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const float *map,
                             float weight, reach box, int n_taps, float *to) {
     float half_x = 0.5f * fabsf(map[0]);
@@ -102,20 +102,59 @@ INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const
     }
 }
 
+/* Texels between `lowest` and `highest` that lie between two places. */
+INLINE void covered(float low, float high, int lowest, int highest, int *first, int *last) {
+    float from = __builtin_floorf(low + 0.5f);
+    float to = __builtin_ceilf(high - 0.5f);
+    *first = from > (float)lowest ? from < (float)(highest + 1) ? (int)from : highest + 1 : lowest;
+    *last = to < (float)highest ? to > (float)(lowest - 1) ? (int)to : lowest - 1 : highest;
+}
+
+INLINE float share_of(float low, float high, int texel) {
+    float from = larger_float(low, (float)texel - 0.5f);
+    float to = high < (float)texel + 0.5f ? high : (float)texel + 0.5f;
+    return to > from ? to - from : 0.0f;
+}
+
+/* The same for pixels that cover more texels than there are zeros between rows: a cell's
+ * and a node's pixels differ so much in fields of 90 degrees.  Reads what is there only. */
+static void add_mapped_wide(const float *texels, int stride, reach stored, const float *map,
+                            float weight, reach box, float *to) {
+    float half_x = 0.5f * fabsf(map[0]);
+    float half_y = 0.5f * fabsf(map[3]);
+    for (int y = -box.up; y <= box.down; ++y)
+        for (int x = -box.left; x <= box.right; ++x, to += 4) {
+            float middle_x = map[0] * (float)x + map[1] * (float)y;
+            float middle_y = map[2] * (float)x + map[3] * (float)y;
+            float left = middle_x - half_x, right = middle_x + half_x;
+            float up = middle_y - half_y, down = middle_y + half_y;
+            int column, last_column, row, last_row;
+            covered(left, right, -stored.left, stored.right, &column, &last_column);
+            covered(up, down, -stored.up, stored.down, &row, &last_row);
+            f32x4 sum = all4(0.0f);
+            for (; row <= last_row; ++row) {
+                const float *from = texels + 4 * ((ptrdiff_t)(row + stored.up) * stride
+                                                  + stored.left);
+                f32x4 line = all4(0.0f);
+                for (int i = column; i <= last_column; ++i)
+                    line += load4(from + 4 * i) * all4(share_of(left, right, i));
+                sum += line * all4(share_of(up, down, row));
+            }
+            store4(to, load4(to) + sum * all4(weight));
+        }
+}
+
 static void add_mapped(const frame *f, const recipe_image *image, const double *map,
                        float weight, reach box, float *to) {
     const float *texels = f->recipe_texels + 4 * image->first_texel;
     reach stored = read_reach(image->reach_px);
     float own[4] = {(float)map[0], (float)map[1], (float)map[2], (float)map[3]};
     float side = larger_float(fabsf(own[0]), fabsf(own[3]));
-    int n_taps = (int)floorf(side) + 2;
-    if (side <= 1.0f) n_taps = 2;
-    if (n_taps == 2) add_mapped_taps(texels, image->stride, stored, own, weight, box, 2, to);
-    else if (n_taps == 3)
+    if (side <= 1.0f) add_mapped_taps(texels, image->stride, stored, own, weight, box, 2, to);
+    else if (side < 2.0f)
         add_mapped_taps(texels, image->stride, stored, own, weight, box, 3, to);
     else
-        add_mapped_taps(texels, image->stride, stored, own, weight, box,
-                        smaller_int(n_taps, MOST_TAPS), to);
+        add_mapped_wide(texels, image->stride, stored, own, weight, box, to);
 }
 
 static void add_unmoved(const frame *f, const recipe_image *image, float weight, reach box,

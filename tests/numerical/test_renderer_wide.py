@@ -1,0 +1,68 @@
+"""A headset's field, 94 x 96 deg: pixels of cells and of nodes differ threefold."""
+
+import numpy as np
+
+from filter_service.rgbd_view import RgbdView
+from tests.numerical.synthetic import psnr_db, texture
+from tests.numerical.test_renderer_field import (
+    FOCUS_DPT,
+    PUPIL_MM,
+    FieldBench,
+    splat_exactly,
+    tangents_of,
+)
+
+SIZE_PX = (56, 60)
+LEFT_EYE = tangents_of(-52, 42, -53, 43)
+
+
+def wide_bench(engine):
+    return FieldBench(
+        engine,
+        "myopia",
+        LEFT_EYE,
+        size=SIZE_PX,
+        mode="dynamic",
+        tolerance="loose",  # few nodes, far apart
+    )
+
+
+def scene(rng):
+    width, height = SIZE_PX
+    color = texture(rng, height, width, cell_px=3).astype(np.float32)
+    depth_m = np.full((height, width), 1.5, np.float32)
+    depth_m[20:40, 10:30] = 0.6
+    return color, depth_m
+
+
+def test_maps_are_as_wide_as_this_is_about(engine):
+    maps = wide_bench(engine).handle.image.maps.tables.node_from_cell
+    assert np.abs(maps).max() > 2.5
+
+
+def test_a_wide_field_agrees_with_the_exact_psf_of_every_pixel(engine, rng):
+    """Where nothing hides anything; at an edge there is more than PSFs to it."""
+    bench = wide_bench(engine)
+    color, depth_m = scene(rng)
+    depth_m[:] = 1.5
+    seen = bench.render(color, depth_m).color
+    exact = splat_exactly(bench, color, depth_m)
+    inner = (slice(4, -4), slice(4, -4))
+    assert psnr_db(seen[inner], exact[inner]) > 43.0
+
+
+def test_a_wide_field_comes_out_the_same_again_and_again(engine, rng):
+    """Whatever lies in memory beside it: a map once read beyond its kernel."""
+    bench = wide_bench(engine)
+    color, depth_m = scene(rng)
+    view = RgbdView(color, depth_m, bench.spec.camera.tangents)
+    first = None
+    for n in range(12):
+        if hasattr(bench.renderer, "trim"):
+            bench.renderer.trim()
+        _ = np.full(1000 * n + 1, np.nan)  # other memory, with other contents
+        seen = bench.renderer.render(
+            view, bench.handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT
+        ).color
+        first = seen if first is None else first
+        np.testing.assert_array_equal(seen, first)
