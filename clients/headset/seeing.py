@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,10 @@ PROFILE_WAIT_S = 2.0
 WAIT_SHARE = 0.6
 """Of a frame's period: so long the answer to the newest frame is waited for, so that a
 quick filter's picture is shown in the frame that it was rendered for."""
+
+PATIENCE_S = 0.15
+"""A filter that took no longer for the frame before is waited for in any case: where
+frames are late anyway, half the age is worth more than a few more of them."""
 
 MS_PER_S = 1e3
 
@@ -104,7 +109,7 @@ class SeeingHere:
 
     def __init__(self, settings: FilterSettings, say: Say) -> None:
         self._say = say
-        self._filters = {
+        self.filters = {
             eye: EyeFilter(
                 settings=settings,
                 on_event=lambda event, eye=eye: (
@@ -116,13 +121,13 @@ class SeeingHere:
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Ask for another eye; frames go on through the one before."""
-        self._filters[eye].set_profile(dict(profile))
+        self.filters[eye].set_profile(dict(profile))
 
     def see(self, frame: LookedAt) -> Seen | None:
         """Filter a frame; None while an eye is being prepared for it."""
         begin_s = time.monotonic()
         planned = plan_views(
-            self._filters.__getitem__,
+            self.filters.__getitem__,
             frame.views,
             frame.states,
             pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
@@ -148,7 +153,7 @@ class SeeingHere:
 
     def close(self) -> None:
         """End what filters."""
-        for eye_filter in self._filters.values():
+        for eye_filter in self.filters.values():
             eye_filter.close()
 
 
@@ -171,6 +176,7 @@ class SeeingByService:
         self._on_way: dict[int, LookedAt] = {}
         self._newest: Seen | None = None
         self._is_there = True
+        self._trip_s = math.inf  # of the last frame that came back
         self.n_dropped: dict[str, int] = {}
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
@@ -205,6 +211,8 @@ class SeeingByService:
         except FilterError as error:
             self._say(f"a frame was not sent: {error}")
         end_s = frame.begun_s + WAIT_SHARE * frame.due.period_s
+        if self._trip_s <= PATIENCE_S:
+            end_s = max(end_s, time.monotonic() + PATIENCE_S)
         self._take_events()
         while self._newest is None or self._newest.frame is not frame:
             wait_s = end_s - time.monotonic()
@@ -251,6 +259,7 @@ class SeeingByService:
         if frame is None:
             return
         header = answer.header
+        self._trip_s = 1e-3 * answer.round_trip_ms
         views = tuple(
             EyeView(
                 picture.view.eye, view.pose or picture.view.pose, picture.view.tangents

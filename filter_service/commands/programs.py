@@ -42,6 +42,7 @@ class Bench(StrEnum):
     COST = "cost"
     PEERS = "peers"
     SWITCH = "switch"
+    HEADSET = "headset"
     ABUSE = "abuse"
     OVERLOAD = "overload"
     RESTART = "restart"
@@ -70,6 +71,7 @@ BENCH_MODULES = {
     Bench.COST: "tests.benchmarks.bench_cost",
     Bench.PEERS: "tests.benchmarks.bench_peers",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
+    Bench.HEADSET: "tests.benchmarks.bench_headset",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
     Bench.RESTART: "tests.benchmarks.bench_restart",

@@ -1,0 +1,233 @@
+"""What a headset's frame takes, stage by stage: in this process, and by a service.
+
+    python -m tests.benchmarks.bench_headset [--quick] [--json]
+    sh tests/headset/run_in_root.sh python -m tests.benchmarks.bench_headset --openxr
+
+The viewer of `ocufilter headset` in a simulated headset of 72 Hz whose head moves: the
+courtyard through a myope's left and a keratoconic right eye, natural focus and pupils.
+Stages: ``scene`` renders both views (Mesa, on the processor); ``look`` finds gaze,
+focus and pupil; ``filter`` is the filter's own time for both eyes; ``around`` what this
+process adds to it; ``service``, ``wire`` and ``wait`` what a service adds: its own
+stages, the way there and back by shared memory, waiting for its turn; ``show`` hands
+the pictures to the runtime; ``age`` is from a frame's begin to where it was shown.
+
+With --openxr, in the root of tests/headset: the same in Monado, with its compositor on
+the processor too, before a striped wall; prints JSON.
+
+The error is the peak signal-to-noise ratio, of 8 bits, of the last pictures to the same
+frame filtered with no tolerance for errors of rendering.  Writes results/headset.json.
+"""
+
+import argparse
+import contextlib
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import moderngl
+import numpy as np
+
+from clients.headset.built_scene import built_scene
+from clients.headset.controls import Controls
+from clients.headset.gltf_scene import load_gltf
+from clients.headset.look import StereoLook
+from clients.headset.poses import upright
+from clients.headset.scenery import SceneScenery
+from clients.headset.seeing import Seeing, SeeingByService, SeeingHere
+from clients.headset.simulated_runtime import SimulatedRuntime
+from clients.headset.viewer import Viewer
+from clients.headset.viewpoint import viewpoint
+from clients.service_process import ServiceProcess
+from filter_service import FilterSettings
+from filter_service.errors import FilterError
+from tests.benchmarks.harness import Row, memory_mb, publish, report
+
+SIZES_PX = ((448, 504), (896, 1007))
+QUICK_SIZES_PX = ((112, 126),)
+N_FRAMES, QUICK_FRAMES = 80, 5
+WARM_S = 60.0
+RATE_HZ = 72.0
+WAYS = ("here", "service, shm")
+PROFILES = {
+    "left": {"kind": "preset", "name": "myopia"},
+    "right": {"kind": "preset", "name": "keratoconus"},
+}
+SETTINGS = FilterSettings(pupil_range_mm=(2.0, 5.0), object_range_dpt=(0.0, 8.5))
+
+
+class Watched:
+    """Passes on what is seen, and keeps the last frame and when eyes are complete."""
+
+    def __init__(self, seeing: Seeing):
+        self._seeing = seeing
+        self.last = None
+
+    def change(self, eye, profile) -> None:
+        self._seeing.change(eye, profile)
+
+    def see(self, frame):
+        self.last = self._seeing.see(frame) or self.last
+        return self.last
+
+    def close(self) -> None:
+        self._seeing.close()
+
+
+def viewer_of(open_runtime, scenery, seeing):
+    return Viewer(
+        open_runtime,
+        scenery,
+        seeing,
+        StereoLook(age_years=30.0),
+        Controls(dict(PROFILES), seeing.change),
+        say=lambda line: None,
+    )
+
+
+def error_db(seen) -> float:
+    """Return the PSNR of what was seen to the same frame without tolerance."""
+    exact = SeeingHere(SETTINGS, lambda line: None)
+    try:
+        for eye, profile in PROFILES.items():
+            exact.change(eye, profile)
+        squares = []
+        for n, (picture, eye) in enumerate(
+            zip(seen.frame.pictures, seen.frame.eyes, strict=True)
+        ):
+            eye_filter, wanted = exact.filters[picture.view.eye], None
+            while wanted is None or not wanted.is_complete:
+                wanted = eye_filter.filter(
+                    seen.frame.views[n],
+                    pupil_diameter_mm=eye.state.pupil_diameter_mm,
+                    focus_dpt=eye.state.focus_dpt,
+                    gaze_deg=eye.gaze_deg,
+                    render_tolerance=0.0,
+                )
+            squares.append((wanted.color - seen.colors[n].astype(float)) ** 2)
+        return float(10.0 * np.log10(255.0**2 / np.mean(squares)))
+    finally:
+        exact.close()
+
+
+def run(open_runtime, scenery, seeing, n_frames: int):
+    """Warm up until both eyes are whole, then measure: log, last frame, seconds."""
+    watched = Watched(seeing)
+    for eye, profile in PROFILES.items():
+        watched.change(eye, profile)
+    viewer = viewer_of(open_runtime, scenery, watched)
+    end_s = time.monotonic() + WARM_S
+    n_whole = 0
+    while time.monotonic() < end_s and n_whole < 5:
+        viewer.run(max_frames=viewer.log.n_filtered + 1, limit_s=WARM_S)
+        n_whole = n_whole + 1 if watched.last and watched.last.is_complete else 0
+    viewer = viewer_of(open_runtime, scenery, watched)
+    start_s = time.monotonic()
+    log = viewer.run(max_frames=n_frames, limit_s=WARM_S)
+    return log, watched.last, time.monotonic() - start_s
+
+
+def rows_of(log, took_s: float, method: str, case: str, error: float):
+    dropped = f"{log.n_filtered / took_s:.1f} Hz, {log.n_repeated} shown again"
+    for name, values in log.stages_ms.items():
+        median_ms, p95_ms = np.percentile(values, (50, 95)).tolist()
+        yield Row(
+            *("headset", f"{method}: {name.removesuffix('_ms')}", case, dropped),
+            *(len(values), median_ms, p95_ms, memory_mb()),
+            *("psnr_db", error, "no tolerance"),
+        )
+
+
+def ways(names):
+    """Yield (name, seeing) of each way to filter."""
+    for name in names:
+        with contextlib.ExitStack() as stack:
+            if name == "service, shm":
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                service = stack.enter_context(
+                    ServiceProcess({"bind": f"ipc://{folder}/service"})
+                )
+                seeing = SeeingByService(service.endpoint, SETTINGS, lambda line: None)
+            else:
+                seeing = SeeingHere(SETTINGS, lambda line: None)
+            stack.callback(seeing.close)
+            yield name, seeing
+
+
+def measure(sizes_px, n_frames: int) -> list[Row]:
+    """Return the rows of a simulated headset."""
+    scene = built_scene("courtyard")
+    stand = upright(viewpoint(scene))
+    rows = []
+    context = moderngl.create_context(standalone=True, backend="egl", require=430)
+    with contextlib.closing(SceneScenery(context, scene, stand)) as scenery:
+        for size_px in sizes_px:
+            for name, seeing in ways(WAYS):
+                log, seen, took_s = run(
+                    lambda size_px=size_px: SimulatedRuntime(size_px, rate_hz=RATE_HZ),
+                    scenery,
+                    seeing,
+                    n_frames,
+                )
+                case = f"2 x {size_px[0]}x{size_px[1]}"
+                rows += rows_of(log, took_s, name, case, error_db(seen))
+    context.release()
+    return rows
+
+
+def measure_openxr(n_frames: int) -> list[Row]:
+    """Return the rows of Monado."""
+    import os
+
+    from clients.headset.openxr_runtime import OpenXrRuntime
+    from tests.headset.monado import Monado
+    from tests.headset.rooms import stripes
+
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        scene = load_gltf(stripes(Path(folder) / "room.glb"))
+        for screen in (False, True):
+            with contextlib.ExitStack() as stack:
+                monado = stack.enter_context(Monado(Path(folder), screen=screen))
+                os.environ.update(monado.environment)
+                context = moderngl.create_context(
+                    standalone=True, backend="egl", require=430
+                )
+                scenery = SceneScenery(context, scene, upright(viewpoint(scene)))
+                stack.callback(context.release)
+                stack.callback(scenery.close)
+                for name, seeing in ways(WAYS):
+                    log, seen, took_s = run(
+                        lambda context=context: OpenXrRuntime(context),
+                        scenery,
+                        seeing,
+                        n_frames,
+                    )
+                    height_px, width_px = seen.colors[0].shape[:2]
+                    kind = "XCB compositor" if screen else "null compositor"
+                    case = f"2 x {width_px}x{height_px}, Monado's {kind}"
+                    rows += rows_of(log, took_s, name, case, error_db(seen))
+    return rows
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small, five frames")
+    parser.add_argument("--openxr", action="store_true", help="in Monado; see above")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    arguments = parser.parse_args()
+    sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
+    n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
+    try:
+        if arguments.openxr:
+            print(json.dumps(report(measure_openxr(n_frames)), indent=1))
+            return
+        rows = measure(sizes_px, n_frames)
+    except FilterError as error:
+        raise SystemExit(f"headset: {error}") from None
+    publish("headset", rows, as_json=arguments.json, is_whole=not arguments.quick)
+
+
+if __name__ == "__main__":
+    main()
