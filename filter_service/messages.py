@@ -24,6 +24,7 @@ from filter_service.view_state import (
     EyeName,
     Pose,
     ViewState,
+    body_of_eye,
     check_states,
 )
 from filter_service.wire.compression import COMPRESSIONS, Compression
@@ -121,6 +122,7 @@ __all__ = [
     "ViewImages",
     "ViewState",
     "Welcome",
+    "body_of_eye",
     "check_states",
     "decode_reply",
     "decode_request",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from msgspec import Meta
 
@@ -15,6 +15,15 @@ from filter_service.settings import GazeDeg, PupilMm, VergenceDpt
 EyeName = Literal["both", "left", "right"]
 EYE_NAMES: tuple[EyeName, ...] = get_args(EyeName)
 """`both` is one eye for all views; `left` and `right` have profiles of their own."""
+
+
+def body_of_eye(body: Mapping[str, Any], eye: EyeName) -> dict[str, Any]:
+    """Return a profile's body for an eye: that of the left one is of a left eye.
+
+    Unless it says otherwise itself.
+    """
+    return ({"eye_side": "OS"} if eye == "left" else {}) | dict(body)
+
 
 PoseNumber = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Pose = tuple[

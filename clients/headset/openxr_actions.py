@@ -19,6 +19,11 @@ _BUTTONS = {
 _CONTROLLER = "/interaction_profiles/khr/simple_controller"
 _TRACKER = "/interaction_profiles/ext/eye_gaze_interaction"
 _GAZE = "/user/eyes_ext/input/gaze_ext/pose"
+_SEEN = (
+    # VALID alone is the last pose that was known, as while the eyes are shut
+    xr.SpaceLocationFlags.ORIENTATION_VALID_BIT
+    | xr.SpaceLocationFlags.ORIENTATION_TRACKED_BIT
+)
 
 
 class Actions:
@@ -81,7 +86,11 @@ class Actions:
         return tuple(pressed)
 
     def gaze(self, head_space, time_ns: int) -> GazeSample | None:
-        """Return where the eyes look, as seen from the head; None while unknown."""
+        """Return where the eyes look, as seen from the head; None while unknown.
+
+        Trackers that cannot predict give their nearest sample, whose time then counts;
+        one that does not know that time says 0, and what was asked for counts.
+        """
         if self._gaze_space is None:
             return None
         state = xr.get_action_state_pose(
@@ -98,7 +107,7 @@ class Actions:
                 self._gaze_space, head_space, time_ns, ctypes.byref(found)
             )
         )
-        if not found.location_flags & xr.SpaceLocationFlags.ORIENTATION_VALID_BIT:
+        if found.location_flags & _SEEN != _SEEN:
             return None
         # A gaze looks along -z of its pose.
         h_deg, v_deg = angles_of(-matrix_of(pose_of(found.pose))[:3, 2])

@@ -1,4 +1,7 @@
-"""OpenGL for OpenXR: an EGL context without a window, and how a session takes it.
+"""OpenGL for OpenXR: a context that a runtime can take, and how a session takes it.
+
+open_context       EGL's without a window, or GLX's of a hidden one
+current_platform   which of both is current: what a session needs, and is told
 
 pyopenxr makes PyOpenGL use GLX when it is imported, so functions are loaded here.
 """
@@ -6,45 +9,246 @@ pyopenxr makes PyOpenGL use GLX when it is imported, so functions are loaded her
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, byref, c_int, c_uint, c_void_p
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes import POINTER, c_int, c_void_p
+from typing import Any
 
 import moderngl
 import xr
 
-_CONFIG_ID, _NONE = 0x3028, 0x3038  # EGL_CONFIG_ID, EGL_NONE
+from clients.headset.runtime import NoRuntime
+
+GRAPHICS_VARIABLE = "OCUFILTER_HEADSET_GRAPHICS"
+OPENGL, EGL_ENABLE = "XR_KHR_opengl_enable", "XR_MNDX_egl_enable"
+
+_VERSION = 430
+_EGL_CONFIG_ID, _EGL_NONE = 0x3028, 0x3038
+_GLX_VISUAL_ID, _GLX_SCREEN, _GLX_FBCONFIG_ID = 0x800B, 0x800C, 0x8013
 _FRAMEBUFFER, _TEXTURE_2D = 0x8D40, 0x0DE1
 _COLOR, _DEPTH = 0x8CE0, 0x8D00  # GL_COLOR_ATTACHMENT0, GL_DEPTH_ATTACHMENT
 
 
-def _egl() -> ctypes.CDLL:
-    egl = ctypes.CDLL("libEGL.so.1")
-    for name in ("eglGetCurrentDisplay", "eglGetCurrentContext", "eglGetProcAddress"):
-        getattr(egl, name).restype = c_void_p
-    egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
-    egl.eglQueryContext.argtypes = [c_void_p, c_void_p, c_int, POINTER(c_int)]
-    egl.eglChooseConfig.argtypes = [
-        *(c_void_p, POINTER(c_int), POINTER(c_void_p), c_int, POINTER(c_int)),
-    ]
-    return egl
+def offered_extensions() -> set[str]:
+    """Return what the runtime offers; raise OpenXR's own exception where none is."""
+    return {
+        properties.extension_name.decode()
+        for properties in xr.enumerate_instance_extension_properties()
+    }
 
 
-def egl_binding() -> xr.GraphicsBindingEGLMNDX:
-    """Return what a session is told of the current EGL context."""
-    egl = _egl()
-    display, context = egl.eglGetCurrentDisplay(), egl.eglGetCurrentContext()
-    config_id, config, n_found = c_int(), c_void_p(), c_int()
-    egl.eglQueryContext(display, context, _CONFIG_ID, byref(config_id))
-    wanted = (c_int * 3)(_CONFIG_ID, config_id.value, _NONE)
-    egl.eglChooseConfig(display, wanted, byref(config), 1, byref(n_found))
-    # The fields are pointer types of PyOpenGL, which take no plain address.
-    kinds = dict(xr.GraphicsBindingEGLMNDX._fields_)
-    return xr.GraphicsBindingEGLMNDX(
-        get_proc_address=ctypes.cast(
-            egl.eglGetProcAddress, xr.PFN_xrEglGetProcAddressMNDX
-        ),
-        display=ctypes.cast(display, kinds["display"]),
-        config=ctypes.cast(config, kinds["config"]),
-        context=ctypes.cast(context, kinds["context"]),
+@contextmanager
+def open_context() -> Iterator[moderngl.Context]:
+    """Give a context that the runtime can take, until it is left; none is current.
+
+    It is EGL's, without a window and without a display, where the runtime takes that,
+    or where there is no runtime yet; otherwise GLX's, of a hidden window under X.  The
+    environment variable ``OCUFILTER_HEADSET_GRAPHICS`` asks for ``egl`` or ``glx``
+    whatever the runtime offers.
+
+    Raises
+    ------
+    NoRuntime
+        The runtime needs an X display, and there is none that does.
+    ValueError
+        The variable asks for something else.
+    """
+    opened = _egl_context() if _wanted() == "egl" else _glx_context()
+    with opened as context:
+        with context:
+            pass  # some drivers' contexts are current from birth; now none is
+        yield context
+
+
+def _wanted() -> str:
+    wanted = os.environ.get(GRAPHICS_VARIABLE, "")
+    if wanted in ("egl", "glx"):
+        return wanted
+    if wanted:
+        raise ValueError(f"{GRAPHICS_VARIABLE} is {wanted!r}; allowed: egl, glx")
+    try:
+        offered = offered_extensions()
+    except xr.XrException:
+        return "egl"
+    return "egl" if EGL_ENABLE in offered else "glx"
+
+
+@contextmanager
+def _egl_context() -> Iterator[moderngl.Context]:
+    context = moderngl.create_context(standalone=True, backend="egl", require=_VERSION)
+    try:
+        yield context
+    finally:
+        context.release()
+
+
+@contextmanager
+def _glx_context() -> Iterator[moderngl.Context]:
+    if not os.environ.get("DISPLAY"):
+        raise _no_display("DISPLAY is not set")
+    # Under Wayland glfw would load a library that knows no GLX.
+    os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
+    try:
+        import glfw
+    except ImportError as error:
+        raise NoRuntime(
+            f"this OpenXR runtime takes windows only, by glfw: {error}"
+        ) from None
+    errors: list[str] = []
+    glfw.set_error_callback(lambda code, text: errors.append(text.decode()))
+    try:
+        window = _hidden_window(glfw)
+        if window is None:
+            raise _no_display("; ".join(errors))
+        glfw.make_context_current(window)
+        # With libraries named it is a context of its own, not moderngl's default one.
+        context = moderngl.create_context(
+            require=_VERSION, libgl="libGL.so.1", libx11="libX11.so.6"
+        )
+        glfw.make_context_current(None)
+        yield context
+        context.release()
+    finally:
+        glfw.terminate()
+
+
+def _hidden_window(glfw: Any):
+    """Return a window that nobody sees; None where it cannot be made."""
+    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+    if not glfw.init():
+        return None
+    for hint, value in (
+        (glfw.VISIBLE, glfw.FALSE),
+        (glfw.CONTEXT_CREATION_API, glfw.NATIVE_CONTEXT_API),
+        (glfw.CONTEXT_VERSION_MAJOR, _VERSION // 100),
+        (glfw.CONTEXT_VERSION_MINOR, _VERSION // 10 % 10),
+        (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+    ):
+        glfw.window_hint(hint, value)
+    return glfw.create_window(16, 16, "ocufilter headset", None, None)
+
+
+def _no_display(why: str) -> NoRuntime:
+    return NoRuntime(f"this OpenXR runtime needs an X display with OpenGL 4.3: {why}")
+
+
+class Egl:
+    """EGL, which has contexts without a window.
+
+    Attributes
+    ----------
+    name : str
+    extensions : what a session that draws with it needs of the runtime
+    """
+
+    name = "EGL"
+    extensions = (OPENGL, EGL_ENABLE)
+
+    def __init__(self) -> None:
+        egl = self._egl = ctypes.CDLL("libEGL.so.1")
+        egl.eglGetCurrentDisplay.restype = egl.eglGetCurrentContext.restype = c_void_p
+        egl.eglGetProcAddress.restype = c_void_p
+        egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+        egl.eglQueryContext.argtypes = [c_void_p, c_void_p, c_int, POINTER(c_int)]
+        egl.eglChooseConfig.argtypes = [
+            *(c_void_p, POINTER(c_int), POINTER(c_void_p), c_int, POINTER(c_int)),
+        ]
+
+    def is_current(self) -> bool:
+        """Return whether the current context is one of it."""
+        return bool(self._egl.eglGetCurrentContext())
+
+    def load(self, name: str) -> int:
+        """Return where a function of OpenGL is."""
+        return self._egl.eglGetProcAddress(name.encode())
+
+    def binding(self) -> xr.GraphicsBindingEGLMNDX:
+        """Return what a session is told of the current context."""
+        egl = self._egl
+        display, context = egl.eglGetCurrentDisplay(), egl.eglGetCurrentContext()
+        config_id, config, n_found = c_int(), c_void_p(), c_int()
+        egl.eglQueryContext(display, context, _EGL_CONFIG_ID, byref(config_id))
+        wanted = (c_int * 3)(_EGL_CONFIG_ID, config_id.value, _EGL_NONE)
+        egl.eglChooseConfig(display, wanted, byref(config), 1, byref(n_found))
+        return _filled(
+            xr.GraphicsBindingEGLMNDX,
+            get_proc_address=egl.eglGetProcAddress,
+            display=display,
+            config=config,
+            context=context,
+        )
+
+
+class Glx:
+    """GLX, which has the contexts of windows under X; else as `Egl`."""
+
+    name = "GLX"
+    extensions = (OPENGL,)
+
+    def __init__(self) -> None:
+        glx, self._x11 = ctypes.CDLL("libGL.so.1"), ctypes.CDLL("libX11.so.6")
+        self._glx = glx
+        glx.glXGetCurrentDisplay.restype = glx.glXGetCurrentContext.restype = c_void_p
+        glx.glXGetCurrentDrawable.restype = c_ulong
+        glx.glXGetProcAddressARB.restype = c_void_p
+        glx.glXGetProcAddressARB.argtypes = [ctypes.c_char_p]
+        asking = [c_void_p, c_void_p, c_int, POINTER(c_int)]
+        glx.glXQueryContext.argtypes = glx.glXGetFBConfigAttrib.argtypes = asking
+        glx.glXChooseFBConfig.argtypes = [
+            *(c_void_p, c_int, POINTER(c_int), POINTER(c_int))
+        ]
+        glx.glXChooseFBConfig.restype = POINTER(c_void_p)
+        self._x11.XFree.argtypes = [c_void_p]
+
+    def load(self, name: str) -> int:
+        """Return where a function of OpenGL is."""
+        return self._glx.glXGetProcAddressARB(name.encode())
+
+    def binding(self) -> xr.GraphicsBindingOpenGLXlibKHR:
+        """Return what a session is told of the current context."""
+        glx = self._glx
+        display, context = glx.glXGetCurrentDisplay(), glx.glXGetCurrentContext()
+        config = self._config(display, context)
+        visual_id = c_int()
+        glx.glXGetFBConfigAttrib(display, config, _GLX_VISUAL_ID, byref(visual_id))
+        return _filled(
+            xr.GraphicsBindingOpenGLXlibKHR,
+            x_display=display,
+            visualid=visual_id.value,
+            glx_fbconfig=config,
+            glx_drawable=glx.glXGetCurrentDrawable(),
+            glx_context=context,
+        )
+
+    def _config(self, display: int, context: int) -> int | None:
+        glx = self._glx
+        config_id, screen, n_found = c_int(), c_int(), c_int()
+        glx.glXQueryContext(display, context, _GLX_FBCONFIG_ID, byref(config_id))
+        glx.glXQueryContext(display, context, _GLX_SCREEN, byref(screen))
+        wanted = (c_int * 3)(_GLX_FBCONFIG_ID, config_id.value, 0)
+        found = glx.glXChooseFBConfig(display, screen, wanted, byref(n_found))
+        config = found[0] if n_found.value else None
+        self._x11.XFree(found)
+        return config
+
+
+def current_platform() -> Egl | Glx:
+    """Return what the current context is of."""
+    egl = Egl()
+    return egl if egl.is_current() else Glx()
+
+
+def _filled(structure: Any, **fields: Any):
+    """Return a structure, its pointers those of PyOpenGL that it asks for."""
+    kinds = dict(structure._fields_)
+    return structure(
+        **{
+            name: value
+            if issubclass(kinds[name], ctypes._SimpleCData)
+            else ctypes.cast(value, kinds[name])
+            for name, value in fields.items()
+        }
     )
 
 
@@ -58,10 +262,10 @@ class Framebuffers:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        load = _egl().eglGetProcAddress
+        load = current_platform().load
 
-        def function(name: str, *types):
-            return ctypes.CFUNCTYPE(None, *types)(load(name.encode()))
+        def function(name: str, *types) -> Callable[..., None]:
+            return ctypes.CFUNCTYPE(None, *types)(load(name))
 
         self._make = function("glGenFramebuffers", c_int, POINTER(c_uint))
         self._bind = function("glBindFramebuffer", c_uint, c_uint)

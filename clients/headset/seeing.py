@@ -16,7 +16,13 @@ from clients.headset.look import LookingEye, RgbdPicture
 from clients.headset.runtime import EYES, DueFrame, Eye, EyeView
 from filter_service import EyeFilter, FilterSettings, RgbdView, plan_views
 from filter_service.errors import FilterError
-from filter_service.messages import Dropped, ErrorReply, Ready, ViewState
+from filter_service.messages import (
+    Dropped,
+    ErrorReply,
+    Ready,
+    ViewState,
+    body_of_eye,
+)
 
 PROFILE_WAIT_S = 2.0
 WAIT_SHARE = 0.6
@@ -121,7 +127,7 @@ class SeeingHere:
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Ask for another eye; frames go on through the one before."""
-        self.filters[eye].set_profile(dict(profile))
+        self.filters[eye].set_profile(body_of_eye(profile, eye))
 
     def see(self, frame: LookedAt) -> Seen | None:
         """Filter a frame; None while an eye is being prepared for it."""

@@ -22,6 +22,7 @@ from filter_service.messages import (
     Ready,
     Reply,
 )
+from filter_service.view_state import body_of_eye
 
 log = logging.getLogger("ocufilter")
 
@@ -113,7 +114,7 @@ class SessionEyes:
         try:
             eye = self._eye(request.eye)
             accepted = eye.eye_filter.set_profile(
-                read_profile(request.body),
+                read_profile(body_of_eye(request.body, request.eye)),
                 settings=request.settings,
                 cameras=request.views,
                 profile_id=request.profile_id,

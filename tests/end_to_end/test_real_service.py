@@ -17,7 +17,7 @@ from clients.service_process import CHECKOUT, ServiceProcess
 from estimator.networks.card import INPUTS, read_card
 from filter_service import EyeFilter, FilterSettings, ViewState, errors
 from filter_service.camera import tangents_from_fov
-from filter_service.messages import Camera, Dropped
+from filter_service.messages import Camera, Dropped, body_of_eye
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
 # A narrow range of pupils and distances keeps the builds of these tests short.
@@ -141,7 +141,8 @@ def test_two_eyes_see_what_each_sees_alone_in_this_process(real_client):
         "tolerance": "loose",
     }
     states = (ViewState("left", 3.0, None, (3.0, 0.0)), ViewState("right"))
-    profiles = {"left": MYOPIA, "right": {"kind": "preset", "name": "keratoconus"}}
+    myope = {"kind": "prescription", "sphere_dpt": -12}
+    profiles = {"left": myope, "right": {"kind": "preset", "name": "keratoconus"}}
     see = SEE | {"gaze_deg": (-3.0, 0.0)}
     for state, seen in zip(states, (left, right), strict=True):
         real_client.set_profile(
@@ -153,9 +154,8 @@ def test_two_eyes_see_what_each_sees_alone_in_this_process(real_client):
             "pupil_diameter_mm": state.pupil_diameter_mm or SEE["pupil_diameter_mm"],
             "gaze_deg": state.gaze_deg or see["gaze_deg"],
         }
-        with EyeFilter(
-            profiles[state.eye], seen.camera, FilterSettings(**settings)
-        ) as alone:
+        body = body_of_eye(profiles[state.eye], state.eye)
+        with EyeFilter(body, seen.camera, FilterSettings(**settings)) as alone:
             alone.wait()
             wanted = alone.filter(seen, **(see | own)).color
         np.testing.assert_allclose(color, wanted, atol=2e-6)

@@ -21,6 +21,7 @@ from filter_service.messages import (
     ResultView,
     SharedPlaces,
     ViewHeader,
+    body_of_eye,
     decode_reply,
     decode_request,
     encode,
@@ -77,6 +78,12 @@ def test_each_view_goes_through_its_own_eye_and_comes_back_with_its_pose(
     assert (left.pose, right.pose) == (LEFT_POSE, RIGHT_POSE)
     assert reply.header.display_time_ns == 2**62 + 1
     assert left.profile_id == reply.header.profile_id != right.profile_id
+
+
+def test_the_left_eye_is_a_left_one_unless_its_profile_says_otherwise():
+    assert body_of_eye({"kind": "preset"}, "left")["eye_side"] == "OS"
+    assert body_of_eye({"eye_side": "OD"}, "left")["eye_side"] == "OD"
+    assert "eye_side" not in body_of_eye({"kind": "preset"}, "right")
 
 
 def test_the_order_of_views_is_the_frames_own(two_eyes, pair):

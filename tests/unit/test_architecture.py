@@ -91,7 +91,7 @@ HOME = {
         "clients/window.py",  # shows frames in a window of its own
         "clients/headset/*",  # renders for both eyes of a headset
     ),
-    "glfw": ("clients/window.py",),
+    "glfw": ("clients/window.py", "clients/headset/openxr_gl.py"),
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
         "filter_service/service/mailbox.py",  # the server's socket and nothing else
