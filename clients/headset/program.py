@@ -12,6 +12,7 @@ focus follows what is looked at, and pupils the light of the scene, as people's 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import logging
 import sys
@@ -22,10 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from clients.extra import HEADSET_INSTALL
+from clients.headset.built_scene import SceneNotBuilt, built_scene
 from clients.headset.controls import HELP, Controls
 from clients.headset.look import StereoLook
 from clients.headset.poses import upright
-from clients.headset.runtime import EYES, NoRuntime, Runtime, SessionLost
+from clients.headset.runtime import EYES, NoRuntime, Runtime
 from clients.headset.seeing import Seeing, SeeingByService, SeeingHere
 from clients.headset.viewer import Viewer, ViewerLog
 from clients.natural import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
@@ -54,8 +56,11 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     scene.add_argument(
         "--scene",
         default="courtyard",
-        metavar="NAME|FILE",
-        help="courtyard, primitives, or a .glb or .gltf file (default: courtyard)",
+        metavar="NAME|FILE|MODULE:FUNCTION",
+        help="courtyard, primitives, or a .glb or .gltf file (default: courtyard); or "
+        "a function of yours, which is given the OpenGL context and gives what "
+        "renders: an object whose pictures(views, size_px) returns an RgbdPicture for "
+        "each view, see clients/headset/scenery.py",
     )
     scene.add_argument(
         "--supersampling", type=int, default=2, help="samples per pixel and axis"
@@ -166,9 +171,29 @@ def profiles_of(options: argparse.Namespace) -> dict[Any, Mapping[str, Any]]:
     return {eye: read_profile(getattr(options, eye) or options.profile) for eye in EYES}
 
 
+def scenery_of(options: argparse.Namespace, context) -> Any:
+    """Return what renders both eyes' pictures: ours, or the user's.
+
+    Raises
+    ------
+    ValueError
+        There is no such scene, file or function.
+    """
+    module, colon, function = options.scene.partition(":")
+    if colon and not Path(options.scene).exists():
+        sys.path.insert(0, "")
+        try:
+            return getattr(importlib.import_module(module), function)(context)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"--scene {options.scene}: {error}") from None
+    from clients.headset.scenery import SceneScenery
+
+    scene, stand = scene_of(options.scene)
+    return SceneScenery(context, scene, stand, supersampling=options.supersampling)
+
+
 def scene_of(name: str):
     """Return a scene of ours by its name, or that of a file; and where to stand."""
-    from clients.headset.built_scene import built_scene
     from clients.headset.gltf_scene import load_gltf
     from clients.headset.viewpoint import viewpoint
 
@@ -182,7 +207,6 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     import moderngl
 
     from clients.headset.keys import TerminalKeys
-    from clients.headset.scenery import SceneScenery
 
     settings, profiles = settings_of(options), profiles_of(options)
     for name, low, high in (("scale", 0.1, 2.0),):
@@ -197,14 +221,11 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         gaze_range_deg=settings.gaze_range_deg,
     )
     size_px = _size(options.size)
-    scene, stand = scene_of(options.scene)
     with ExitStack() as stack:
         context = moderngl.create_context(standalone=True, backend="egl", require=430)
         stack.callback(context.release)
-        scenery = SceneScenery(
-            context, scene, stand, supersampling=options.supersampling
-        )
-        stack.callback(scenery.close)
+        scenery = scenery_of(options, context)
+        stack.callback(getattr(scenery, "close", lambda: None))
         seeing = _seeing(options, settings)
         stack.callback(seeing.close)
         keeper = _Pictures()
@@ -329,7 +350,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"headset: {error}", file=sys.stderr)
         return 2
-    except (FilterError, NoRuntime, SessionLost, OSError, RuntimeError) as error:
+    except (FilterError, NoRuntime, SceneNotBuilt, OSError, RuntimeError) as error:
         print(f"headset: {error}", file=sys.stderr)
         return 1
     sys.stdout.write((json.dumps(report) if options.json else _lines(report)) + "\n")

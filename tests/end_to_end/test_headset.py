@@ -503,11 +503,52 @@ def test_the_command_shows_a_scene_in_a_simulated_headset(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"left.png", "right.png"}
 
 
+OWN_SCENERY = """
+import numpy as np
+from clients.headset.look import RgbdPicture
+
+class Grey:
+    def pictures(self, views, size_px):
+        width, height = size_px
+        color = np.full((height, width, 3), 99, np.uint8)
+        depth_m = np.full((height, width), 2.0, np.float32)
+        return tuple(RgbdPicture(view, color, depth_m) for view in views)
+
+def make(context):
+    assert context.version_code >= 430
+    return Grey()
+"""
+
+
+def test_a_program_of_ones_own_renders(tmp_path):
+    (tmp_path / "own_scenery.py").write_text(OWN_SCENERY)
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-m", "filter_service", "headset", "--simulated"),
+            *("--scene", "own_scenery:make", "--size", "48x54", "--frames", "2"),
+            *("--settings", json.dumps({"tolerance": "loose", "mode": "on-axis"})),
+            *("--out", "pictures", "--seconds", "60"),
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    from PIL import Image
+
+    seen = np.asarray(Image.open(tmp_path / "pictures" / "left.png"))
+    assert seen.shape == (54, 48, 3)
+    assert np.abs(seen.astype(int) - 99).max() <= 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--scene", "nowhere"), "nowhere"),
         (("--scene", "missing.glb"), "missing.glb"),
+        (("--scene", "no_such_module:make"), "no_such_module"),
         (("--size", "5x5"), "WIDTHxHEIGHT"),
         (("--age", "200"), "3 to 120"),
         (("--pupil-mm", "30"), "0.5 to 9"),
