@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from ctypes import POINTER, c_int, c_void_p
+from ctypes import POINTER, byref, c_int, c_uint, c_ulong, c_void_p
 from typing import Any
 
 import moderngl

@@ -9,7 +9,7 @@ import ctypes
 import logging
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import wraps
 from typing import Any
 
@@ -17,7 +17,12 @@ import moderngl
 import xr
 
 from clients.headset.openxr_actions import EYE_GAZE, Actions, raise_failure
-from clients.headset.openxr_gl import egl_binding
+from clients.headset.openxr_gl import (
+    EGL_ENABLE,
+    GRAPHICS_VARIABLE,
+    current_platform,
+    offered_extensions,
+)
 from clients.headset.openxr_swapchains import StereoImages, pose_of, tangents_of
 from clients.headset.runtime import (
     EYES,
@@ -28,14 +33,8 @@ from clients.headset.runtime import (
     ShownView,
 )
 
-_OPENGL, _EGL, _HEADLESS = (
-    "XR_KHR_opengl_enable",
-    "XR_MNDX_egl_enable",
-    "XR_MND_headless",
-)
 _DEPTH = "XR_KHR_composition_layer_depth"
 _STEREO = xr.ViewConfigurationType.PRIMARY_STEREO
-_BLEND = xr.EnvironmentBlendMode.OPAQUE
 _IDLE_S = 0.02
 _END_S = 3.0
 _TRACKED = (
@@ -62,6 +61,8 @@ def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
             raise SessionLost("the OpenXR runtime is gone") from None
         except xr.RuntimeFailureError as error:
             raise SessionLost(f"the OpenXR runtime failed: {error}") from None
+        except xr.TimeoutExpired:
+            raise SessionLost("the OpenXR runtime gave no image to draw in") from None
 
     return wrapped
 
@@ -71,9 +72,8 @@ class OpenXrRuntime:
 
     Parameters
     ----------
-    context : moderngl.Context, optional
-        An EGL context of its own, which what is shown is drawn in.  Without one the
-        session is headless: poses, and no pictures.
+    context : moderngl.Context
+        As of `openxr_gl.open_context`, which what is shown is drawn in.
     layers : sequence of str
         OpenXR API layers to load, as ``XR_APILAYER_LUNARG_core_validation``.
     scale : float
@@ -87,7 +87,7 @@ class OpenXrRuntime:
 
     def __init__(
         self,
-        context: moderngl.Context | None,
+        context: moderngl.Context,
         *,
         layers: Sequence[str] = (),
         scale: float = 1.0,
@@ -109,14 +109,13 @@ class OpenXrRuntime:
     # Opening
 
     def _open(self, layers: Sequence[str]) -> None:
-        offered = {
-            properties.extension_name.decode()
-            for properties in xr.enumerate_instance_extension_properties()
-        }
-        needed = [_HEADLESS] if self._context is None else [_OPENGL, _EGL]
+        offered = offered_extensions()
+        with self._context:
+            self._platform = current_platform()
+        needed = self._platform.extensions
         missing = [name for name in needed if name not in offered]
         if missing:
-            raise NoRuntime(f"the OpenXR runtime does not offer {', '.join(missing)}")
+            raise NoRuntime(_lacks(missing))
         optional = [name for name in (_DEPTH, EYE_GAZE) if name in offered]
         self._instance = xr.create_instance(
             xr.InstanceCreateInfo(
@@ -133,13 +132,8 @@ class OpenXrRuntime:
         self._system = xr.get_system(
             self._instance, xr.SystemGetInfo(xr.FormFactor.HEAD_MOUNTED_DISPLAY)
         )
-        view = xr.enumerate_view_configuration_views(
-            self._instance, self._system, _STEREO
-        )[0]
-        self.size_px = (
-            round(self._scale * view.recommended_image_rect_width),
-            round(self._scale * view.recommended_image_rect_height),
-        )
+        self.size_px = self._size()
+        self._blend = self._blend_mode()
         self._session = self._new_session()
         self._closing.callback(_quietly, xr.destroy_session, self._session)
         self._room = self._space(xr.ReferenceSpaceType.LOCAL)
@@ -147,21 +141,39 @@ class OpenXrRuntime:
         has_gaze = EYE_GAZE in optional and self._tracks_eyes()
         self._actions = Actions(self._instance, self._session, with_gaze=has_gaze)
         self.notes = [] if has_gaze else ["no eye tracker: gaze is straight ahead"]
-        self._images = None
-        if self._context is not None:
-            with self._context:
-                self._images = StereoImages(
-                    self._session,
-                    self._context,
-                    self.size_px,
-                    with_depth=_DEPTH in optional,
-                )
-            self._closing.callback(self._release_images)
+        with self._context:
+            self._images = StereoImages(
+                self._session,
+                self._context,
+                self.size_px,
+                with_depth=_DEPTH in optional,
+            )
+        self._closing.callback(self._release_images)
+
+    def _size(self) -> tuple[int, int]:
+        """Return (width, height) of a picture: as recommended, and as allowed."""
+        view = xr.enumerate_view_configuration_views(
+            self._instance, self._system, _STEREO
+        )[0]
+        width = round(self._scale * view.recommended_image_rect_width)
+        height = round(self._scale * view.recommended_image_rect_height)
+        return (
+            min(width, view.max_image_rect_width),
+            min(height, view.max_image_rect_height),
+        )
+
+    def _blend_mode(self) -> xr.EnvironmentBlendMode:
+        """Return how the room is hidden, or what comes next to that."""
+        opaque = xr.EnvironmentBlendMode.OPAQUE
+        offered = [
+            xr.EnvironmentBlendMode(mode)
+            for mode in xr.enumerate_environment_blend_modes(
+                self._instance, self._system, _STEREO
+            )
+        ]
+        return opaque if opaque in offered else offered[0]
 
     def _new_session(self):
-        info = xr.SessionCreateInfo(system_id=self._system)
-        if self._context is None:
-            return xr.create_session(self._instance, info)
         # The standard asks for this call, whatever its answer.
         ask = ctypes.cast(
             xr.get_instance_proc_addr(
@@ -172,7 +184,7 @@ class OpenXrRuntime:
         wanted = xr.GraphicsRequirementsOpenGLKHR()
         ask(self._instance, self._system, ctypes.byref(wanted))
         with self._context:
-            binding = egl_binding()
+            binding = self._platform.binding()
             info = xr.SessionCreateInfo(
                 system_id=self._system,
                 next=ctypes.cast(ctypes.pointer(binding), ctypes.c_void_p),
@@ -200,14 +212,14 @@ class OpenXrRuntime:
     @property
     def has_depth(self) -> bool:
         """Return whether depth is handed to the compositor."""
-        return self._images is not None and self._images.has_depth
+        return self._images.has_depth
 
     # Frames
 
     @_or_lost
     def begin_frame(self) -> DueFrame | None:
         """Wait for the next frame; None where there is none for the moment."""
-        with self._current():
+        with self._context:
             self._take_events()
             if self._is_over:
                 raise SessionLost("the headset's session has ended")
@@ -215,8 +227,9 @@ class OpenXrRuntime:
                 time.sleep(_IDLE_S)
                 return None
             state = xr.wait_frame(self._session, xr.FrameWaitInfo())
-            xr.begin_frame(self._session, xr.FrameBeginInfo())
-            self._time_ns = time_ns = int(state.predicted_display_time)
+            with suppress(xr.FrameDiscarded):  # it has begun, in place of another
+                xr.begin_frame(self._session, xr.FrameBeginInfo())
+            time_ns = int(state.predicted_display_time)
             pressed = self._actions.sync()
             views = self._views(time_ns)
             return DueFrame(
@@ -232,17 +245,14 @@ class OpenXrRuntime:
     @_or_lost
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
         """Show a frame; nothing where ``shown`` is empty."""
-        with self._current():
+        with self._context:
             layers, kept = [], []
-            if shown and self._images is not None:
+            if shown:
                 layer, kept = self._images.layer(self._room, shown)
                 layers = [ctypes.byref(layer)]
-            info = xr.FrameEndInfo(due.display_time_ns, _BLEND, layers=layers)
+            info = xr.FrameEndInfo(due.display_time_ns, self._blend, layers=layers)
             xr.end_frame(self._session, info)
             del kept  # until here the layer pointed to it
-
-    def _current(self):
-        return ExitStack() if self._context is None else self._context
 
     def _views(self, time_ns: int) -> tuple[EyeView, ...]:
         state, views = xr.locate_views(
@@ -314,9 +324,8 @@ class OpenXrRuntime:
                 self.end_frame(due, ())
 
     def _release_images(self) -> None:
-        if self._images is not None and self._context is not None:
-            with self._context:
-                _quietly(self._images.release)
+        with self._context:
+            _quietly(self._images.release)
 
 
 def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
@@ -325,6 +334,16 @@ def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
         release(*arguments)
     except xr.XrException as error:
         log.debug("%s: %s", getattr(release, "__name__", release), error)
+
+
+def _lacks(missing: Sequence[str]) -> str:
+    words = f"the OpenXR runtime does not offer {', '.join(missing)}"
+    if missing == [EGL_ENABLE]:
+        words += (
+            ": start it before this program, or set "
+            f"{GRAPHICS_VARIABLE}=glx, which needs an X display"
+        )
+    return words
 
 
 def _explained(error: Exception) -> str:
