@@ -45,6 +45,11 @@ class EyeState:
     pupil_diameter_mm: float
     focus_dpt: float
 
+    def with_pupil(self, diameter_mm: float) -> EyeState:
+        """Return the same with a pupil that was measured, within what eyes have."""
+        low_mm, high_mm = PUPIL_RANGE_MM
+        return EyeState(min(max(diameter_mm, low_mm), high_mm), self.focus_dpt)
+
 
 class NaturalEye:
     """Pupil and focus of a person who looks at a display.
@@ -98,11 +103,9 @@ class NaturalEye:
                     self._age_years, self._field_area_deg2, luminance_cd_m2
                 )
             pupil_mm = self._pupil.follow(luminance_cd_m2, at_s)
-        low_mm, high_mm = PUPIL_RANGE_MM
         wanted_dpt = min(max(distance_dpt, 0.0), MAX_VERGENCE_DPT)
-        return EyeState(
-            min(max(pupil_mm, low_mm), high_mm), self._focus.follow(wanted_dpt, at_s)
-        )
+        focus_dpt = self._focus.follow(wanted_dpt, at_s)
+        return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
 
     def learn(self, asked_dpt: float, used_dpt: float) -> None:
         """Take in what a filter made of a focus: where this eye cannot follow.

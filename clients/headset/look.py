@@ -114,6 +114,8 @@ class StereoLook:
         for picture in pictures:
             eye = self._eye(picture)
             state = eye.look(light_cd_m2, 1.0 / distance_m, at_s)
+            if due.pupil_diameter_mm is not None:
+                state = state.with_pupil(due.pupil_diameter_mm)
             point = head[:3, 3] + min(distance_m, FAR_M) * direction
             own = matrix_of(picture.view.pose)
             gaze_deg = angles_of(own[:3, :3].T @ (point - own[:3, 3]))

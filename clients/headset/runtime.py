@@ -65,6 +65,8 @@ class DueFrame:
     head : the pose between the eyes, where it is known
     gaze : GazeSample, optional
     pressed : names of what was pressed on a controller since the last frame
+    pupil_diameter_mm : float, optional
+        As a tracker measures it.
     period_s : float
         From one frame to the next, where the runtime says so; else 0.
     """
@@ -76,6 +78,7 @@ class DueFrame:
     gaze: GazeSample | None = None
     pressed: tuple[str, ...] = ()
     period_s: float = 0.0
+    pupil_diameter_mm: float | None = None
 
     @property
     def now_s(self) -> float:

@@ -57,6 +57,8 @@ class Happening:
         No frames for the moment.
     gaze_deg : (h, v), optional
         What a tracker sees; None is no tracker.
+    pupil_diameter_mm : float, optional
+        What it measures.
     pressed : names that come with the next frame
     """
 
@@ -64,6 +66,7 @@ class Happening:
     is_lost: bool = False
     is_paused: bool = False
     gaze_deg: tuple[float, float] | None = None
+    pupil_diameter_mm: float | None = None
     pressed: list[str] = field(default_factory=list)
 
 
@@ -131,6 +134,7 @@ class SimulatedRuntime:
             None if gaze is None else GazeSample(*gaze, at_s=at_s),
             pressed,
             self._period_s,
+            happening.pupil_diameter_mm,
         )
         return self._begun
 

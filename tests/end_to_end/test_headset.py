@@ -295,6 +295,15 @@ def test_focus_follows_the_depth_at_the_gaze_and_not_vergence():
         assert eye.gaze_deg == pytest.approx(angles_of(own), abs=0.02)
 
 
+def test_a_pupil_that_is_measured_counts_and_the_light_does_not():
+    head = still(0.0)
+    for measured_mm, used_mm in ((5.5, 5.5), (0.1, 0.5), (None, None)):
+        due = DueFrame(0, True, eye_views(head), head, pupil_diameter_mm=measured_mm)
+        for eye in StereoLook(age_years=25.0).follow(due, pictures_of(head)):
+            found_mm = eye.state.pupil_diameter_mm
+            assert found_mm == used_mm if used_mm else 2.0 < found_mm < 5.0
+
+
 def test_without_a_tracker_eyes_look_straight_ahead():
     head = still(0.0)
     look = StereoLook(age_years=25.0)
