@@ -98,7 +98,7 @@ def test_a_scene_streams_with_what_it_hides(real_service):
         [
             *(sys.executable, "-W", "error", "-m", "clients.pyrender_stream"),
             *("--endpoint", real_service.endpoint, *arguments),
-            *("--size", "96x54", "--frames", "3", "--json"),
+            *("--size", "96x54", "--frames", "3", "--json", "--natural"),
         ],
         cwd=CHECKOUT,
         capture_output=True,
