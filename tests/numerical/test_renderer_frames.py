@@ -5,9 +5,11 @@ import pytest
 
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.rendering import reference
+from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
+from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, depth_scene, psnr_db, tangents, texture
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
@@ -179,3 +181,35 @@ def test_pupil_outside_the_prepared_range_is_clamped_with_a_note(bench, view):
     result = bench.render(view, pupil_diameter_mm=1.0)
     assert result.pupil_diameter_mm == pytest.approx(2.0)
     assert any("prepared" in note for note in result.notes)
+
+
+def test_two_eyes_in_turn_find_their_kernels_again(gl_engine, rng):
+    """As the frames of a stereo stream do; a third eye takes the place of the first."""
+    benches = [
+        OneKernelBench(
+            gl_engine, disc(2 + 3 * i), width_px=96, height_px=64, spread_px=4.0
+        )
+        for i in range(3)
+    ]
+    renderer = benches[0].renderer
+    handles = [renderer.load(bench.store) for bench in benches]
+    color = texture(rng, 64, 96).astype(np.float32)
+    depth_m = np.ones((64, 96), np.float32)
+    view = RgbdView(color, depth_m, benches[0].tangents, "radial")
+
+    def seen(handle):
+        return renderer.render(view, handle, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
+
+    first = [seen(handle) for handle in handles[:2]]
+    assert all("psf_blend_ms" in one.stage_times_ms for one in first)
+    for _ in range(3):
+        for before, handle in zip(first, handles, strict=False):
+            again = seen(handle)
+            assert "psf_blend_ms" not in again.stage_times_ms
+            np.testing.assert_array_equal(again.color, before.color)
+    assert "psf_blend_ms" in seen(handles[2]).stage_times_ms
+    assert "psf_blend_ms" in seen(handles[0]).stage_times_ms
+    handles[2].release()
+    again = seen(handles[0])
+    assert "psf_blend_ms" not in again.stage_times_ms
+    np.testing.assert_array_equal(again.color, first[0].color)

@@ -16,6 +16,7 @@ from filter_service.constants import (
     THREADS,
     TILE_SIZE_PX,
 )
+from filter_service.gl.gpu import Atlas
 from filter_service.rendering.gl.kernel_passes import (
     KernelSet,
     used_pairs,
@@ -104,6 +105,7 @@ class FragmentPasses:
         self.search_blocks = 0
         self.kernel_count = 0
         self.kernel_texel_count = 0
+        self.atlas: Atlas | None = None
 
     def upload(self) -> None:
         """Send the strip; bytes are padded to whole words."""
@@ -177,6 +179,7 @@ class FragmentPasses:
         self.strip.buffers.update(kernels.buffers)
         self.kernel_count = kernels.kernels.count
         self.kernel_texel_count = kernels.texel_count
+        self.atlas = kernels.atlas
         self.strip.reserve(
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,

@@ -51,7 +51,9 @@ class FramePasses:
         self.fragments.upload()
         used = self.fragments.build_fragments()
         self.fragments.merge_fragments(kernels(used))
-        self.lists = ListPasses(self.strip, self.fragments.search_blocks)
+        self.lists = ListPasses(
+            self.strip, self.fragments.search_blocks, self.fragments.atlas
+        )
         self.lists.run()
 
     def read_back(self, output: str) -> NDArray:

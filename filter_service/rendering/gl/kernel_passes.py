@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
 from filter_service.errors import GridTooLarge
-from filter_service.gl.gpu import Buffer, Gpu, Pages
+from filter_service.gl.gpu import Atlas, Buffer, Gpu, Pages
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.store import FrameLayers, PsfStore
@@ -35,7 +35,7 @@ MAX_KERNEL_TEXELS = 24 * 2**20
 
 @dataclass(frozen=True)
 class KernelSet:
-    """Kernels on the GPU, in the context's atlas.
+    """Kernels on the GPU.
 
     Attributes
     ----------
@@ -44,18 +44,32 @@ class KernelSet:
         Of all kernels, at all levels.
     buffers : dict
         KERNELS and KERNEL_OF.
+    atlas : Atlas
+        Their texels.
     """
 
     kernels: FrameKernels
     texel_count: int
     buffers: dict[str, Buffer]
+    atlas: Atlas
 
 
 class KernelMaker:
-    """Makes the kernels that a frame uses; the last frame's serve if they can."""
+    """Makes the kernels that a frame uses; the last frame's serve if they can.
 
-    def __init__(self, gpu: Gpu):
-        self._gpu = gpu
+    Parameters
+    ----------
+    gpu : Gpu
+    slot : int
+        Of several makers in one context: each has memory of its own.
+    """
+
+    def __init__(self, gpu: Gpu, slot: int = 0):
+        self._gpu, self._slot = gpu, slot
+        self.forget()
+
+    def forget(self) -> None:
+        """Let go of what the last frame's kernels were made for."""
         self._made_for: tuple | None = None
         self._have: NDArray[np.bool_] | None = None
         self._set: KernelSet | None = None
@@ -105,13 +119,15 @@ class KernelMaker:
         nodes, node_texels = node_table(kernels.nodes)
         texels = int(sizes.sum())
         node_atlas = gpu.atlas("nodes", node_texels)
-        atlas = gpu.atlas("kernels", texels)
+        atlas = gpu.atlas(f"kernels {self._slot}", texels)
         buffers = {
             "NODES": gpu.upload("NODES", nodes),
             "RECIPES": gpu.upload("RECIPES", kernels.nodes.recipes),
-            "KERNELS": gpu.upload("KERNELS", table),
+            "KERNELS": gpu.upload(f"KERNELS {self._slot}", table),
             "PARTS": gpu.upload("PARTS", part_table(kernels)),
-            "KERNEL_OF": gpu.upload("KERNEL_OF", pair_index(kernels, shape)),
+            "KERNEL_OF": gpu.upload(
+                f"KERNEL_OF {self._slot}", pair_index(kernels, shape)
+            ),
         }
         node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
         self._run(
@@ -137,7 +153,7 @@ class KernelMaker:
                 uniforms={"level": level},
             )
         kept = {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(kernels, texels, kept)
+        return KernelSet(kernels, texels, kept, atlas)
 
     def _run(
         self,

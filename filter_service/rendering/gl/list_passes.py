@@ -17,7 +17,7 @@ from filter_service.constants import (
     TILES_PER_BIN,
     TOTAL_WORDS,
 )
-from filter_service.gl.gpu import Buffer
+from filter_service.gl.gpu import Atlas, Buffer
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.list_bands import ENTRY_BYTES
 from filter_service.rendering.gl.strip import Strip
@@ -56,10 +56,13 @@ class ListPasses:
     strip : Strip
     search_blocks : int
         How far a bin looks for fragments that reach it.
+    atlas : Atlas, optional
+        Texels of the kernels that they are splatted with.
     """
 
-    def __init__(self, strip: Strip, search_blocks: int):
+    def __init__(self, strip: Strip, search_blocks: int, atlas: Atlas | None = None):
         self.strip = strip
+        self.atlas = atlas
         self.search_blocks = search_blocks
         self.lists = list_bands.ListTotals()
         self.bands: list[tuple[int, int, int]] = []
@@ -218,7 +221,7 @@ class ListPasses:
                 (TILES_PER_BIN, bin_count),
                 *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BIN_COUNTS", "BIN_OFFSETS"),
                 *("ENTRIES", "KERNELS", "PIXELS", "COLOR_OUT"),
-                textures={"ATLAS": self.strip.gpu.atlas("kernels", 1)},
+                textures={"ATLAS": self.atlas},
                 frame_size_px=self.strip.size,
                 tile_grid=self.strip.grid,
                 bin_columns=self.strip.bin_grid[0],

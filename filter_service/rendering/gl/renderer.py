@@ -22,10 +22,10 @@ from filter_service.rendering.frame import (
     fill_missing_depth,
 )
 from filter_service.rendering.frame_options import FrameOptions, frame_options
-from filter_service.rendering.frame_states import FrameStates, FrameStore
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
-from filter_service.rendering.gl.kernel_passes import KernelMaker
+from filter_service.rendering.gl.kept_eyes import KeptEye, KeptEyes
 from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.image_cells import (
     ImageCells,
@@ -47,9 +47,11 @@ class GlStore(FrameStore):
     """A store whose kernels are on the GPU."""
 
     pages: Pages
+    is_released: bool = False
 
     def release(self) -> None:
         """Free the GPU copy."""
+        object.__setattr__(self, "is_released", True)
         self.pages.release()
 
 
@@ -58,8 +60,7 @@ class FilterRenderer:
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
-        self._states = FrameStates()
-        self._kernels = KernelMaker(gpu)
+        self._kept = KeptEyes(gpu)
         self._lacks_depth = False
 
     @property
@@ -156,10 +157,11 @@ class FilterRenderer:
         self, view, handle, pupil_diameter_mm, focus_dpt, options: FrameOptions
     ) -> FilteredView:
         timer = StageTimer(self._gpu)
-        layers = self._states.layers(
+        kept = self._kept.of(handle)
+        layers = kept.states.layers(
             timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
         )
-        picture, counts = self._filled(timer, view, handle, layers, options)
+        picture, counts = self._filled(timer, view, kept, layers, options)
         self._gpu.check("render")
         bad_color_count = counts["bad_color_count"]
         return FilteredView(
@@ -174,7 +176,12 @@ class FilterRenderer:
         )
 
     def _filled(
-        self, timer, view: RgbdView, handle, layers: FrameLayers, options: FrameOptions
+        self,
+        timer,
+        view: RgbdView,
+        kept: KeptEye,
+        layers: FrameLayers,
+        options: FrameOptions,
     ) -> tuple[NDArray, dict[str, int]]:
         """Picture and counts of a view, whose missing depth is filled in.
 
@@ -186,7 +193,7 @@ class FilterRenderer:
                 view = replace(view, hidden_color=None, hidden_depth_m=None)
         missing_count = 0
         if not self._lacks_depth:
-            picture, counts = self._filtered(timer, view, handle, layers, options)
+            picture, counts = self._filtered(timer, view, kept, layers, options)
             self._lacks_depth = counts["missing_depth_count"] > 0
             if not self._lacks_depth:
                 return picture, counts
@@ -194,28 +201,40 @@ class FilterRenderer:
             depth_m, missing_count = fill_missing_depth(view.depth_m)
             view = replace(view, depth_m=depth_m)
         self._lacks_depth = missing_count > 0
-        picture, counts = self._filtered(timer, view, handle, layers, options)
+        picture, counts = self._filtered(timer, view, kept, layers, options)
         return picture, {**counts, "missing_depth_count": missing_count}
 
     def _filtered(
-        self, timer, view: RgbdView, handle, layers: FrameLayers, options: FrameOptions
+        self,
+        timer,
+        view: RgbdView,
+        kept: KeptEye,
+        layers: FrameLayers,
+        options: FrameOptions,
     ) -> tuple[NDArray, dict[str, int]]:
         """Picture and counts; with larger cells where kernels take too much memory."""
         while True:
-            image = self._states.cells(timer, handle, options.gaze_deg)
+            image = kept.states.cells(timer, kept.handle, options.gaze_deg)
             try:
-                return self._in_strips(timer, view, handle, layers, image, options)
+                return self._in_strips(timer, view, kept, layers, image, options)
             except KernelsTooLarge:
-                self._states.coarsen(image)
+                kept.states.coarsen(image)
 
     def _in_strips(
-        self, timer, view, handle, layers, image: ImageCells, options: FrameOptions
+        self,
+        timer,
+        view,
+        kept: KeptEye,
+        layers,
+        image: ImageCells,
+        options: FrameOptions,
     ) -> tuple[NDArray, dict[str, int]]:
+        handle = kept.handle
         reach_px = ceil(image.maps.largest_stretch_ratio * layers.max_radius_px) + 2
         border_px = border_px_of(view, reach_px)
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
-        change_dpt = self._states.corner_change_dpt(timer, layers, image)
+        change_dpt = kept.states.corner_change_dpt(timer, layers, image)
         pictures: list[NDArray] = []
         counts: Counter[str] = Counter()
         for rows in _strips(whole, reach_px, self._gpu.max_block_bytes):
@@ -242,7 +261,7 @@ class FilterRenderer:
             )
             passes = FramePasses(shared, fragments)
             passes.run(
-                lambda used: self._kernels.kernels(
+                lambda used: kept.kernels.kernels(
                     handle.store, handle.pages, layers, image, used, timer
                 )
             )
