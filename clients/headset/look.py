@@ -122,6 +122,13 @@ class StereoLook:
             found.append(LookingEye(state, self._clamped(gaze_deg)))
         return tuple(found)
 
+    def restart(self) -> None:
+        """Begin anew: a runtime's clock may start again with it."""
+        self._follower = GazeFollower()
+        self._eyes = {}
+        self._distance_m = None
+        self.is_tracked = False
+
     def learn(self, asked_dpt: dict[Eye, float], used_dpt: dict[Eye, float]) -> None:
         """Take in what the filter made of each eye's focus."""
         for eye, used in used_dpt.items():

@@ -56,8 +56,10 @@ def open_context() -> Iterator[moderngl.Context]:
     """
     opened = _egl_context() if _wanted() == "egl" else _glx_context()
     with opened as context:
+        # EGL's is current from birth.  In a thread where a context of EGL is current
+        # none of GLX can be, nor the other way round; the filter has one of EGL.
         with context:
-            pass  # some drivers' contexts are current from birth; now none is
+            pass
         yield context
 
 
@@ -92,9 +94,7 @@ def _glx_context() -> Iterator[moderngl.Context]:
     try:
         import glfw
     except ImportError as error:
-        raise NoRuntime(
-            f"this OpenXR runtime takes windows only, by glfw: {error}"
-        ) from None
+        raise NoRuntime(f"this OpenXR runtime needs glfw: {error}") from None
     errors: list[str] = []
     glfw.set_error_callback(lambda code, text: errors.append(text.decode()))
     try:
@@ -200,6 +200,10 @@ class Glx:
         ]
         glx.glXChooseFBConfig.restype = POINTER(c_void_p)
         self._x11.XFree.argtypes = [c_void_p]
+
+    def is_current(self) -> bool:
+        """Return whether the current context is one of it."""
+        return bool(self._glx.glXGetCurrentContext())
 
     def load(self, name: str) -> int:
         """Return where a function of OpenGL is."""

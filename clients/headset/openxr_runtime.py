@@ -29,6 +29,7 @@ from clients.headset.runtime import (
     DueFrame,
     EyeView,
     NoRuntime,
+    SessionEnded,
     SessionLost,
     ShownView,
 )
@@ -96,6 +97,7 @@ class OpenXrRuntime:
         self._scale = scale
         self._is_running = False
         self._is_over = False
+        self._ending: Exception = SessionLost("the headset's session has ended")
         self._closing = ExitStack()
         try:
             self._open(layers)
@@ -222,7 +224,7 @@ class OpenXrRuntime:
         with self._context:
             self._take_events()
             if self._is_over:
-                raise SessionLost("the headset's session has ended")
+                raise self._ending
             if not self._is_running:
                 time.sleep(_IDLE_S)
                 return None
@@ -302,6 +304,8 @@ class OpenXrRuntime:
             self._is_running = False
         elif state in (xr.SessionState.EXITING, xr.SessionState.LOSS_PENDING):
             self._is_over, self._is_running = True, False
+            if state == xr.SessionState.EXITING:
+                self._ending = SessionEnded("the session was ended in the headset")
 
     # Closing
 
@@ -310,7 +314,7 @@ class OpenXrRuntime:
         if self._is_running and not self._is_over:
             try:
                 self._leave()
-            except (xr.XrException, SessionLost):
+            except (xr.XrException, SessionLost, SessionEnded):
                 pass  # gone is gone
         self._is_running = False
         self._closing.close()

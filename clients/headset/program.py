@@ -183,7 +183,8 @@ def scenery_of(options: argparse.Namespace, context) -> Any:
     if colon and not Path(options.scene).exists():
         sys.path.insert(0, "")
         try:
-            return getattr(importlib.import_module(module), function)(context)
+            with context:
+                return getattr(importlib.import_module(module), function)(context)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"--scene {options.scene}: {error}") from None
     from clients.headset.scenery import SceneScenery
@@ -204,8 +205,6 @@ def scene_of(name: str):
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Show the scene until the end; return what became of the frames."""
-    import moderngl
-
     from clients.headset.keys import TerminalKeys
 
     settings, profiles = settings_of(options), profiles_of(options)
@@ -222,8 +221,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     )
     size_px = _size(options.size)
     with ExitStack() as stack:
-        context = moderngl.create_context(standalone=True, backend="egl", require=430)
-        stack.callback(context.release)
+        context = _context(options, stack)
         scenery = scenery_of(options, context)
         stack.callback(getattr(scenery, "close", lambda: None))
         seeing = _seeing(options, settings)
@@ -266,15 +264,32 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         return _report(options, log, took_s, seeing)
 
 
-def _open_xr(context, options: argparse.Namespace) -> Runtime:
+def _openxr(name: str) -> Any:
+    """Return a module that needs pyopenxr."""
     try:
-        from clients.headset.openxr_runtime import OpenXrRuntime
+        return importlib.import_module(f"clients.headset.{name}")
     except ModuleNotFoundError as error:
         raise ValueError(
             f"the package {error.name} is not installed: {HEADSET_INSTALL}"
         ) from None
+
+
+def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
+    """Return the OpenGL context that everything is drawn in."""
+    if not options.simulated:
+        return stack.enter_context(_openxr("openxr_gl").open_context())
+    import moderngl
+
+    context = moderngl.create_context(standalone=True, backend="egl", require=430)
+    stack.callback(context.release)
+    return context
+
+
+def _open_xr(context, options: argparse.Namespace) -> Runtime:
     layers = [CORE_VALIDATION] if options.validate else []
-    runtime = OpenXrRuntime(context, layers=layers, scale=options.scale)
+    runtime = _openxr("openxr_runtime").OpenXrRuntime(
+        context, layers=layers, scale=options.scale
+    )
     for note in runtime.notes:
         say(note)
     return runtime
@@ -343,6 +358,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; return its exit code."""
     options = arguments_of(argv)
     logging.basicConfig(format="headset: %(message)s", level=logging.INFO)
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # pyopenxr imports it
     try:
         report = run(options)
     except KeyboardInterrupt:

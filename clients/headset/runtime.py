@@ -23,6 +23,10 @@ class SessionLost(Exception):
     """The headset went away in the middle; it may come back."""
 
 
+class SessionEnded(Exception):
+    """The user has ended the program from within the headset."""
+
+
 @dataclass(frozen=True)
 class EyeView:
     """Where one eye is at the time a frame is shown, and what its display covers.
@@ -127,6 +131,9 @@ class Runtime(Protocol):
         Raises
         ------
         SessionLost
+            It may come back.
+        SessionEnded
+            The user wants it so.
         """
 
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:

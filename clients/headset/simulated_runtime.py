@@ -17,6 +17,7 @@ from clients.headset.runtime import (
     DueFrame,
     EyeView,
     GazeSample,
+    SessionEnded,
     SessionLost,
     ShownView,
 )
@@ -53,6 +54,8 @@ class Happening:
         False: the headset is taken off.
     is_lost : bool
         The next call says that the session is lost.
+    is_ended : bool
+        The next frame says that the user has ended it.
     is_paused : bool
         No frames for the moment.
     gaze_deg : (h, v), optional
@@ -64,6 +67,7 @@ class Happening:
 
     should_render: bool = True
     is_lost: bool = False
+    is_ended: bool = False
     is_paused: bool = False
     gaze_deg: tuple[float, float] | None = None
     pupil_diameter_mm: float | None = None
@@ -116,6 +120,8 @@ class SimulatedRuntime:
         happening = self.happening
         if happening.is_lost:
             raise SessionLost("the simulated session is lost")
+        if happening.is_ended:
+            raise SessionEnded("the simulated session was ended")
         if self._begun is not None:
             raise RuntimeError("a frame begins before the last one has ended")
         if happening.is_paused:

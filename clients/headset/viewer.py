@@ -16,6 +16,7 @@ from clients.headset.runtime import (
     EyeView,
     NoRuntime,
     Runtime,
+    SessionEnded,
     SessionLost,
     ShownView,
 )
@@ -150,8 +151,12 @@ class Viewer:
             said = ""
             self.log.n_sessions += 1
             self._say(f"{runtime.name}: {runtime.size_px[0]}x{runtime.size_px[1]} px")
+            self._look.restart()
             try:
                 self._run_session(runtime, is_done)
+            except SessionEnded as error:
+                self._say(str(error))
+                break
             except SessionLost as error:
                 self._say(f"{error}; trying again")
                 self._last = None

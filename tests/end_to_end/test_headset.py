@@ -206,6 +206,39 @@ def test_a_lost_session_and_a_missing_headset_are_waited_for(monkeypatch):
     assert any("it is gone" in line for line in said)
 
 
+def test_a_session_that_the_user_ends_is_not_begun_again():
+    happening, seeing, said = Happening(), Inverting(), []
+
+    def keys():  # asked after a frame has begun: the next one does not
+        happening.is_ended = len(seeing.frames) == 2
+        return ""
+
+    runtime = SimulatedRuntime(SIZE_PX, rate_hz=500.0, happening=happening)
+    log = viewer_of([runtime], seeing, said=said, keys=keys).run(max_frames=50)
+    assert (log.n_sessions, log.n_filtered) == (1, 3)
+    assert said[-1] == "the simulated session was ended"
+
+
+def test_a_clock_that_starts_again_does_not_stop_the_eyes():
+    """As Monado's does when it is started again: to the eyes it is another day."""
+    head = still(0.0)
+    look = StereoLook(age_years=25.0, gaze_range_deg=(20.0, 20.0))
+    pictures = pictures_of(head)
+
+    def gaze_at(at_s, h_deg):
+        sample = None if h_deg is None else GazeSample(h_deg, 0.0, at_s)
+        due = DueFrame(int(1e9 * at_s), True, eye_views(head), head, sample)
+        return look.follow(due, pictures)[0].gaze_deg[0]
+
+    for step in range(10):
+        gaze_at(10.0 + 0.1 * step, 5.0)
+    assert look.is_tracked
+    look.restart()
+    assert gaze_at(0.3, None) < 2.0
+    assert not look.is_tracked
+    assert gaze_at(0.4, -8.0) < -5.0
+
+
 def test_an_error_in_mid_frame_still_ends_the_frame():
     class Failing(Inverting):
         def see(self, frame):
