@@ -100,7 +100,7 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
     kernels = made_kernels(bench, view, pupil_diameter_mm=3.3, focus_dpt=7.0)
     expected = reference.kernel_pairs(bench.store, kernels)
     table, _ = frame_kernels.kernel_table(kernels)
-    line = atlas_line(bench.gpu, "kernels")
+    line = atlas_line(bench.gpu, "kernels 0")
     largest, levels = expected.shape[2] // 2, set()
     assert kernels.count > (1 if mode == "on-axis" else 50)
     for k in range(0, kernels.count, max(kernels.count // 50, 1)):
