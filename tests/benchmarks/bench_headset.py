@@ -1,7 +1,8 @@
-"""What a headset's frame takes, stage by stage: in this process, and by a service.
+r"""What a headset's frame takes, stage by stage: in this process, and by a service.
 
     python -m tests.benchmarks.bench_headset [--quick] [--json]
-    sh tests/headset/run_in_root.sh python -m tests.benchmarks.bench_headset --openxr
+    sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \
+        python -m tests.benchmarks.bench_headset --openxr
 
 The viewer of `ocufilter headset` in a simulated headset of 72 Hz whose head moves: the
 courtyard through a myope's left and a keratoconic right eye, natural focus and pupils.

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import resource
+import shutil
 import subprocess
 import time
 from dataclasses import asdict, dataclass
@@ -67,6 +68,8 @@ def commit_id() -> str:
     told = os.environ.get("OCUFILTER_COMMIT")
     if told:
         return told
+    if shutil.which("git") is None:
+        return "none"
 
     def git(*arguments: str) -> str:
         answer = subprocess.run(
