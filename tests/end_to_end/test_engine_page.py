@@ -370,6 +370,34 @@ def test_the_gpus_times_are_those_of_the_readme():
     ]
 
 
+def test_the_budget_has_the_gpus_figures():
+    content = json.loads((ROOT / "tests/benchmarks/results/gpu.json").read_text())
+    rows = {
+        (row["method"].strip(), row["case"]): row["median_ms"]
+        for row in content["rows"]
+        if row["setting"] == "2 x 1832x1920 moving"
+    }
+    eyes = {case for _, case in rows}
+    assert len(eyes) == 3
+
+    def of(name):
+        return [rows[name, eye] for eye in eyes]
+
+    rest = [
+        rows["frame", e]
+        - sum(rows[name, e] for name in ("upload", "psf_plan", "passes"))
+        for e in eyes
+    ]
+    for start, found in (
+        ("filter: into the card's memory", of("upload")),
+        ("filter: plan of kernels, on the processor", of("psf_plan")),
+        ("filter: passes", of("passes")),
+        ("filter: back, calls of the driver", rest),
+    ):
+        low, high = re.search(rf"\| {start} \| ([\d.]+) to ([\d.]+)", PAGE).groups()
+        assert [float(low), float(high)] == [round(min(found), 1), round(max(found), 1)]
+
+
 def test_the_commands_that_it_shows_are_known():
     commands = re.findall(r"^    ocufilter (.*)$", PAGE, re.MULTILINE)
     shown = {command.split()[0]: command.split()[1:] for command in commands}
