@@ -67,7 +67,7 @@ class Case:
     eye: str
     setting: str
     view: RgbdView
-    renderers: list[FilterRenderer]
+    renderer: FilterRenderer
     handles: list
     memory_mb: float
     error_db: float
@@ -76,8 +76,8 @@ class Case:
         """Filter the views of one frame; wall time and stages, ms."""
         stages_ms: dict[str, float] = {}
         start_s = time.perf_counter()
-        for renderer, handle in zip(self.renderers, self.handles, strict=True):
-            seen = renderer.render(self.view, handle, output="srgb8", **state)
+        for handle in self.handles:
+            seen = self.renderer.render(self.view, handle, output="srgb8", **state)
             for name, ms in seen.stage_times_ms.items():
                 stages_ms[name] = stages_ms.get(name, 0.0) + ms
         return 1e3 * (time.perf_counter() - start_s), stages_ms
@@ -138,14 +138,14 @@ def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Cas
     native = NativeRenderer()
     expected = native.render(view, native.load(store), **state).color
     native.close()
-    renderers = [FilterRenderer(gpu) for _ in range(view_count)]
-    handles = [renderer.load(store) for renderer in renderers]
-    seen = renderers[0].render(view, handles[0], **state).color
+    renderer = FilterRenderer(gpu)
+    handles = [renderer.load(store) for _ in range(view_count)]  # an eye for each view
+    seen = renderer.render(view, handles[0], **state).color
     return Case(
         eye,
         setting,
         view,
-        renderers,
+        renderer,
         handles,
         gpu.memory_mb,
         psnr_db(seen, expected),
