@@ -4,28 +4,17 @@ Monado simulates no eye tracker; `gaze_layer` stands before it and has one.  Sta
 `run_in_root.sh`, like test_runtime.py.
 """
 
-import contextlib
 import json
-import os
-import shutil
-import subprocess
-import sys
-import threading
 from itertools import islice
 
 import numpy as np
 import pytest
 
-from tests.headset.monado import Monado, RemoteHead
+from tests.headset.monado import RemoteHead
+from tests.headset.program import Program
 from tests.headset.rooms import stripes
 from tests.headset.test_runtime import HEADS
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("monado-service") is None,
-    reason="no runtime of OpenXR here; tests/headset/run_in_root.sh has one",
-)
-
-TIMEOUT_S = 90.0
 SOON = 40
 """Frames after which a program has seen what a script says."""
 
@@ -34,73 +23,6 @@ DIRECTIONS_DEG = ((0.0, 0.0), (10.0, 0.0), (0.0, 10.0), (-25.0, 12.5), (7.0, -20
 LOSSES = ("not active", "not valid", "not tracked")
 TRACKED, LOST = "eyes are tracked", "the eye tracker lost the eyes"
 VALIDATION = "XR_APILAYER_LUNARG_core_validation"
-
-
-class Program:
-    """A program with what it says, ended with the context.
-
-    Parameters
-    ----------
-    folder : Path
-        For what it says, and for the validation layer's report.
-    environment : dict of str
-        Beside this process's own.
-    *arguments : str
-        Of python.
-    """
-
-    def __init__(self, folder, environment, *arguments: str):
-        self._said, self._report = folder / "said.txt", folder / "validation.txt"
-        own = {
-            "XR_CORE_VALIDATION_EXPORT_TYPE": "text",
-            "XR_CORE_VALIDATION_FILE_NAME": str(self._report),
-        }
-        with self._said.open("wb") as said:
-            self._process = subprocess.Popen(
-                [sys.executable, "-X", "faulthandler", *arguments],
-                env=os.environ | own | environment,
-                stdout=subprocess.PIPE,
-                stderr=said,
-                text=True,
-            )
-        self._timer = threading.Timer(TIMEOUT_S, self._process.kill)
-        self._timer.start()
-
-    def __enter__(self) -> "Program":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._timer.cancel()
-        self._process.kill()
-        self._process.wait()
-        self._process.stdout.close()
-
-    def lines(self):
-        """Yield what it tells, until it ends."""
-        for line in self._process.stdout:
-            if line.startswith("{"):
-                yield json.loads(line)
-
-    def exit_code(self) -> int:
-        """Wait until it has ended."""
-        return self._process.wait()
-
-    @property
-    def said(self) -> str:
-        return self._said.read_text(encoding="utf-8", errors="replace")
-
-    def complaints(self) -> list[str]:
-        """Return what the validation layer reports, beside that it was there."""
-        lines = self._report.read_text(encoding="utf-8").splitlines()
-        assert "VUID-CoreValidation-Initialize" in lines[0]
-        return [line for line in lines if "VUID" in line and "VALID_DEBUG" not in line]
-
-
-@pytest.fixture
-def started(tmp_path):
-    """Return how to start a runtime that ends with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda **options: stack.enter_context(Monado(tmp_path, **options))
 
 
 @pytest.fixture

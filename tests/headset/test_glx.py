@@ -9,19 +9,13 @@ tests start it.  Started by `run_in_root.sh`, like test_runtime.py.
 import argparse
 import contextlib
 import json
-import shutil
 
 import numpy as np
 import pytest
 
-from tests.headset.monado import Monado, Xvfb
+from tests.headset.monado import Xvfb
+from tests.headset.program import Program
 from tests.headset.rooms import stripes
-from tests.headset.test_gaze import Program
-
-pytestmark = pytest.mark.skipif(
-    shutil.which("monado-service") is None,
-    reason="no runtime of OpenXR here; tests/headset/run_in_root.sh has one",
-)
 
 EYE_SRGB = ((200, 40, 30), (20, 60, 180))
 DEPTH_M = 2.0
@@ -30,13 +24,6 @@ EDGE_PX = 3
 N_FRAMES = 60
 VARIABLE = "OCUFILTER_HEADSET_GRAPHICS"
 NO_DISPLAY = "this OpenXR runtime needs an X display"
-
-
-@pytest.fixture
-def started(tmp_path):
-    """Return how to start a runtime that ends with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda **options: stack.enter_context(Monado(tmp_path, **options))
 
 
 @pytest.fixture

@@ -3,30 +3,17 @@
 Started by `run_in_root.sh`; elsewhere, where there is no runtime, it is skipped.
 """
 
-import contextlib
-import json
-import os
-import shutil
-import subprocess
-import sys
-import threading
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tests.headset.monado import Eye, Monado, Pose, RemoteHead
-
-pytestmark = pytest.mark.skipif(
-    shutil.which("monado-service") is None,
-    reason="no runtime of OpenXR here; tests/headset/run_in_root.sh has one",
-)
+from tests.headset.program import Program
 
 PROBE = Path(__file__).with_name("probe.py")
 EYE_SRGB = ((200, 40, 30), (20, 60, 180))  # as probe.py has them
 PATCH_SRGB = (255, 255, 255)
 
-TIMEOUT_S = 60
 START = ["IDLE", "READY", "SYNCHRONIZED", "VISIBLE", "FOCUSED"]
 END = ["VISIBLE", "SYNCHRONIZED", "STOPPING", "IDLE", "EXITING"]
 MANY_FRAMES = "100000"
@@ -52,7 +39,7 @@ SOON = 3
 """Frames after which a headset that was moved is seen where it is."""
 
 
-class Probe:
+class Probe(Program):
     """One run of probe.py.
 
     Parameters
@@ -66,34 +53,7 @@ class Probe:
     """
 
     def __init__(self, monado: Monado, folder: Path, *arguments: str):
-        self._report = folder / "validation.txt"
-        self._process = subprocess.Popen(
-            [sys.executable, str(PROBE), *arguments],
-            env=os.environ
-            | monado.environment
-            | {
-                "XR_CORE_VALIDATION_EXPORT_TYPE": "text",
-                "XR_CORE_VALIDATION_FILE_NAME": str(self._report),
-            },
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._timer = threading.Timer(TIMEOUT_S, self._process.kill)
-        self._timer.start()
-
-    def __enter__(self) -> "Probe":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._timer.cancel()
-        self._process.kill()
-        self._process.wait()
-        self._process.stdout.close()
-
-    def lines(self):
-        """Yield what it tells, until it ends."""
-        for line in self._process.stdout:
-            yield json.loads(line)
+        super().__init__(folder, monado.environment, str(PROBE), *arguments)
 
     def frames(self):
         """Yield the two views of each frame it shows."""
@@ -101,22 +61,9 @@ class Probe:
             if "frame" in line:
                 yield line["frame"]
 
-    def complaints(self) -> list[str]:
-        """Return what the validation layer reports, beside that it was there."""
-        lines = self._report.read_text(encoding="utf-8").splitlines()
-        assert "VUID-CoreValidation-Initialize" in lines[0]
-        return [line for line in lines if "VUID" in line and "VALID_DEBUG" not in line]
-
 
 def told(lines, key):
     return [line[key] for line in lines if key in line]
-
-
-@pytest.fixture
-def started(tmp_path):
-    """Return how to start a runtime that ends with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda **options: stack.enter_context(Monado(tmp_path, **options))
 
 
 def test_frames_with_depth_are_taken(started, tmp_path):

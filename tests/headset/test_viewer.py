@@ -4,96 +4,43 @@ Started by `run_in_root.sh`, like test_runtime.py.
 """
 
 import contextlib
-import json
 import os
 import shutil
-import subprocess
-import sys
-import threading
 import time
 
 import numpy as np
 import pytest
 
 from tests.headset.monado import Monado, Pose, RemoteHead
+from tests.headset.program import Program
 from tests.headset.rooms import stripes
 from tests.headset.test_runtime import EYES, HEADS, SOON, pose_error
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("monado-service") is None,
-    reason="no runtime of OpenXR here; tests/headset/run_in_root.sh has one",
-)
-
 N_FRAMES = 300
-TIMEOUT_S = 150.0
 LONG = "100000"
 LOOSE = '{"tolerance": "loose", "object_range_dpt": [0, 1]}'
 CONTRAST = 0.25  # of the stripes that a sharp eye sees
 
 
-class Viewer:
+class Viewer(Program):
     """One run of `watched_viewer`."""
 
     def __init__(self, monado: Monado, folder, *arguments: str):
-        self.validation = folder / "validation.txt"
-        self._said = folder / "said.txt"
-        command = (sys.executable, "-m", "tests.headset.watched_viewer", *arguments)
-        with self._said.open("wb") as said:
-            self._process = subprocess.Popen(
-                command,
-                env=os.environ
-                | monado.environment
-                | {
-                    "XR_CORE_VALIDATION_EXPORT_TYPE": "text",
-                    "XR_CORE_VALIDATION_FILE_NAME": str(self.validation),
-                },
-                stdout=subprocess.PIPE,
-                stderr=said,
-                text=True,
-            )
-        self._timer = threading.Timer(TIMEOUT_S, self._process.kill)
-        self._timer.start()
-
-    def __enter__(self) -> "Viewer":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._timer.cancel()
-        self._process.kill()
-        self._process.wait()
-        self._process.stdout.close()
-
-    @property
-    def said(self) -> str:
-        return self._said.read_text(encoding="utf-8", errors="replace")
-
-    def lines(self):
-        for line in self._process.stdout:
-            if line.startswith("{"):
-                yield json.loads(line)
+        module = "tests.headset.watched_viewer"
+        super().__init__(folder, monado.environment, "-m", module, *arguments)
 
     def frames(self):
+        """Yield what was asked for and shown, frame by frame."""
         for line in self.lines():
             if "frame" in line:
                 yield line["frame"]
 
     def await_frame(self, is_wanted):
+        """Return the first frame that is."""
         for frame in self.frames():
             if is_wanted(frame):
                 return frame
         raise AssertionError(f"it ended before that: {self.said[-2000:]}")
-
-    def complaints(self) -> list[str]:
-        lines = self.validation.read_text(encoding="utf-8").splitlines()
-        assert "VUID-CoreValidation-Initialize" in lines[0]
-        return [line for line in lines if "VUID" in line and "VALID_DEBUG" not in line]
-
-
-@pytest.fixture
-def started(tmp_path):
-    """Return how to start a runtime that ends with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda **options: stack.enter_context(Monado(tmp_path, **options))
 
 
 @pytest.fixture
