@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +15,15 @@ from numpy.typing import NDArray
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.headset.look import LookingEye, RgbdPicture
 from clients.headset.runtime import EYES, DueFrame, Eye, EyeView
-from filter_service import EyeFilter, FilterSettings, RgbdView, plan_views
+from filter_service import (
+    BuildingEye,
+    EyeFailed,
+    EyeFilter,
+    EyeReady,
+    FilterSettings,
+    RgbdView,
+    plan_views,
+)
 from filter_service.errors import FilterError
 from filter_service.messages import (
     Dropped,
@@ -31,12 +40,13 @@ quick filter's picture is shown in the frame that it was rendered for."""
 
 PATIENCE_S = 0.4
 """A filter that took no longer for the frame before is waited for in any case: where
-frames are late anyway, half the age is worth more than a few more of them.  On two cores
-that both share, frames of 896x1007 were 0.8 s old without, and not more."""
+frames are late anyway, half the age is worth more than a few more of them.  On two
+cores that both share, frames of 896x1007 were 0.8 s old without, and not more."""
 
 MS_PER_S = 1e3
 
 Say = Callable[[str], None]
+EyeEvent = BuildingEye | EyeReady | EyeFailed
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +110,9 @@ class Seeing(Protocol):
     def see(self, frame: LookedAt) -> Seen | None:
         """Hand a frame over; return the newest that is seen, None while none is."""
 
+    def restart(self) -> None:
+        """Forget what was seen: its poses are of a room that is gone."""
+
     def close(self) -> None:
         """Let go of everything."""
 
@@ -117,14 +130,15 @@ class SeeingHere:
     def __init__(self, settings: FilterSettings, say: Say) -> None:
         self._say = say
         self.filters = {
-            eye: EyeFilter(
-                settings=settings,
-                on_event=lambda event, eye=eye: (
-                    say(_event_line(eye, event)) if _event_line(eye, event) else None
-                ),
-            )
+            eye: EyeFilter(settings=settings, on_event=partial(self._tell, eye))
             for eye in EYES
         }
+
+    def _tell(self, eye: Eye, event: EyeEvent) -> None:
+        if isinstance(event, EyeReady) and event.is_complete:
+            self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
+        elif isinstance(event, EyeFailed):
+            self._say(f"{eye} eye: {event.error}")
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Ask for another eye; frames go on through the one before."""
@@ -157,6 +171,9 @@ class SeeingHere:
                 "around_ms": whole_ms - sum(stages_ms.values()),
             },
         )
+
+    def restart(self) -> None:
+        """Nothing is kept from frame to frame."""
 
     def close(self) -> None:
         """End what filters."""
@@ -289,6 +306,11 @@ class SeeingByService:
             },
         )
 
+    def restart(self) -> None:
+        """Forget what was seen, and what is on its way."""
+        self._newest = None
+        self._on_way = {}
+
     def close(self) -> None:
         """End the session."""
         self._client.close()
@@ -300,13 +322,3 @@ _OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
 def _added_ms(stages_ms: Mapping[str, float]) -> float:
     """Return what the service's own stages took, beside the filter."""
     return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)
-
-
-def _event_line(eye: Eye, event) -> str:
-    """Return what to say of what happens to an eye; empty for nothing."""
-    kind = type(event).__name__
-    if kind == "EyeReady" and event.is_complete:
-        return f"{eye} eye: ready after {event.build_ms:.0f} ms"
-    if kind == "EyeFailed":
-        return f"{eye} eye: {event.error}"
-    return ""

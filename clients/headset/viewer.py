@@ -27,6 +27,7 @@ STALE_S = 1.0
 """A picture begun so long ago is not shown any more: the scene is, as it is."""
 
 RETRY_S = 1.0
+MAX_NOTES = 100
 SPLIT_RATIO = 0.5
 
 
@@ -62,6 +63,12 @@ class ViewerLog:
         self.n_filtered += 1
         for name, value_ms in times_ms.items():
             self.stages_ms.setdefault(name, []).append(value_ms)
+
+    def add_notes(self, notes: Sequence[str]) -> None:
+        """Count what the filter has to say; of very many kinds the first."""
+        for note in notes:
+            if note in self.notes or len(self.notes) < MAX_NOTES:
+                self.notes[note] = self.notes.get(note, 0) + 1
 
     def summary(self) -> dict[str, Any]:
         """Return counts and percentiles."""
@@ -152,6 +159,7 @@ class Viewer:
             self.log.n_sessions += 1
             self._say(f"{runtime.name}: {runtime.size_px[0]}x{runtime.size_px[1]} px")
             self._look.restart()
+            self._seeing.restart()
             try:
                 self._run_session(runtime, is_done)
             except SessionEnded as error:
@@ -176,33 +184,38 @@ class Viewer:
                 self.log.n_hidden += 1
                 runtime.end_frame(due, ())
                 continue
-            shown: Sequence[ShownView] = ()
             try:
-                frame, shown, seen = self._frame(due, begun_s, runtime.size_px)
+                seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
             except BaseException:
                 # A frame that was begun is to be ended, whatever happened to it.
                 runtime.end_frame(due, ())
                 raise
             show_s = time.monotonic()
             runtime.end_frame(due, shown)
-            self._note(frame, seen, show_s)
+            times_ms["show_ms"] = MS_PER_S * (time.monotonic() - show_s)
+            self._note(seen, times_ms)
 
-    def _frame(self, due: DueFrame, begun_s: float, size_px: tuple[int, int]):
+    def _frame(
+        self, due: DueFrame, begun_s: float, size_px: tuple[int, int]
+    ) -> tuple[Seen | None, tuple[ShownView, ...], dict[str, float]]:
+        """Return what is seen, what is to be shown, and what that took."""
         pictures = self._scenery.pictures(due.views, size_px)
-        self._scene_ms = MS_PER_S * (time.monotonic() - begun_s)
-        look_s = time.monotonic()
+        rendered_s = time.monotonic()
         eyes = self._look.follow(due, pictures)
-        self._look_ms = MS_PER_S * (time.monotonic() - look_s)
+        looked_s = time.monotonic()
         self._tell_tracking()
         frame = LookedAt(due, pictures, eyes, begun_s)
         seen = self._seeing.see(frame)
-        if seen is not None and begun_s - seen.frame.begun_s > STALE_S:
-            if not self._was_stale:
-                self._say("the filter is late: the scene is shown as it is")
-            self._was_stale, seen = True, None
-        elif seen is not None:
-            self._was_stale = False
-        return frame, self._shown(frame, seen), seen
+        is_stale = seen is not None and begun_s - seen.frame.begun_s > STALE_S
+        if is_stale and not self._was_stale:
+            self._say("the filter is late: the scene is shown as it is")
+        self._was_stale = is_stale
+        times_ms = {
+            "scene_ms": MS_PER_S * (rendered_s - begun_s),
+            "look_ms": MS_PER_S * (looked_s - rendered_s),
+        }
+        seen = None if is_stale else seen
+        return seen, self._shown(frame, seen), times_ms
 
     def _shown(self, frame: LookedAt, seen: Seen | None) -> tuple[ShownView, ...]:
         """Return what is shown: a picture always with the view that it is of."""
@@ -219,8 +232,7 @@ class Viewer:
             )
         )
 
-    def _note(self, frame: LookedAt, seen: Seen | None, show_s: float) -> None:
-        now_s = time.monotonic()
+    def _note(self, seen: Seen | None, times_ms: dict[str, float]) -> None:
         if seen is None:
             self.log.n_plain += 1
             return
@@ -234,17 +246,15 @@ class Viewer:
                 dict(zip(EYES, asked, strict=True)),
                 dict(zip(EYES, seen.used_focus_dpt, strict=True)),
             )
-        for note in seen.notes:
-            if note not in self.log.notes and len(self.log.notes) < 100:
-                self.log.notes[note] = 0
-            if note in self.log.notes:
-                self.log.notes[note] += 1
+        self.log.add_notes(seen.notes)
+        age_s = time.monotonic() - seen.frame.begun_s
+        scene_ms, look_ms, show_ms = times_ms.values()
         self.log.add(
-            scene_ms=self._scene_ms,
-            look_ms=self._look_ms,
+            scene_ms=scene_ms,
+            look_ms=look_ms,
             **seen.stages_ms,
-            show_ms=MS_PER_S * (now_s - show_s),
-            age_ms=MS_PER_S * (now_s - seen.frame.begun_s),
+            show_ms=show_ms,
+            age_ms=MS_PER_S * age_s,
         )
 
     def _tell_tracking(self) -> None:

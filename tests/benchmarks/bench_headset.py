@@ -71,6 +71,9 @@ class Watched:
         self.last = self._seeing.see(frame) or self.last
         return self.last
 
+    def restart(self) -> None:
+        self._seeing.restart()
+
     def close(self) -> None:
         self._seeing.close()
 

@@ -92,6 +92,10 @@ class Inverting:
             (),
         )
 
+    def restart(self):
+        """What was seen in another session does not come back."""
+        self.frames = []
+
     def close(self):
         """Nothing is held."""
 
@@ -432,6 +436,43 @@ def test_a_service_filters_both_eyes_and_gives_the_poses_back(start_service):
     assert stages["filter_ms"]["p50"] > 15.0
     parts = ("scene_ms", "look_ms", "wait_ms", "wire_ms", "service_ms", "filter_ms")
     assert sum(stages[name]["p50"] for name in parts) <= stages["age_ms"]["p50"] * 1.2
+
+
+def test_nothing_of_a_lost_session_is_shown_in_the_next(start_service, monkeypatch):
+    """Another session has another room: an old pose would be anywhere in it."""
+    monkeypatch.setattr("clients.headset.viewer.RETRY_S", 0.01)
+    service = start_service(filter_ms=30)
+    seeing = SeeingByService(service.endpoint, FilterSettings(), lambda line: None)
+    for eye, profile in TWO_EYES.items():
+        seeing.change(eye, profile)
+    first, shown_in = Happening(), [[], []]
+
+    def keys():
+        first.is_lost = len(shown_in[0]) > 100
+        return ""
+
+    def elsewhere(at_s):
+        return (5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+    sessions = [
+        SimulatedRuntime(
+            SIZE_PX,
+            rate_hz=100.0,
+            head_at=head_at,
+            happening=happening,
+            on_shown=lambda due, shown, n=n: shown_in[n].extend(shown),
+        )
+        for n, (head_at, happening) in enumerate(
+            ((swaying, first), (elsewhere, Happening()))
+        )
+    ]
+    viewer = viewer_of(sessions, seeing, keys=keys)
+    viewer.run(limit_s=5.0)
+    seeing.close()
+    assert len(shown_in[1]) > 50
+    assert all(view.view.pose[0] > 4.0 for view in shown_in[1])
+    marks = {int(view.color[0, 0, 0]) for view in shown_in[1][-10:]}
+    assert marks <= {21, 42}, "both eyes are seen in the second session, too"
 
 
 @pytest.mark.clock
