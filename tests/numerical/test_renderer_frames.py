@@ -213,3 +213,53 @@ def test_two_eyes_in_turn_find_their_kernels_again(gl_engine, rng):
     again = seen(handles[0])
     assert "psf_blend_ms" not in again.stage_times_ms
     np.testing.assert_array_equal(again.color, first[0].color)
+
+
+def reads_of(gpu, monkeypatch):
+    """Return the list that each wait for the GPU is noted in."""
+    noted, read = [], gpu.read_into
+    monkeypatch.setattr(
+        gpu, "read_into", lambda *parts: (noted.append(len(parts)), read(*parts))
+    )
+    return noted
+
+
+def test_a_steady_frame_waits_for_the_gpu_once(gl_engine, gpu, rng, monkeypatch):
+    """In the end, for the picture and what was counted; nothing in the middle."""
+    bench = Bench(gl_engine, MYOPIA, **SIZE)
+    view = bench.view(texture(rng, 101, 150), depth_scene())
+    first = bench.render(view, pupil_diameter_mm=5.0)
+    noted = reads_of(gpu, monkeypatch)
+    again = bench.render(view, pupil_diameter_mm=5.0)
+    assert len(noted) == 1
+    np.testing.assert_array_equal(again.color, first.color)
+    bench.render(view, pupil_diameter_mm=4.0)
+    assert len(noted) == 3, "another state: which kernels it needs is asked for"
+
+
+def test_a_frame_that_needs_other_kernels_is_done_again(
+    gl_engine, gpu, rng, monkeypatch
+):
+    """Another scene in the same state: the picture is as if it were the first."""
+    bench = Bench(gl_engine, MYOPIA, **SIZE)
+    color = texture(rng, 101, 150)
+    near, far = (
+        bench.view(color, np.full((101, 150), depth_m, np.float32))
+        for depth_m in (0.5, 3.0)
+    )
+    expected = [
+        Bench(gl_engine, MYOPIA, **SIZE).render(view, pupil_diameter_mm=5.0)
+        for view in (near, far)
+    ]
+    bench.render(near, pupil_diameter_mm=5.0)
+    noted = reads_of(gpu, monkeypatch)
+    seen = bench.render(far, pupil_diameter_mm=5.0)
+    assert len(noted) == 3  # in the end; which kernels; in the end
+    np.testing.assert_array_equal(seen.color, expected[1].color)
+    for counted in ("fragment_count", "merged_count", "missing_depth_count"):
+        assert getattr(seen, counted) == getattr(expected[1], counted)
+    for view, first in ((near, expected[0]), (far, expected[1])):
+        noted.clear()
+        seen = bench.render(view, pupil_diameter_mm=5.0)
+        assert len(noted) == 1, "both scenes' kernels are kept"
+        np.testing.assert_array_equal(seen.color, first.color)

@@ -106,6 +106,7 @@ class FragmentPasses:
         self.kernel_count = 0
         self.kernel_texel_count = 0
         self.atlas: Atlas | None = None
+        self.used_words = np.zeros((0, 0), np.uint32)
 
     def upload(self) -> None:
         """Send the strip; bytes are padded to whole words."""
@@ -122,10 +123,10 @@ class FragmentPasses:
                 "DEPTH_IN", *depths_m
             )
 
-    def build_fragments(self) -> NDArray[np.bool_]:
-        """Linear light, dioptres and layers; returns the used pairs."""
+    def build_fragments(self) -> None:
+        """Linear light, dioptres and layers, and which pairs are used."""
         n_words = words_per_cell(self.strip.layers)
-        used = np.zeros((self.image.count, n_words), np.uint32)
+        self.used_words = np.zeros((self.image.count, n_words), np.uint32)
         n_pixels = self.strip.surface_count * self.strip.pixel_count
         self.strip.reserve(PIXELS=16 * n_pixels, PIXEL_LAYER=4 * n_pixels)
         self.strip.buffers["LAYER_DPT"] = self.strip.gpu.upload(
@@ -134,7 +135,7 @@ class FragmentPasses:
         self.strip.buffers["FIELD_DEFOCUS"] = self.strip.gpu.upload(
             "FIELD_DEFOCUS", self.corner_change_dpt
         )
-        self.strip.buffers["USED"] = self.strip.gpu.upload("USED", used)
+        self.strip.buffers["USED"] = self.strip.gpu.upload("USED", self.used_words)
         self.strip.buffers["STATS"] = self.strip.gpu.upload("STATS", self.stats)
         with self.strip.timer.stage("fragments_ms"):
             self.strip.run(
@@ -154,11 +155,17 @@ class FragmentPasses:
                 counted_px=self.counted_px,
                 defines=COLOR_VARIANTS[self.strip.view.color.dtype.name],
             )
+
+    def wait_for_used(self) -> NDArray[np.bool_]:
+        """Read the used pairs in the middle of the frame."""
         with self.strip.timer.wall("psf_plan_ms"):
-            words = self.strip.gpu.read(
-                self.strip.buffers["USED"], used.shape, np.uint32
-            )
-            return used_pairs(words, self.strip.layers)
+            self.strip.gpu.read_into((self.strip.buffers["USED"], 0, self.used_words))
+            return self.used
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Return the used pairs (n_cells, n_intervals), once they were read."""
+        return used_pairs(self.used_words, self.strip.layers)
 
     @property
     def _common(self) -> dict:

@@ -39,18 +39,29 @@ class FramePasses:
         self.strip = strip
         self.fragments = fragments
         self.lists: ListPasses | None = None
+        self.has_all_kernels = True
+        self._kept: KernelSet | None = None
 
-    def run(self, kernels: Callable[[NDArray[np.bool_]], KernelSet]) -> None:
+    def run(
+        self,
+        kernels: Callable[[NDArray[np.bool_]], KernelSet],
+        kept: KernelSet | None = None,
+    ) -> None:
         """Filter the strip; `read_back` fetches the picture.
 
         Parameters
         ----------
         kernels : callable
             From the used (cell, interval) pairs to the kernels for them.
+        kept : KernelSet, optional
+            Kernels that may serve: then nothing is read in the middle of the frame, and
+            in the end `has_all_kernels` says whether they did.
         """
         self.fragments.upload()
-        used = self.fragments.build_fragments()
-        self.fragments.merge_fragments(kernels(used))
+        self.fragments.build_fragments()
+        self._kept = kept
+        ready = kept or kernels(self.fragments.wait_for_used())
+        self.fragments.merge_fragments(ready)
         self.lists = ListPasses(
             self.strip, self.fragments.search_blocks, self.fragments.atlas
         )
@@ -60,7 +71,7 @@ class FramePasses:
         """Fetch the filtered picture, encoded as asked, and all that was counted."""
         width, height = self.strip.size
         picture = np.empty((height, width, RGB), ENCODERS[output][2])
-        if not self._fetch(picture, output):
+        if not self._fetch(picture, output) and self.has_all_kernels:
             self.lists.splat_bands()
             self._fetch(picture, output)
         return picture
@@ -70,12 +81,17 @@ class FramePasses:
         name, pixels_per_thread, _ = ENCODERS[output]
         self._encode(name, pixels_per_thread)
         totals = np.empty(TOTAL_WORDS, np.uint32)
+        parts = [
+            (self.strip.buffers["COLOR_IN"], 0, picture),
+            (*self.lists.totals, totals),
+            (self.strip.buffers["STATS"], 0, self.fragments.stats),
+        ]
+        if self._kept is not None:
+            parts.append((self.strip.buffers["USED"], 0, self.fragments.used_words))
         with self.strip.timer.wall("readback_ms"):
-            self.strip.gpu.read_into(
-                (self.strip.buffers["COLOR_IN"], 0, picture),
-                (*self.lists.totals, totals),
-                (self.strip.buffers["STATS"], 0, self.fragments.stats),
-            )
+            self.strip.gpu.read_into(*parts)
+        if self._kept is not None:
+            self.has_all_kernels = not self._kept.lacks(self.fragments.used)
         return self.lists.take_totals(totals)
 
     def _encode(self, name: str, pixels_per_thread: int) -> None:

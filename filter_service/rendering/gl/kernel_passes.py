@@ -46,12 +46,19 @@ class KernelSet:
         KERNELS and KERNEL_OF.
     atlas : Atlas
         Their texels.
+    have : (n_cells, n_intervals), bool
+        Pairs that there are kernels for.
     """
 
     kernels: FrameKernels
     texel_count: int
     buffers: dict[str, Buffer]
     atlas: Atlas
+    have: NDArray[np.bool_]
+
+    def lacks(self, used: NDArray[np.bool_]) -> bool:
+        """Return whether a frame uses pairs that there are no kernels for."""
+        return bool(np.any(used & ~self.have))
 
 
 class KernelMaker:
@@ -71,8 +78,18 @@ class KernelMaker:
     def forget(self) -> None:
         """Let go of what the last frame's kernels were made for."""
         self._made_for: tuple | None = None
-        self._have: NDArray[np.bool_] | None = None
         self._set: KernelSet | None = None
+
+    def kept(
+        self, pages: Pages, layers: FrameLayers, image: ImageCells
+    ) -> KernelSet | None:
+        """Return the last frame's kernels, if they were made for the same state."""
+        key = (pages, layers, image)
+        if self._made_for is None or any(
+            a is not b for a, b in zip(self._made_for, key, strict=True)
+        ):
+            return None
+        return self._set
 
     def kernels(
         self,
@@ -84,28 +101,35 @@ class KernelMaker:
         timer: StageTimer,
     ) -> KernelSet:
         """Return kernels for all used (cell, interval) pairs (n_cells, n_intervals)."""
-        key = (pages, layers, image)
-        if self._made_for is not None and all(
-            a is b for a, b in zip(self._made_for, key, strict=True)
-        ):
-            if not np.any(used & ~self._have):
-                return self._set
+        kept = self.kept(pages, layers, image)
+        if kept is not None and not kept.lacks(used):
+            return kept
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
+            if kept is not None:
+                used = self._with_those_before(store, layers, image, used, kept.have)
             kernels = frame_kernels(store.tables, layers, image, used)
-            widths, heights = box_sizes(kernels.reach_px)
-            check_texels(int((widths * heights).sum()), image, store.spec)
-            table, sizes = kernel_table(kernels)
-            n_texels = int(sizes.sum())
-        if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):
-            raise KernelsTooLarge(
-                f"the frame's kernels need {n_texels} texels; allowed are "
-                f"{MAX_KERNEL_TEXELS}",
-            )
+            table, sizes = _records(kernels, store, image)
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(kernels, table, sizes, pages, used.shape)
-        self._made_for, self._have = key, used
+            self._set = self._blend(kernels, table, sizes, pages, used)
+        self._made_for = (pages, layers, image)
         return self._set
+
+    @staticmethod
+    def _with_those_before(
+        store: PsfStore,
+        layers: FrameLayers,
+        image: ImageCells,
+        used: NDArray[np.bool_],
+        have: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Add the pairs of the frame before, if they fit: the next may use them."""
+        try:
+            both = used | have
+            _records(frame_kernels(store.tables, layers, image, both), store, image)
+        except KernelsTooLarge:
+            return used
+        return both
 
     def _blend(
         self,
@@ -113,7 +137,7 @@ class KernelMaker:
         table: NDArray[np.uint32],
         sizes: NDArray[np.int64],
         pages: Pages,
-        shape: tuple,
+        used: NDArray[np.bool_],
     ) -> KernelSet:
         gpu = self._gpu
         nodes, node_texels = node_table(kernels.nodes)
@@ -126,7 +150,7 @@ class KernelMaker:
             "KERNELS": gpu.upload(f"KERNELS {self._slot}", table),
             "PARTS": gpu.upload("PARTS", part_table(kernels)),
             "KERNEL_OF": gpu.upload(
-                f"KERNEL_OF {self._slot}", pair_index(kernels, shape)
+                f"KERNEL_OF {self._slot}", pair_index(kernels, used.shape)
             ),
         }
         node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
@@ -153,7 +177,7 @@ class KernelMaker:
                 uniforms={"level": level},
             )
         kept = {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(kernels, texels, kept, atlas)
+        return KernelSet(kernels, texels, kept, atlas, used)
 
     def _run(
         self,
@@ -174,6 +198,28 @@ class KernelMaker:
             uniforms={"group_count": len(work), **(uniforms or {})},
             **bindings,
         )
+
+
+def _records(
+    kernels: FrameKernels, store: PsfStore, image: ImageCells
+) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Return the records of kernels, and how many texels they have.
+
+    Raises
+    ------
+    KernelsTooLarge
+        Larger cells would have fewer.
+    """
+    widths, heights = box_sizes(kernels.reach_px)
+    check_texels(int((widths * heights).sum()), image, store.spec)
+    table, sizes = kernel_table(kernels)
+    n_texels = int(sizes.sum())
+    if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):
+        raise KernelsTooLarge(
+            f"the frame's kernels need {n_texels} texels; allowed are "
+            f"{MAX_KERNEL_TEXELS}",
+        )
+    return table, sizes
 
 
 def words_per_cell(layers: FrameLayers) -> int:

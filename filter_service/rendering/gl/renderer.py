@@ -26,6 +26,7 @@ from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kept_eyes import KeptEye, KeptEyes
+from filter_service.rendering.gl.kernel_passes import KernelSet
 from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.image_cells import (
     ImageCells,
@@ -235,43 +236,67 @@ class FilterRenderer:
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = kept.states.corner_change_dpt(timer, layers, image)
+        light = white_level(view.color)
         pictures: list[NDArray] = []
         counts: Counter[str] = Counter()
         for rows in _strips(whole, reach_px, self._gpu.max_block_bytes):
-            shared = Strip(
-                self._gpu,
-                rows.view,
-                timer,
-                layers=layers,
-                paper_rule=options.paper_rule,
-            )
-            fragments = FragmentPasses(
-                shared,
-                image=image,
-                corner_change_dpt=change_dpt,
-                tolerance=options.tolerance if options.merge else 0.0,
-                first_row=rows.first_row,
-                frame_pixel_count=whole.width_px * whole.height_px,
-                image_size_px=(view.width_px, view.height_px),
-                border_px=border_px,
-                counted_px=_counted_px(rows, view, border_px),
-                object_range_dpt=_prepared_range_dpt(handle.store),
-                white_level=white_level(view.color),
-                is_encoded=options.is_encoded,
-            )
-            passes = FramePasses(shared, fragments)
-            passes.run(
+
+            def passes_of(rows: _Rows = rows) -> FramePasses:
+                shared = Strip(
+                    self._gpu,
+                    rows.view,
+                    timer,
+                    layers=layers,
+                    paper_rule=options.paper_rule,
+                )
+                fragments = FragmentPasses(
+                    shared,
+                    image=image,
+                    corner_change_dpt=change_dpt,
+                    tolerance=options.tolerance if options.merge else 0.0,
+                    first_row=rows.first_row,
+                    frame_pixel_count=whole.width_px * whole.height_px,
+                    image_size_px=(view.width_px, view.height_px),
+                    border_px=border_px,
+                    counted_px=_counted_px(rows, view, border_px),
+                    object_range_dpt=_prepared_range_dpt(handle.store),
+                    white_level=light,
+                    is_encoded=options.is_encoded,
+                )
+                return FramePasses(shared, fragments)
+
+            passes, seen = _run(
+                passes_of,
                 lambda used: kept.kernels.kernels(
                     handle.store, handle.pages, layers, image, used, timer
-                )
+                ),
+                kept.kernels.kept(handle.pages, layers, image),
+                options.output,
             )
-            pictures.append(passes.read_back(options.output)[rows.kept])
+            pictures.append(seen[rows.kept])
             counts.update(passes.counts())
         picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
         rows, columns = (
             slice(border_px, border_px + n) for n in (view.height_px, view.width_px)
         )
         return np.ascontiguousarray(picture[rows, columns]), dict(counts)
+
+
+def _run(
+    passes_of: Callable[[], FramePasses],
+    kernels: Callable[[NDArray[np.bool_]], KernelSet],
+    kept: KernelSet | None,
+    output: str,
+) -> tuple[FramePasses, NDArray]:
+    """Filter a strip with the kernels that there are; once more where some lack."""
+    passes = passes_of()
+    passes.run(kernels, kept)
+    picture = passes.read_back(output)
+    if not passes.has_all_kernels:
+        passes = passes_of()
+        passes.run(kernels)
+        picture = passes.read_back(output)
+    return passes, picture
 
 
 def _counted_px(
