@@ -67,6 +67,7 @@ class Gpu:
         self._atlases: dict[str, moderngl.Texture] = {}
         self._uniforms: dict[moderngl.ComputeShader, dict] = {}
         self._queries: list[moderngl.Query] = []
+        self._owners: dict[str, object] = {}
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
         # On a software renderer all memory is the host's: a copy more gains nothing.
         self.use_staging(not self.is_software)
@@ -219,6 +220,14 @@ class Gpu:
         atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._atlases[name] = atlas
         return atlas
+
+    def claim(self, name: str, owner: object) -> None:
+        """Note who has filled memory of a name last."""
+        self._owners[name] = owner
+
+    def is_owner(self, name: str, owner: object) -> bool:
+        """Return whether nobody else has filled it since."""
+        return self._owners.get(name) is owner
 
     def read(self, buffer: moderngl.Buffer, shape: tuple, dtype) -> NDArray:
         """Read the start of a buffer as an array; waits for the GPU."""

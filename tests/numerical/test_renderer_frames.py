@@ -263,3 +263,12 @@ def test_a_frame_that_needs_other_kernels_is_done_again(
         seen = bench.render(view, pupil_diameter_mm=5.0)
         assert len(noted) == 1, "both scenes' kernels are kept"
         np.testing.assert_array_equal(seen.color, first.color)
+
+
+def test_two_renderers_of_one_context_do_not_take_each_others_kernels(gl_engine, rng):
+    benches = [Bench(gl_engine, MYOPIA, **SIZE) for _ in range(2)]
+    view = benches[0].view(texture(rng, 101, 150), depth_scene())
+    first = benches[0].render(view, pupil_diameter_mm=5.0)
+    benches[1].render(view, pupil_diameter_mm=2.5)
+    again = benches[0].render(view, pupil_diameter_mm=5.0)
+    np.testing.assert_array_equal(again.color, first.color)

@@ -73,6 +73,7 @@ class KernelMaker:
 
     def __init__(self, gpu: Gpu, slot: int = 0):
         self._gpu, self._slot = gpu, slot
+        self._memory = f"kernels {slot}"
         self.forget()
 
     def forget(self) -> None:
@@ -83,8 +84,13 @@ class KernelMaker:
     def kept(
         self, pages: Pages, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
-        """Return the last frame's kernels, if they were made for the same state."""
+        """Return the last frame's kernels, if they were made for the same state.
+
+        And are still there: another renderer of this context has memory of the same name.
+        """
         key = (pages, layers, image)
+        if not self._gpu.is_owner(self._memory, self):
+            return None
         if self._made_for is None or any(
             a is not b for a, b in zip(self._made_for, key, strict=True)
         ):
@@ -143,7 +149,8 @@ class KernelMaker:
         nodes, node_texels = node_table(kernels.nodes)
         texels = int(sizes.sum())
         node_atlas = gpu.atlas("nodes", node_texels)
-        atlas = gpu.atlas(f"kernels {self._slot}", texels)
+        gpu.claim(self._memory, self)
+        atlas = gpu.atlas(self._memory, texels)
         buffers = {
             "NODES": gpu.upload("NODES", nodes),
             "RECIPES": gpu.upload("RECIPES", kernels.nodes.recipes),
