@@ -86,7 +86,7 @@ class KernelMaker:
     ) -> KernelSet | None:
         """Return the last frame's kernels, if they were made for the same state.
 
-        And are still there: another renderer of this context has memory of the same name.
+        And are still there: another renderer of this context has memory of that name.
         """
         key = (pages, layers, image)
         if not self._gpu.is_owner(self._memory, self):
