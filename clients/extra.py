@@ -1,5 +1,7 @@
 """What the programs that render scenes need beside the service."""
 
+import sys
+
 INSTALL = "pip install 'ocufilter[clients]' && pip install --no-deps pyrender==0.1.45"
 """pyrender apart and without its dependencies: it pins a PyOpenGL that is too old."""
 
@@ -9,4 +11,4 @@ def what_to_install(error: ModuleNotFoundError) -> str:
     return f"the package {error.name} is not installed; to render scenes: {INSTALL}"
 
 
-HEADSET_INSTALL = "pip install 'ocufilter[headset]'"
+HEADSET_INSTALL = f"{sys.executable} -m pip install pyopenxr"

@@ -227,23 +227,11 @@ class FilterClient:
         """
         if wait not in (True, False, "first"):
             raise ValueError(f"wait is {wait!r}; allowed: True, False or 'first'")
-        cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
-        if isinstance(body, str):
-            body = {"kind": "preset", "name": body}
-        if not isinstance(settings, FilterSettings):
-            settings = FilterSettings(**settings)
-        if eye not in EYE_NAMES:
-            raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
-        request = ProfileRequest(
-            self._next_profile_id, dict(body), settings, cameras, eye
-        )
-        self._camera = next(iter(cameras), self._camera)
+        previous = self._link.profiles.get(eye)
+        request = self._request(body, eye, settings, views)
         parts = encode(request)  # before any state changes: it may refuse the body
         self.hello()
-        self._next_profile_id += 1
-        previous = self._link.profiles.get(eye)
-        self._link.profiles[eye] = request
-        self._link.say(parts)
+        self._ask(request, parts)
         try:
             return self._await_profile(request, wait, on_progress, timeout_s)
         except FilterError:
@@ -253,6 +241,49 @@ class FilterClient:
             else:
                 self._link.profiles[eye] = previous
             raise
+
+    def request_profile(
+        self,
+        body: Mapping[str, Any] | str,
+        *,
+        eye: EyeName = "both",
+        settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
+        views: Sequence[Camera | RgbdView] = (),
+    ) -> int:
+        """Ask for another eye like `set_profile`, and wait for nothing.
+
+        Returns
+        -------
+        int
+            The profile's number: `poll` hands out the Accepted, Progress, Ready or
+            ErrorReply with it.
+        """
+        request = self._request(body, eye, settings, views)
+        self._ask(request, encode(request))
+        return request.profile_id
+
+    def _request(
+        self,
+        body: Mapping[str, Any] | str,
+        eye: EyeName,
+        settings: FilterSettings | Mapping[str, Any],
+        views: Sequence[Camera | RgbdView],
+    ) -> ProfileRequest:
+        cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
+        if isinstance(body, str):
+            body = {"kind": "preset", "name": body}
+        if not isinstance(settings, FilterSettings):
+            settings = FilterSettings(**settings)
+        if eye not in EYE_NAMES:
+            raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
+        return ProfileRequest(self._next_profile_id, dict(body), settings, cameras, eye)
+
+    def _ask(self, request: ProfileRequest, parts: list[Any]) -> None:
+        self._camera = next(iter(request.views), self._camera)
+        self._next_profile_id += 1
+        self._link.profiles[request.eye] = request
+        if self.welcome is not None:  # else hello is followed by it
+            self._link.say(parts)
 
     def _await_profile(
         self,
@@ -432,7 +463,7 @@ class FilterClient:
         states = tuple(states) or (ViewState(),) * len(items)
         if len(states) != len(items):
             raise ValueError(f"{len(states)} states; allowed: {len(items)}, as views")
-        check_states(states)
+        check_states(states, pupil_diameter_mm, focus_dpt)
         if self.welcome is not None:
             check_limits(items, self.welcome)
         frame = Frame(

@@ -11,7 +11,7 @@ import numpy as np
 
 from clients.filter_client import FilteredFrame
 
-_NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
+NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
 
 
 @dataclass
@@ -32,7 +32,7 @@ class FrameLog:
             self.stages_ms.setdefault(stage, []).append(time_ms)
         for note in answer.header.notes:
             # A note's numbers change with every frame; its kind is worth counting.
-            kind = _NUMBER.sub("#", note)
+            kind = NUMBER.sub("#", note)
             count, example = self.notes.get(kind, (0, note))
             self.notes[kind] = (count + 1, example)
 

@@ -90,6 +90,7 @@ class NaturalEye:
         self._fixed_mm = pupil_diameter_mm
         self._pupil: PupilReflex | None = None
         self._focus = AccommodationResponse(0.0, MAX_VERGENCE_DPT)
+        self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
     def look(
         self, luminance_cd_m2: float, distance_dpt: float, at_s: float
@@ -105,25 +106,34 @@ class NaturalEye:
             pupil_mm = self._pupil.follow(luminance_cd_m2, at_s)
         wanted_dpt = min(max(distance_dpt, 0.0), MAX_VERGENCE_DPT)
         focus_dpt = self._focus.follow(wanted_dpt, at_s)
+        far_dpt, near_dpt = self._far_dpt, self._near_dpt
+        self._focus.hold(far_dpt, near_dpt)
+        if far_dpt < focus_dpt < near_dpt:
+            return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
+        # At its limit it tries on: so a limit that has moved is found out.
+        if focus_dpt <= far_dpt:
+            focus_dpt = min(wanted_dpt, far_dpt)
+        else:
+            focus_dpt = max(wanted_dpt, near_dpt)
         return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
 
     def learn(self, asked_dpt: float, used_dpt: float) -> None:
         """Take in what a filter made of a focus: where this eye cannot follow.
 
         Farther than its far point, or nearer than its near point, the eye does not
-        move; its way back begins there.
+        move; its way back begins there.  Both change with the pupil: an eye at its
+        limit goes on asking for more.
         """
-        focus = self._focus
         if used_dpt > asked_dpt + LIMIT_STEP_DPT:
-            if abs(used_dpt - focus.far_dpt) > LIMIT_STEP_DPT:
-                near_dpt = max(focus.near_dpt, used_dpt)
-                self._focus = AccommodationResponse(used_dpt, near_dpt)
+            self._far_dpt = used_dpt
         elif used_dpt < asked_dpt - LIMIT_STEP_DPT:
-            focus.near_dpt = max(used_dpt, focus.far_dpt)
+            self._near_dpt = used_dpt
+        self._far_dpt = min(self._far_dpt, used_dpt)
+        self._near_dpt = max(self._near_dpt, used_dpt)
 
     def change(self) -> None:
         """Become another eye, whose far and near point are not known yet."""
-        self._focus = AccommodationResponse(0.0, MAX_VERGENCE_DPT)
+        self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
 
 def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:

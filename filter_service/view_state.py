@@ -61,19 +61,31 @@ class ViewState(Record):
     pose: Pose | None = None
 
 
-def check_states(states: Sequence[ViewState]) -> None:
+def check_states(
+    states: Sequence[ViewState], pupil_diameter_mm: float, focus_dpt: float
+) -> None:
     """Refuse two pupils, or two focuses, for one eye.
+
+    Parameters
+    ----------
+    states : of the views of a frame
+    pupil_diameter_mm, focus_dpt : float
+        Of the frame, for views that have none of their own.
 
     Raises
     ------
     BadMessage
         Names the view.
     """
+    usual = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
     first_of: dict[EyeName, ViewState] = {}
     for i, state in enumerate(states):
         first = first_of.setdefault(state.eye, state)
-        for name in ("pupil_diameter_mm", "focus_dpt"):
-            wanted, found = getattr(first, name), getattr(state, name)
+        for name, of_frame in usual.items():
+            wanted, found = (
+                of_frame if own is None else own
+                for own in (getattr(first, name), getattr(state, name))
+            )
             if found != wanted:
                 raise BadMessage(
                     f"it is {found}",

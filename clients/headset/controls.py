@@ -17,7 +17,7 @@ PRESETS = (
     "post_lasik",
 )
 HELP = (
-    "keys: 1 to 6 both eyes "
+    "keys: 1 to 6 both eyes: "
     + ", ".join(f"{n} {name}" for n, name in enumerate(PRESETS, 1))
     + "; l, r the next one for the left, the right eye; f filter on, off; "
     "s split, before and after; q ends"
@@ -33,18 +33,24 @@ class Controls:
     profiles : of each eye
     change : callable
         ``change(eye, profile)`` is told of another eye.
+    say : callable
+        Told in a line what was switched.
     is_on : bool
         False: the scene as it is.
     is_split : bool
         The left half as it is, the right half as it is seen.
     is_over : bool
+    is_begun : bool
+        The eyes were asked for.
     """
 
     profiles: dict[Eye, Mapping[str, Any]]
     change: Callable[[Eye, Mapping[str, Any]], None]
+    say: Callable[[str], None] = lambda line: None
     is_on: bool = True
     is_split: bool = False
     is_over: bool = False
+    is_begun: bool = False
     _numbers: dict[Eye, int] = field(default_factory=lambda: {e: -1 for e in EYES})
 
     def press(self, keys: str, buttons: Sequence[str] = ()) -> None:
@@ -57,17 +63,22 @@ class Controls:
                 eye: Eye = "left" if key == "l" else "right"
                 self._set(eye, (self._numbers[eye] + 1) % len(PRESETS))
             elif key == "f":
-                self.is_on = not self.is_on
+                self._switch()
             elif key == "s":
                 self.is_split = not self.is_split
+                self.say(f"split {'on' if self.is_split else 'off'}")
             elif key == "q":
                 self.is_over = True
         for button in buttons:
             if button == "on_off":
-                self.is_on = not self.is_on
+                self._switch()
             elif button == "next_eye":
                 for eye in EYES:
                     self._set(eye, (self._numbers[eye] + 1) % len(PRESETS))
+
+    def _switch(self) -> None:
+        self.is_on = not self.is_on
+        self.say(f"filter {'on' if self.is_on else 'off: the scene as it is'}")
 
     def _set(self, eye: Eye, number: int) -> None:
         self._numbers[eye] = number

@@ -54,10 +54,19 @@ class RgbdPicture:
 
 @dataclass(frozen=True)
 class LookingEye:
-    """One eye in a moment; gaze is in its own picture."""
+    """One eye in a moment.
+
+    Attributes
+    ----------
+    state : EyeState
+    gaze_deg, ahead_deg : (h, v)
+        Where it looks, and straight ahead of the head, in its own picture: displays may
+        be canted.
+    """
 
     state: EyeState
     gaze_deg: tuple[float, float]
+    ahead_deg: tuple[float, float] = STRAIGHT_AHEAD
 
 
 class StereoLook:
@@ -87,7 +96,7 @@ class StereoLook:
             )
         self._age_years, self._pupil_mm = age_years, pupil_diameter_mm
         self._white_cd_m2 = white_cd_m2
-        self._gaze_range_deg = gaze_range_deg
+        self.gaze_range_deg = gaze_range_deg
         self._follower = GazeFollower()
         self._eyes: dict[Eye, NaturalEye] = {}
         self._distance_m: float | None = None
@@ -119,7 +128,9 @@ class StereoLook:
             point = head[:3, 3] + min(distance_m, FAR_M) * direction
             own = matrix_of(picture.view.pose)
             gaze_deg = angles_of(own[:3, :3].T @ (point - own[:3, 3]))
-            found.append(LookingEye(state, self._clamped(gaze_deg)))
+            ahead_deg = _rounded(angles_of(own[:3, :3].T @ -head[:3, 2]))
+            gaze_deg = self._clamped(gaze_deg, ahead_deg)
+            found.append(LookingEye(state, gaze_deg, ahead_deg))
         return tuple(found)
 
     def restart(self) -> None:
@@ -129,11 +140,10 @@ class StereoLook:
         self._distance_m = None
         self.is_tracked = False
 
-    def learn(self, asked_dpt: dict[Eye, float], used_dpt: dict[Eye, float]) -> None:
-        """Take in what the filter made of each eye's focus."""
-        for eye, used in used_dpt.items():
-            if eye in self._eyes:
-                self._eyes[eye].learn(asked_dpt[eye], used)
+    def learn(self, eye: Eye, asked_dpt: float, used_dpt: float) -> None:
+        """Take in what the filter made of an eye's focus."""
+        if eye in self._eyes:
+            self._eyes[eye].learn(asked_dpt, used_dpt)
 
     def change(self, eye: Eye) -> None:
         """Let an eye become another one."""
@@ -163,10 +173,14 @@ class StereoLook:
                 return found_m
         return before_m
 
-    def _clamped(self, gaze_deg: tuple[float, float]) -> tuple[float, float]:
+    def _clamped(
+        self, gaze_deg: tuple[float, float], ahead_deg: tuple[float, float]
+    ) -> tuple[float, float]:
         h, v = (
-            min(max(angle, -reach), reach)
-            for angle, reach in zip(gaze_deg, self._gaze_range_deg, strict=True)
+            min(max(angle, middle - reach), middle + reach)
+            for angle, middle, reach in zip(
+                gaze_deg, ahead_deg, self.gaze_range_deg, strict=True
+            )
         )
         return h, v
 
@@ -197,7 +211,16 @@ def _head(due: DueFrame, pictures: Sequence[RgbdPicture]):
     """Return the head's matrix; between the eyes where the runtime does not say."""
     if due.head is not None:
         return matrix_of(due.head)
-    matrices = [matrix_of(picture.view.pose) for picture in pictures]
-    between = matrices[0].copy()
-    between[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices], axis=0)
-    return between
+    poses = np.array([picture.view.pose for picture in pictures])
+    # q and -q are the same turn
+    signs = np.sign(poses[:, 3:] @ poses[0, 3:])
+    poses[:, 3:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
+    between = poses.mean(axis=0)
+    between[3:] /= np.linalg.norm(between[3:])
+    return matrix_of(tuple(between.tolist()))
+
+
+def _rounded(angles_deg: tuple[float, float]) -> tuple[float, float]:
+    """Return angles without noise: PSFs are prepared for them."""
+    h, v = (round(angle_deg, 2) + 0.0 for angle_deg in angles_deg)
+    return h, v

@@ -140,9 +140,13 @@ class OpenXrRuntime:
         self._closing.callback(_quietly, xr.destroy_session, self._session)
         self._room = self._space(xr.ReferenceSpaceType.LOCAL)
         self._head = self._space(xr.ReferenceSpaceType.VIEW)
-        has_gaze = EYE_GAZE in optional and self._tracks_eyes()
-        self._actions = Actions(self._instance, self._session, with_gaze=has_gaze)
-        self.notes = [] if has_gaze else ["no eye tracker: gaze is straight ahead"]
+        self.tracks_eyes = EYE_GAZE in optional and self._tracks_eyes()
+        self._actions = Actions(
+            self._instance, self._session, with_gaze=self.tracks_eyes
+        )
+        self.notes = []
+        if not self.tracks_eyes:
+            self.notes.append("no eye tracker: gaze is straight ahead")
         with self._context:
             self._images = StereoImages(
                 self._session,

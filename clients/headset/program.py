@@ -15,6 +15,9 @@ import argparse
 import importlib
 import json
 import logging
+import math
+import os
+import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -67,9 +70,11 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     eyes = parser.add_argument_group("the eyes")
     what = "a preset's name, JSON, or a .json file"
-    eyes.add_argument("--profile", default="myopia", help=f"of both eyes: {what}")
-    eyes.add_argument("--left", metavar="PROFILE", help="of the left eye")
-    eyes.add_argument("--right", metavar="PROFILE", help="of the right eye")
+    eyes.add_argument(
+        "--profile", default="myopia", help=f"of both eyes: {what} (default: myopia)"
+    )
+    eyes.add_argument("--left", metavar="PROFILE", help="of the left eye, instead")
+    eyes.add_argument("--right", metavar="PROFILE", help="of the right eye, instead")
     eyes.add_argument(
         "--age",
         type=float,
@@ -166,9 +171,26 @@ def settings_of(options: argparse.Namespace) -> FilterSettings:
         raise ValueError(f"--settings: {error}") from None
 
 
+def gaze_range_of(
+    options: argparse.Namespace, settings: FilterSettings, runtime: Runtime
+) -> tuple[float, float]:
+    """Return how far eyes turn: as was asked for, else as far as is tracked."""
+    is_told = options.gaze_range is not None or any(settings.gaze_range_deg)
+    if runtime.tracks_eyes and not is_told:
+        return TRACKED_RANGE_DEG
+    return settings.gaze_range_deg
+
+
 def profiles_of(options: argparse.Namespace) -> dict[Any, Mapping[str, Any]]:
     """Return the profile of each eye."""
-    return {eye: read_profile(getattr(options, eye) or options.profile) for eye in EYES}
+    return {
+        eye: (
+            read_profile(options.profile)
+            if getattr(options, eye) is None
+            else read_profile(getattr(options, eye), f"--{eye}")
+        )
+        for eye in EYES
+    }
 
 
 def scenery_of(options: argparse.Namespace, context) -> Any:
@@ -183,10 +205,16 @@ def scenery_of(options: argparse.Namespace, context) -> Any:
     if colon and not Path(options.scene).exists():
         sys.path.insert(0, "")
         try:
-            with context:
-                return getattr(importlib.import_module(module), function)(context)
+            make = getattr(importlib.import_module(module), function)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"--scene {options.scene}: {error}") from None
+        try:
+            with context:
+                return make(context)
+        except Exception as error:  # it is the user's own
+            raise ValueError(
+                f"--scene {options.scene}: {type(error).__name__}: {error}"
+            ) from error
     from clients.headset.scenery import SceneScenery
 
     scene, stand = scene_of(options.scene)
@@ -220,6 +248,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         gaze_range_deg=settings.gaze_range_deg,
     )
     size_px = _size(options.size)
+    _check_limits(options)
     with ExitStack() as stack:
         context = _context(options, stack)
         scenery = scenery_of(options, context)
@@ -234,9 +263,18 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             seeing.change(eye, profile)
             say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
 
-        controls = Controls(dict(profiles), change)
-        for eye, profile in profiles.items():
-            change(eye, profile)
+        controls = Controls(dict(profiles), change, say)
+
+        def on_session(runtime: Runtime) -> None:
+            """Begin with the eyes once it is known how far they turn."""
+            reach_deg = gaze_range_of(options, settings, runtime)
+            if controls.is_begun and reach_deg == look.gaze_range_deg:
+                return
+            controls.is_begun = True
+            look.gaze_range_deg = reach_deg
+            seeing.settings = settings.changed(gaze_range_deg=reach_deg)
+            for eye, profile in controls.profiles.items():
+                change(eye, profile)
 
         def open_runtime() -> Runtime:
             if options.simulated:
@@ -255,9 +293,17 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             controls,
             read_keys=keys.pressed,
             say=say,
+            on_session=on_session,
         )
+        if sys.stdin is not None and sys.stdin.isatty():
+            say(HELP)
         started_s = time.monotonic()
-        log = viewer.run(max_frames=options.frames, limit_s=options.seconds)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            viewer.run(max_frames=options.frames, limit_s=options.seconds)
+        except KeyboardInterrupt:
+            say("ended")
+        log = viewer.log
         took_s = time.monotonic() - started_s
         if options.out is not None:
             keeper.write(options.out)
@@ -266,11 +312,14 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 def _openxr(name: str) -> Any:
     """Return a module that needs pyopenxr."""
+    # The loader says much on stderr while there is no runtime; we say it once.
+    os.environ.setdefault("XR_LOADER_DEBUG", "none")
     try:
         return importlib.import_module(f"clients.headset.{name}")
-    except ModuleNotFoundError as error:
+    except ModuleNotFoundError:
         raise ValueError(
-            f"the package {error.name} is not installed: {HEADSET_INSTALL}"
+            f"pyopenxr is not installed: {HEADSET_INSTALL}; or see what a headset "
+            "would show with --simulated"
         ) from None
 
 
@@ -299,6 +348,16 @@ def _seeing(options: argparse.Namespace, settings: FilterSettings) -> Seeing:
     if options.service is not None:
         return SeeingByService(options.service, settings, say)
     return SeeingHere(settings, say)
+
+
+def _check_limits(options: argparse.Namespace) -> None:
+    """Refuse limits that are none, and a folder that cannot be written to."""
+    for name in ("frames", "seconds"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"--{name} is {value}; allowed: above 0")
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -346,11 +405,14 @@ def _lines(report: Mapping[str, Any]) -> str:
     lines = [
         f"{report['filtered']} frames filtered in {report['seconds']:.1f} s "
         f"({report['where']}), {report['repeated']} shown again, "
-        f"{report['plain']} plain, {report['not_rendered']} not rendered"
+        f"{report['plain']} plain, {report['not_rendered']} not rendered, "
+        f"{report['incomplete']} through an eye that was not whole yet"
     ]
     for name, values in report["stages_ms"].items():
         words = ", ".join(f"{p} {value:g}" for p, value in values.items())
         lines.append(f"  {name.removesuffix('_ms'):10s} {words} ms")
+    for note in report["notes"]:
+        lines.append(f"  {note['frames']} frames: {note['example']}")
     return "\n".join(lines)
 
 
@@ -361,7 +423,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # pyopenxr imports it
     try:
         report = run(options)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # before there was anything to show
         return 130
     except ValueError as error:
         print(f"headset: {error}", file=sys.stderr)
@@ -370,6 +432,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"headset: {error}", file=sys.stderr)
         return 1
     sys.stdout.write((json.dumps(report) if options.json else _lines(report)) + "\n")
+    if not report["filtered"]:
+        print("headset: no frame was filtered", file=sys.stderr)
+        return 1
     return 0
 
 

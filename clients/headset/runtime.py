@@ -120,10 +120,12 @@ class Runtime(Protocol):
     ----------
     name : str
     size_px : (width, height) of each eye's picture
+    tracks_eyes : bool
     """
 
     name: str
     size_px: tuple[int, int]
+    tracks_eyes: bool
 
     def begin_frame(self) -> DueFrame | None:
         """Wait for the next frame; None where there is none for the moment.

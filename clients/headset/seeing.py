@@ -24,16 +24,22 @@ from filter_service import (
     RgbdView,
     plan_views,
 )
-from filter_service.errors import FilterError
+from filter_service.errors import BuildCancelled, FilterError
 from filter_service.messages import (
     Dropped,
     ErrorReply,
     Ready,
+    Result,
+    ResultView,
     ViewState,
     body_of_eye,
 )
 
-PROFILE_WAIT_S = 2.0
+RETRY_S = 1.0
+SAY_AGAIN_S = 10.0
+ASK_AGAIN = ("worker_crashed", "no_profile")
+"""Errors after which a profile is sent once more."""
+
 WAIT_SHARE = 0.6
 """Of a frame's period: so long the answer to the newest frame is waited for, so that a
 quick filter's picture is shown in the frame that it was rendered for."""
@@ -88,21 +94,30 @@ class Seen:
         What went in.
     views : EyeView of each picture, with the pose that came back with it
     colors : (h, w, 3) uint8 of each eye
-    used_focus_dpt : of each eye
+    used_focus_dpt : of each eye; None where that tells nothing of the eye that is
+        wanted, as it is seen through the one before, or through a preview
     stages_ms : times of the filter, and of the way to it and back
     """
 
     frame: LookedAt
     views: tuple[EyeView, ...]
     colors: tuple[NDArray[np.uint8], ...]
-    used_focus_dpt: tuple[float, ...]
+    used_focus_dpt: tuple[float | None, ...]
     is_complete: bool
     notes: tuple[str, ...]
     stages_ms: Mapping[str, float] = field(default_factory=dict)
 
 
 class Seeing(Protocol):
-    """Filters frames, each eye through its own profile."""
+    """Filters frames, each eye through its own profile.
+
+    Attributes
+    ----------
+    settings : FilterSettings
+        Of eyes from the next change on; where they look straight ahead is each view's.
+    """
+
+    settings: FilterSettings
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Ask for another eye; frames go on through the one before."""
@@ -129,24 +144,52 @@ class SeeingHere:
 
     def __init__(self, settings: FilterSettings, say: Say) -> None:
         self._say = say
+        self.settings = settings
         self.filters = {
             eye: EyeFilter(settings=settings, on_event=partial(self._tell, eye))
             for eye in EYES
         }
+        self._wanted: dict[Eye, Mapping[str, Any]] = {}
+        self._generations: dict[Eye, int] = {}
 
     def _tell(self, eye: Eye, event: EyeEvent) -> None:
         if isinstance(event, EyeReady) and event.is_complete:
             self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
-        elif isinstance(event, EyeFailed):
+        elif isinstance(event, EyeFailed) and not isinstance(
+            event.error, BuildCancelled
+        ):
             self._say(f"{eye} eye: {event.error}")
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Ask for another eye; frames go on through the one before."""
-        self.filters[eye].set_profile(body_of_eye(profile, eye))
+        self._wanted[eye] = profile
+
+    def _set_profiles(self, frame: LookedAt) -> None:
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            try:
+                accepted = self.filters[eye].set_profile(
+                    body_of_eye(profile, eye),
+                    settings=_settings_ahead(self.settings, looking),
+                    cameras=[picture.camera],
+                )
+                self._generations[eye] = accepted.generation
+            except ValueError as error:
+                self._say(f"{eye} eye: {error}")
 
     def see(self, frame: LookedAt) -> Seen | None:
-        """Filter a frame; None while an eye is being prepared for it."""
+        """Filter a frame; None while an eye is being prepared for it.
+
+        Raises
+        ------
+        FilterError
+            An eye cannot be prepared, and there is none before it.
+        """
         begin_s = time.monotonic()
+        self._set_profiles(frame)
         planned = plan_views(
             self.filters.__getitem__,
             frame.views,
@@ -163,7 +206,13 @@ class SeeingHere:
             frame,
             tuple(picture.view for picture in frame.pictures),
             tuple(view.color for view in seen.views),
-            tuple(view.seen.focus_dpt for view in seen.views),
+            tuple(
+                view.seen.focus_dpt
+                if view.seen.is_complete
+                and view.seen.generation == self._generations.get(picture.view.eye)
+                else None
+                for view, picture in zip(seen.views, frame.pictures, strict=True)
+            ),
             seen.is_complete,
             seen.notes,
             {
@@ -193,10 +242,13 @@ class SeeingByService:
     """
 
     def __init__(self, endpoint: str, settings: FilterSettings, say: Say) -> None:
+        self._say_once = _Once(say)
         self._say = say
-        self._settings = settings
+        self.settings = settings
         self._client = FilterClient(endpoint, client_name="headset", timeout_s=5.0)
         self._wanted: dict[Eye, dict[str, Any]] = {}
+        self._asked: dict[Eye, tuple[int, dict[str, Any]]] = {}
+        self._retry_s = 0.0  # when a profile that is sent again may be
         self._on_way: dict[int, LookedAt] = {}
         self._newest: Seen | None = None
         self._is_there = True
@@ -246,22 +298,20 @@ class SeeingByService:
         return self._newest
 
     def _send_profiles(self, frame: LookedAt) -> None:
-        for picture in frame.pictures:
+        if time.monotonic() < self._retry_s:
+            return
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
             eye = picture.view.eye
             profile = self._wanted.pop(eye, None)
             if profile is None:
                 continue
-            try:
-                self._client.set_profile(
-                    profile,
-                    eye=eye,
-                    settings=self._settings,
-                    views=[picture.camera],
-                    wait=False,
-                    timeout_s=PROFILE_WAIT_S,
-                )
-            except FilterError as error:
-                self._say(f"{eye} eye: {error}")
+            profile_id = self._client.request_profile(
+                profile,
+                eye=eye,
+                settings=_settings_ahead(self.settings, looking),
+                views=[picture.camera],
+            )
+            self._asked[eye] = profile_id, profile
 
     def _take_events(self, wait_s: float = 0.0) -> None:
         for event in self._client.poll(wait_s):
@@ -273,10 +323,22 @@ class SeeingByService:
                 self.n_dropped[reason] = self.n_dropped.get(reason, 0) + 1
             elif isinstance(event, ErrorReply):
                 self._on_way.pop(event.frame_id, None)
-                if event.code != "build_cancelled":
-                    self._say(str(event.exception()))
+                self._take_error(event)
             elif isinstance(event, Ready) and event.is_complete:
                 self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
+
+    def _take_error(self, reply: ErrorReply) -> None:
+        """Say what is wrong, once; ask again for eyes that are lost by no fault."""
+        if reply.code == "build_cancelled":
+            return
+        self._say_once(str(reply.exception()))
+        if reply.code not in ASK_AGAIN:
+            return
+        for eye, (profile_id, profile) in self._asked.items():
+            # Frames are answered with what their eye has failed with, again and again.
+            if eye not in self._wanted and reply.profile_id in (None, profile_id):
+                self._wanted[eye] = profile
+                self._retry_s = time.monotonic() + RETRY_S
 
     def _take(self, answer: FilteredFrame) -> None:
         frame = self._on_way.pop(answer.frame_id, None)
@@ -295,7 +357,7 @@ class SeeingByService:
             frame,
             views,
             answer.colors,
-            tuple(float(view.focus_dpt or 0.0) for view in header.views),
+            tuple(self._used_focus_dpt(header, view) for view in header.views),
             header.is_complete,
             header.notes,
             {
@@ -306,6 +368,15 @@ class SeeingByService:
             },
         )
 
+    def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
+        """Return a view's focus, if it is that of the eye that is wanted."""
+        if view.profile_id is None:  # a service that knows one eye alone
+            return header.focus_dpt if header.is_complete else None
+        asked = self._asked.get(view.eye)
+        if asked is None or asked[0] != view.profile_id or not view.is_complete:
+            return None
+        return view.focus_dpt
+
     def restart(self) -> None:
         """Forget what was seen, and what is on its way."""
         self._newest = None
@@ -314,6 +385,27 @@ class SeeingByService:
     def close(self) -> None:
         """End the session."""
         self._client.close()
+
+
+class _Once:
+    """Says the same line now and then only."""
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._said_s: dict[str, float] = {}
+
+    def __call__(self, line: str) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s.get(line, -math.inf) > SAY_AGAIN_S:
+            self._said_s = {line: now_s, **self._said_s}
+            self._say(line)
+
+
+def _settings_ahead(settings: FilterSettings, eye: LookingEye) -> FilterSettings:
+    """Return settings whose gaze is straight ahead of the head in a canted view."""
+    if settings.gaze_deg != (0.0, 0.0):
+        return settings
+    return settings.changed(gaze_deg=eye.ahead_deg)
 
 
 _OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")

@@ -108,6 +108,7 @@ class SimulatedRuntime:
             raise ValueError(f"size_px is {size_px}; allowed: 1 px or more")
         self.size_px = size_px
         self.happening = happening or Happening()
+        self.tracks_eyes = self.happening.gaze_deg is not None
         self._period_s = 1.0 / rate_hz
         self._head_at = head_at
         self._on_shown = on_shown

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from clients.frame_log import percentiles
+from clients.frame_log import NUMBER, percentiles
 from clients.headset.controls import Controls
 from clients.headset.look import RgbdPicture, StereoLook
 from clients.headset.runtime import (
-    EYES,
     DueFrame,
     EyeView,
     NoRuntime,
@@ -27,7 +26,6 @@ STALE_S = 1.0
 """A picture begun so long ago is not shown any more: the scene is, as it is."""
 
 RETRY_S = 1.0
-MAX_NOTES = 100
 SPLIT_RATIO = 0.5
 
 
@@ -56,7 +54,8 @@ class ViewerLog:
     n_hidden: int = 0
     n_sessions: int = 0
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
-    notes: dict[str, int] = field(default_factory=dict)
+    n_incomplete: int = 0
+    notes: dict[str, tuple[int, str]] = field(default_factory=dict)
 
     def add(self, **times_ms: float) -> None:
         """Note a filtered frame's times."""
@@ -65,10 +64,11 @@ class ViewerLog:
             self.stages_ms.setdefault(name, []).append(value_ms)
 
     def add_notes(self, notes: Sequence[str]) -> None:
-        """Count what the filter has to say; of very many kinds the first."""
+        """Count what the filter has to say, by its kind: numbers differ each time."""
         for note in notes:
-            if note in self.notes or len(self.notes) < MAX_NOTES:
-                self.notes[note] = self.notes.get(note, 0) + 1
+            kind = NUMBER.sub("#", note)
+            count, example = self.notes.get(kind, (0, note))
+            self.notes[kind] = count + 1, example
 
     def summary(self) -> dict[str, Any]:
         """Return counts and percentiles."""
@@ -81,7 +81,11 @@ class ViewerLog:
             "stages_ms": {
                 name: percentiles(values) for name, values in self.stages_ms.items()
             },
-            "notes": self.notes,
+            "incomplete": self.n_incomplete,
+            "notes": [
+                {"frames": count, "example": example}
+                for count, example in self.notes.values()
+            ],
         }
 
 
@@ -100,6 +104,8 @@ class Viewer:
         Gives the keys that were pressed.
     say : callable
         Told in a line what the user should know.
+    on_session : callable
+        Told of each runtime that a session begins with.
     """
 
     def __init__(
@@ -112,6 +118,7 @@ class Viewer:
         *,
         read_keys: Callable[[], str] = str,
         say: Callable[[str], None] = print,
+        on_session: Callable[[Runtime], None] = lambda runtime: None,
     ) -> None:
         self._open_runtime = open_runtime
         self._scenery = scenery
@@ -120,6 +127,7 @@ class Viewer:
         self._controls = controls
         self._read_keys = read_keys
         self._say = say
+        self._on_session = on_session
         self._last: Seen | None = None
         self._was_tracked: bool | None = None
         self._was_stale = False
@@ -148,7 +156,7 @@ class Viewer:
         while not is_done():
             try:
                 runtime = self._open_runtime()
-            except NoRuntime as error:
+            except (NoRuntime, SessionLost) as error:
                 if str(error) != said:
                     said = str(error)
                     self._say(f"{said}; trying again every {RETRY_S:g} s")
@@ -160,6 +168,7 @@ class Viewer:
             self._say(f"{runtime.name}: {runtime.size_px[0]}x{runtime.size_px[1]} px")
             self._look.restart()
             self._seeing.restart()
+            self._on_session(runtime)
             try:
                 self._run_session(runtime, is_done)
             except SessionEnded as error:
@@ -177,15 +186,14 @@ class Viewer:
         while not is_done():
             due = runtime.begin_frame()
             begun_s = time.monotonic()
-            self._controls.press(self._read_keys(), () if due is None else due.pressed)
             if due is None:
-                continue
-            if not due.should_render:
-                self.log.n_hidden += 1
-                runtime.end_frame(due, ())
+                self._controls.press(self._read_keys())
                 continue
             try:
-                seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
+                self._controls.press(self._read_keys(), due.pressed)
+                seen, shown, times_ms = None, (), {}
+                if due.should_render:
+                    seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
             except BaseException:
                 # A frame that was begun is to be ended, whatever happened to it.
                 runtime.end_frame(due, ())
@@ -193,7 +201,10 @@ class Viewer:
             show_s = time.monotonic()
             runtime.end_frame(due, shown)
             times_ms["show_ms"] = MS_PER_S * (time.monotonic() - show_s)
-            self._note(seen, times_ms)
+            if due.should_render:
+                self._note(seen, times_ms)
+            else:
+                self.log.n_hidden += 1
 
     def _frame(
         self, due: DueFrame, begun_s: float, size_px: tuple[int, int]
@@ -240,13 +251,13 @@ class Viewer:
             self.log.n_repeated += 1
             return
         self._last = seen
-        if seen.is_complete:  # a preview's focus tells nothing of the eye
-            asked = [eye.state.focus_dpt for eye in seen.frame.eyes]
-            self._look.learn(
-                dict(zip(EYES, asked, strict=True)),
-                dict(zip(EYES, seen.used_focus_dpt, strict=True)),
-            )
+        for picture, eye, used_dpt in zip(
+            seen.frame.pictures, seen.frame.eyes, seen.used_focus_dpt, strict=True
+        ):
+            if used_dpt is not None:
+                self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
         self.log.add_notes(seen.notes)
+        self.log.n_incomplete += not seen.is_complete
         age_s = time.monotonic() - seen.frame.begun_s
         scene_ms, look_ms, show_ms = times_ms.values()
         self.log.add(

@@ -73,6 +73,10 @@ class AccommodationResponse:
             0.0, LATENCY_S, lambda begin, end: time_constant_s(begin, end, cue)
         )
 
+    def hold(self, far_dpt: float, near_dpt: float) -> None:
+        """Keep the eye between a far and a near point that it turns out to have."""
+        self._response.hold(far_dpt - self.far_dpt, near_dpt - self.far_dpt)
+
     def follow(self, distance_dpt: float, at_s: float) -> float:
         """Look at something from now on; return where the eye is focused now, dpt."""
         wanted_dpt = min(max(distance_dpt, self.far_dpt), self.near_dpt)

@@ -69,6 +69,16 @@ class DelayedApproach:
         self._approach(at_s)
         return self._value
 
+    def hold(self, low: float, high: float) -> None:
+        """Keep the value within limits that it has come to; targets stay.
+
+        From a limit that moves away a movement to the target begins.
+        """
+        held = min(max(self._value, low), high)
+        if held != self._value:
+            self._value = held
+            self._tau_s = self._time_constant_s(held, self._target)
+
     def _approach(self, at_s: float) -> None:
         if at_s > self._at_s:
             if math.isfinite(self._at_s):

@@ -5,6 +5,7 @@ The service never imports its clients or tests; it can only start them.
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 from enum import StrEnum
@@ -118,8 +119,13 @@ def headset(context: typer.Context) -> None:
         command = [sys.executable, "-m", program, "--help"]
         folder = _folder_to_start_in(program)
         say(subprocess.check_output(command, cwd=folder, text=True).rstrip())
-    else:
-        _run_program(program, context.args, json_output=False)
+    else:  # it takes this process's place: signals are its own
+        command = [sys.executable, "-m", program, *context.args]
+        folder = _folder_to_start_in(program)
+        if folder is not None:
+            os.chdir(folder)
+        sys.stdout.flush()
+        os.execv(sys.executable, command)
 
 
 def bench(

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 
 from filter_service.checked import checked
-from filter_service.errors import NoProfile
+from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
@@ -108,7 +108,7 @@ class PlannedViews:
 
 
 def plan_views(
-    filter_of: Callable[[EyeName], EyeFilter],
+    filter_of: Callable[[EyeName], EyeFilter | None],
     views: Sequence[RgbdView],
     states: Sequence[ViewState],
     *,
@@ -143,17 +143,28 @@ def plan_views(
     SessionError
         An eye has no profile (field ``views[i].eye``), or its build failed.
     """
-    check_states(states)
+    if len(states) != len(views):
+        raise BadMessage(
+            f"there are {len(states)}",
+            field="states",
+            allowed=f"{len(views)}, as views",
+        )
+    check_states(states, pupil_diameter_mm, focus_dpt)
     indices: dict[EyeName, tuple[int, ...]] = {}
     for i, state in enumerate(states):
         indices[state.eye] = (*indices.get(state.eye, ()), i)
-    for eye in indices:
-        filter_of(eye).keep_going()
+    for eye, own in indices.items():
+        found = filter_of(eye)
+        if found is None:
+            raise _of_eye(NoProfile("there is no filter"), eye, own[0])
+        found.keep_going()
     planned: dict[EyeName, PlannedFrame] = {}
     waits: list[Wait] = []
+    failure: SessionError | None = None
     for eye, own in indices.items():
         state = states[own[0]]
         eye_filter = filter_of(eye)
+        assert eye_filter is not None
         try:
             frame = eye_filter.plan(
                 [views[i] for i in own],
@@ -161,22 +172,30 @@ def plan_views(
                 focus_dpt=_first(state.focus_dpt, focus_dpt),
                 prepared_only=prepared_only,
             )
-        except NoProfile as error:
-            if eye == "both":
-                raise
-            raise NoProfile(
-                f"the {eye} eye has no profile",
-                field=f"views[{own[0]}].eye",
-                allowed=error.allowed,
-            ) from None
+        except SessionError as error:
+            failure = failure or _of_eye(error, eye, own[0])
+            continue
         if frame is not None:
             planned[eye] = frame
         else:
             waits.append("extending" if eye_filter.is_extending else "preparing")
     gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
+    if failure is not None:
+        raise failure.with_traceback(None)
     if waits:
         return "preparing" if "preparing" in waits else "extending"
     return PlannedViews(planned, indices, gazes_deg)
+
+
+def _of_eye(error: SessionError, eye: EyeName, view: int) -> SessionError:
+    """Say of which eye there is no profile."""
+    if not isinstance(error, NoProfile):
+        return error
+    return NoProfile(
+        f"the eye {eye} has no profile",
+        field=f"views[{view}].eye",
+        allowed=error.allowed,
+    )
 
 
 def _first(own: float | None, of_frame: float) -> float:

@@ -171,7 +171,8 @@ class Frame(Message):
         for i, view in enumerate(self.views):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
-        check_states([view.state for view in self.views])
+        states = [view.state for view in self.views]
+        check_states(states, self.pupil_diameter_mm, self.focus_dpt)
         if self.memory is None:
             images = images_from_parts(self.views, parts, limits, self.compression)
             return self._with_payload(images)

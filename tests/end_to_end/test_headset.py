@@ -5,6 +5,7 @@
 
 import json
 import math
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clients.headset import program
 from clients.headset.controls import Controls
 from clients.headset.look import EyeState, LookingEye, RgbdPicture, StereoLook
 from clients.headset.poses import angles_of, direction_of, matrix_of, turned, upright
@@ -392,10 +394,110 @@ def test_the_far_point_is_learnt_from_what_the_filter_says():
         return look.follow(due, seen)[0].state.focus_dpt
 
     asked = at(0.0, pictures)
-    look.learn({"left": asked, "right": asked}, {"left": 4.0, "right": 4.0})
+    look.learn("left", asked, 4.0)
     begun = [at(0.02 * step, near) for step in range(1, 300)]
     assert begun[0] == pytest.approx(4.0, abs=1e-6)
     assert begun[-1] == pytest.approx(5.0, abs=0.05)
+
+
+def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
+    with_tracker = SimulatedRuntime(happening=Happening(gaze_deg=(0.0, 0.0)))
+    without = SimulatedRuntime()
+    for arguments, runtime, expected in (
+        ((), with_tracker, (15.0, 10.0)),
+        ((), without, (0.0, 0.0)),
+        (("--gaze-range", "3,2"), with_tracker, (3.0, 2.0)),
+        (("--gaze-range", "0,0"), with_tracker, (0.0, 0.0)),
+        (("--settings", '{"gaze_range_deg": [5, 4]}'), without, (5.0, 4.0)),
+    ):
+        options = program.arguments_of(arguments)
+        settings = program.settings_of(options)
+        assert program.gaze_range_of(options, settings, runtime) == expected
+
+
+@pytest.mark.parametrize("with_head", [True, False])
+def test_straight_ahead_is_the_heads_own_in_canted_views(with_head):
+    """Displays that look 10 deg outwards: ahead is 10 deg inwards in each."""
+    head = still(0.0)
+    views = tuple(
+        replace(view, pose=(*view.pose[:3], *turned(yaw_deg)))
+        for view, yaw_deg in zip(eye_views(head), (10.0, -10.0), strict=True)
+    )
+    due = DueFrame(0, True, views, head if with_head else None)
+    wall = Wall().pictures(views, (400, 360))
+    left, right = StereoLook(age_years=25.0).follow(due, wall)
+    assert left.ahead_deg == left.gaze_deg == pytest.approx((10.0, 0.0), abs=0.01)
+    assert right.ahead_deg == right.gaze_deg == pytest.approx((-10.0, 0.0), abs=0.01)
+
+
+def test_an_eye_learns_from_its_own_pictures_only():
+    """The eye before serves until the new one is ready: what it can do is another's."""
+    seeing = SeeingHere(
+        FilterSettings(
+            pupil_range_mm=(4.0, 4.0),
+            object_range_dpt=(0.0, 1.0),
+            tolerance="loose",
+            mode="on-axis",
+        ),
+        lambda line: None,
+    )
+    views = [
+        replace(view, tangents=(-0.2, 0.2, 0.18, -0.18))
+        for view in eye_views(still(0.0))
+    ]
+    color = np.full((36, 40, 3), 90, np.uint8)
+    depth_m = np.full((36, 40), 4.0, np.float32)
+    frame = LookedAt(
+        DueFrame(0, True, tuple(views)),
+        tuple(RgbdPicture(view, color, depth_m) for view in views),
+        (LookingEye(EyeState(4.0, 0.0), (0.0, 0.0)),) * 2,
+        0.0,
+    )
+
+    def until(is_wanted):
+        for _ in range(3000):
+            seen = seeing.see(frame)
+            if seen is not None and is_wanted(seen.used_focus_dpt):
+                return seen.used_focus_dpt
+            time.sleep(0.005)
+        raise AssertionError("in vain")
+
+    try:
+        for eye in EYES:
+            seeing.change(eye, {"kind": "prescription", "sphere_dpt": -6})
+        assert min(until(lambda used: None not in used)) > 5.0
+        seeing.change("right", {"kind": "prescription", "sphere_dpt": -1})
+        told = seeing.see(frame).used_focus_dpt
+        assert told[0] > 5.0 and told[1] is None, "still the eye before"
+        assert until(lambda used: used[1] is not None)[1] < 1.5
+    finally:
+        seeing.close()
+
+
+def test_what_is_wrong_with_an_eye_is_said_once_and_it_is_asked_for_again(
+    start_service,
+):
+    service = start_service()
+    said = []
+    seeing = SeeingByService(service.endpoint, FilterSettings(), said.append)
+    seeing.change("left", TWO_EYES["left"])
+    seeing.change("right", {"kind": "double", "mark": 7, "crash": True})
+    changed = []
+
+    def keys():
+        killed = [line for line in said if "SIGKILL" in line]
+        if killed and not changed:
+            changed.append(time.monotonic())
+            seeing.change("right", TWO_EYES["right"])
+        return ""
+
+    runtime = SimulatedRuntime(SIZE_PX, rate_hz=100.0)
+    log = viewer_of(runtime, seeing, said=said, keys=keys).run(
+        max_frames=20, limit_s=TIMEOUT_S
+    )
+    seeing.close()
+    assert log.n_filtered == 20
+    assert len([line for line in said if "SIGKILL" in line]) == 1
 
 
 TWO_EYES = {
@@ -603,6 +705,35 @@ def make(context):
 """
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_ends_it_with_its_report_and_its_pictures(tmp_path, name):
+    command = (
+        *(sys.executable, "-m", "filter_service", "headset", "--simulated", "--json"),
+        *("--size", "48x54", "--scene", "own_scenery:make", "--out", "pictures"),
+        *("--settings", json.dumps({"tolerance": "loose", "mode": "on-axis"})),
+    )
+    (tmp_path / "own_scenery.py").write_text(OWN_SCENERY)
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        try:
+            n_ready = 0
+            while n_ready < 2:
+                n_ready += "ready after" in running.stderr.readline()
+            time.sleep(0.5)
+            running.send_signal(getattr(signal, name))
+            printed, _ = running.communicate(timeout=30.0)
+        finally:
+            running.kill()
+    assert running.returncode == 0
+    assert json.loads(printed)["filtered"] > 0
+    assert (tmp_path / "pictures" / "left.png").is_file()
+
+
 def test_a_program_of_ones_own_renders(tmp_path):
     (tmp_path / "own_scenery.py").write_text(OWN_SCENERY)
     finished = subprocess.run(
@@ -640,6 +771,10 @@ def test_a_program_of_ones_own_renders(tmp_path):
         (("--scale", "9"), "0.1 to 2"),
         (("--white-cd-m2", "-1"), "white_cd_m2"),
         (("--profile", "{broken"), "no JSON"),
+        (("--left", "{broken"), "--left"),
+        (("--right", "missing.json"), "--right missing.json"),
+        (("--frames", "0"), "--frames is 0"),
+        (("--scene", "math:sqrt"), "math:sqrt: TypeError"),
     ],
 )
 def test_a_wrong_argument_is_named(arguments, words):

@@ -113,6 +113,56 @@ def test_a_stream_follows_light_and_distance():
     assert seen[0].color is far.color
 
 
+def moving(eye, distances_dpt, limits_dpt, rate_hz=50):
+    """Ask an eye for a second of each distance; answer as a filter with limits does."""
+    found = []
+    for step, distance_dpt in enumerate(np.repeat(distances_dpt, rate_hz)):
+        far_dpt, near_dpt = limits_dpt(step / rate_hz)
+        asked = eye.look(50.0, distance_dpt, step / rate_hz).focus_dpt
+        used = min(max(asked, far_dpt), near_dpt)
+        eye.learn(asked, used)
+        found.append(used)
+    return np.array(found)
+
+
+def test_a_far_point_that_moves_with_the_pupil_is_followed_both_ways():
+    """5.6 dpt through a wide pupil, 0 through a narrow one, as of a cataract."""
+    eye = NaturalEye(pupil_diameter_mm=4.0)
+    used = moving(
+        eye, [0.0] * 12, lambda at_s: (5.6 if at_s < 4 or at_s >= 8 else 0.0, 20.0)
+    )
+    assert used[199] == pytest.approx(5.6)
+    assert used[399] == pytest.approx(0.0, abs=0.05)
+    assert used[-1] == pytest.approx(5.6)
+
+
+def test_a_way_from_the_far_point_is_gone_without_a_jump():
+    """A myope of 2 dpt: latency, then up to 5 dpt and back, steadily."""
+    used = moving(
+        NaturalEye(pupil_diameter_mm=4.0),
+        [0.0] * 2 + [5.0] * 3 + [0.0] * 4,
+        lambda at_s: (2.0, 7.0),
+    )
+    assert used[:100] == pytest.approx(2.0)
+    up, down = used[100:250], used[270:]  # after the latency
+    assert np.all(np.diff(up) >= -1e-9)
+    assert np.all(np.diff(down) <= 1e-9)
+    assert up[-1] == pytest.approx(5.0, abs=0.05)
+    assert used[-1] == pytest.approx(2.0)
+    assert np.abs(np.diff(used)).max() < 0.5
+
+
+def test_a_near_point_stops_an_old_eye():
+    used = moving(
+        NaturalEye(pupil_diameter_mm=4.0),
+        [0.0] + [3.0] * 4 + [0.0] * 4,
+        lambda at_s: (0.0, 0.8),
+    )
+    assert used[230:250] == pytest.approx(0.8)
+    assert used[-1] == pytest.approx(0.0, abs=0.02)
+    assert np.all(np.diff(used[260:]) <= 1e-9)
+
+
 def test_a_fixed_pupil_stays_and_wrong_values_are_named():
     eye = NaturalEye(pupil_diameter_mm=4.5)
     assert eye.look(1.0, 0.0, 0.0).pupil_diameter_mm == 4.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame
-from filter_service import ViewState, errors
+from filter_service import ViewState, errors, plan_views
 from filter_service.messages import (
     Accepted,
     Dropped,
@@ -144,10 +144,35 @@ def test_an_eye_without_a_profile_is_named(client, pair):
     client.set_profile(double(5), views=list(pair))
     assert marks_of(client.filter(pair, **SEE)) == [5, 5]
     client.set_profile(double(6), eye="left", views=[pair[0]])
-    with pytest.raises(errors.NoProfile, match="right eye") as caught:
+    with pytest.raises(errors.NoProfile, match="eye right") as caught:
         client.filter(pair, **SEE, states=EYES)
     assert caught.value.field == "views[1].eye"
     assert marks_of(client.filter(pair, **SEE)) == [5, 5]
+
+
+def test_frames_that_are_refused_for_one_eye_prepare_the_other(client, pair):
+    """They say which camera the right eye sees by, whatever the left one lacks."""
+    with pytest.raises(errors.NoProfile):
+        client.filter(pair, **SEE, states=EYES)
+    for eye in ("right", "left"):
+        accepted = client.set_profile(double(3), eye=eye, wait=False)
+        assert accepted.n_cameras == 1, eye
+    assert marks_of(client.filter(pair, **SEE, states=EYES)) == [3, 3]
+
+
+def test_in_process_an_eye_that_is_not_there_is_named(pair):
+    see = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+    with pytest.raises(errors.NoProfile, match="eye right") as caught:
+        plan_views({}.get, pair, (ViewState("right"), ViewState("left")), **see)
+    assert caught.value.field == "views[0].eye"
+    with pytest.raises(errors.BadMessage, match="2, as views"):
+        plan_views({}.get, pair, (ViewState("right"),), **see)
+
+
+def test_a_value_of_ones_own_may_be_the_frames(client, pair):
+    client.set_profile(double(5), views=list(pair))
+    states = (ViewState(pupil_diameter_mm=4.0), ViewState(focus_dpt=0.5))
+    assert marks_of(client.filter(pair, **SEE, states=states)) == [5, 5]
 
 
 def test_one_eye_has_one_pupil_and_one_focus(client, pair):

@@ -37,15 +37,21 @@ class KeptEyes:
 
     def of(self, handle: Released) -> KeptEye:
         """Return what is kept of an eye, which is now the one used last."""
+        self.drop_released()
         found = next((kept for kept in self._kept if kept.handle is handle), None)
         others = [kept for kept in self._kept if kept is not found]
-        gone = [kept for kept in others if kept.handle.is_released]
-        others = [kept for kept in others if kept not in gone]
         if found is None and len(others) == MAX_KEPT:
-            gone.append(others.pop(0))
-        for kept in gone:
-            kept.kernels.forget()
-            self._free.append(kept.kernels)
+            self._let_go(others.pop(0))
         found = found or KeptEye(handle, self._free.pop(0))
         self._kept = [*others, found]
         return found
+
+    def drop_released(self) -> None:
+        """Let go of eyes whose stores were given up."""
+        for kept in [kept for kept in self._kept if kept.handle.is_released]:
+            self._kept.remove(kept)
+            self._let_go(kept)
+
+    def _let_go(self, kept: KeptEye) -> None:
+        kept.kernels.forget()
+        self._free.append(kept.kernels)

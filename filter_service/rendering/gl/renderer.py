@@ -75,7 +75,11 @@ class FilterRenderer:
         return loaded
 
     def trim(self) -> None:
-        """Keep what is held: a GPU's buffers are bounded, and dear to make anew."""
+        """Keep what is held: a GPU's buffers are bounded, and dear to make anew.
+
+        But for eyes that were given up.
+        """
+        self._kept.drop_released()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Do without: no frame keeps a GPU for long."""
