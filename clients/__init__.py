@@ -12,7 +12,7 @@ Importing this loads nothing but names.
     headset/         a scene in an OpenXR headset, each eye with its own profile
     natural          an eye that follows light and distance
     frame_log        what became of a stream's frames
-    profile_arguments  profiles on a command line
+    arguments          profiles, settings, sizes on command lines
     pyrender_stream  a scene through a running service
     demo             two scenes through six eyes
     latency          how long a frame takes

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.arguments import size_px_argument
 from clients.demo_eyes import EYES
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
@@ -38,7 +39,7 @@ from filter_service.progress import Progress
 
 try:
     from clients.frame_log import FrameLog
-    from clients.pyrender_stream import parse_size, path_settings
+    from clients.pyrender_stream import path_settings
     from clients.scene_renderer import SceneFrame, scene_frames
     from clients.scenes.catalogue import build_scene
     from clients.streaming import change_eye, filter_in_order
@@ -97,7 +98,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     parser.add_argument("--frames", type=int, default=60, help="frames for each eye")
-    parser.add_argument("--size", type=parse_size, default="480x270", metavar="WxH")
+    parser.add_argument(
+        "--size", type=size_px_argument, default="480x270", metavar="WxH"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     if options.frames < 1:

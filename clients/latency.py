@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from clients.arguments import read_object, read_profile, read_size_px
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
 from clients.latency_report import (
     SERVICE_STAGES,
@@ -33,7 +34,6 @@ from clients.latency_report import (
     save_plot,
     summary,
 )
-from clients.profile_arguments import read_object, read_profile
 from clients.service_process import ServiceProcess
 from clients.socket_floor import socket_floor_ms
 from filter_service import tangents_from_fov
@@ -357,16 +357,14 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
     """
     usual = "1832x1920" if arguments.stereo else "1280x720"
     size = "320x180" if arguments.quick else arguments.size or usual
-    sides = size.lower().split("x")
-    if len(sides) != 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
-        raise ValueError(f"--size is {size!r}; allowed: WIDTHxHEIGHT in px")
+    width_px, height_px = read_size_px(size)
     if not 0 < arguments.rate_hz <= 1000:
         raise ValueError(f"--rate-hz is {arguments.rate_hz:g}; allowed: up to 1000")
     if not arguments.seconds > 0:
         raise ValueError(f"--seconds is {arguments.seconds:g}; allowed: above 0")
     return Settings(
-        width_px=int(sides[0]),
-        height_px=int(sides[1]),
+        width_px=width_px,
+        height_px=height_px,
         n_views=2 if arguments.stereo else arguments.views,
         transport=arguments.transport,
         compression=arguments.compression,

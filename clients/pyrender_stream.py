@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from clients.arguments import size_px_argument
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.natural import (
@@ -76,20 +77,6 @@ def profile_body(name_or_file: str) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise ValueError(f"{path} holds {type(body).__name__}; allowed: an object")
     return body
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Read WxH in pixels.
-
-    Raises
-    ------
-    ValueError
-        Not two whole numbers of at least 16.
-    """
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
-        raise ValueError(f"size {text!r}; allowed: WIDTHxHEIGHT, 16 px or more each")
-    return int(parts[0]), int(parts[1])
 
 
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
@@ -234,7 +221,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--profile", default="myopia", help="a preset's name or a JSON file"
     )
-    parser.add_argument("--size", default="480x270", type=parse_size, metavar="WxH")
+    parser.add_argument(
+        "--size", default="480x270", type=size_px_argument, metavar="WxH"
+    )
     parser.add_argument("--frames", default=96, type=int, help="frames of the path")
     parser.add_argument(
         "--hidden",

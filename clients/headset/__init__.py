@@ -1,6 +1,7 @@
 """A scene through a person's two eyes in an OpenXR headset: `ocufilter headset`.
 
 program            the command
+options            what it is told
 viewer             its loop: render, look, filter, show, whatever the headset does
 controls           what it can be told while it runs
 keys               single keys from a terminal
@@ -12,7 +13,9 @@ openxr_actions     its controllers and its eye tracker
 simulated_runtime  one that is not there
 poses              positions and orientations
 look               gaze, focus and pupils of both eyes
-seeing             the filter: in this process, or a service
+seeing             what eyes are given, and what they see of it
+seeing_here        filtered in this process
+seeing_by_service  or by a service
 scenery            both eyes' pictures of a scene
 presenting         pictures into a headset's images
 scene_view         a scene's colour and depth in an OpenGL context

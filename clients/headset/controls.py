@@ -40,8 +40,6 @@ class Controls:
     is_split : bool
         The left half as it is, the right half as it is seen.
     is_over : bool
-    is_begun : bool
-        The eyes were asked for.
     """
 
     profiles: dict[Eye, Mapping[str, Any]]
@@ -50,7 +48,6 @@ class Controls:
     is_on: bool = True
     is_split: bool = False
     is_over: bool = False
-    is_begun: bool = False
     _numbers: dict[Eye, int] = field(default_factory=lambda: {e: -1 for e in EYES})
 
     def press(self, keys: str, buttons: Sequence[str] = ()) -> None:

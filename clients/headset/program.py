@@ -15,26 +15,33 @@ import argparse
 import importlib
 import json
 import logging
-import math
 import os
 import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from clients.arguments import read_size_px
 from clients.extra import HEADSET_INSTALL
 from clients.headset.built_scene import SceneNotBuilt, built_scene
 from clients.headset.controls import HELP, Controls
 from clients.headset.look import StereoLook
+from clients.headset.options import (
+    arguments_of,
+    check_limits,
+    profiles_of,
+    settings_of,
+)
 from clients.headset.poses import upright
-from clients.headset.runtime import EYES, NoRuntime, Runtime
-from clients.headset.seeing import Seeing, SeeingByService, SeeingHere
+from clients.headset.runtime import Eye, NoRuntime, Runtime
+from clients.headset.seeing import Seeing
+from clients.headset.seeing_by_service import SeeingByService
+from clients.headset.seeing_here import SeeingHere
 from clients.headset.viewer import Viewer, ViewerLog
-from clients.natural import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
-from clients.profile_arguments import read_profile
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
 
@@ -47,150 +54,13 @@ def say(line: str) -> None:
     print(f"headset: {line}", file=sys.stderr, flush=True)
 
 
-def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        prog="ocufilter headset",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=HELP,
-    )
-    scene = parser.add_argument_group("the scene")
-    scene.add_argument(
-        "--scene",
-        default="courtyard",
-        metavar="NAME|FILE|MODULE:FUNCTION",
-        help="courtyard, primitives, or a .glb or .gltf file (default: courtyard); or "
-        "a function of yours, which is given the OpenGL context and gives what "
-        "renders: an object whose pictures(views, size_px) returns an RgbdPicture for "
-        "each view, see clients/headset/scenery.py",
-    )
-    scene.add_argument(
-        "--supersampling", type=int, default=2, help="samples per pixel and axis"
-    )
-    eyes = parser.add_argument_group("the eyes")
-    what = "a preset's name, JSON, or a .json file"
-    eyes.add_argument(
-        "--profile", default="myopia", help=f"of both eyes: {what} (default: myopia)"
-    )
-    eyes.add_argument("--left", metavar="PROFILE", help="of the left eye, instead")
-    eyes.add_argument("--right", metavar="PROFILE", help="of the right eye, instead")
-    eyes.add_argument(
-        "--age",
-        type=float,
-        default=USUAL_AGE_YEARS,
-        metavar="YEARS",
-        help=f"of the person (default: {USUAL_AGE_YEARS:g})",
-    )
-    eyes.add_argument(
-        "--pupil-mm",
-        type=float,
-        metavar="MM",
-        help="a fixed pupil, instead of one that follows the light",
-    )
-    eyes.add_argument(
-        "--white-cd-m2",
-        type=float,
-        default=USUAL_WHITE_CD_M2,
-        metavar="L",
-        help="luminance of the display's white, which the pupil goes by "
-        f"(default: {USUAL_WHITE_CD_M2:g})",
-    )
-    eyes.add_argument(
-        "--gaze-range",
-        default=None,
-        metavar="H,V",
-        help="how far eyes turn, in deg: default 15,10 with a tracker, else 0,0; a "
-        "larger range takes longer to prepare",
-    )
-    eyes.add_argument(
-        "--settings",
-        default="{}",
-        metavar="JSON",
-        help='of the filter, as {"tolerance": "loose"}',
-    )
-    where = parser.add_argument_group("where it is filtered and shown")
-    where.add_argument(
-        "--service",
-        metavar="ENDPOINT",
-        help="a running service, as tcp://127.0.0.1:5577; else in this process",
-    )
-    where.add_argument(
-        "--simulated",
-        action="store_true",
-        help="no headset: a head that looks around, and pictures for --out",
-    )
-    where.add_argument(
-        "--size", default="448x504", metavar="WxH", help="with --simulated: of each eye"
-    )
-    where.add_argument(
-        "--rate-hz", type=float, default=72.0, help="with --simulated: frames a second"
-    )
-    where.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        help="of the headset's own picture size, 0.1 to 2",
-    )
-    where.add_argument(
-        "--validate", action="store_true", help="load OpenXR's core validation layer"
-    )
-    end = parser.add_argument_group("until when")
-    end.add_argument("--frames", type=int, metavar="N", help="filtered ones")
-    end.add_argument("--seconds", type=float)
-    end.add_argument("--out", type=Path, metavar="DIR", help="for the last pictures")
-    end.add_argument("--json", action="store_true", help="print one JSON object")
-    return parser.parse_args(argv)
-
-
-def settings_of(options: argparse.Namespace) -> FilterSettings:
-    """Return the filter's settings.
-
-    Raises
-    ------
-    ValueError
-        Names the option or the setting.
-    """
-    try:
-        given = json.loads(options.settings)
-    except ValueError as error:
-        raise ValueError(f"--settings is no JSON: {error}") from None
-    if not isinstance(given, dict):
-        raise ValueError(f"--settings is {given!r}; allowed: a JSON object")
-    if options.gaze_range is not None:
-        parts = options.gaze_range.split(",")
-        try:
-            given["gaze_range_deg"] = tuple(map(float, parts))
-        except ValueError:
-            raise ValueError(
-                f"--gaze-range is {options.gaze_range!r}; allowed: H,V in deg"
-            ) from None
-    try:
-        return FilterSettings(**given)
-    except TypeError as error:
-        raise ValueError(f"--settings: {error}") from None
-
-
 def gaze_range_of(
-    options: argparse.Namespace, settings: FilterSettings, runtime: Runtime
+    settings: FilterSettings, runtime: Runtime, *, is_told: bool
 ) -> tuple[float, float]:
-    """Return how far eyes turn: as was asked for, else as far as is tracked."""
-    is_told = options.gaze_range is not None or any(settings.gaze_range_deg)
-    if runtime.tracks_eyes and not is_told:
+    """Return how far eyes turn in deg: as is told, else as far as is tracked."""
+    if runtime.tracks_eyes and not is_told and not any(settings.gaze_range_deg):
         return TRACKED_RANGE_DEG
     return settings.gaze_range_deg
-
-
-def profiles_of(options: argparse.Namespace) -> dict[Any, Mapping[str, Any]]:
-    """Return the profile of each eye."""
-    return {
-        eye: (
-            read_profile(options.profile)
-            if getattr(options, eye) is None
-            else read_profile(getattr(options, eye), f"--{eye}")
-        )
-        for eye in EYES
-    }
 
 
 def scenery_of(options: argparse.Namespace, context) -> Any:
@@ -231,83 +101,98 @@ def scene_of(name: str):
     return scene, upright(viewpoint(scene))
 
 
+@dataclass
+class _Eyes:
+    """Both eyes, as they are asked for and as they look."""
+
+    settings: FilterSettings
+    is_range_told: bool
+    look: StereoLook
+    seeing: Seeing
+    profiles: dict[Eye, Mapping[str, Any]]
+    is_begun: bool = False
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Ask for another eye."""
+        self.look.change(eye)
+        self.seeing.change(eye, profile)
+        say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
+
+    def begin(self, runtime: Runtime) -> None:
+        """Ask for both once it is known how far they turn, and when that changes."""
+        reach_deg = gaze_range_of(self.settings, runtime, is_told=self.is_range_told)
+        if self.is_begun and reach_deg == self.look.gaze_range_deg:
+            return
+        self.is_begun = True
+        self.look.gaze_range_deg = reach_deg
+        self.seeing.settings = self.settings.changed(gaze_range_deg=reach_deg)
+        for eye, profile in self.profiles.items():
+            self.change(eye, profile)
+
+
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Show the scene until the end; return what became of the frames."""
     from clients.headset.keys import TerminalKeys
 
     settings, profiles = settings_of(options), profiles_of(options)
-    for name, low, high in (("scale", 0.1, 2.0),):
-        if not low <= getattr(options, name) <= high:
-            raise ValueError(
-                f"--{name} is {getattr(options, name)}; allowed: {low:g} to {high:g}"
-            )
+    size_px = read_size_px(options.size)
     look = StereoLook(
         age_years=options.age,
         pupil_diameter_mm=options.pupil_mm,
         white_cd_m2=options.white_cd_m2,
         gaze_range_deg=settings.gaze_range_deg,
     )
-    size_px = _size(options.size)
-    _check_limits(options)
+    check_limits(options)
+    pictures = _Pictures()
     with ExitStack() as stack:
         context = _context(options, stack)
         scenery = scenery_of(options, context)
         stack.callback(getattr(scenery, "close", lambda: None))
         seeing = _seeing(options, settings)
         stack.callback(seeing.close)
-        keeper = _Pictures()
-        keys = stack.enter_context(TerminalKeys())
-
-        def change(eye, profile) -> None:
-            look.change(eye)
-            seeing.change(eye, profile)
-            say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
-
-        controls = Controls(dict(profiles), change, say)
-
-        def on_session(runtime: Runtime) -> None:
-            """Begin with the eyes once it is known how far they turn."""
-            reach_deg = gaze_range_of(options, settings, runtime)
-            if controls.is_begun and reach_deg == look.gaze_range_deg:
-                return
-            controls.is_begun = True
-            look.gaze_range_deg = reach_deg
-            seeing.settings = settings.changed(gaze_range_deg=reach_deg)
-            for eye, profile in controls.profiles.items():
-                change(eye, profile)
-
-        def open_runtime() -> Runtime:
-            if options.simulated:
-                from clients.headset.simulated_runtime import SimulatedRuntime
-
-                return SimulatedRuntime(
-                    size_px, rate_hz=options.rate_hz, on_shown=keeper.keep
-                )
-            return _open_xr(context, options)
-
+        is_told = options.gaze_range is not None
+        eyes = _Eyes(settings, is_told, look, seeing, profiles)
         viewer = Viewer(
-            open_runtime,
+            lambda: _runtime(options, context, size_px, pictures),
             scenery,
             seeing,
             look,
-            controls,
-            read_keys=keys.pressed,
+            Controls(profiles, eyes.change, say),
+            read_keys=stack.enter_context(TerminalKeys()).pressed,
             say=say,
-            on_session=on_session,
+            on_session=eyes.begin,
         )
-        if sys.stdin is not None and sys.stdin.isatty():
-            say(HELP)
-        started_s = time.monotonic()
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            viewer.run(max_frames=options.frames, limit_s=options.seconds)
-        except KeyboardInterrupt:
-            say("ended")
-        log = viewer.log
-        took_s = time.monotonic() - started_s
+        took_s = _view(viewer, options)
         if options.out is not None:
-            keeper.write(options.out)
-        return _report(options, log, took_s, seeing)
+            pictures.write(options.out)
+        return _report(options, viewer.log, took_s, seeing)
+
+
+def _view(viewer: Viewer, options: argparse.Namespace) -> float:
+    """Show until the end, or until a signal; return how long it took, in s."""
+    if sys.stdin is not None and sys.stdin.isatty():
+        say(HELP)
+    started_s = time.monotonic()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        viewer.run(max_frames=options.frames, limit_s=options.seconds)
+    except KeyboardInterrupt:
+        say("ended")
+    return time.monotonic() - started_s
+
+
+def _runtime(
+    options: argparse.Namespace,
+    context: Any,
+    size_px: tuple[int, int],
+    pictures: _Pictures,
+) -> Runtime:
+    """Return the headset, or what stands for it."""
+    if not options.simulated:
+        return _open_xr(context, options)
+    from clients.headset.simulated_runtime import SimulatedRuntime
+
+    return SimulatedRuntime(size_px, rate_hz=options.rate_hz, on_shown=pictures.keep)
 
 
 def _openxr(name: str) -> Any:
@@ -350,23 +235,6 @@ def _seeing(options: argparse.Namespace, settings: FilterSettings) -> Seeing:
     return SeeingHere(settings, say)
 
 
-def _check_limits(options: argparse.Namespace) -> None:
-    """Refuse limits that are none, and a folder that cannot be written to."""
-    for name in ("frames", "seconds"):
-        value = getattr(options, name)
-        if value is not None and not 0 < value < math.inf:
-            raise ValueError(f"--{name} is {value}; allowed: above 0")
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-
-
-def _size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
-        raise ValueError(f"--size is {text!r}; allowed: WIDTHxHEIGHT, 16 px or more")
-    return int(parts[0]), int(parts[1])
-
-
 class _Pictures:
     """The last pictures that were shown."""
 
@@ -378,10 +246,9 @@ class _Pictures:
         self._shown = shown or self._shown
 
     def write(self, folder: Path) -> None:
-        """Write one PNG of each eye."""
+        """Write one PNG of each eye into a folder that is there."""
         from PIL import Image
 
-        folder.mkdir(parents=True, exist_ok=True)
         for shown in self._shown:
             path = folder / f"{shown.view.eye}.png"
             Image.fromarray(shown.color).save(path)
@@ -418,7 +285,7 @@ def _lines(report: Mapping[str, Any]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; return its exit code."""
-    options = arguments_of(argv)
+    options = arguments_of(argv, __doc__)
     logging.basicConfig(format="headset: %(message)s", level=logging.INFO)
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # pyopenxr imports it
     try:

@@ -23,9 +23,7 @@ import numpy as np
 from estimator.dynamics import AccommodationResponse, PupilReflex, steady_pupil_mm
 from tests.benchmarks.harness import OUT, RESULTS, Row, memory_mb, publish
 from tests.numerical.moving_eyes import (
-    PUPIL_CURVES,
-    RECORDED_LATENCY_S,
-    pupil_of_a_pulse,
+    recorded_pulses,
     steps_response,
 )
 from tests.source_tree import ROOT
@@ -55,34 +53,6 @@ def step_ms(n_steps: int) -> dict[str, tuple[float, float]]:
     return found
 
 
-def pulses():
-    """Yield (name, times_s, recorded_mm, ours_mm) of each pulse."""
-    pulse = PUPIL_CURVES["pulse"]
-    times_s = np.array(pulse["time_s"])
-    kept = times_s >= 0
-    for power_uw, seen_mm in zip(
-        pulse["power_uw"], np.array(pulse["pupil_mm"]).T, strict=True
-    ):
-        ours_mm = pupil_of_a_pulse(
-            times_s[kept],
-            begin_mm=seen_mm[0],
-            end_mm=seen_mm.min() - 0.15,
-            off_s=1.0,
-            latency_s=RECORDED_LATENCY_S,
-        )
-        yield f"1 s, {power_uw} uW", times_s[kept], seen_mm[kept], ours_mm
-    pulse = PUPIL_CURVES["long_pulse"]
-    times_s, seen_mm = np.array(pulse["time_s"]), np.array(pulse["pupil_mm"])
-    ours_mm = pupil_of_a_pulse(
-        times_s,
-        begin_mm=pulse["begin_mm"],
-        end_mm=seen_mm.min(),
-        off_s=2.4,
-        latency_s=RECORDED_LATENCY_S,
-    )
-    yield "2.4 s, not fitted", times_s, seen_mm, ours_mm
-
-
 def peak_speeds():
     """Yield (kind, step_dpt, published, ours) in dpt/s."""
     for cue, per_dpt in SPEEDS_PER_DPT.items():
@@ -108,7 +78,7 @@ def measured_rows(n_steps: int) -> list[Row]:
         )
 
     rows = []
-    for name, _, seen_mm, ours_mm in pulses():
+    for name, _, seen_mm, ours_mm in recorded_pulses():
         method = "pupil, not fitted" if "not fitted" in name else "pupil, fitted"
         rms_mm = np.sqrt(np.mean((ours_mm - seen_mm) ** 2))
         of_mm = f"of {np.ptp(seen_mm):.2f} mm"
@@ -148,7 +118,7 @@ def draw(path) -> None:
 
     figure, axes = pyplot.subplots(2, 2, figsize=(12, 8), layout="constrained")
     (pulse, longer), (steps, speeds) = axes
-    for number, (name, times_s, seen_mm, ours_mm) in enumerate(pulses()):
+    for number, (name, times_s, seen_mm, ours_mm) in enumerate(recorded_pulses()):
         at = longer if "not fitted" in name else pulse
         color = f"C{number}"
         at.plot(times_s, seen_mm, "o", color=color, markersize=4, label=name)

@@ -35,7 +35,9 @@ from clients.headset.gltf_scene import load_gltf
 from clients.headset.look import StereoLook
 from clients.headset.poses import upright
 from clients.headset.scenery import SceneScenery
-from clients.headset.seeing import Seeing, SeeingByService, SeeingHere
+from clients.headset.seeing import Seeing
+from clients.headset.seeing_by_service import SeeingByService
+from clients.headset.seeing_here import SeeingHere
 from clients.headset.simulated_runtime import SimulatedRuntime
 from clients.headset.viewer import Viewer
 from clients.headset.viewpoint import viewpoint

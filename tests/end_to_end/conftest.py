@@ -2,11 +2,13 @@
 
 import sys
 
+import moderngl
 import numpy as np
 import pytest
 import zmq
 
 from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
+from clients.headset.scene_view import SceneView
 from clients.service_process import ServiceProcess
 from filter_service.messages import (
     Camera,
@@ -133,3 +135,24 @@ def make_view(width_px=64, height_px=36, dtype=np.uint8, seed=0):
         color = (255 * color).astype(np.uint8)
     depth_m = np.full((height_px, width_px), 2.0, np.float32)
     return RgbdView(color, depth_m, tangents_from_fov(60.0, width_px, height_px))
+
+
+@pytest.fixture(scope="module")
+def context():
+    """An OpenGL context in which a module's tests leave no error."""
+    context = moderngl.create_context(standalone=True, require=330, backend="egl")
+    yield context
+    with context:
+        assert context.error == "GL_NO_ERROR"
+    context.release()
+
+
+@pytest.fixture
+def show(context):
+    """Render a scene once."""
+
+    def render(scene, pose, tangents, size_px, *, supersampling=2):
+        with SceneView(context, scene, size_px, supersampling=supersampling) as view:
+            return view.render(pose, tangents)
+
+    return render

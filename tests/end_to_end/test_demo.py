@@ -13,9 +13,10 @@ import pytest
 from PIL import Image
 
 from clients import demo, pyrender_stream, sheet, video
+from clients.arguments import read_size_px
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
-from clients.pyrender_stream import parse_size, path_settings, profile_body
+from clients.pyrender_stream import path_settings, profile_body
 from clients.scenes.catalogue import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.progress import INTERVAL_S
@@ -224,8 +225,8 @@ def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
 
 @pytest.mark.parametrize("text", ["480", "480x", "8x8", "axb", "480x270x3"])
 def test_bad_size_is_refused_with_what_is_allowed(text):
-    with pytest.raises(ValueError, match=r"size '.*'; allowed: WIDTHxHEIGHT"):
-        parse_size(text)
+    with pytest.raises(ValueError, match=r"size is '.*'; allowed: WIDTHxHEIGHT"):
+        read_size_px(text)
 
 
 def test_profile_is_a_preset_or_a_json_file(tmp_path):

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import moderngl
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +13,6 @@ from trimesh.visual.material import PBRMaterial
 
 from clients.headset.built_scene import SceneNotBuilt, built_scene
 from clients.headset.gltf_scene import BACKGROUND_SRGB, light_on, load_gltf
-from clients.headset.scene_view import SceneView
 from clients.headset.viewpoint import EYE_HEIGHT_M, viewpoint
 from clients.scenes.geometry import rotation, srgb_from_linear
 from clients.scenes.paths import PATHS, path_moments
@@ -22,26 +20,6 @@ from clients.scenes.scene import Scene
 
 ROOT = Path(__file__).parents[2]
 ONE_TO_ONE = (-1.0, 1.0, 1.0, -1.0)
-
-
-@pytest.fixture(scope="module")
-def context():
-    context = moderngl.create_context(standalone=True, require=330, backend="egl")
-    yield context
-    with context:
-        assert context.error == "GL_NO_ERROR"
-    context.release()
-
-
-@pytest.fixture
-def show(context):
-    """Render a scene once."""
-
-    def render(scene, pose, tangents, size_px, *, supersampling=2):
-        with SceneView(context, scene, size_px, supersampling=supersampling) as view:
-            return view.render(pose, tangents)
-
-    return render
 
 
 # ----- files

@@ -51,15 +51,6 @@ with open(out, "wb") as file:
 """
 
 
-@pytest.fixture(scope="module")
-def context():
-    context = moderngl.create_context(standalone=True, require=330, backend="egl")
-    yield context
-    with context:
-        assert context.error == "GL_NO_ERROR"
-    context.release()
-
-
 @pytest.fixture(scope="module", params=sorted(PATHS))
 def seen(request, tmp_path_factory):
     """A scene, a pose, tangents, and pyrender's pictures of it, made apart.
@@ -70,17 +61,6 @@ def seen(request, tmp_path_factory):
     arguments = [request.param, *map(str, SIZE_PX), str(out)]
     subprocess.run([sys.executable, "-c", _PYRENDER, *arguments], check=True, cwd=ROOT)
     return pickle.loads(out.read_bytes())
-
-
-@pytest.fixture
-def show(context):
-    """Render a scene once."""
-
-    def render(scene, pose, tangents, size_px, *, supersampling=2):
-        with SceneView(context, scene, size_px, supersampling=supersampling) as view:
-            return view.render(pose, tangents)
-
-    return render
 
 
 def psnr_db(a, b):

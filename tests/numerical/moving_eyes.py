@@ -36,6 +36,37 @@ RECORDED_LATENCY_S = 0.25
 errors below are 0.15 to 0.26 mm and 0.59 mm."""
 
 
+def recorded_pulses():
+    """Yield (name, times_s, recorded_mm, ours_mm) of Martin et al.'s (2021) pupils.
+
+    Five pulses of 1 s, which the time constants were fitted to, and a longer one.
+    """
+    pulse = PUPIL_CURVES["pulse"]
+    times_s = np.array(pulse["time_s"])
+    kept = times_s >= 0
+    for power_uw, seen_mm in zip(
+        pulse["power_uw"], np.array(pulse["pupil_mm"]).T, strict=True
+    ):
+        ours_mm = pupil_of_a_pulse(
+            times_s[kept],
+            begin_mm=seen_mm[0],
+            end_mm=seen_mm.min() - 0.15,  # a second of light is not the end of it
+            off_s=1.0,
+            latency_s=RECORDED_LATENCY_S,
+        )
+        yield f"1 s, {power_uw} uW", times_s[kept], seen_mm[kept], ours_mm
+    pulse = PUPIL_CURVES["long_pulse"]
+    times_s, seen_mm = np.array(pulse["time_s"]), np.array(pulse["pupil_mm"])
+    ours_mm = pupil_of_a_pulse(
+        times_s,
+        begin_mm=pulse["begin_mm"],
+        end_mm=seen_mm.min(),
+        off_s=2.4,
+        latency_s=RECORDED_LATENCY_S,
+    )
+    yield "2.4 s, not fitted", times_s, seen_mm, ours_mm
+
+
 def steps_response(begin_dpt, end_dpt, **settings):
     response = AccommodationResponse(0.0, 7.0, **settings)
     response.follow(begin_dpt, 0.0)

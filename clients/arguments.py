@@ -1,7 +1,8 @@
-"""Profiles and settings on a command line: a name, JSON text, or a file."""
+"""What several programs read from their command lines: profiles, settings, sizes."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -36,3 +37,27 @@ def read_object(option: str, text: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{option} is {value!r}; allowed: a JSON object")
     return value
+
+
+def read_size_px(text: str, option: str = "--size") -> tuple[int, int]:
+    """Return width and height in px from text such as ``1280x720``.
+
+    Raises
+    ------
+    ValueError
+        Not two whole numbers of at least 16; names the option.
+    """
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
+        raise ValueError(
+            f"{option} is {text!r}; allowed: WIDTHxHEIGHT, 16 px or more each"
+        )
+    return int(parts[0]), int(parts[1])
+
+
+def size_px_argument(text: str) -> tuple[int, int]:
+    """Return what `read_size_px` does, for argparse, which then shows its error."""
+    try:
+        return read_size_px(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

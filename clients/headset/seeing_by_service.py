@@ -1,0 +1,213 @@
+"""What a person sees in a headset, filtered by a service."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from clients.filter_client import FilterClient, FilteredFrame
+from clients.headset.runtime import Eye, EyeView
+from clients.headset.seeing import LookedAt, Say, Seen, settings_ahead
+from filter_service import FilterSettings
+from filter_service.errors import FilterError
+from filter_service.messages import Dropped, ErrorReply, Ready, Result, ResultView
+
+RETRY_S = 1.0
+SAY_AGAIN_S = 10.0
+ASK_AGAIN = ("worker_crashed", "no_profile")
+"""Errors after which a profile is sent once more."""
+
+WAIT_SHARE = 0.6
+"""Of a frame's period: so long the answer to the newest frame is waited for, so that a
+quick filter's picture is shown in the frame that it was rendered for."""
+
+PATIENCE_S = 0.4
+"""A filter that took no longer for the frame before is waited for in any case: where
+frames are late anyway, half the age is worth more than a few more of them.  On two
+cores that both share, frames of 896x1007 were 0.8 s old without, and not more."""
+
+_OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
+
+
+class SeeingByService:
+    """Filters through a service: what is seen is the newest that has come back.
+
+    Parameters
+    ----------
+    endpoint : str
+    settings : FilterSettings
+    say : callable
+        Told in a line what happens.
+    """
+
+    def __init__(self, endpoint: str, settings: FilterSettings, say: Say) -> None:
+        self._say_once = SayOnce(say)
+        self._say = say
+        self.settings = settings
+        self._client = FilterClient(endpoint, client_name="headset", timeout_s=5.0)
+        self._wanted: dict[Eye, dict[str, Any]] = {}
+        self._asked: dict[Eye, tuple[int, dict[str, Any]]] = {}
+        self._retry_s = 0.0  # when a profile that is sent again may be
+        self._on_way: dict[int, LookedAt] = {}
+        self._newest: Seen | None = None
+        self._is_there = True
+        self._trip_s = math.inf  # of the last frame that came back
+        self.n_dropped: dict[str, int] = {}
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Ask for another eye, as soon as there is a service."""
+        self._wanted[eye] = dict(profile)
+
+    def see(self, frame: LookedAt) -> Seen | None:
+        """Send a frame, the newest counts; return the newest that has come back.
+
+        None while there is none, or none of the service that is there now.
+        """
+        client = self._client
+        self._take_events()
+        if client.welcome is None:
+            if self._is_there:
+                self._say("no filter service: the scene is shown as it is; trying on")
+            self._is_there, self._newest = False, None
+            return None
+        if not self._is_there:
+            self._say("the filter service is there")
+            self._is_there = True
+        self._send_profiles(frame)
+        try:
+            frame_id = client.submit(
+                frame.views,
+                pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+                focus_dpt=frame.eyes[0].state.focus_dpt,
+                states=frame.states,
+                display_time_ns=frame.due.display_time_ns,
+            )
+            self._on_way[frame_id] = frame
+        except FilterError as error:
+            self._say(f"a frame was not sent: {error}")
+        end_s = frame.begun_s + WAIT_SHARE * frame.due.period_s
+        if self._trip_s <= PATIENCE_S:
+            end_s = max(end_s, time.monotonic() + PATIENCE_S)
+        self._take_events()
+        while self._newest is None or self._newest.frame is not frame:
+            wait_s = end_s - time.monotonic()
+            if wait_s <= 0.0 or frame not in self._on_way.values():
+                break
+            self._take_events(wait_s)
+        return self._newest
+
+    def _send_profiles(self, frame: LookedAt) -> None:
+        if time.monotonic() < self._retry_s:
+            return
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            profile_id = self._client.request_profile(
+                profile,
+                eye=eye,
+                settings=settings_ahead(self.settings, looking),
+                views=[picture.camera],
+            )
+            self._asked[eye] = profile_id, profile
+
+    def _take_events(self, wait_s: float = 0.0) -> None:
+        for event in self._client.poll(wait_s):
+            if isinstance(event, FilteredFrame):
+                self._take(event)
+            elif isinstance(event, Dropped):
+                self._on_way.pop(event.frame_id, None)
+                reason = event.reason
+                self.n_dropped[reason] = self.n_dropped.get(reason, 0) + 1
+            elif isinstance(event, ErrorReply):
+                self._on_way.pop(event.frame_id, None)
+                self._take_error(event)
+            elif isinstance(event, Ready) and event.is_complete:
+                self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
+
+    def _take_error(self, reply: ErrorReply) -> None:
+        """Say what is wrong, once; ask again for eyes that are lost by no fault."""
+        if reply.code == "build_cancelled":
+            return
+        self._say_once(str(reply.exception()))
+        if reply.code not in ASK_AGAIN:
+            return
+        for eye, (profile_id, profile) in self._asked.items():
+            # Frames are answered with what their eye has failed with, again and again.
+            if eye not in self._wanted and reply.profile_id in (None, profile_id):
+                self._wanted[eye] = profile
+                self._retry_s = time.monotonic() + RETRY_S
+
+    def _take(self, answer: FilteredFrame) -> None:
+        frame = self._on_way.pop(answer.frame_id, None)
+        if frame is None:
+            return
+        header = answer.header
+        self._trip_s = 1e-3 * answer.round_trip_ms
+        views = tuple(
+            EyeView(
+                picture.view.eye, view.pose or picture.view.pose, picture.view.tangents
+            )
+            for picture, view in zip(frame.pictures, header.views, strict=True)
+        )
+        filter_ms = header.total_ms
+        self._newest = Seen(
+            frame,
+            views,
+            answer.colors,
+            tuple(self._used_focus_dpt(header, view) for view in header.views),
+            header.is_complete,
+            header.notes,
+            {
+                "filter_ms": filter_ms - _added_ms(header.stage_times_ms),
+                "service_ms": _added_ms(header.stage_times_ms),
+                "wire_ms": answer.round_trip_ms - filter_ms,
+                "wait_ms": answer.age_ms - answer.round_trip_ms,
+            },
+        )
+
+    def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
+        """Return a view's focus, if it is that of the eye that is wanted."""
+        if view.profile_id is None:  # a service that knows one eye alone
+            return header.focus_dpt if header.is_complete else None
+        asked = self._asked.get(view.eye)
+        if asked is None or asked[0] != view.profile_id or not view.is_complete:
+            return None
+        return view.focus_dpt
+
+    def restart(self) -> None:
+        """Forget what was seen, and what is on its way."""
+        self._newest = None
+        self._on_way = {}
+
+    def close(self) -> None:
+        """End the session."""
+        self._client.close()
+
+
+class SayOnce:
+    """Says the same line now and then only."""
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._said_s: dict[str, float] = {}
+
+    def __call__(self, line: str) -> None:
+        """Say a line, unless it was said just now."""
+        now_s = time.monotonic()
+        self._said_s = {
+            said: at_s
+            for said, at_s in self._said_s.items()
+            if now_s - at_s <= SAY_AGAIN_S
+        }
+        if line not in self._said_s:
+            self._said_s[line] = now_s
+            self._say(line)
+
+
+def _added_ms(stages_ms: Mapping[str, float]) -> float:
+    """Return what the service's own stages took, beside the filter."""
+    return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)
