@@ -97,19 +97,19 @@ def error_db(seen) -> float:
     try:
         for eye, profile in PROFILES.items():
             exact.change(eye, profile)
+        while (whole := exact.see(seen.frame)) is None or not whole.is_complete:
+            time.sleep(0.01)
         squares = []
         for n, (picture, eye) in enumerate(
             zip(seen.frame.pictures, seen.frame.eyes, strict=True)
         ):
-            eye_filter, wanted = exact.filters[picture.view.eye], None
-            while wanted is None or not wanted.is_complete:
-                wanted = eye_filter.filter(
-                    seen.frame.views[n],
-                    pupil_diameter_mm=eye.state.pupil_diameter_mm,
-                    focus_dpt=eye.state.focus_dpt,
-                    gaze_deg=eye.gaze_deg,
-                    render_tolerance=0.0,
-                )
+            wanted = exact.filters[picture.view.eye].filter(
+                seen.frame.views[n],
+                pupil_diameter_mm=eye.state.pupil_diameter_mm,
+                focus_dpt=eye.state.focus_dpt,
+                gaze_deg=eye.gaze_deg,
+                render_tolerance=0.0,
+            )
             squares.append((wanted.color - seen.colors[n].astype(float)) ** 2)
         return float(10.0 * np.log10(255.0**2 / np.mean(squares)))
     finally:

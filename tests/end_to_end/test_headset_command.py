@@ -170,3 +170,18 @@ def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
         is_told = options.gaze_range is not None
         found = program.gaze_range_of(settings, runtime, is_told=is_told)
         assert found == expected
+
+
+def test_the_benchmark_runs_and_is_right():
+    finished = subprocess.run(
+        [sys.executable, "-m", "tests.benchmarks.bench_headset", "--quick", "--json"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=200.0,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    rows = json.loads(finished.stdout)["rows"]
+    assert {row["error_name"] for row in rows} == {"psnr_db"}
+    assert min(row["error"] for row in rows) > 45.0
