@@ -95,7 +95,22 @@ class NaturalEye:
     def look(
         self, luminance_cd_m2: float, distance_dpt: float, at_s: float
     ) -> EyeState:
-        """See this light and look at this distance from now on; return the eye now."""
+        """See this light and look at this distance from now on; return the eye now.
+
+        Parameters
+        ----------
+        luminance_cd_m2 : float
+            Mean of what is seen; see the function of this name.
+        distance_dpt : float
+            One over metres; beyond 0 to `MAX_VERGENCE_DPT` it is taken as the limit.
+        at_s : float
+            By any clock; it runs on only.
+
+        Raises
+        ------
+        ValueError
+            No light (``luminance_cd_m2`` below 0), or something not finite.
+        """
         if self._fixed_mm is not None:
             pupil_mm = self._fixed_mm
         else:
@@ -108,12 +123,10 @@ class NaturalEye:
         focus_dpt = self._focus.follow(wanted_dpt, at_s)
         far_dpt, near_dpt = self._far_dpt, self._near_dpt
         self._focus.hold(far_dpt, near_dpt)
-        if far_dpt < focus_dpt < near_dpt:
-            return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
         # At its limit it tries on: so a limit that has moved is found out.
         if focus_dpt <= far_dpt:
             focus_dpt = min(wanted_dpt, far_dpt)
-        else:
+        elif focus_dpt >= near_dpt:
             focus_dpt = max(wanted_dpt, near_dpt)
         return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
 
@@ -123,6 +136,11 @@ class NaturalEye:
         Farther than its far point, or nearer than its near point, the eye does not
         move; its way back begins there.  Both change with the pupil: an eye at its
         limit goes on asking for more.
+
+        Parameters
+        ----------
+        asked_dpt, used_dpt : float
+            What a frame was sent with, and what came back with its picture.
         """
         if used_dpt > asked_dpt + LIMIT_STEP_DPT:
             self._far_dpt = used_dpt

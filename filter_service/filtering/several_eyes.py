@@ -66,7 +66,7 @@ class SeenViews:
         return stages_ms
 
     def total(self, counter: str) -> int:
-        """Return the sum of a counter of `Filtered` over the eyes."""
+        """Return the sum over the eyes of a counter of `Filtered`, by its name."""
         return sum(int(getattr(seen, counter)) for seen in self.by_eye.values())
 
 
