@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import N_TERMS, flip_horizontal
 from estimator.periphery.meridian import KNOTS_DEG, TERMS
 
-SMOOTHING_DEG = 4.0
-"""Deviation of the Gaussian about a knot, under which a parabola is laid."""
+SMOOTHING_RATIO = 0.15
+"""Deviation of the Gaussian about a knot, under which a parabola is laid, of the knot's
+own angle: changes are small near the axis, and no window reaches past it."""
 
 LEAST_POINTS = 2
 
@@ -91,11 +92,11 @@ def knots_um(people: People) -> NDArray[np.float64]:
     for eye, rows_um in enumerate(change_um):
         is_known = np.isfinite(rows_um).all(axis=1)
         for knot, at_deg in enumerate(KNOTS_DEG):
-            away = h_deg - at_deg
-            if (is_known & (np.abs(away) <= SMOOTHING_DEG)).sum() < LEAST_POINTS:
+            away, width_deg = h_deg - at_deg, SMOOTHING_RATIO * abs(at_deg)
+            if (is_known & (np.abs(away) <= width_deg)).sum() < LEAST_POINTS:
                 continue
-            used = is_known & (np.abs(away) <= 2.5 * SMOOTHING_DEG)
-            root = np.exp(-0.25 * np.square(away[used] / SMOOTHING_DEG))[:, None]
+            used = is_known & (np.abs(away) <= 2.5 * width_deg)
+            root = np.exp(-0.25 * np.square(away[used] / width_deg))[:, None]
             parabola = np.stack([away[used] ** k for k in range(3)], axis=-1)
             fitted = np.linalg.lstsq(root * parabola, root * rows_um[used], rcond=None)
             found[eye, :, knot] = fitted[0][0]
