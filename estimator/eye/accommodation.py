@@ -356,7 +356,9 @@ class AccommodatingEye(Focusing):
         return [
             replace(
                 state,
-                focus_dpt=self._sharpest_dpt(state.accommodation_dpt, pupil_mm),
+                focus_dpt=self.sharpest_dpt(
+                    state.accommodation_dpt, pupil_diameter_mm=pupil_mm
+                ),
                 notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
             )
             for focus_dpt, state in zip(
@@ -385,7 +387,9 @@ class AccommodatingEye(Focusing):
         return FocusedEye(
             parameters=eye,
             surfaces=eye_surfaces(eye, retina=self.retina),
-            focus_dpt=self._sharpest_dpt(accommodation_dpt, self.pupil_diameter_mm),
+            focus_dpt=self.sharpest_dpt(
+                accommodation_dpt, pupil_diameter_mm=self.pupil_diameter_mm
+            ),
             accommodation_dpt=accommodation_dpt,
             lens_diameter_change_mm=diameter_mm - relaxed.lens_diameter_mm,
             aqueous_thickness_change_mm=(

@@ -38,12 +38,16 @@ class FocusTable:
         self._squares_mm2 = np.square(pupils_mm)
         self._pupil_shares = _barycentric_shares(self._squares_mm2)
         self._used_shares = _barycentric_shares(accommodations_dpt)
+        self._last: tuple[float, NDArray] = (0.0, np.zeros(0))
 
     def _at_pupil(self, pupil_mm: float) -> NDArray[np.float64]:
-        """Refractions (m,) at a pupil."""
-        return _through(
-            self._squares_mm2, self._refractions_dpt, self._pupil_shares, pupil_mm**2
-        )
+        """Refractions (m,) at a pupil; of the last, which is asked of again, kept."""
+        last = self._last
+        if last[0] != pupil_mm:
+            nodes, values = self._squares_mm2, self._refractions_dpt
+            last = pupil_mm, _through(nodes, values, self._pupil_shares, pupil_mm**2)
+            self._last = last
+        return last[1]
 
     def refraction_dpt(self, *, pupil_mm: float, accommodation_dpt: float) -> float:
         """Refraction through a pupil at an accommodation."""
@@ -83,8 +87,8 @@ def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
 def _through(nodes: NDArray, values: NDArray, shares: NDArray, at: float):
     """Value at a place of the polynomial through values (n, ...) at nodes (n,)."""
     away = at - nodes
-    hit = np.flatnonzero(np.abs(away) < 1e-12)
-    if hit.size:
-        return values[hit[0]]
+    is_hit = np.abs(away) < 1e-12
+    if is_hit.any():
+        return values[is_hit.argmax()]
     terms = shares / away
     return terms @ values / terms.sum()

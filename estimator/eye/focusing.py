@@ -60,11 +60,13 @@ class Focusing(ABC):
             pupil_diameter_mm=pupil_diameter_mm,
         )
 
-    def _sharpest_dpt(self, used_dpt: float, pupil_diameter_mm: float) -> float:
+    def sharpest_dpt(
+        self, accommodation_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
         """Distance that is sharpest at an accommodation, through a pupil."""
         return self.vergence.object_dpt(
             -self.refraction_at_dpt(
-                pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=used_dpt
+                pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
             )
         )
 
@@ -75,13 +77,13 @@ class Focusing(ABC):
         used_dpt = self.accommodation_dpt(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
-        return self._sharpest_dpt(used_dpt, pupil_diameter_mm)
+        return self.sharpest_dpt(used_dpt, pupil_diameter_mm=pupil_diameter_mm)
 
     def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
         """Far point and near point through a pupil, dpt."""
         largest_dpt = self.largest_accommodation_dpt(pupil_diameter_mm)
         far_dpt, near_dpt = (
-            self._sharpest_dpt(used_dpt, pupil_diameter_mm)
+            self.sharpest_dpt(used_dpt, pupil_diameter_mm=pupil_diameter_mm)
             for used_dpt in (0.0, largest_dpt)
         )
         return far_dpt, near_dpt

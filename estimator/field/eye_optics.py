@@ -36,6 +36,11 @@ class EyeOptics(Protocol):
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
         """Accommodation at which a distance, dpt, is sharpest through a pupil."""
 
+    def sharpest_dpt(
+        self, accommodation_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Distance that is sharpest at an accommodation, through a pupil, dpt."""
+
     def reachable_focus_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float
     ) -> float:

@@ -41,7 +41,7 @@ _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
 """A rim's centre goes with the square of the pupil, its axes with the pupil."""
 
-_POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
+POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
 """How coefficients change with the pupil A: a term of order 8 (7 for the odd) that a
 fit of order 6 leaves out adds a share that goes with A^(8 - degree) to a coefficient of
 its parity; a rim departs from its paraxial form with A² and a little A⁴."""
@@ -320,8 +320,8 @@ class FieldInterpolation:
         lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
         lower = np.clip(lower, 0, nodes_mm.size - 2)
         high_mm = nodes_mm[lower + 1]
-        lowest = (nodes_mm[lower] / high_mm)[:, None] ** _POWER
-        share = ((pupil_mm / high_mm)[:, None] ** _POWER - lowest) / (1.0 - lowest)
+        lowest = (nodes_mm[lower] / high_mm)[:, None] ** POWER
+        share = ((pupil_mm / high_mm)[:, None] ** POWER - lowest) / (1.0 - lowest)
         return lower, share
 
     def _channels(self, wavelength_nm: NDArray) -> NDArray[np.int64]:

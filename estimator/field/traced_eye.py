@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.focusing import FocusingEye
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
+from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import (
     FieldInterpolation,
     accommodation_nodes_dpt,
@@ -211,17 +212,20 @@ class TracedEye(FocusingEye):
         """Accommodation at which the nearest distance is seen through a pupil."""
         return self._accommodating.largest_accommodation_dpt(pupil_diameter_mm)
 
-    def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say in words what of the request this eye cannot meet, or was not traced."""
-        notes = super().notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-        pupil_mm = self.usable_pupil_mm(pupil_diameter_mm)
-        if self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm):
+    def focus_notes(
+        self, focus_dpt: float, *, pupil_diameter_mm: float
+    ) -> tuple[str, ...]:
+        """Say in words what of a focus distance it cannot meet, or was not traced."""
+        notes = super().focus_notes(focus_dpt, pupil_diameter_mm=pupil_diameter_mm)
+        if notes:
             return notes  # the eye itself ends there
-        used_dpt = self.reachable_focus_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+        used_dpt = self.reachable_focus_dpt(
+            focus_dpt, pupil_diameter_mm=pupil_diameter_mm
+        )
         if abs(used_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
-            return notes
+            return ()
         said = f"focus {focus_dpt:g} dpt is outside what was prepared: {used_dpt:.3g}"
-        return (*notes, f"{said} dpt used")
+        return (f"{said} dpt used",)
 
     def accommodation_nodes_dpt(
         self,
@@ -271,16 +275,23 @@ class TracedEye(FocusingEye):
         first, number = distinct_rows(*columns)
         h_deg, v_deg, wavelength_nm = (column[first] for column in columns)
         self._check_fields(h_deg, v_deg)
-        fields = self._fields(h_deg, v_deg, wavelength_nm)
+        fields = self._fields(h_deg, v_deg, wavelength_nm).fixed_defocus()
         return partial(self._defocus_dpt, fields, number.reshape(states[0].shape))
 
     def _defocus_dpt(
-        self, fields: TracedFields, number: NDArray, **state: float
+        self,
+        fields: FixedDefocus,
+        number: NDArray,
+        *,
+        pupil_diameter_mm: float,
+        accommodation_dpt: float,
     ) -> NDArray[np.float64]:
-        states = {name: np.full(fields.count, value) for name, value in state.items()}
-        self._check_states(**states)
-        zernike_um, _, radius_mm = fields.wavefronts(**states)
-        return total_defocus_dpt(zernike_um, radius_mm)[number]
+        state = {
+            "pupil_diameter_mm": np.float64(pupil_diameter_mm),
+            "accommodation_dpt": np.float64(accommodation_dpt),
+        }
+        self._check_states(**state)
+        return fields.at(**state)[number]
 
     def wavefronts(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.measured_rest import MeasuredRest
+from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import FieldInterpolation
 from estimator.field.peripheral_rest import PeripheralRest, stretch_ratio
 from estimator.wavefront.field_wavefronts import (
@@ -90,11 +91,6 @@ class TracedFields:
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
         )
 
-    @property
-    def count(self) -> int:
-        """Number of states."""
-        return self._states.field.size
-
     def wavefronts(
         self,
         *,
@@ -120,6 +116,18 @@ class TracedFields:
             polynomial_um + self._added_um + residue_um, radius_mm
         )
         return zernike_um, rim_mm, radius_mm
+
+    def fixed_defocus(self) -> FixedDefocus:
+        """Return the total defocus alone, of states that share pupil and focus."""
+        return FixedDefocus(
+            (self._field, self._states),
+            (self._on_axis, self._axis_states),
+            self._rest,
+            left_share=self._left_share,
+            people_um=self._people_um,
+            added_um=self._added_um,
+            open_mm=self._open_mm,
+        )
 
     def _rim_scale(self, pupil_mm: NDArray, used_dpt: NDArray) -> NDArray[np.float64]:
         """Pupils (n,) asked for over the traced ones, on axis."""

@@ -23,8 +23,10 @@ TILT_Y, TILT_X = 1, 2
 N_RIM = 5
 """Columns of a rim: centre x, y and the matrix' xx, xy, yy, mm."""
 
-_ANGLES = 2.0 * np.pi * np.arange(16) / 16
-_NEWTON_STEPS = 4
+N_SAMPLED, N_NEWTON_STEPS, NEWTON_STEP_RAD = 16, 4, 0.2
+"""How a rim's farthest point is found: the farthest of so many, and Newton's steps."""
+
+_ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,11 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
     sampled = half_square(_ANGLES)
     angle = _ANGLES[np.argmax(sampled, axis=-1)][..., None]
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(N_NEWTON_STEPS):
         first, second = derivatives(angle)
         bends_down = second < 0.0
         step = np.where(bends_down, -first / np.where(bends_down, second, 1.0), 0.0)
-        angle = angle + np.clip(step, -0.2, 0.2)
+        angle = angle + np.clip(step, -NEWTON_STEP_RAD, NEWTON_STEP_RAD)
     highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
     return np.sqrt(2.0 * highest)
 

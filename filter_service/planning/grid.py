@@ -8,7 +8,6 @@ Frame layers follow the paper, as far as they must: never more than a step of bl
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -296,72 +295,3 @@ def defocus_nodes_dpt(
     first = max(int(np.searchsorted(nodes, low_dpt, side="right")) - 1, 0)
     last = min(int(np.searchsorted(nodes, high_dpt, side="left")), len(nodes) - 1)
     return nodes[first : last + 1]
-
-
-def layer_distances_dpt(
-    range_dpt: tuple[float, float],
-    *,
-    ends_dpt: NDArray[np.float64],
-    blur_radius_px,
-    blur_px_per_dpt: float,
-    blur_ratio: float,
-    step_ratio: float = 1.0,
-) -> NDArray[np.float64]:
-    """Vergences of a frame's layers, ascending, over a range of them.
-
-    Parameters
-    ----------
-    ends_dpt : (n,)
-        Those that become layers themselves: where some channel is in focus, so that
-        the blur is monotone between layers, and where distances begin or end.
-    blur_radius_px : callable
-        (n,) vergences in dpt to blur radii (n, m) in px, of field nodes and channels.
-    blur_px_per_dpt : float
-        Of a perfect eye.
-    blur_ratio : float
-        Step of blur, of its radius.
-    step_ratio : float
-        All steps against the usual.
-
-    References
-    ----------
-    Csoba & Kunkli 2023, Eq. 8: L = ceil(|R(k+1) - R(k)|) - 1 transitional layers, here
-    with steps in proportion to R, and none where R stays.
-    """
-    low_dpt, high_dpt = range_dpt
-    count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
-    inside = ends_dpt[(ends_dpt > low_dpt) & (ends_dpt < high_dpt)]
-    at_dpt = np.unique(
-        np.concatenate([np.linspace(low_dpt, high_dpt, max(count, 1)), inside])
-    )
-    if at_dpt.size == 1:
-        return at_dpt
-    blur_px = blur_radius_px(at_dpt)
-    smaller_px = np.minimum(blur_px[1:], blur_px[:-1])
-    step_px = np.maximum(blur_ratio * smaller_px, MIN_BLUR_STEP_PX)
-    steps = (np.abs(np.diff(blur_px, axis=0)) / step_px).max(axis=1)
-    gap_px = LAYER_GAP_STEPS * blur_ratio * smaller_px.min(axis=1)
-    gap_dpt = np.maximum(gap_px / max(blur_px_per_dpt, 1e-12), BASE_OBJECT_STEP_DPT)
-    steps = np.maximum(steps, np.diff(at_dpt) / gap_dpt) / step_ratio
-    steps_before = np.append(0.0, np.cumsum(steps))
-    ends = np.searchsorted(at_dpt, np.append(inside, high_dpt))
-    return np.unique(
-        np.concatenate(
-            [at_dpt[:1], *_between(at_dpt, steps_before, np.unique(ends).tolist())]
-        )
-    )
-
-
-def _between(
-    at_dpt: NDArray, steps_before: NDArray, ends: list[int]
-) -> Iterator[NDArray[np.float64]]:
-    """Distances with one step or less from each to the next, as far as each end."""
-    first = 0
-    for end in ends:
-        low, high = steps_before[first], steps_before[end]
-        count = max(math.ceil(high - low - 1e-9), 1)
-        wanted = np.linspace(low, high, count + 1)[1:]
-        found_dpt = np.interp(wanted, steps_before, at_dpt)
-        found_dpt[-1] = at_dpt[end]
-        yield found_dpt
-        first = end

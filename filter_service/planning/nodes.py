@@ -153,11 +153,16 @@ class CachePlan:
     is_limited: NDArray[np.bool_]
     shrink_ratio: NDArray[np.float64] | None = None
 
-    @property
+    @cached_property
     def field_nodes_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Azimuths and elevations (n_fields,) of the nodes, [v, h] in C order."""
         v_deg, h_deg = np.meshgrid(self.v_deg, self.h_deg, indexing="ij")
         return h_deg.ravel(), v_deg.ravel()
+
+    @cached_property
+    def axis_node(self) -> int:
+        """Number of the field node that is nearest to the direction of gaze."""
+        return int(np.argmin(np.hypot(*self.field_nodes_deg)))
 
     @property
     def group_shape(self) -> tuple[int, int, int, int]:

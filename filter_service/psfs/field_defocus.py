@@ -11,7 +11,7 @@ from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GREEN, GridSpec
 
 if TYPE_CHECKING:
-    from scipy.interpolate import RectBivariateSpline
+    from scipy.interpolate import BSpline
 
 COLUMNS, ROWS = 17, 11
 """Directions at which the eye is asked.  Between them, over +-40 x 25 deg at 5 mm, the
@@ -20,30 +20,65 @@ in the corners, beyond where people were measured, and 99 % within 0.008, 0.014 
 0.021.  With 13 x 9 it is 0.055 in myopia, and a new state takes 0.1 ms less."""
 
 
+class FieldAxes:
+    """Directions at which the eye is asked, and the spline between them.
+
+    A spline through values is a sum of those through one 1 among zeros, which are the
+    same whatever the values: so a new state costs a product.
+
+    Parameters
+    ----------
+    h_deg, v_deg : (n_h,), (n_v,)
+    """
+
+    def __init__(self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]):
+        self.h_deg, self.v_deg = h_deg, v_deg
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of rows and columns."""
+        return self.v_deg.size, self.h_deg.size
+
+    @cached_property
+    def _splines(self) -> "tuple[BSpline, BSpline]":
+        from scipy.interpolate import make_interp_spline
+
+        return tuple(
+            make_interp_spline(axis, np.eye(axis.size), k=3)
+            for axis in (self.v_deg, self.h_deg)
+        )
+
+    def weights(
+        self, h_deg: ArrayLike, v_deg: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Weights (..., n_v) and (..., n_h) at directions; the border's beyond it."""
+        h_deg, v_deg = np.broadcast_arrays(h_deg, v_deg)
+        if self.shape == (1, 1):
+            return np.ones((*h_deg.shape, 1)), np.ones((*h_deg.shape, 1))
+        of_rows, of_columns = self._splines
+        return (
+            of_rows(np.clip(v_deg, self.v_deg[0], self.v_deg[-1])),
+            of_columns(np.clip(h_deg, self.h_deg[0], self.h_deg[-1])),
+        )
+
+
 @dataclass(frozen=True)
 class FieldDefocus:
     """Total defocus over the field, against that of the direction of gaze.
 
     Attributes
     ----------
-    h_deg, v_deg : (n_h,), (n_v,)
+    axes : FieldAxes
     change_dpt : (n_v, n_h)
     """
 
-    h_deg: NDArray[np.float64]
-    v_deg: NDArray[np.float64]
+    axes: FieldAxes
     change_dpt: NDArray[np.float64]
 
     @classmethod
     def none(cls) -> "FieldDefocus":
         """Return that of an eye whose defocus is the same everywhere."""
-        return cls(np.zeros(1), np.zeros(1), np.zeros((1, 1)))
-
-    @cached_property
-    def _spline(self) -> "RectBivariateSpline":
-        from scipy.interpolate import RectBivariateSpline
-
-        return RectBivariateSpline(self.v_deg, self.h_deg, self.change_dpt)
+        return cls(FieldAxes(np.zeros(1), np.zeros(1)), np.zeros((1, 1)))
 
     @property
     def range_dpt(self) -> tuple[float, float]:
@@ -52,14 +87,12 @@ class FieldDefocus:
 
     def at(self, h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
         """Change (...) in dpt at field directions; at the border's beyond it."""
-        h_deg, v_deg = np.broadcast_arrays(h_deg, v_deg)
-        if self.change_dpt.size == 1:
-            return np.full(h_deg.shape, self.change_dpt[0, 0])
-        return self._spline(
-            np.clip(v_deg, self.v_deg[0], self.v_deg[-1]),
-            np.clip(h_deg, self.h_deg[0], self.h_deg[-1]),
-            grid=False,
-        )
+        return self.of_weights(self.axes.weights(h_deg, v_deg))
+
+    def of_weights(self, weights: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+        """Change (...) where `FieldAxes.weights` were taken."""
+        of_rows, of_columns = weights
+        return ((of_rows @ self.change_dpt) * of_columns).sum(axis=-1)
 
 
 class EyeDefocus:
@@ -82,15 +115,14 @@ class EyeDefocus:
             )
         )
         self._node_shape = (np.size(h_deg), wavelengths_nm.size)
-        self._axes_deg = None
+        self._axes: FieldAxes | None = None
         if spec.follows_field and spec.blends_at_equal_blur:
-            self._axes_deg = tuple(
-                np.linspace(low, high, count)
-                for (low, high), count in zip(
-                    spec.field_range_deg, (COLUMNS, ROWS), strict=True
-                )
+            (left, right), (down, up) = spec.field_range_deg
+            self._axes = FieldAxes(
+                np.linspace(left, right, COLUMNS), np.linspace(down, up, ROWS)
             )
-            over_h_deg, over_v_deg = _directions(*self._axes_deg)
+            self._node_weights = self._axes.weights(h_deg, v_deg)
+            over_h_deg, over_v_deg = _directions(self._axes.h_deg, self._axes.v_deg)
             h, v = np.append(h, over_h_deg), np.append(v, over_v_deg)
             nm = np.append(nm, np.full(over_h_deg.size, wavelengths_nm[GREEN]))
         self._defocus_dpt = eye.defocus_at(h_deg=h, v_deg=v, wavelength_nm=nm)
@@ -107,13 +139,17 @@ class EyeDefocus:
         )
         n_nodes = int(np.prod(self._node_shape))
         nodes_dpt = at_infinity_dpt[:n_nodes].reshape(self._node_shape)
-        if self._axes_deg is None:
+        if self._axes is None:
             return nodes_dpt, FieldDefocus.none()
         over_dpt = at_infinity_dpt[n_nodes:]
         change_dpt = over_dpt[:-1] - over_dpt[-1]
-        return nodes_dpt, FieldDefocus(
-            *self._axes_deg, change_dpt.reshape(ROWS, COLUMNS)
-        )
+        return nodes_dpt, FieldDefocus(self._axes, change_dpt.reshape(ROWS, COLUMNS))
+
+    def change_at_nodes_dpt(self, change: FieldDefocus) -> NDArray[np.float64]:
+        """Change of a state (n_fields, 1) at the field nodes."""
+        if self._axes is None:
+            return np.zeros((self._node_shape[0], 1))
+        return change.of_weights(self._node_weights)[:, None]
 
 
 def _directions(h_deg: NDArray, v_deg: NDArray) -> tuple[NDArray, NDArray]:

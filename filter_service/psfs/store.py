@@ -3,20 +3,18 @@
 Plain arrays without GL: the worker fills it, the renderer uploads it.
 """
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.field.eye_optics import EyeOptics
 from estimator.optics.vergence import ObjectVergence
-from filter_service.planning.grid import (
-    LAYER_BLUR_RATIO,
-    GridSpec,
-    layer_distances_dpt,
-)
-from filter_service.planning.nodes import CachePlan, bracket_axis
+from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
+from filter_service.planning.nodes import CachePlan
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.boxes import pack_reach
 from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
@@ -166,17 +164,20 @@ def frame_layers(
     Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
     """
     # Whoever holds a store need not load numba: the service gets ready before.
-    from filter_service.psfs.read_loops import largest_radius_px, layer_blur_px
+    from filter_service.psfs.layer_loops import layer_distances_dpt
+    from filter_service.psfs.read_loops import largest_radius_px
 
     plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
-    notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
     accommodation_dpt = eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+    reached_dpt = eye.sharpest_dpt(accommodation_dpt, pupil_diameter_mm=pupil_mm)
+    is_met = abs(reached_dpt - focus_dpt) <= OUT_OF_REACH_DPT
+    if not is_met or pupil_mm != pupil_diameter_mm:
+        notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
     at_infinity_dpt, change = store.defocus.state(
         pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
     )
-    h_deg, v_deg = plan.field_nodes_deg
-    layer_zero_dpt = at_infinity_dpt - change.at(h_deg, v_deg)[:, None]
+    layer_zero_dpt = at_infinity_dpt - store.defocus.change_at_nodes_dpt(change)
     corners = tuple(
         (pupil, used, pupil_weight * used_weight)
         for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
@@ -185,21 +186,19 @@ def frame_layers(
     )
     notes += _limit_notes(store, corners)
     reads = _state_reads(plan, pupil_mm, corners)
-    gaze = int(np.argmin(np.hypot(h_deg, v_deg)))
     far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
     far_near_dpt = (
-        eye.vergence.vergence_dpt(far_dpt),
-        eye.vergence.vergence_dpt(near_dpt),
+        float(eye.vergence.vergence_dpt(far_dpt)),
+        float(eye.vergence.vergence_dpt(near_dpt)),
     )
+    low_dpt, high_dpt = change.range_dpt
+    in_focus_dpt = -layer_zero_dpt[plan.axis_node]
+    blur_px_per_dpt = store.spec.blur_px_per_dpt(pupil_mm)
     layer_dpt = layer_distances_dpt(
-        tuple(np.add(far_near_dpt, change.range_dpt)),
-        ends_dpt=np.append(-layer_zero_dpt[gaze], _plane_ends_dpt(store, change)),
-        blur_radius_px=lambda at_dpt: layer_blur_px(
-            store.tables, reads, layer_zero_dpt, at_dpt
-        ),
-        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
-        blur_ratio=LAYER_BLUR_RATIO[store.spec.settings.mode],
-        step_ratio=step_ratio,
+        *(store.tables, reads, layer_zero_dpt),
+        (far_near_dpt[0] + low_dpt, far_near_dpt[1] + high_dpt),
+        np.append(in_focus_dpt, _plane_ends_dpt(store, change)),
+        *(blur_px_per_dpt, LAYER_BLUR_RATIO[store.spec.settings.mode], step_ratio),
     )
     return FrameLayers(
         layer_dpt=layer_dpt,
@@ -212,8 +211,8 @@ def frame_layers(
             store.tables, reads, layer_zero_dpt, layer_dpt[0], layer_dpt[-1]
         ),
         pupil_diameter_mm=pupil_mm,
-        focus_dpt=eye.reachable_focus_dpt(focus_dpt, pupil_diameter_mm=pupil_mm),
-        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
+        focus_dpt=reached_dpt,
+        blur_px_per_dpt=blur_px_per_dpt,
         notes=notes,
     )
 
@@ -253,8 +252,17 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
 
 
 def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
-    lower, upper, share = bracket_axis(nodes, value)
-    return [(int(lower), 1.0 - float(share)), (int(upper), float(share))]
+    """Return the nodes on both sides of a value and their weights.
+
+    As `bracket_axis` has them, in plain numbers: that costs a tenth.
+    """
+    axis = nodes.tolist()
+    upper = min(bisect_left(axis, value), len(axis) - 1)
+    lower = max(upper - 1, 0)
+    upper = min(lower + 1, len(axis) - 1)
+    span = axis[upper] - axis[lower] or 1.0
+    share = min(max((value - axis[lower]) / span, 0.0), 1.0)
+    return [(lower, 1.0 - share), (upper, share)]
 
 
 def _state_reads(plan: CachePlan, pupil_mm: float, corners: tuple) -> StateReads:

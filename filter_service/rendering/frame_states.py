@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.psfs.field_defocus import FieldAxes
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 
@@ -59,6 +60,7 @@ class FrameStates:
         self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
+        self._corner_weights: tuple[FieldAxes, ImageCells, tuple] | None = None
 
     def _forget_others(self, handle: FrameStore) -> None:
         if self._handle is not handle:
@@ -117,9 +119,19 @@ class FrameStates:
         last = self._change
         if last is None or last[0] is not layers or last[1] is not image:
             with timer.wall("psf_plan_ms"):
-                change_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
+                change_dpt = layers.field.of_weights(self._weights(layers, image))
             self._change = layers, image, change_dpt.astype(np.float32)
         return self._change[2]
+
+    def _weights(
+        self, layers: FrameLayers, image: ImageCells
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Weights of the corners in the field's spline, the same in any state."""
+        axes, last = layers.field.axes, self._corner_weights
+        if last is None or last[0] is not axes or last[1] is not image:
+            weights = axes.weights(image.corner_h_deg, image.corner_v_deg)
+            self._corner_weights = axes, image, weights
+        return self._corner_weights[2]
 
     def coarsen(self, image: ImageCells) -> None:
         """Take cells twice as wide from now on."""

@@ -1,0 +1,107 @@
+"""Total defocus of a traced eye at fixed fields, as pupil and focus change.
+
+What depends on field and wavelength alone is summed up once; see `defocus_loops`.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.estimate.measured_rest import MeasuredRest
+from estimator.field.interpolation import (
+    POWER,
+    FieldInterpolation,
+    FieldValues,
+    lagrange_weights,
+)
+from estimator.field.peripheral_rest import WIDEST_RATIO
+from estimator.optics.prescription import C20
+from estimator.optics.zernike import N_TERMS, monomial_matrix
+from estimator.periphery.meridian import CIRCLE_MM
+from estimator.wavefront.field_wavefronts import DEGREE
+
+DEGREES = (2, 4, 6)
+"""Of monomials that have a C(2,0)."""
+
+
+class FixedDefocus:
+    """Total defocus of n fields and wavelengths, one state after the other.
+
+    Parameters
+    ----------
+    field, on_axis : (FieldInterpolation, FieldValues)
+        Over the field, and on the axis at the same wavelengths.
+    rest : MeasuredRest
+    left_share : (n,)
+        Of its residue.
+    people_um : (n, 28), optional
+        What people's periphery adds.
+    added_um : (n, 28)
+        What is added at any pupil.
+    open_mm : (n,), optional
+        Pupils that light passes; all where it is None.
+    """
+
+    def __init__(
+        self,
+        field: tuple[FieldInterpolation, FieldValues],
+        on_axis: tuple[FieldInterpolation, FieldValues],
+        rest: MeasuredRest,
+        *,
+        left_share: NDArray[np.float64],
+        people_um: NDArray[np.float64] | None,
+        added_um: NDArray[np.float64],
+        open_mm: NDArray[np.float64] | None,
+    ):
+        self._grids = tuple(_Grid(*part) for part in (field, on_axis))
+        values = field[1]
+        count = values.field.size
+        open_mm = np.full(count, np.inf) if open_mm is None else open_mm
+        self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
+        people_um = np.zeros((count, N_TERMS)) if people_um is None else people_um
+        fading = left_share[:, None] * sums_by_degree(rest.residue_um)
+        self._added = (
+            sums_by_degree(added_um),
+            np.ascontiguousarray(fading),
+            float(rest.radius_mm),
+            sums_by_degree(people_um),
+            WIDEST_RATIO * CIRCLE_MM,
+        )
+
+    def at(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> NDArray[np.float64]:
+        """Least-squares refraction (n,), dpt, on the pupil's circle."""
+        from estimator.field.defocus_loops import fill_defocus
+
+        found_dpt = np.empty(self._state[0].size)
+        grids = (grid.used_at(accommodation_dpt) for grid in self._grids)
+        fill_defocus(
+            float(pupil_diameter_mm), *grids, self._state, self._added, found_dpt
+        )
+        return found_dpt
+
+
+class _Grid:
+    """A grid's nodes, and its values as sums by degree and rims."""
+
+    def __init__(self, interpolation: FieldInterpolation, values: FieldValues):
+        self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
+        self._accommodations_dpt = interpolation.grid.accommodations_dpt
+        whole = values.values
+        sums, rims = sums_by_degree(whole[..., :N_TERMS]), whole[..., N_TERMS:]
+        self._values = np.ascontiguousarray(np.concatenate([sums, rims], axis=-1))
+        of_degree = [float(POWER[:N_TERMS][DEGREE == degree][0]) for degree in DEGREES]
+        self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
+
+    def used_at(self, accommodation_dpt: float) -> tuple:
+        """Return what the loop takes of it, at an accommodation."""
+        at_dpt = np.array([accommodation_dpt])
+        used = lagrange_weights(self._accommodations_dpt, at_dpt)[0]
+        return self._nodes_mm, self._powers, used, self._values
+
+
+def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what monomials (..., 28) of a degree add to C(2,0) on a circle of 1 mm."""
+    share = np.linalg.inv(monomial_matrix())[:, C20] * polynomial_um
+    sums = [share[..., DEGREE == degree].sum(axis=-1) for degree in DEGREES]
+    return np.stack(sums, axis=-1)

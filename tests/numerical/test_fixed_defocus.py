@@ -1,0 +1,43 @@
+"""Total defocus of fixed fields, by a compiled loop, against that of whole wavefronts."""
+
+import numpy as np
+import pytest
+
+from tests.numerical.plan_cases import spec_for, traced_eye
+
+WIDE = {
+    "mode": "dynamic",
+    "pupil_range_mm": (1.5, 8.0),
+    "focus_range_dpt": (0.0, 4.0),
+}
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus", "cataract"])
+def test_defocus_equals_that_of_the_wavefronts(name, rng):
+    """Through small, whole and cut-off pupils, relaxed and accommodating."""
+    spec = spec_for(320, 180, **WIDE)
+    eye = traced_eye(name, spec)
+    (left, right), (down, up) = spec.field_range_deg
+    h_deg, v_deg = rng.uniform(left, right, 40), rng.uniform(down, up, 40)
+    fields = {"h_deg": h_deg, "v_deg": v_deg}
+    fields["wavelength_nm"] = np.resize(spec.channel_wavelengths_nm, 40)
+    at_state = eye.defocus_at(**fields)
+    largest_mm = min(8.0, eye.max_pupil_diameter_mm)
+    last_dpt = float(eye.grid.accommodations_dpt[-1])
+    for pupil_mm in (1.5, *rng.uniform(1.5, largest_mm, 6), largest_mm):
+        for used_dpt in (0.0, 0.37 * last_dpt, last_dpt):
+            state = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": used_dpt}
+            np.testing.assert_allclose(
+                at_state(**state),
+                eye.total_defocus_dpt(**fields, **state),
+                rtol=1e-10,
+                atol=1e-11,
+            )
+
+
+def test_a_state_that_was_not_traced_is_refused():
+    spec = spec_for(320, 180, **WIDE)
+    eye = traced_eye("emmetropia", spec)
+    at_state = eye.defocus_at(h_deg=[0.0], v_deg=[0.0], wavelength_nm=[536.0])
+    with pytest.raises(ValueError, match="pupil_diameter_mm 12 to 12: traced are"):
+        at_state(pupil_diameter_mm=12.0, accommodation_dpt=0.0)
