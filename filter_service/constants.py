@@ -187,7 +187,12 @@ NO_LEVEL = 0x7FFFFFFF
 a kernel is too sharp for."""
 
 MAX_LAYERS = 2048
-"""Layers of a frame; the note of what it uses is then 256 bytes of shared memory."""
+"""Layers of a frame."""
+
+USED_PARTS = 4
+"""Of an interval between layers, noted one by one where a frame uses them: layers of
+another state lie elsewhere, and what they need is told from parts with fewer too many.
+The note of a tile is then 1 KB of shared memory."""
 
 RECIPE_TAPS = 8
 """Cached kernels that one layer of a field node is blended from."""

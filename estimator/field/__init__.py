@@ -8,7 +8,8 @@ interpolation    between the nodes
 peripheral_rest  what people's periphery has beyond the model's
 trace_range      what of the field is traced
 traced_fields    fixed fields, changing pupil and focus
-fixed_defocus    their defocus alone, by a compiled loop
+fixed_defocus    their defocus alone
+defocus_loops    its compiled loop
 traced_eye       an estimated eye, ray-traced over the field
 prepare          from a profile to such an eye: the entry
 field_table      its wavefronts in many directions, as an instrument gives them

@@ -14,6 +14,7 @@ store                the cache, and the layers of a frame
 field_defocus        change of defocus over the field
 read_kernels         which cached kernels a state reads, as plain arrays
 read_loops           the compiled loops that read them
+layer_loops          where a frame's layers lie
 store_cache          stores kept on disk
 cache_folder         where, if anywhere
 kept_eyes            whose, to be listed and erased

@@ -6,7 +6,9 @@ spends after it is ready; compiling them, once on a machine, 10 s.
 
 import numpy as np
 
+from estimator.field.defocus_loops import N_DEGREES, fill_defocus
 from estimator.media.straylight import Straylight
+from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.psfs.store import frame_layers
@@ -20,6 +22,7 @@ from filter_service.rendering.frame_kernels import (
 )
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rendering.media_effects import MediaEffects, encoded
+from filter_service.rendering.pair_loops import carry_over, spread, used_pairs
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
     SIDE_PX,
@@ -45,8 +48,26 @@ def plan_once() -> None:
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
+    _tell_pairs_once()
+    _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
     MediaEffects(Straylight()).change(light, view)
     encoded(light, "srgb8")
+
+
+def _tell_pairs_once() -> None:
+    words = np.ones((1, 1, 1), np.uint32)
+    corners, layer_dpt = np.zeros((2, 2), np.float32), np.arange(3.0)
+    used_pairs(words[0], 1)
+    spread(carry_over(words, layer_dpt, corners, layer_dpt, corners, 0.0))
+
+
+def _defocus_once() -> None:
+    """Of a traced eye at fixed fields: the perfect eye is a wavefront."""
+    count = N_DEGREES + N_RIM
+    grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
+    index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))
+    fields, added = (index, index, np.ones(1)), (sums, sums, 1.0, sums, 1.0)
+    fill_defocus(2.0, grid, grid, fields, added, np.empty(1))

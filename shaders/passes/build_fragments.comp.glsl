@@ -6,8 +6,9 @@
 //      DEPTH_IN (f32 metres; what is hidden lies where it is above 0),
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
-//      PIXEL_LAYER (position), USED (a bit per cell and interval), STATS (pixels without
-//      depth, beyond what was prepared, and without a finite colour, which is then 0).
+//      PIXEL_LAYER (position), USED (a bit per cell and part of an interval), STATS
+//      (pixels without depth, beyond what was prepared, and without a finite colour,
+//      which is then 0).
 // Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
 // Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
 
@@ -42,7 +43,7 @@ uniform float vergence_offset_m;
 bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; }
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
-shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
+shared uint group_used[MAX_LAYERS * USED_PARTS / BITS_PER_WORD];
 shared uint group_stats[STAT_FRAGMENTS];  // those that are counted here
 
 uint byte_at(uint index) {
@@ -134,9 +135,12 @@ float distance_of(uint pixel, uint seen, vec2 at) {
     return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
 }
 
-void note_use(ivec2 at, int interval) {
-    uint bit = 1u << uint(interval % BITS_PER_WORD);
-    uint word = uint(interval / BITS_PER_WORD);
+void note_use(ivec2 at, float place) {
+    int interval = position_interval(place, layer_count);
+    int part = interval * USED_PARTS;
+    part += clamp(int((place - float(interval)) * float(USED_PARTS)), 0, USED_PARTS - 1);
+    uint bit = 1u << uint(part % BITS_PER_WORD);
+    uint word = uint(part / BITS_PER_WORD);
     if (group_lies_in_one_cell()) {
         atomicOr(group_used[word], bit);
         return;
@@ -173,7 +177,7 @@ void main() {
             dpt = clamp(dpt, vergence_range_dpt.x, vergence_range_dpt.y);
             float place = layer_position(dpt + field_defocus_dpt(at));
             position[pixel] = place;
-            note_use(at, position_interval(place, layer_count));
+            note_use(at, place);
         }
         pixels[pixel] = vec4(linear_rgb, dpt);
     }

@@ -27,6 +27,7 @@ import numpy as np
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
@@ -133,7 +134,8 @@ def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Cas
         focus_range_dpt=(0.0, 1.0),
         mode="dynamic",
     )
-    store = build_psf_store(parse_profile(EYES[eye]), spec)
+    traced, _ = eye_for_spec(parse_profile(EYES[eye]), spec)
+    store = build_psf_store(traced, spec)
     state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}
     native = NativeRenderer()
     expected = native.render(view, native.load(store), **state).color

@@ -1,4 +1,4 @@
-"""Total defocus of fixed fields, by a compiled loop, against that of whole wavefronts."""
+"""Total defocus of fixed fields by a compiled loop, against that of wavefronts."""
 
 import numpy as np
 import pytest

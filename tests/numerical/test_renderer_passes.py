@@ -8,6 +8,7 @@ from filter_service.rendering import frame_kernels, reference
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.pair_loops import used_pairs
 from tests.numerical.synthetic import Bench, depth_scene, texture
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
@@ -86,9 +87,9 @@ def made_kernels(bench, view, **state):
     """Kernels that the renderer made for a view, planned again."""
     bench.render(view, **state)
     layers, image = bench.layers(**state), image_cells(bench.spec, bench.store.plan)
-    words = -(-frame_kernels.interval_count(layers) // 32)
+    words = kernel_passes.words_per_cell(layers)
     used = read(bench, "USED", (image.count, words), np.uint32)
-    used = kernel_passes.used_pairs(used, layers)
+    used = used_pairs(used, frame_kernels.interval_count(layers))
     return frame_kernels.frame_kernels(bench.store.tables, layers, image, used)
 
 

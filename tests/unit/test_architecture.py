@@ -118,11 +118,14 @@ HOME = {
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
+        "estimator/field/defocus_loops.py",  # of a traced eye in a new state
         "filter_service/psfs/read_loops.py",  # planning a frame
+        "filter_service/psfs/layer_loops.py",
         "filter_service/rendering/map_loops.py",
         "filter_service/rendering/haze_loops.py",
         "filter_service/rendering/spectacle_loops.py",
         "filter_service/rendering/kernel_loops.py",
+        "filter_service/rendering/pair_loops.py",
         "filter_service/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

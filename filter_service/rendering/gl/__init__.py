@@ -6,6 +6,7 @@ fragment_passes  pixels to fragments
 list_passes      lists, order, splat
 frame_passes     all of them, and the picture
 kernel_passes    a frame's kernels
+expected_pairs   kernels told from the frame before
 kept_eyes        what of two eyes is kept between frames
 list_bands       lists in bands that fit a buffer
 compile_passes   every pass compiled before the first frame

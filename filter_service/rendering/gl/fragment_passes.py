@@ -17,11 +17,8 @@ from filter_service.constants import (
     TILE_SIZE_PX,
 )
 from filter_service.gl.gpu import Atlas
-from filter_service.rendering.gl.kernel_passes import (
-    KernelSet,
-    used_pairs,
-    words_per_cell,
-)
+from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells
 
@@ -165,7 +162,9 @@ class FragmentPasses:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Return the used pairs (n_cells, n_intervals), once they were read."""
-        return used_pairs(self.used_words, self.strip.layers)
+        from filter_service.rendering.pair_loops import used_pairs
+
+        return used_pairs(self.used_words, interval_count(self.strip.layers))
 
     @property
     def _common(self) -> dict:

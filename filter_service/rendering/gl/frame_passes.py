@@ -45,7 +45,9 @@ class FramePasses:
     def run(
         self,
         kernels: Callable[[NDArray[np.bool_]], KernelSet],
-        kept: KernelSet | None = None,
+        *,
+        expected: Callable[[], KernelSet | None] = lambda: None,
+        used: NDArray[np.bool_] | None = None,
     ) -> None:
         """Filter the strip; `read_back` fetches the picture.
 
@@ -53,15 +55,19 @@ class FramePasses:
         ----------
         kernels : callable
             From the used (cell, interval) pairs to the kernels for them.
-        kept : KernelSet, optional
-            Kernels that may serve: then nothing is read in the middle of the frame, and
-            in the end `has_all_kernels` says whether they did.
+        expected : callable, optional
+            To kernels that may serve, if there are some: then nothing is read in the
+            middle of the frame, and in the end `has_all_kernels` says whether they did.
+            They are made while the GPU has something to do.
+        used : (n_cells, n_intervals), optional
+            Which pairs are, where that is known.
         """
         self.fragments.upload()
         self.fragments.build_fragments()
-        self._kept = kept
-        ready = kept or kernels(self.fragments.wait_for_used())
-        self.fragments.merge_fragments(ready)
+        self._kept = None if used is not None else expected()
+        if self._kept is None and used is None:
+            used = self.fragments.wait_for_used()
+        self.fragments.merge_fragments(self._kept or kernels(used))
         self.lists = ListPasses(
             self.strip, self.fragments.search_blocks, self.fragments.atlas
         )
@@ -85,9 +91,8 @@ class FramePasses:
             (self.strip.buffers["COLOR_IN"], 0, picture),
             (*self.lists.totals, totals),
             (self.strip.buffers["STATS"], 0, self.fragments.stats),
+            (self.strip.buffers["USED"], 0, self.fragments.used_words),
         ]
-        if self._kept is not None:
-            parts.append((self.strip.buffers["USED"], 0, self.fragments.used_words))
         with self.strip.timer.wall("readback_ms"):
             self.strip.gpu.read_into(*parts)
         if self._kept is not None:

@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import MAX_LAYERS, MAX_LEVEL, THREADS
+from filter_service.constants import (
+    BITS_PER_WORD,
+    MAX_LAYERS,
+    MAX_LEVEL,
+    THREADS,
+    USED_PARTS,
+)
 from filter_service.errors import GridTooLarge
 from filter_service.gl.gpu import Atlas, Buffer, Gpu, Pages
 from filter_service.gl.stage_timer import StageTimer
@@ -21,6 +27,7 @@ from filter_service.rendering.frame_kernels import (
     part_table,
     work_list,
 )
+from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
 from filter_service.rendering.gl.strip import grid_of
 from filter_service.rendering.image_cells import (
     ImageCells,
@@ -74,12 +81,38 @@ class KernelMaker:
     def __init__(self, gpu: Gpu, slot: int = 0):
         self._gpu, self._slot = gpu, slot
         self._memory = f"kernels {slot}"
+        self._pairs = ExpectedPairs()
         self.forget()
 
     def forget(self) -> None:
         """Let go of what the last frame's kernels were made for."""
         self._made_for: tuple | None = None
         self._set: KernelSet | None = None
+        self._pairs.forget()
+
+    def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
+        """Take what a whole frame used, by which the next is told."""
+        self._pairs.note(state, words)
+
+    def expected(
+        self, store: PsfStore, pages: Pages, state: FrameState, timer: StageTimer
+    ) -> KernelSet | None:
+        """Return kernels that will serve a frame, it seems: the last, or new ones.
+
+        None where nothing is known, or where it pays to ask the GPU: a software
+        renderer does not keep one waiting.
+        """
+        kept = self.kept(pages, state.layers, state.image)
+        if kept is not None or self._gpu.is_software:
+            return kept
+        with timer.wall("psf_plan_ms"):
+            used = self._pairs.at(state)
+        if used is None:
+            return None
+        try:
+            return self.kernels(store, pages, state.layers, state.image, used, timer)
+        except KernelsTooLarge:
+            return None  # those that are really used may fit
 
     def kept(
         self, pages: Pages, layers: FrameLayers, image: ImageCells
@@ -230,7 +263,7 @@ def _records(
 
 
 def words_per_cell(layers: FrameLayers) -> int:
-    """32-bit words that note the used intervals of a cell.
+    """Words that note the used parts of a cell's intervals.
 
     Raises
     ------
@@ -243,10 +276,4 @@ def words_per_cell(layers: FrameLayers) -> int:
             f"{layers.layer_dpt[0]:g} and {layers.layer_dpt[-1]:g} dpt",
             allowed=f"{MAX_LAYERS} layers: a smaller pupil or fewer pixels per degree",
         )
-    return -(-interval_count(layers) // 32)
-
-
-def used_pairs(words: NDArray[np.uint32], layers: FrameLayers) -> NDArray[np.bool_]:
-    """Return used pairs (n_cells, n_intervals) from words (n_cells, n_words)."""
-    bits = np.unpackbits(words.astype("<u4").view(np.uint8), axis=1, bitorder="little")
-    return bits[:, : interval_count(layers)].astype(bool)
+    return -(-interval_count(layers) * USED_PARTS // BITS_PER_WORD)

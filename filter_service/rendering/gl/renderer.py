@@ -23,10 +23,11 @@ from filter_service.rendering.frame import (
 )
 from filter_service.rendering.frame_options import FrameOptions, frame_options
 from filter_service.rendering.frame_states import FrameStore
+from filter_service.rendering.gl.expected_pairs import FrameState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kept_eyes import KeptEye, KeptEyes
-from filter_service.rendering.gl.kernel_passes import KernelSet
+from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.image_cells import (
     ImageCells,
@@ -240,6 +241,8 @@ class FilterRenderer:
         with timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = kept.states.corner_change_dpt(timer, layers, image)
+        state = FrameState(layers, image, change_dpt)
+        used_words = np.zeros((image.count, words_per_cell(layers)), np.uint32)
         light = white_level(view.color)
         pictures: list[NDArray] = []
         counts: Counter[str] = Counter()
@@ -274,11 +277,13 @@ class FilterRenderer:
                 lambda used: kept.kernels.kernels(
                     handle.store, handle.pages, layers, image, used, timer
                 ),
-                kept.kernels.kept(handle.pages, layers, image),
+                lambda: kept.kernels.expected(handle.store, handle.pages, state, timer),
                 options.output,
             )
             pictures.append(seen[rows.kept])
             counts.update(passes.counts())
+            used_words |= passes.fragments.used_words
+        kept.kernels.note(state, used_words)
         picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
         rows, columns = (
             slice(border_px, border_px + n) for n in (view.height_px, view.width_px)
@@ -289,16 +294,17 @@ class FilterRenderer:
 def _run(
     passes_of: Callable[[], FramePasses],
     kernels: Callable[[NDArray[np.bool_]], KernelSet],
-    kept: KernelSet | None,
+    expected: Callable[[], KernelSet | None],
     output: str,
 ) -> tuple[FramePasses, NDArray]:
-    """Filter a strip with the kernels that there are; once more where some lack."""
+    """Filter a strip with the kernels that one expects; once more where some lack."""
     passes = passes_of()
-    passes.run(kernels, kept)
+    passes.run(kernels, expected=expected)
     picture = passes.read_back(output)
     if not passes.has_all_kernels:
+        used = passes.fragments.used
         passes = passes_of()
-        passes.run(kernels)
+        passes.run(kernels, used=used)
         picture = passes.read_back(output)
     return passes, picture
 

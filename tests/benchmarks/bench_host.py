@@ -1,0 +1,241 @@
+"""What a frame of the engine gl costs the processor: all passes run on nothing.
+
+    python -m tests.benchmarks.bench_host [--quick] [--json]
+
+Frames are filtered once for real; then every dispatch gets no work groups, while all
+else runs as it is: checks, plans, copies to and from the driver, calls of it.  What the
+passes had written stays, and which kernels a frame uses is put in its place, so that
+plans are those of real frames.  The shaders' variants, mapped memory and the way a
+frame is planned are a hardware GPU's, whatever the driver.
+
+- ``all``: the frame;
+- ``image copies``: between the caller's arrays and the driver's memory, GB/s beside it;
+- ``driver's copies``: between its buffers, barriers and waits, which a GPU does by
+  itself and a software driver on this processor;
+- ``rest``: Python, numpy, compiled loops and calls: what an issue is made of.
+
+"frozen": pupil and focus stay; "moving": they change with every frame.  The error is
+that of the real frames against the native engine, PSNR in linear light.  The number of
+dispatches, bindings, uniforms, copies and waits of a frame stands with its case.
+Least times stand beside medians: another process on a core shows in the latter.
+
+Writes results/host.json.
+"""
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from unittest.mock import patch
+
+import moderngl
+import numpy as np
+
+from filter_service.gl import gpu as gpu_module
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.staging import Staging
+from tests.benchmarks.bench_gpu import FOCUS_DPT, PUPIL_MM, REFERENCE, Case, open_case
+from tests.benchmarks.frame_runs import states_towards
+from tests.benchmarks.harness import Row, publish
+
+VIEWS = {"1280x720": ((1280, 720), 1), "2 x 1832x1920": ((1832, 1920), 2)}
+QUICK_VIEWS = {"192x108": ((192, 108), 1), "2 x 96x100": ((96, 100), 2)}
+EYES, QUICK_EYES = ("-6 dpt", "emmetropia"), ("emmetropia",)
+STATES = 4
+FRAMES, WARM_FRAMES = 200, 30
+PARTS = ("all", "image copies", "driver's copies", "rest")
+
+
+def hardware_like() -> Gpu:
+    """Return the context, used as a hardware GPU's is."""
+    gpu = Gpu()
+    gpu.is_software = False
+    gpu.use_staging(True)
+    return gpu
+
+
+class Clock:
+    """Times of named parts of a frame, ms, and how often things happened."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a frame."""
+        self.times_ms: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
+        self.copied_bytes = 0
+
+    def timed(self, part: str, function):
+        """Return a function whose time is added to a part."""
+
+        def call(*arguments, **options):
+            start_s = time.perf_counter()
+            try:
+                return function(*arguments, **options)
+            finally:
+                self.times_ms[part] += 1e3 * (time.perf_counter() - start_s)
+                self.counts[part] += 1
+
+        return call
+
+    def counted(self, name: str, function):
+        """Return a function whose calls are counted."""
+
+        def call(*arguments, **options):
+            self.counts[name] += 1
+            return function(*arguments, **options)
+
+        return call
+
+
+class NotedWords:
+    """What frames use, noted while they run for real and put in place afterwards."""
+
+    def __init__(self) -> None:
+        self.state = 0
+        self.is_real = True
+        self._words: dict[int, np.ndarray] = {}
+
+    def read(self, function):
+        """Return `Gpu.read_into` that notes the words, or puts them in place."""
+
+        def call(gpu, *parts):
+            function(gpu, *parts)
+            used = gpu._buffers.get("USED")
+            for buffer, _, out in parts:
+                if buffer is not used:
+                    continue
+                if self.is_real:
+                    self._words[self.state] = out.copy()
+                else:
+                    out[...] = self._words[self.state]
+
+        return call
+
+
+@contextmanager
+def empty_passes(clock: Clock) -> Iterator[None]:
+    """Within, dispatches have no groups; copies are timed, calls are counted."""
+
+    def run(shader, *_groups):
+        clock.counts["dispatches"] += 1
+        shader.mglo.run(0, 0, 0)
+
+    def copy(target, source):
+        clock.copied_bytes += source.size
+        np.copyto(target, source)
+
+    compute = moderngl.ComputeShader
+    context, buffer = moderngl.Context, moderngl.Buffer
+    changes = [
+        (compute, "run", run),
+        (compute, "run_indirect", run),
+        (gpu_module, "copy_bytes", clock.timed("image copies", copy)),
+        (Staging, "_copy", clock.timed("driver's copies", Staging._copy)),
+        *(
+            (context, name, clock.timed(name, getattr(context, name)))
+            for name in ("memory_barrier", "finish")
+        ),
+        (
+            buffer,
+            "bind_to_storage_buffer",
+            clock.counted("bindings", buffer.bind_to_storage_buffer),
+        ),
+        (
+            moderngl.Uniform,
+            "value",
+            moderngl.Uniform.value.setter(
+                clock.counted("uniforms", moderngl.Uniform.value.fset)
+            ),
+        ),
+    ]
+    with ExitStack() as stack:
+        for where, name, what in changes:
+            stack.enter_context(patch.object(where, name, what))
+        yield
+
+
+def case_rows(case: Case, is_moving: bool, count: int) -> Iterator[Row]:
+    """Times of an eye's frames on nothing."""
+    spec = case.handles[0].store.spec
+    states = states_towards(spec, PUPIL_MM, FOCUS_DPT, STATES if is_moving else 1)
+    words, clock = NotedWords(), Clock()
+    frames = []
+    with patch.object(Gpu, "read_into", words.read(Gpu.read_into)):
+        for words.state, state in enumerate(states):
+            case.frame(state)
+        words.is_real = False
+        with empty_passes(clock):
+            for k in range(WARM_FRAMES + count):
+                words.state = k % len(states)
+                clock.clear()
+                total_ms, stages_ms = case.frame(states[words.state])
+                if k >= WARM_FRAMES:
+                    frames.append((total_ms, clock.times_ms, stages_ms))
+    yield from _rows(case, is_moving, frames, clock)
+
+
+def _rows(case: Case, is_moving: bool, frames: list, clock: Clock) -> Iterator[Row]:
+    told = ", ".join(
+        f"{clock.counts[name]} {said}"
+        for name, said in (
+            ("dispatches", "dispatches"),
+            ("bindings", "bindings"),
+            ("uniforms", "uniforms"),
+            ("driver's copies", "copies"),
+            ("finish", "waits"),
+        )
+    )
+    times_ms = {name: [] for name in PARTS}
+    for total_ms, parts_ms, _ in frames:
+        copies_ms = parts_ms["image copies"]
+        driver_ms = sum(
+            parts_ms[name] for name in ("driver's copies", "memory_barrier", "finish")
+        )
+        values = (total_ms, copies_ms, driver_ms, total_ms - copies_ms - driver_ms)
+        for name, value in zip(PARTS, values, strict=True):
+            times_ms[name].append(value)
+    gigabytes_s = clock.copied_bytes / 1e6 / np.median(times_ms["image copies"])
+    said = {"all": told, "image copies": f"{gigabytes_s:.1f} GB/s"}
+    said["rest"] = f"least {np.min(times_ms['rest']):.2f} ms"
+    plans_ms = [stages_ms.get("psf_plan_ms", 0.0) for *_, stages_ms in frames]
+    times_ms["plans of it"] = plans_ms
+    for name, values in times_ms.items():
+        setting = f"{case.setting} {'moving' if is_moving else 'frozen'}"
+        yield Row(
+            bench="host",
+            method=name,
+            case=case.eye,
+            setting=f"{setting}; {said[name]}" if name in said else setting,
+            n=len(values),
+            median_ms=float(np.median(values)),
+            p95_ms=float(np.percentile(values, 95)),
+            memory_mb=case.memory_mb,
+            error_name="psnr_db",
+            error=case.error_db,
+            reference=REFERENCE,
+        )
+
+
+def main() -> None:
+    """Run, print, and write tests/benchmarks/results/host.json."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="small frames, few")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    gpu, rows = hardware_like(), []
+    views = QUICK_VIEWS if options.quick else VIEWS
+    for setting, (size_px, view_count) in views.items():
+        for eye in QUICK_EYES if options.quick else EYES:
+            case = open_case(gpu, eye, setting, size_px, view_count)
+            for is_moving in (False, True):
+                rows += case_rows(case, is_moving, 20 if options.quick else FRAMES)
+            for handle in case.handles:
+                handle.release()
+    publish("host", rows, as_json=options.json, is_whole=not options.quick)
+
+
+if __name__ == "__main__":
+    main()
