@@ -88,15 +88,16 @@ class Gpu:
 
     def close(self) -> None:
         """Free everything; the object is of no use afterwards."""
-        for buffer in self._buffers.values():
-            buffer.release()
+        with self.context:  # without one, the driver frees nothing
+            for memory in (*self._buffers.values(), *self._atlases.values()):
+                memory.release()
+            for program in self._programs.values():
+                program.release()
+            for block in (self._staging or {}).values():
+                block.release()
         self._buffers.clear()
-        for atlas in self._atlases.values():
-            atlas.release()
         self._atlases.clear()
         self._programs.clear()
-        for block in (self._staging or {}).values():
-            block.release()
         self.context.release()
 
     # ----- buffers

@@ -164,6 +164,11 @@ class CachePlan:
         """Number of the field node that is nearest to the direction of gaze."""
         return int(np.argmin(np.hypot(*self.field_nodes_deg)))
 
+    @cached_property
+    def has_limits(self) -> bool:
+        """Whether any group's blur is drawn smaller than it is."""
+        return bool(self.is_limited.any())
+
     @property
     def group_shape(self) -> tuple[int, int, int, int]:
         """Numbers of nodes (v, h, pupil, accommodation)."""

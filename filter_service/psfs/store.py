@@ -227,6 +227,8 @@ def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64
 
 
 def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
+    if not store.plan.has_limits:
+        return ()
     limited = store.plan.is_limited.reshape(store.plan.group_shape)
     if not any(limited[:, :, pupil, used].any() for pupil, used, _ in corners):
         return ()

@@ -48,13 +48,15 @@ UPLOAD_LINES = 512
 class GlStore(FrameStore):
     """A store whose kernels are on the GPU."""
 
+    gpu: Gpu
     pages: Pages
     is_released: bool = False
 
     def release(self) -> None:
         """Free the GPU copy."""
         object.__setattr__(self, "is_released", True)
-        self.pages.release()
+        with self.gpu.context:  # without one, the driver frees nothing
+            self.pages.release()
 
 
 class FilterRenderer:
@@ -107,11 +109,12 @@ class FilterRenderer:
                     self._gpu.write_pages(pages, first, lines)
                 yield None
         except GeneratorExit:
-            pages.release()
+            with self._gpu.context:
+                pages.release()
             raise
         _ = store.defocus, store.tables  # made here and not by the first frame
         yield GlStore(
-            store=store, pages=pages, image=image_cells(store.spec, store.plan)
+            store=store, gpu=self._gpu, pages=pages, image=image_cells(store.spec, store.plan)
         )
 
     def render(
