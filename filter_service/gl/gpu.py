@@ -1,5 +1,9 @@
 """The OpenGL context, buffers and programs: the home of moderngl."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +72,7 @@ class Gpu:
         self._uniforms: dict[moderngl.ComputeShader, dict] = {}
         self._queries: list[moderngl.Query] = []
         self._owners: dict[str, object] = {}
+        self._reads: list[_Read] = []
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
         # On a software renderer all memory is the host's: a copy more gains nothing.
         self.use_staging(not self.is_software)
@@ -238,24 +243,46 @@ class Gpu:
 
     def read_into(self, *parts: tuple[moderngl.Buffer, int, NDArray]) -> None:
         """Fill arrays from buffers, each from a byte on; waits for the GPU once."""
+        self.begin_read(*parts)()
+
+    def begin_read(
+        self, *parts: tuple[moderngl.Buffer, int, NDArray]
+    ) -> Callable[[], None]:
+        """Have buffers sent; call what is returned to wait for it and fill the arrays.
+
+        What is dispatched between may change the buffers.  Without mapped memory it is
+        done at once.
+        """
         parts = tuple(part for part in parts if part[2].nbytes)
         if self._staging is None:
             for buffer, offset, out in parts:
                 buffer.read_into(_bytes_of(out), size=out.nbytes, offset=offset)
-            return
+            return lambda: None
         block = self._staging["from"]
         room = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
-        first, free = block.take(room)
-        starts, start = [], 0
+        if not block.has_room(room):
+            for waiting in tuple(self._reads):
+                self._end_read(waiting)
+        start, free = block.take(room)
+        targets, at = [], 0
         for buffer, offset, out in parts:
-            block.copy_from(buffer, offset, first + start, out.nbytes)
-            starts.append(start)
-            start += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
-        self.context.finish()
-        for (_, _, out), start in zip(parts, starts, strict=True):
-            copy_bytes(_bytes_of(out), free[start : start + out.nbytes])
-        for block in self._staging.values():
-            block.reset()  # nothing waits any more
+            block.copy_from(buffer, offset, start + at, out.nbytes)
+            targets.append((_bytes_of(out), free[at : at + out.nbytes]))
+            at += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
+        waiting = _Read(block.fence(), targets)
+        self._reads.append(waiting)
+        return partial(self._end_read, waiting)
+
+    def _end_read(self, waiting: "_Read") -> None:
+        if not any(one is waiting for one in self._reads):
+            return
+        self._reads = [one for one in self._reads if one is not waiting]
+        self._staging["from"].wait(waiting.fence)
+        for target, source in waiting.targets:
+            copy_bytes(target, source)
+        if not self._reads:
+            for block in self._staging.values():
+                block.reset()  # nothing waits any more
 
     @property
     def memory_mb(self) -> float:
@@ -358,6 +385,13 @@ class Gpu:
             raise OutOfGpuMemory(f"{where}: {error}")
         if error != "GL_NO_ERROR":
             raise RenderFailed(f"{where}: {error}")
+
+
+class _Read(NamedTuple):
+    """What was sent: after a fence, to arrays from mapped memory."""
+
+    fence: int
+    targets: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
 def _bytes_of(array: NDArray) -> NDArray[np.uint8]:

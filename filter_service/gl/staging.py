@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.errors import OutOfGpuMemory
+from filter_service.errors import OutOfGpuMemory, RenderFailed
 
 if TYPE_CHECKING:
     import moderngl
@@ -30,6 +30,15 @@ ALIGNMENT = 256
 
 FIRST_BYTES = 1 << 20
 
+MOST_BYTES = 1 << 29
+"""A block grows to hold what is in flight, up to this; then it waits, and starts anew.
+"""
+
+GL_SYNC_GPU_COMMANDS_COMPLETE = 0x9117
+GL_SYNC_FLUSH_COMMANDS_BIT = 0x1
+GL_TIMEOUT_EXPIRED, GL_WAIT_FAILED = 0x911B, 0x911D
+WAIT_NS = 1_000_000_000
+
 _uint, _size, _pointer = ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p
 _SIGNATURES = {
     "glGenBuffers": (None, ctypes.c_int, _pointer),
@@ -38,6 +47,10 @@ _SIGNATURES = {
     "glBufferStorage": (None, _uint, _size, _pointer, _uint),
     "glMapBufferRange": (_pointer, _uint, _size, _size, _uint),
     "glCopyBufferSubData": (None, _uint, _uint, _size, _size, _size),
+    "glFenceSync": (_pointer, _uint, _uint),
+    "glClientWaitSync": (_uint, _pointer, _uint, ctypes.c_uint64),
+    "glDeleteSync": (None, _pointer),
+    "glFlush": (None,),
 }
 
 
@@ -95,6 +108,33 @@ class Staging:
         """Give out the block from its start; the caller knows that no copy waits."""
         self._used = 0
 
+    def has_room(self, n_bytes: int) -> bool:
+        """Whether so many bytes are free."""
+        return self._used + n_bytes <= self.size
+
+    def fence(self) -> int:
+        """Return a mark behind all that the GPU was told; it begins with that now."""
+        mark = self._calls["glFenceSync"](GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
+        self._calls["glFlush"]()
+        return int(mark)
+
+    def wait(self, mark: int) -> None:
+        """Wait until the GPU has come to a mark, which is of no use afterwards.
+
+        Raises
+        ------
+        RenderFailed
+            The driver cannot wait: it has lost the GPU.
+        """
+        found = GL_TIMEOUT_EXPIRED
+        while found == GL_TIMEOUT_EXPIRED:
+            found = self._calls["glClientWaitSync"](
+                mark, GL_SYNC_FLUSH_COMMANDS_BIT, WAIT_NS
+            )
+        self._calls["glDeleteSync"](mark)
+        if found == GL_WAIT_FAILED:
+            raise RenderFailed("the driver cannot wait for the GPU")
+
     def take(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
         """Return the place of free bytes and the bytes.
 
@@ -105,10 +145,11 @@ class Staging:
         OutOfGpuMemory
             The driver maps no block of that size.
         """
-        if self._used + n_bytes > self.size:
+        if not self.has_room(n_bytes):
             self._context.finish()
-            if n_bytes > self.size:
-                self._allocate(max(2 * n_bytes, FIRST_BYTES))
+            wanted = max(2 * (self._used + n_bytes), FIRST_BYTES)
+            if n_bytes > self.size or wanted <= MOST_BYTES:
+                self._allocate(max(min(wanted, MOST_BYTES), n_bytes))
             self._used = 0
         start = self._used
         self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT

@@ -136,9 +136,9 @@ def test_frames_whose_state_changes_wait_once(hardware, store, monkeypatch):
     renderer = FilterRenderer(hardware)
     handle = renderer.load(store)
     renderer.render(view, handle, **states[0])
-    waits, read = [], hardware.read_into
+    waits, read = [], hardware.begin_read
     monkeypatch.setattr(
-        hardware, "read_into", lambda *parts: (waits.append(1), read(*parts))
+        hardware, "begin_read", lambda *parts: waits.append(1) or read(*parts)
     )
     for state, wanted in zip(states[1:], expected[1:], strict=True):
         waits.clear()
@@ -156,9 +156,9 @@ def test_a_moving_scene_is_whole_and_told_by_its_neighbours(
     view = scene_view("courtyard", **SIZE)
     renderer = FilterRenderer(hardware)
     handle = renderer.load(store)
-    waits, read = [], hardware.read_into
+    waits, read = [], hardware.begin_read
     monkeypatch.setattr(
-        hardware, "read_into", lambda *parts: (waits.append(1), read(*parts))
+        hardware, "begin_read", lambda *parts: waits.append(1) or read(*parts)
     )
     counts = []
     for k in range(6):

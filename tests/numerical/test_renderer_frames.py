@@ -217,9 +217,9 @@ def test_two_eyes_in_turn_find_their_kernels_again(gl_engine, rng):
 
 def reads_of(gpu, monkeypatch):
     """Return the list that each wait for the GPU is noted in."""
-    noted, read = [], gpu.read_into
+    noted, read = [], gpu.begin_read
     monkeypatch.setattr(
-        gpu, "read_into", lambda *parts: (noted.append(len(parts)), read(*parts))
+        gpu, "begin_read", lambda *parts: noted.append(len(parts)) or read(*parts)
     )
     return noted
 

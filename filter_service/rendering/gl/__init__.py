@@ -1,6 +1,8 @@
 """The frame engine of OpenGL compute shaders.
 
-renderer         the engine: layers, strips, the answer
+renderer         the engine: stores, frames, the answer
+frame_run        a view begun, and finished later
+strips           a frame cut so that its buffers fit
 strip            a frame or strip: size and buffers
 fragment_passes  pixels to fragments
 list_passes      lists, order, splat

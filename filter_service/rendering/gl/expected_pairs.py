@@ -47,6 +47,10 @@ def part_edges_dpt(layers: FrameLayers) -> NDArray[np.float64]:
     return np.interp(places, np.arange(ends_dpt.size), ends_dpt)
 
 
+def _is_same(one: FrameState, other: FrameState) -> bool:
+    return one.layers is other.layers and one.image is other.image
+
+
 class ExpectedPairs:
     """Used pairs (n_cells, n_intervals) of an eye's next frame."""
 
@@ -68,6 +72,9 @@ class ExpectedPairs:
             used = used_pairs(words, told.shape[1])
             is_wrong = bool(np.any(used & ~told))
             self._moving = MOVING_FRAMES if is_wrong else max(self._moving - 1, 0)
+        last = self._last
+        if last is not None and _is_same(last[0], state):
+            words = words | last[1]  # of another view of the eye, or a scene that moves
         self._last, self._told = (state, words), None
 
     def at(self, state: FrameState) -> NDArray[np.bool_] | None:

@@ -25,6 +25,10 @@ ENCODERS = {
 """How a picture is packed: pass, pixels a thread (for RGB words), dtype."""
 
 
+PASSES = "buffers of the passes"
+"""Claimed by whoever runs them, see `Gpu.claim`."""
+
+
 class FramePasses:
     """All passes of one strip, in order.
 
@@ -39,8 +43,10 @@ class FramePasses:
         self.strip = strip
         self.fragments = fragments
         self.lists: ListPasses | None = None
-        self.has_all_kernels = True
         self._kept: KernelSet | None = None
+        self._output = ""
+        self._arrived: Callable[[], None] = lambda: None
+        self._picture, self._totals = np.zeros(0), np.zeros(0, np.uint32)
 
     def run(
         self,
@@ -57,11 +63,12 @@ class FramePasses:
             From the used (cell, interval) pairs to the kernels for them.
         expected : callable, optional
             To kernels that may serve, if there are some: then nothing is read in the
-            middle of the frame, and in the end `has_all_kernels` says whether they did.
-            They are made while the GPU has something to do.
+            middle of the frame, and in the end it is seen whether they did.  They are
+            made while the GPU has something to do.
         used : (n_cells, n_intervals), optional
             Which pairs are, where that is known.
         """
+        self.strip.gpu.claim(PASSES, self)
         self.fragments.upload()
         self.fragments.build_fragments()
         self._kept = None if used is not None else expected()
@@ -75,29 +82,44 @@ class FramePasses:
 
     def read_back(self, output: str) -> NDArray:
         """Fetch the filtered picture, encoded as asked, and all that was counted."""
-        width, height = self.strip.size
-        picture = np.empty((height, width, RGB), ENCODERS[output][2])
-        if not self._fetch(picture, output) and self.has_all_kernels:
-            self.lists.splat_bands()
-            self._fetch(picture, output)
-        return picture
+        self.begin_read(output)
+        return self.end_read()
 
-    def _fetch(self, picture: NDArray, output: str) -> bool:
-        """Fill a picture, and note what was counted; whether it is whole."""
-        name, pixels_per_thread, _ = ENCODERS[output]
+    def begin_read(self, output: str) -> None:
+        """Have the picture and the counts sent."""
+        self._output = output
+        name, pixels_per_thread, dtype = ENCODERS[output]
         self._encode(name, pixels_per_thread)
-        totals = np.empty(TOTAL_WORDS, np.uint32)
-        parts = [
-            (self.strip.buffers["COLOR_IN"], 0, picture),
-            (*self.lists.totals, totals),
-            (self.strip.buffers["STATS"], 0, self.fragments.stats),
-            (self.strip.buffers["USED"], 0, self.fragments.used_words),
-        ]
+        width, height = self.strip.size
+        self._picture = np.empty((height, width, RGB), dtype)
+        self._totals = np.empty(TOTAL_WORDS, np.uint32)
         with self.strip.timer.wall("readback_ms"):
-            self.strip.gpu.read_into(*parts)
-        if self._kept is not None:
-            self.has_all_kernels = not self._kept.lacks(self.fragments.used)
-        return self.lists.take_totals(totals)
+            self._arrived = self.strip.gpu.begin_read(
+                (self.strip.buffers["COLOR_IN"], 0, self._picture),
+                (*self.lists.totals, self._totals),
+                (self.strip.buffers["STATS"], 0, self.fragments.stats),
+                (self.strip.buffers["USED"], 0, self.fragments.used_words),
+            )
+
+    def end_read(self) -> NDArray | None:
+        """Return the picture; None where the strip must be done again.
+
+        That is where a kernel was lacking, or where the lists did not fit and other
+        passes have run since.
+        """
+        with self.strip.timer.wall("readback_ms"):
+            self._arrived()
+        if self._kept is not None and self._kept.lacks(self.fragments.used):
+            return None
+        if self.lists.take_totals(self._totals):
+            return self._picture
+        if not self.strip.gpu.is_owner(PASSES, self):
+            return None
+        self.lists.splat_bands()
+        self.begin_read(self._output)
+        with self.strip.timer.wall("readback_ms"):
+            self._arrived()
+        return self._picture
 
     def _encode(self, name: str, pixels_per_thread: int) -> None:
         with self.strip.timer.stage("encode_ms"):

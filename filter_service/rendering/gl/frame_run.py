@@ -1,0 +1,248 @@
+"""One view on its way through the GPU: begun, and finished when its picture is wanted.
+
+Between the two the processor is free for another view.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.stage_timer import StageTimer
+from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame_options import FrameOptions
+from filter_service.rendering.gl.expected_pairs import FrameState
+from filter_service.rendering.gl.fragment_passes import FragmentPasses
+from filter_service.rendering.gl.frame_passes import FramePasses
+from filter_service.rendering.gl.kept_eyes import KeptEye
+from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
+from filter_service.rendering.gl.strip import Strip
+from filter_service.rendering.gl.strips import Rows, counted_px, cut_in_strips
+from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
+from filter_service.rendering.white_level import white_level
+from filter_service.rgbd_view import RgbdView
+
+Counts = dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What all strips of a frame share."""
+
+    whole: RgbdView
+    border_px: int
+    state: FrameState
+    white_level: float
+    strips: list[Rows]
+
+
+class FrameRun:
+    """A view of an eye in a state.
+
+    The GPU counts the pixels without depth.  A frame that turns out to have some is
+    done again with their depth filled in.
+
+    Parameters
+    ----------
+    fill_depth : bool
+        Look for them first, as the frame before had some.
+
+    Attributes
+    ----------
+    layers : FrameLayers
+    """
+
+    def __init__(
+        self,
+        gpu: Gpu,
+        kept: KeptEye,
+        view: RgbdView,
+        options: FrameOptions,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        fill_depth: bool,
+    ):
+        self.timer = StageTimer(gpu)
+        self._gpu, self._kept, self._options = gpu, kept, options
+        self._missing_count: int | None = None
+        self.layers: FrameLayers = kept.states.layers(
+            self.timer, kept.handle, pupil_diameter_mm, focus_dpt, options.tolerance
+        )
+        with self.timer.wall("prepare_ms"):
+            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
+                view = replace(view, hidden_color=None, hidden_depth_m=None)
+        self._view = view
+        if fill_depth:
+            self._fill_depth()
+        self._begun = self._begin()
+
+    def finish(self) -> tuple[NDArray, Counts]:
+        """Return picture and counts."""
+        picture, counts = self._begun_or_whole()
+        if self._missing_count is None and counts["missing_depth_count"]:
+            self._fill_depth()
+            picture, counts = self._whole()
+        if self._missing_count is not None:
+            counts = {**counts, "missing_depth_count": self._missing_count}
+        return picture, counts
+
+    def _fill_depth(self) -> None:
+        with self.timer.wall("prepare_ms"):
+            depth_m, self._missing_count = fill_missing_depth(self._view.depth_m)
+            self._view = replace(self._view, depth_m=depth_m)
+
+    def _begin(self) -> "_StripRun | None":
+        """Begin a frame of one strip; others are done when they are wanted."""
+        plan = self._plan()
+        if len(plan.strips) > 1:
+            return None
+        begun = _StripRun(self, plan, plan.strips[0])
+        try:
+            begun.begin()
+        except KernelsTooLarge:
+            self._kept.states.coarsen(plan.state.image)
+            return None
+        return begun
+
+    def _begun_or_whole(self) -> tuple[NDArray, Counts]:
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            try:
+                return self._joined(begun.plan, [begun])
+            except KernelsTooLarge:
+                self._kept.states.coarsen(begun.plan.state.image)
+        return self._whole()
+
+    def _whole(self) -> tuple[NDArray, Counts]:
+        """Do the frame; with larger cells where kernels take too much memory."""
+        while True:
+            plan = self._plan()
+            runs = [_StripRun(self, plan, rows) for rows in plan.strips]
+            try:
+                return self._joined(plan, runs)
+            except KernelsTooLarge:
+                self._kept.states.coarsen(plan.state.image)
+
+    def _plan(self) -> _Plan:
+        kept, view = self._kept, self._view
+        image = kept.states.cells(self.timer, kept.handle, self._options.gaze_deg)
+        stretch_ratio = image.maps.largest_stretch_ratio
+        reach_px = ceil(stretch_ratio * self.layers.max_radius_px) + 2
+        border_px = border_px_of(view, reach_px)
+        with self.timer.wall("prepare_ms"):
+            whole = extended(view, border_px)
+        change_dpt = kept.states.corner_change_dpt(self.timer, self.layers, image)
+        return _Plan(
+            whole,
+            border_px,
+            FrameState(self.layers, image, change_dpt),
+            white_level(view.color),
+            cut_in_strips(whole, reach_px, self._gpu.max_block_bytes),
+        )
+
+    def _joined(self, plan: _Plan, runs: "list[_StripRun]") -> tuple[NDArray, Counts]:
+        """Finish strips, and put their pictures together."""
+        pictures, counts = [], Counter[str]()
+        shape = (plan.state.image.count, words_per_cell(self.layers))
+        used_words = np.zeros(shape, np.uint32)
+        for run in runs:
+            pictures.append(run.finish()[run.rows.kept])
+            counts.update(run.passes.counts())
+            used_words |= run.passes.fragments.used_words
+        self._kept.kernels.note(plan.state, used_words)
+        picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
+        rows, columns = (
+            slice(plan.border_px, plan.border_px + n)
+            for n in (self._view.height_px, self._view.width_px)
+        )
+        return np.ascontiguousarray(picture[rows, columns]), dict(counts)
+
+    # ----- what its strips ask for
+
+    def passes_of(self, plan: _Plan, rows: Rows) -> FramePasses:
+        """Return the passes of a strip."""
+        image, options = plan.state.image, self._options
+        strip = Strip(
+            self._gpu,
+            rows.view,
+            self.timer,
+            layers=self.layers,
+            paper_rule=options.paper_rule,
+        )
+        fragments = FragmentPasses(
+            strip,
+            image=image,
+            corner_change_dpt=plan.state.change_dpt,
+            tolerance=options.tolerance if options.merge else 0.0,
+            first_row=rows.first_row,
+            frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
+            image_size_px=(self._view.width_px, self._view.height_px),
+            border_px=plan.border_px,
+            counted_px=counted_px(rows, self._view, plan.border_px),
+            object_range_dpt=_prepared_range_dpt(self._kept.handle.store),
+            white_level=plan.white_level,
+            is_encoded=options.is_encoded,
+        )
+        return FramePasses(strip, fragments)
+
+    def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
+        """Return kernels for used pairs."""
+        handle = self._kept.handle
+        return self._kept.kernels.kernels(
+            handle.store, handle.pages, self.layers, image, used, self.timer
+        )
+
+    def expected(self, state: FrameState) -> KernelSet | None:
+        """Return kernels that will serve, it seems."""
+        handle = self._kept.handle
+        return self._kept.kernels.expected(
+            handle.store, handle.pages, state, self.timer
+        )
+
+    @property
+    def output(self) -> str:
+        """How the picture is encoded."""
+        return self._options.output
+
+
+class _StripRun:
+    """A strip with the kernels that one expects; once more where some lack."""
+
+    def __init__(self, frame: FrameRun, plan: _Plan, rows: Rows):
+        self._frame, self.plan, self.rows = frame, plan, rows
+        self.passes = frame.passes_of(plan, rows)
+        self._is_begun = False
+
+    def begin(self) -> None:
+        """Have the GPU do it, and send the picture."""
+        self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
+        self.passes.begin_read(self._frame.output)
+        self._is_begun = True
+
+    def finish(self) -> NDArray:
+        """Return the picture."""
+        if not self._is_begun:
+            self.begin()
+        picture = self.passes.end_read()
+        if picture is None:
+            used = self.passes.fragments.used
+            self.passes = self._frame.passes_of(self.plan, self.rows)
+            self._run(self.passes, used=used)
+            picture = self.passes.read_back(self._frame.output)
+        return picture
+
+    def _run(self, passes: FramePasses, **options) -> None:
+        image = self.plan.state.image
+        passes.run(lambda used: self._frame.kernels(image, used), **options)
+
+
+def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
+    """Object distances that a store is for, with room for rounding."""
+    low_dpt, high_dpt = store.spec.object_range_dpt
+    margin = 1e-6 * max(high_dpt, 1.0)
+    return low_dpt - margin, high_dpt + margin

@@ -1,0 +1,83 @@
+"""A frame cut into strips of rows whose buffers fit the GPU's storage blocks."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from filter_service.constants import BIN_SIZE_PX, TILE_SIZE_PX
+from filter_service.errors import OutOfGpuMemory
+from filter_service.rendering.frame import IMAGES
+from filter_service.rgbd_view import RgbdView
+
+BYTES_PER_PIXEL = 16
+"""Of the largest buffers, per pixel and surface: a strip's must fit a storage block."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a frame that go through the passes together.
+
+    ``view`` has the rows that send light to those ``kept``, which are the strip's part
+    of the picture.
+    """
+
+    view: RgbdView
+    first_row: int
+    kept: slice
+
+
+def cut_in_strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[Rows]:
+    """Cut a frame so that each strip's buffers fit a storage block.
+
+    Strips start on rows of bins, so that lists and merged squares are the whole's.
+    """
+    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
+    padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
+    rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
+    rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
+    if rows >= view.height_px:
+        return [Rows(view, 0, slice(None))]
+    step = rows - 2 * halo
+    if step < BIN_SIZE_PX:
+        raise OutOfGpuMemory(
+            f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
+            f"a storage block of {max_block_bytes / 1e6:.0f} MB"
+        )
+    strips = []
+    for top in range(0, view.height_px, step):
+        bottom = min(top + step, view.height_px)
+        first, last = max(top - halo, 0), min(bottom + halo, view.height_px)
+        strips.append(
+            Rows(
+                view=_rows_of(view, first, last),
+                first_row=first,
+                kept=slice(top - first, bottom - first),
+            )
+        )
+    return strips
+
+
+def _rows_of(view: RgbdView, first: int, last: int) -> RgbdView:
+    """Rows first..last of a view, with the tangents of their edges."""
+    left, right, up, down = view.tangents
+    per_row = (down - up) / view.height_px
+    images = {
+        name: np.ascontiguousarray(image[first:last])
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
+    return replace(
+        view,
+        **images,
+        tangents=(left, right, up + first * per_row, up + last * per_row),
+    )
+
+
+def counted_px(rows: Rows, view: RgbdView, border_px: int) -> tuple[int, int, int, int]:
+    """Pixels (left, top, right, bottom) of a strip that are its part of the image."""
+    top, bottom = (
+        border_px - rows.first_row,
+        border_px + view.height_px - rows.first_row,
+    )
+    first, last, _ = rows.kept.indices(rows.view.height_px)
+    return border_px, max(top, first), border_px + view.width_px, min(bottom, last)
