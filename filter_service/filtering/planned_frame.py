@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.stream_eyes import RenderPlan
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
-from filter_service.rendering.media_effects import MediaEffects, render_through_media
+from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.media_effects import MediaEffects, begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, Output
 
@@ -53,31 +55,54 @@ class PlannedFrame:
         RenderError
             The engine failed.
         """
+        return self.begin(
+            gazes_deg=gazes_deg,
+            output=output,
+            accumulation=accumulation,
+            merge=merge,
+            render_tolerance=render_tolerance,
+            out=out,
+        )()
+
+    def begin(
+        self,
+        *,
+        gazes_deg: Sequence[GazeDegrees],
+        out: Sequence[NDArray[Any] | None] | None = None,
+        **options: Any,
+    ) -> Callable[[], Filtered]:
+        """Begin the frame, as `render` takes it; call what is returned for the answer.
+
+        Other eyes' frames may be begun between.
+        """
         plan = self.plan
         rooms = out or [None] * len(self.views)
         started_s = time.monotonic()
         effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
-        rendered = [
-            render_through_media(
+        begun = [
+            begin_through_media(
                 self.workshop.engine,
                 view,
                 store,
                 effects,
                 pupil_diameter_mm=self.pupil_diameter_mm,
                 focus_dpt=self.focus_dpt,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
-                output=output,
                 gaze_deg=gaze_deg,
                 out=room,
+                **options,
             )
             for view, store, gaze_deg, room in zip(
                 self.views, plan.stores, gazes_deg, rooms, strict=True
             )
         ]
+        return partial(self._finish, begun, started_s)
+
+    def _finish(
+        self, begun: Sequence[Callable[[], FilteredView]], started_s: float
+    ) -> Filtered:
+        rendered = [finish() for finish in begun]
         self.workshop.frame_s = time.monotonic() - started_s
-        return _filtered(plan, rendered)
+        return _filtered(self.plan, rendered)
 
 
 def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:

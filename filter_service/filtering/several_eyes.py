@@ -87,19 +87,26 @@ class PlannedViews:
         render_tolerance: float = 1.0,
         out: Sequence[NDArray[Any] | None] | None = None,
     ) -> SeenViews:
-        """Filter the frame, one eye after the other; see `EyeFilter.filter`."""
+        """Filter the frame, all eyes begun before one is finished.
+
+        See `EyeFilter.filter`.
+        """
         found: dict[EyeName, Filtered] = {}
         views: dict[int, SeenView] = {}
-        for eye, planned in self.by_eye.items():
-            indices = self.indices[eye]
-            found[eye] = seen = planned.render(
-                gazes_deg=[self.gazes_deg[i] for i in indices],
+        begun = {
+            eye: planned.begin(
+                gazes_deg=[self.gazes_deg[i] for i in self.indices[eye]],
                 output=output,
                 accumulation=accumulation,
                 merge=merge,
                 render_tolerance=render_tolerance,
-                out=None if out is None else [out[i] for i in indices],
+                out=None if out is None else [out[i] for i in self.indices[eye]],
             )
+            for eye, planned in self.by_eye.items()
+        }
+        for eye, finish in begun.items():
+            indices = self.indices[eye]
+            found[eye] = seen = finish()
             for i, color, gaze_deg in zip(
                 indices, seen.colors, seen.gazes_deg, strict=True
             ):

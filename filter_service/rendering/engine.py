@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from numpy.typing import NDArray
 
@@ -102,3 +102,18 @@ class FrameEngine(Protocol):
         FilterError
             `BadMessage`, `CameraMismatch` or another `RenderError`.
         """
+
+
+def begin_view(
+    engine: FrameEngine, view: RgbdView, handle: Any, **options: Any
+) -> Callable[[], Rendered]:
+    """Have an engine begin with a view; call what is returned for the answer.
+
+    Where an engine can, other views may be begun between (its ``begin``, with the
+    arguments of `FrameEngine.render`); else the view is done at once.
+    """
+    begin = getattr(engine, "begin", None)
+    if begin is not None:
+        return cast(Callable[[], Rendered], begin(view, handle, **options))
+    seen = engine.render(view, handle, **options)
+    return lambda: seen

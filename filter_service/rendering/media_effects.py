@@ -6,8 +6,9 @@ Spectacles draw the view anew before the eye filters it, media change its light 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +18,7 @@ from estimator.media.absorption import channel_gains
 from estimator.media.straylight import Straylight
 from estimator.profiles.parse import EyeProfile
 from filter_service.displays import display_wavelengths_nm
-from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.engine import FrameEngine, Rendered, begin_view
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.haze import add_haze, in_threads
 from filter_service.rendering.spectacles import (
@@ -71,7 +72,15 @@ class MediaEffects:
             color *= np.array(self.gain_ratio, np.float32)
 
 
-def render_through_media(
+def render_through_media(*arguments: Any, **options: Any) -> FilteredView:
+    """Filter a view as `FrameEngine.render` does, with effects that are asked for.
+
+    Arguments are those of `begin_through_media`.
+    """
+    return begin_through_media(*arguments, **options)()
+
+
+def begin_through_media(
     engine: FrameEngine,
     view: RgbdView,
     handle: Any,
@@ -80,18 +89,27 @@ def render_through_media(
     output: str,
     out: NDArray[Any] | None = None,
     **options: Any,
-) -> FilteredView:
-    """Filter a view as `FrameEngine.render` does, with effects that are asked for."""
+) -> Callable[[], FilteredView]:
+    """Begin a view as `begin_view` does, with effects that are asked for."""
     if effects is None:
-        found = engine.render(view, handle, output=output, out=out, **options)
-        return cast(FilteredView, found)
+        begun = begin_view(engine, view, handle, output=output, out=out, **options)
+        return cast(Callable[[], FilteredView], begun)
     started_s = time.perf_counter()
     if effects.magnification_ratio is not None:
         view = seen_through(view, effects.magnification_ratio)
     before_s = time.perf_counter() - started_s
-    rendered = cast(
-        FilteredView, engine.render(view, handle, output="linear", **options)
-    )
+    begun = begin_view(engine, view, handle, output="linear", **options)
+    return partial(_changed, begun, effects, view, output, before_s)
+
+
+def _changed(
+    begun: Callable[[], Rendered],
+    effects: MediaEffects,
+    view: RgbdView,
+    output: str,
+    before_s: float,
+) -> FilteredView:
+    rendered = cast(FilteredView, begun())
     started_s = time.perf_counter()
     color = np.ascontiguousarray(rendered.color, dtype=np.float32)
     effects.change(color, view)

@@ -77,9 +77,12 @@ class Case:
         """Filter the views of one frame; wall time and stages, ms."""
         stages_ms: dict[str, float] = {}
         start_s = time.perf_counter()
-        for handle in self.handles:
-            seen = self.renderer.render(self.view, handle, output="srgb8", **state)
-            for name, ms in seen.stage_times_ms.items():
+        begun = [
+            self.renderer.begin(self.view, handle, output="srgb8", **state)
+            for handle in self.handles
+        ]
+        for finish in begun:
+            for name, ms in finish().stage_times_ms.items():
                 stages_ms[name] = stages_ms.get(name, 0.0) + ms
         return 1e3 * (time.perf_counter() - start_s), stages_ms
 

@@ -99,20 +99,25 @@ class NotedWords:
         self._words: dict[int, np.ndarray] = {}
 
     def read(self, function):
-        """Return `Gpu.read_into` that notes the words, or puts them in place."""
+        """Return `Gpu.begin_read` that notes the words, or puts them in place."""
 
-        def call(gpu, *parts):
-            function(gpu, *parts)
+        def begin(gpu, *parts):
+            arrive = function(gpu, *parts)
             used = gpu._buffers.get("USED")
-            for buffer, _, out in parts:
-                if buffer is not used:
-                    continue
-                if self.is_real:
-                    self._words[self.state] = out.copy()
-                else:
-                    out[...] = self._words[self.state]
+            arrays = [out for buffer, _, out in parts if buffer is used]
+            state = self.state
 
-        return call
+            def end():
+                arrive()
+                for words in arrays:
+                    if self.is_real:
+                        self._words[state] = words.copy()
+                    else:
+                        words[...] = self._words[state]
+
+            return end
+
+        return begin
 
 
 @contextmanager
@@ -128,15 +133,18 @@ def empty_passes(clock: Clock) -> Iterator[None]:
         np.copyto(target, source)
 
     compute = moderngl.ComputeShader
-    context, buffer = moderngl.Context, moderngl.Buffer
+    buffer = moderngl.Buffer
     changes = [
         (compute, "run", run),
         (compute, "run_indirect", run),
         (gpu_module, "copy_bytes", clock.timed("image copies", copy)),
         (Staging, "_copy", clock.timed("driver's copies", Staging._copy)),
-        *(
-            (context, name, clock.timed(name, getattr(context, name)))
-            for name in ("memory_barrier", "finish")
+        (Staging, "fence", clock.timed("fences", Staging.fence)),
+        (Staging, "wait", clock.timed("waits", Staging.wait)),
+        (
+            moderngl.Context,
+            "memory_barrier",
+            clock.timed("barriers", moderngl.Context.memory_barrier),
         ),
         (
             buffer,
@@ -163,7 +171,7 @@ def case_rows(case: Case, is_moving: bool, count: int) -> Iterator[Row]:
     states = states_towards(spec, PUPIL_MM, FOCUS_DPT, STATES if is_moving else 1)
     words, clock = NotedWords(), Clock()
     frames = []
-    with patch.object(Gpu, "read_into", words.read(Gpu.read_into)):
+    with patch.object(Gpu, "begin_read", words.read(Gpu.begin_read)):
         for words.state, state in enumerate(states):
             case.frame(state)
         words.is_real = False
@@ -185,14 +193,15 @@ def _rows(case: Case, is_moving: bool, frames: list, clock: Clock) -> Iterator[R
             ("bindings", "bindings"),
             ("uniforms", "uniforms"),
             ("driver's copies", "copies"),
-            ("finish", "waits"),
+            ("waits", "waits"),
         )
     )
     times_ms = {name: [] for name in PARTS}
     for total_ms, parts_ms, _ in frames:
         copies_ms = parts_ms["image copies"]
         driver_ms = sum(
-            parts_ms[name] for name in ("driver's copies", "memory_barrier", "finish")
+            parts_ms[name]
+            for name in ("driver's copies", "barriers", "fences", "waits")
         )
         values = (total_ms, copies_ms, driver_ms, total_ms - copies_ms - driver_ms)
         for name, value in zip(PARTS, values, strict=True):
