@@ -44,6 +44,7 @@ class Bench(StrEnum):
     PEERS = "peers"
     SWITCH = "switch"
     HEADSET = "headset"
+    HOST = "host"
     ABUSE = "abuse"
     OVERLOAD = "overload"
     RESTART = "restart"
@@ -73,6 +74,7 @@ BENCH_MODULES = {
     Bench.PEERS: "tests.benchmarks.bench_peers",
     Bench.SWITCH: "tests.benchmarks.bench_switch",
     Bench.HEADSET: "tests.benchmarks.bench_headset",
+    Bench.HOST: "tests.benchmarks.bench_host",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
     Bench.RESTART: "tests.benchmarks.bench_restart",

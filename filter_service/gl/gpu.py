@@ -36,6 +36,19 @@ PASS_BLOCKS = 9
 """Storage blocks of the pass with most, if an atlas is one of them."""
 
 
+_BARRIERS = (
+    moderngl.SHADER_STORAGE_BARRIER_BIT
+    | moderngl.COMMAND_BARRIER_BIT  # sizes of dispatches that a pass has written
+    | moderngl.BUFFER_UPDATE_BARRIER_BIT  # copies to mapped memory
+)
+_IMAGE_BARRIERS = (
+    _BARRIERS
+    | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
+    | moderngl.TEXTURE_FETCH_BARRIER_BIT
+)
+"""What comes after a pass and may read what it wrote."""
+
+
 class Gpu:
     """A standalone EGL context with named, grow-only storage buffers.
 
@@ -357,7 +370,7 @@ class Gpu:
             program.run_indirect(*indirect)
         else:
             program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
-        self.context.memory_barrier()
+        self.context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
 
     def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
         """Set those that differ from the last dispatch's: each is a driver call."""

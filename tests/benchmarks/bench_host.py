@@ -44,6 +44,7 @@ QUICK_VIEWS = {"192x108": ((192, 108), 1), "2 x 96x100": ((96, 100), 2)}
 EYES, QUICK_EYES = ("-6 dpt", "emmetropia"), ("emmetropia",)
 STATES = 4
 FRAMES, WARM_FRAMES = 200, 30
+DRIVERS = ("driver's copies", "barriers", "fences", "waits")
 PARTS = ("all", "image copies", "driver's copies", "rest")
 
 
