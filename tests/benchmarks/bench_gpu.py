@@ -1,6 +1,6 @@
 """A frame on a hardware GPU: its passes, what surrounds them, and what it shows.
 
-    python -m tests.benchmarks.bench_gpu [--quick] [--json]
+    python -m tests.benchmarks.bench_gpu [--quick] [--json] [--views NAME ...]
 
 The courtyard over the whole visual field ("dynamic"), colour and depth in host memory,
 8-bit sRGB in and out, one eye or two of a headset.  "moving": pupil and focus change
@@ -171,12 +171,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="small frames, few")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
     options = parser.parse_args()
     gpu = Gpu()
     count, warm_s = (3, 0.0) if options.quick else (60, 2.0)
     rows, clocks = [], {}
+    views = {name: VIEWS[name] for name in options.views}
     for setting, (size_px, view_count) in (
-        QUICK_VIEWS if options.quick else VIEWS
+        QUICK_VIEWS if options.quick else views
     ).items():
         for eye in EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
@@ -191,7 +193,8 @@ def main() -> None:
         print(json.dumps(content))
     else:
         print_rows(rows)
-    if not (options.quick or gpu.is_software):
+    is_whole = not options.quick and len(views) == len(VIEWS)
+    if is_whole and not gpu.is_software:
         write_report("gpu", content)
 
 
