@@ -11,8 +11,16 @@ from pathlib import Path
 
 from tests.native_build import COMPILER, build_library
 
-EXPECTED = ("numpy", "scipy", "numba", "matplotlib", "PIL", "onnxruntime")
-"""Modules that the kit does not carry, unless it was made with them."""
+EXPECTED = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "numba": "numba llvmlite",
+    "matplotlib": "matplotlib contourpy cycler fonttools kiwisolver pyparsing "
+    "python-dateutil",
+    "PIL": "pillow",
+    "onnxruntime": "onnxruntime protobuf flatbuffers",
+}
+"""Modules that the kit does not carry, unless it was made with these packages."""
 
 GL_LIBRARIES = ("libEGL.so.1", "libGL.so.1", "libOpenGL.so.0")
 
@@ -87,14 +95,14 @@ def _outer_packages() -> str:
     if sys.prefix == sys.base_prefix:
         return ""
     paths = {sysconfig.get_paths()[name] for name in ("purelib", "platlib")}
-    return f"import site; [site.addsitedir(p) for p in {sorted(paths)!r}]\n"
+    return "".join(f"import site; site.addsitedir({p!r})\n" for p in sorted(paths))
 
 
 def missing_modules(python: Path) -> list[str]:
     """Return which of the modules that the kit does not carry are not there."""
     script = (
         "import importlib.util as u\n"
-        f"print(*[m for m in {EXPECTED!r} if u.find_spec(m) is None])"
+        f"print(*[m for m in {tuple(EXPECTED)!r} if u.find_spec(m) is None])"
     )
     return _ask(python, script).split()
 

@@ -80,8 +80,9 @@ class Run:
         if missing:
             notes.append(f"not here, nor carried: {', '.join(missing)}")
         if {"numpy", "scipy", "numba"} & set(missing):
+            names = " ".join(environment.EXPECTED[module] for module in missing)
             raise environment.SetUpFailed(
-                f"{notes[-1]}; make the kit with WITH='{' '.join(missing)} llvmlite'"
+                f"{notes[-1]}; make the kit with WITH='{names}'"
             )
         native, note = _native(work)
         folder = _loaders(kit, loaders)

@@ -135,7 +135,7 @@ def kept_rows(path: Path, since_s: float) -> dict:
     """Return rows that a program kept as they came, since a time of the clock."""
     if not path.is_file() or path.stat().st_mtime < since_s:
         return {}
-    lines = path.read_text(encoding="utf-8").splitlines()
+    *lines, _ = path.read_text(encoding="utf-8").split("\n")  # the last may be half
     return {"rows": [json.loads(line)["row"] for line in lines]} if lines else {}
 
 
