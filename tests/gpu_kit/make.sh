@@ -20,7 +20,7 @@ python=${PYTHON:-.venv/bin/python}
 CARRIED="moderngl glcontext pyzmq msgpack msgspec lz4 lazy-loader packaging OpenEXR
     typer rich shellingham annotated-doc markdown-it-py mdurl Pygments pydantic
     pydantic-core annotated-types typing-extensions typing-inspection
-    pyrender PyOpenGL trimesh freetype-py pyglet imageio six networkx
+    pyrender PyOpenGL trimesh freetype-py pyglet imageio six networkx glfw
     pytest pluggy iniconfig hypothesis sortedcontainers"
 # what it is expected to have: large, and bound to its other packages
 EXPECTED="numpy scipy numba matplotlib pillow onnxruntime"

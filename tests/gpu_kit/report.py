@@ -49,6 +49,8 @@ def _goal_table(outcomes, goals: list[Goal], *, is_quick, is_judged) -> str:
         value = goal.measured(content, is_quick=is_quick)
         verdict = goal.verdict(value, is_judged=is_judged)
         told = "-" if value is None else f"{value:.4g} {goal.unit}"
+        if is_quick and goal.quick_row:
+            told += f" ({', '.join(goal.quick_row.values())})"
         shown = "" if verdict == NOT_JUDGED else verdict
         rows.append(
             f"| {goal.what} | {goal.wanted} | {told} | {shown} | {goal.source} |"
@@ -59,7 +61,7 @@ def _goal_table(outcomes, goals: list[Goal], *, is_quick, is_judged) -> str:
 def _step_table(outcomes: list[Outcome]) -> str:
     rows = ["| step | what | state | s | of |", "|---|---|---|---|---|"]
     rows += [
-        f"| {outcome.name} | {outcome.what} | {outcome.state} "
+        f"| {outcome.name} | {_told(outcome)} | {outcome.state} "
         f"| {outcome.seconds:.1f} | {outcome.limit_s:.0f} |"
         for outcome in outcomes
     ]
@@ -67,8 +69,15 @@ def _step_table(outcomes: list[Outcome]) -> str:
     return "\n".join([*rows, f"| all | | | {total_s:.1f} | |"])
 
 
+def _told(outcome: Outcome) -> str:
+    """What a step measures; of one that prints no rows what it said last."""
+    if outcome.state != DONE or outcome.content or not outcome.tail:
+        return outcome.what
+    return f"{outcome.what}: {outcome.tail[-1][:LINE_LENGTH]}"
+
+
 def _tails(outcomes: list[Outcome]) -> list[str]:
-    """Last lines of what did not end well; of the others the last one."""
+    """Last lines of what did not end well."""
     blocks = []
     for outcome in outcomes:
         lines = outcome.tail if outcome.state != DONE else ()

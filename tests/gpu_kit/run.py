@@ -140,6 +140,19 @@ class Run:
         """Note how a step went, in its file and in the report."""
         self.outcomes.append(outcome)
         say(f"{outcome.name}: {outcome.state}, {outcome.seconds:.1f} s")
+        for each in self.outcomes:  # the first did not know the hardware
+            self._write(each)
+        page = report_text(
+            self.outcomes,
+            read_goals(),
+            hardware=self.hardware,
+            commit=self.commit,
+            is_quick=self.is_quick,
+        )
+        (self.out / "report.md").write_text(page, encoding="utf-8")
+
+    def _write(self, outcome: Outcome) -> None:
+        """Write a step's file: what it printed, hardware, commit, how it went."""
         content = {
             **outcome.content,
             "hardware": self.hardware,
@@ -155,14 +168,6 @@ class Run:
         }
         text = json.dumps(content, indent=1) + "\n"
         (self.out / f"{outcome.name}.json").write_text(text, encoding="utf-8")
-        page = report_text(
-            self.outcomes,
-            read_goals(),
-            hardware=self.hardware,
-            commit=self.commit,
-            is_quick=self.is_quick,
-        )
-        (self.out / "report.md").write_text(page, encoding="utf-8")
 
 
 def _native(work: Path) -> tuple[Path | None, str]:

@@ -87,7 +87,7 @@ def test_the_page_has_goal_beside_measured():
 
 def test_a_quick_run_reads_its_own_rows_and_judges_none():
     text = page([Outcome("gpu", "", DONE, content=ROWS)], is_quick=True)
-    assert "| frame | <= 2 ms | 0.5 ms |  | a forecast |" in text
+    assert "| frame | <= 2 ms | 0.5 ms (90p) |  | a forecast |" in text
     assert "not judged" in text
 
 
@@ -101,7 +101,7 @@ def test_a_software_renderer_is_not_judged():
 def test_last_lines_stand_there_of_what_did_not_end_well_alone():
     text = page(
         [
-            Outcome("a", "", DONE, tail=("all well",)),
+            Outcome("a", "", DONE, content=ROWS, tail=("all well",)),
             Outcome("b", "", FAILED, tail=("x" * 300, "ValueError: bad")),
             Outcome("c", "", NOT_BEGUN, tail=("the budget is spent",)),
         ]
@@ -111,6 +111,11 @@ def test_last_lines_stand_there_of_what_did_not_end_well_alone():
     assert "c, not begun:\n\n    the budget is spent" in text
     assert max(map(len, text.splitlines())) < 120
     assert "| frame | <= 2 ms | - | not measured |" in text
+
+
+def test_what_prints_no_rows_says_its_last_line():
+    text = page([Outcome("tests", "of the GPU", DONE, tail=("begun", "3 passed"))])
+    assert "| tests | of the GPU: 3 passed | done |" in text
 
 
 def test_without_any_machine_there_is_a_page_all_the_same():
