@@ -30,6 +30,9 @@ VENDOR_FOLDERS = ("/etc/glvnd/egl_vendor.d", "/usr/share/glvnd/egl_vendor.d")
 OTHER_VENDOR_FOLDERS = ("/usr/local/nvidia/share/glvnd/egl_vendor.d",)
 """Where drivers put them on machines that run containers."""
 
+DRIVER_FOLDERS = ("/usr/local/nvidia/lib64", "/usr/local/nvidia/lib")
+"""And their libraries, which the system's list need not know yet."""
+
 
 class SetUpFailed(Exception):
     """The machine lacks something; says what, and what helps."""
@@ -155,11 +158,13 @@ def variables(
     }
     if native is not None:
         own["OCUFILTER_NATIVE_LIBRARY"] = str(native)
+    libraries = [own.get("LD_LIBRARY_PATH", "")]
+    libraries += [folder for folder in DRIVER_FOLDERS if Path(folder).is_dir()]
     if loaders is not None:
-        before = own.get("LD_LIBRARY_PATH")
-        own["LD_LIBRARY_PATH"] = f"{loaders}:{before}" if before else str(loaders)
+        libraries.insert(0, str(loaders))
         own["GLCONTEXT_LINUX_LIBGL"] = "libGL.so.1"
         own["GLCONTEXT_LINUX_LIBEGL"] = "libEGL.so.1"
+    own["LD_LIBRARY_PATH"] = ":".join(filter(None, libraries))
     drivers = vendor_files()
     if drivers:
         own.setdefault("__EGL_VENDOR_LIBRARY_FILENAMES", ":".join(drivers))

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,17 +87,19 @@ def test_a_wheel_of_another_python_is_named(tmp_path):
 def test_variables_name_what_is_there(tmp_path, monkeypatch):
     monkeypatch.setenv("LD_LIBRARY_PATH", "/elsewhere")
     monkeypatch.setattr(environment, "vendor_files", lambda: ["/a.json", "/b.json"])
+    folders = (str(tmp_path), str(tmp_path / "none"))
+    monkeypatch.setattr(environment, "DRIVER_FOLDERS", folders)
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
     python = tmp_path / "venv/bin/python"
     common = {"python": python, "commit": "abc1234"}
-    own = environment.variables(**common, loaders=tmp_path, native=tmp_path / "l.so")
+    own = environment.variables(**common, loaders=Path("/gl"), native=tmp_path / "l.so")
     assert own["OCUFILTER_COMMIT"] == "abc1234"
-    assert own["LD_LIBRARY_PATH"] == f"{tmp_path}:/elsewhere"
+    assert own["LD_LIBRARY_PATH"] == f"/gl:/elsewhere:{tmp_path}"
     assert own["OCUFILTER_NATIVE_LIBRARY"] == str(tmp_path / "l.so")
     assert own["__EGL_VENDOR_LIBRARY_FILENAMES"] == "/a.json:/b.json"
     assert own["PATH"].startswith(str(python.parent) + ":")
     bare = environment.variables(**common, loaders=None, native=None)
-    assert bare["LD_LIBRARY_PATH"] == "/elsewhere"
+    assert bare["LD_LIBRARY_PATH"] == f"/elsewhere:{tmp_path}"
     assert "GLCONTEXT_LINUX_LIBEGL" not in bare
 
 
