@@ -56,19 +56,7 @@ def make_environment(folder: Path, wheels: list[Path]) -> Path:
 
 
 def unpack_wheel(wheel: Path, site: Path) -> None:
-    """Unpack a wheel into a folder of packages; its scripts and headers stay out.
-
-    Raises
-    ------
-    SetUpFailed
-        The wheel is of another Python.
-    """
-    if not is_for_this_python(wheel.name):
-        raise SetUpFailed(
-            f"{wheel.name} is not for Python {sys.version_info.major}."
-            f"{sys.version_info.minor}: make the kit with PYTHON_VERSION="
-            f"{sys.version_info.major}.{sys.version_info.minor}"
-        )
+    """Unpack a wheel into a folder of packages; its scripts and headers stay out."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
     for data in site.glob("*.data"):
@@ -76,18 +64,6 @@ def unpack_wheel(wheel: Path, site: Path) -> None:
             if (data / part).is_dir():
                 shutil.copytree(data / part, site, dirs_exist_ok=True)
         shutil.rmtree(data)
-
-
-def is_for_this_python(name: str, version: tuple[int, int] = sys.version_info[:2]):
-    """Tell from a wheel's name whether this Python may import it."""
-    pythons, abis, _ = name.removesuffix(".whl").split("-")[-3:]
-    own = f"cp{version[0]}{version[1]}"
-    if "abi3" in abis.split("."):
-        return any(
-            tag.startswith(f"cp{version[0]}") and int(tag[3:] or 0) <= version[1]
-            for tag in pythons.split(".")
-        )
-    return own in pythons.split(".") or (abis == "none" and "py3" in pythons.split("."))
 
 
 def _outer_packages() -> str:

@@ -7,6 +7,14 @@
 set -eu
 kit=$(cd "$(dirname "$0")" && pwd)
 commit=$(cat "$kit/COMMIT")
+wanted=$(cat "$kit/PYTHON_VERSION")
+python=${PYTHON:-python3}
+found=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+if [ "$found" != "$wanted" ]; then
+    echo "gpu-kit: the wheels are for Python $wanted, and $python is $found:" \
+        "name another in PYTHON, or make the kit with PYTHON_VERSION=$found" >&2
+    exit 1
+fi
 tree=$kit/work/tree-$commit
 if [ ! -e "$tree/.whole" ]; then
     mkdir -p "$tree"
@@ -14,4 +22,4 @@ if [ ! -e "$tree/.whole" ]; then
     touch "$tree/.whole"
 fi
 cd "$tree"
-exec "${PYTHON:-python3}" -m tests.gpu_kit.run --kit "$kit" "$@"
+exec "$python" -m tests.gpu_kit.run --kit "$kit" "$@"

@@ -1,6 +1,8 @@
 """The GPU kit's environment: which wheels go in, what they become, what goes along."""
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -36,24 +38,6 @@ def test_every_wheel_has_a_pin():
     assert packages("CARRIED") - pinned == set()
 
 
-@pytest.mark.parametrize(
-    ("name", "fits"),
-    [
-        ("a-1-py3-none-any.whl", True),
-        ("a-1-py2.py3-none-any.whl", True),
-        ("a-1-py3-none-manylinux_2_5_x86_64.whl", True),
-        ("a-1-cp312-cp312-manylinux2014_x86_64.whl", True),
-        ("a-1-cp311-cp311-manylinux2014_x86_64.whl", False),
-        ("a-1-cp39-abi3-manylinux2014_x86_64.whl", True),
-        ("a-1-cp312-abi3-manylinux2014_x86_64.whl", True),
-        ("a-1-cp313-abi3-manylinux2014_x86_64.whl", False),
-        ("a-1-py2-none-any.whl", False),
-    ],
-)
-def test_a_wheel_tells_its_python_by_its_name(name, fits):
-    assert environment.is_for_this_python(name, (3, 12)) == fits
-
-
 def make_wheel(folder, name="pkg-1-py3-none-any.whl"):
     with zipfile.ZipFile(folder / name, "w") as archive:
         archive.writestr("pkg_of_kit/__init__.py", "NUMBER = 41\n")
@@ -77,11 +61,19 @@ def test_an_environment_has_its_wheels_and_what_this_python_has(tmp_path):
     assert environment.missing_modules(python) == []
 
 
-def test_a_wheel_of_another_python_is_named(tmp_path):
-    wheel = make_wheel(tmp_path, "pkg-1-cp27-cp27m-manylinux1_x86_64.whl")
-    own = f"PYTHON_VERSION=3.{sys.version_info.minor}"
-    with pytest.raises(environment.SetUpFailed, match=f"cp27m.*{own}"):
-        environment.unpack_wheel(wheel, tmp_path / "site")
+def test_a_kit_for_another_python_says_so(tmp_path):
+    (tmp_path / "COMMIT").write_text("abc1234\n")
+    (tmp_path / "PYTHON_VERSION").write_text("3.2\n")
+    shutil.copy(ROOT / "tests/gpu_kit/run.sh", tmp_path)
+    ran = subprocess.run(
+        ["sh", tmp_path / "run.sh"],
+        env={**os.environ, "PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 1
+    assert "for Python 3.2" in ran.stderr
+    assert f"PYTHON_VERSION=3.{sys.version_info.minor}" in ran.stderr
 
 
 def test_variables_name_what_is_there(tmp_path, monkeypatch):
