@@ -97,6 +97,7 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
             BENCHES + "bench_psf_build",
             limit_s=90.0,
             words=("--json",),
+            full=("--set-only",),
             quick=("--quick",),
         ),
         Step(
