@@ -5,9 +5,9 @@
 The slices are those of `psf_rates.py`: one pupil and focus of the paper's dynamic grid,
 traced through an estimated eye.  On a hardware GPU, or with --whole, the whole set of
 201,825 PSFs follows, its kernels left on the GPU; with --set-only it stands alone.
-`rates` holds, per build, PSFs a second of wall time and of processor time (other programs
-on the machine hardly change the latter), and the operations and bytes that the method
-needs.
+`rates` holds, per build, PSFs a second of wall time and of processor time (other
+programs on the machine hardly change the latter), and the operations and bytes that the
+method needs.
 """
 
 import argparse

@@ -1,9 +1,10 @@
 """One page: goals beside what was measured, and how each step went."""
 
 from tests.gpu_kit.goals import NOT_JUDGED, Goal
-from tests.gpu_kit.runner import DONE, Outcome
+from tests.gpu_kit.runner import DONE, FAILED, TOO_LONG, Outcome
 
 LINE_LENGTH = 100
+ENDED_BADLY = (FAILED, TOO_LONG)
 
 
 def report_text(
@@ -70,8 +71,9 @@ def _step_table(outcomes: list[Outcome]) -> str:
 
 
 def _told(outcome: Outcome) -> str:
-    """What a step measures; of one that prints no rows what it said last."""
-    if outcome.state != DONE or outcome.content or not outcome.tail:
+    """What a step measures; why it did not; of one without rows what it said last."""
+    is_silent = outcome.state == DONE and outcome.content
+    if is_silent or outcome.state in ENDED_BADLY or not outcome.tail:
         return outcome.what
     return f"{outcome.what}: {outcome.tail[-1][:LINE_LENGTH]}"
 
@@ -80,8 +82,7 @@ def _tails(outcomes: list[Outcome]) -> list[str]:
     """Last lines of what did not end well."""
     blocks = []
     for outcome in outcomes:
-        lines = outcome.tail if outcome.state != DONE else ()
-        if lines:
-            text = "\n".join("    " + line[:LINE_LENGTH] for line in lines)
+        if outcome.state in ENDED_BADLY and outcome.tail:
+            text = "\n".join("    " + line[:LINE_LENGTH] for line in outcome.tail)
             blocks.append(f"{outcome.name}, {outcome.state}:\n\n{text}")
     return blocks

@@ -5,7 +5,6 @@ from pathlib import Path
 
 BENCHES = "tests.benchmarks."
 KIT = "tests.gpu_kit."
-VIEWS = ("1280x720", "2 x 1832x1920")
 GL = ("--json", "--engine", "gl")
 FIELD = ("--eyes", "myopia", "--sizes", "1280x720", "--scenes", "courtyard")
 RADIUS = ("--json", "--plot", "--sweeps", "radius")
@@ -68,11 +67,18 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
         ),
         Step(
             "gpu",
-            "a frame: 720p, and stereo at 1832x1920",
+            "frames at 720p",
             BENCHES + "bench_gpu",
-            limit_s=120.0,
-            words=("--json",),
-            full=("--views", *VIEWS),
+            limit_s=80.0,
+            words=("--json", "--views", "1280x720"),
+            quick=("--quick",),
+        ),
+        Step(
+            "stereo",
+            "frames of two eyes at 1832x1920",
+            BENCHES + "bench_gpu",
+            limit_s=80.0,
+            words=("--json", "--views", "2 x 1832x1920"),
             quick=("--quick",),
         ),
         Step(
@@ -114,7 +120,7 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
             "from a profile to the first frame",
             BENCHES + "bench_switch",
             limit_s=70.0,
-            words=("--json", "--mode", "dynamic"),
+            words=("--json", "--mode", "dynamic", "--eyes", "keratoconus"),
             quick=("--quick",),
         ),
         Step(

@@ -19,6 +19,7 @@ from tests.source_tree import ROOT
 
 KEPT = {
     "gpu": "gpu",
+    "stereo": "gpu",
     "render": "render_h100",
     "psf_build": "build_h100",
     "switch": "switch",
@@ -103,12 +104,12 @@ def test_last_lines_stand_there_of_what_did_not_end_well_alone():
         [
             Outcome("a", "", DONE, content=ROWS, tail=("all well",)),
             Outcome("b", "", FAILED, tail=("x" * 300, "ValueError: bad")),
-            Outcome("c", "", NOT_BEGUN, tail=("the budget is spent",)),
+            Outcome("c", "rows", NOT_BEGUN, tail=("the budget is spent",)),
         ]
     )
     assert "all well" not in text
     assert "    ValueError: bad" in text
-    assert "c, not begun:\n\n    the budget is spent" in text
+    assert "| c | rows: the budget is spent | not begun |" in text
     assert max(map(len, text.splitlines())) < 120
     assert "| frame | <= 2 ms | - | not measured |" in text
 
