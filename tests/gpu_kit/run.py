@@ -49,7 +49,7 @@ class Run:
     Parameters
     ----------
     out : Path
-        Folder of the results; what was there is removed.
+        Folder of the results; of steps that do not run what is there stays.
     commit : str
     is_quick : bool
     budget : Budget
@@ -72,9 +72,8 @@ class Run:
             The machine lacks something.
         """
         start_s, notes = time.monotonic(), []
-        work = kit / "work"
         python = environment.make_environment(
-            work / "venv", sorted((kit / "wheels").glob("*.whl"))
+            kit / "work" / "venv", sorted((kit / "wheels").glob("*.whl"))
         )
         missing = environment.missing_modules(python)
         if missing:
@@ -84,7 +83,7 @@ class Run:
             raise environment.SetUpFailed(
                 f"{notes[-1]}; make the kit with WITH='{names}'"
             )
-        native, note = _native(work)
+        native, note = _native()
         folder = _loaders(kit, loaders)
         notes.append(note)
         notes.append(
@@ -101,39 +100,50 @@ class Run:
     def run(self, step: Step, python: Path, variables: dict[str, str]) -> None:
         """Run a step, if there is time for it."""
         limit_s = self.budget.limit_s(QUICK_LIMIT_S if self.is_quick else step.limit_s)
-        reason = ""
         if step.needs_torch and self.hardware.get("torch") == "":
-            state, reason = LEFT_OUT, "torch is not on this machine"
+            self._pass_over(step, LEFT_OUT, "torch is not on this machine")
         elif limit_s == 0.0:
-            state = NOT_BEGUN
-            reason = f"the budget of {self.budget.seconds:.0f} s is spent"
-        if reason:
-            self.add(Outcome(step.name, step.what, state, tail=(reason,)))
-            return
-        say(f"{step.name}: {step.what} (at most {limit_s:.0f} s)")
+            spent = f"the budget of {self.budget.seconds:.0f} s is spent"
+            self._pass_over(step, NOT_BEGUN, spent)
+        else:
+            say(f"{step.name}: {step.what} (at most {limit_s:.0f} s)")
+            outcome = self._done(step, limit_s, python, variables)
+            if step.name == "machine":
+                today = time.strftime("%Y-%m-%d", time.gmtime())
+                self.hardware = outcome.content | {"date": today}
+            self.add(outcome)
+
+    def _pass_over(self, step: Step, state: str, reason: str) -> None:
+        self.add(Outcome(step.name, step.what, state, tail=(reason,)))
+
+    def _done(self, step: Step, limit_s, python: Path, variables) -> Outcome:
+        """Run a step's program, and take what it left."""
         words = step.command(self.out / "pictures", is_quick=self.is_quick)
-        since_s = time.time()
+        since_s, logs = time.time(), self.out / "logs"
         state, seconds = run_program(
             [str(python), "-m", *words],
             name=step.name,
             limit_s=limit_s,
-            logs=self.out / "logs",
+            logs=logs,
             cwd=TREE,
             environment=variables,
         )
-        out, log = (self.out / "logs" / f"{step.name}.{end}" for end in ("out", "log"))
+        out, log = logs / f"{step.name}.out", logs / f"{step.name}.log"
         content = printed_json(out) if step.is_json else {}
         if not content and step.rows_file:
             content = kept_rows(TREE / step.rows_file, since_s)
-        tail = last_lines(log) if step.is_json else last_lines(out, log)
         for picture in step.pictures:
             if (TREE / picture).is_file() and state == DONE:
                 shutil.copy(TREE / picture, self.out / "pictures")
-        if step.name == "machine":
-            self.hardware = content | {"date": time.strftime("%Y-%m-%d", time.gmtime())}
-        words = ("python", "-m", *words)
-        self.add(
-            Outcome(step.name, step.what, state, seconds, limit_s, words, content, tail)
+        return Outcome(
+            step.name,
+            step.what,
+            state,
+            seconds,
+            limit_s,
+            ("python", "-m", *words),
+            content,
+            last_lines(log) if step.is_json else last_lines(out, log),
         )
 
     def add(self, outcome: Outcome) -> None:
@@ -170,10 +180,10 @@ class Run:
         (self.out / f"{outcome.name}.json").write_text(text, encoding="utf-8")
 
 
-def _native(work: Path) -> tuple[Path | None, str]:
+def _native() -> tuple[Path | None, str]:
     """The native engine's library, and what there is to say of it."""
     try:
-        library = environment.native_library(work)
+        library = environment.native_library(TREE / "out")
     except subprocess.CalledProcessError as error:
         line = (error.stderr.strip().splitlines() or ["no word"])[-1]
         return None, f"the native engine could not be compiled: {line}"
