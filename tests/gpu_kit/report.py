@@ -50,7 +50,7 @@ def _goal_table(outcomes, goals: list[Goal], *, is_quick, is_judged) -> str:
         value = goal.measured(content, is_quick=is_quick)
         verdict = goal.verdict(value, is_judged=is_judged)
         told = "-" if value is None else f"{value:.4g} {goal.unit}"
-        if is_quick and goal.quick_row:
+        if is_quick and goal.quick_row and value is not None:
             told += f" ({', '.join(goal.quick_row.values())})"
         shown = "" if verdict == NOT_JUDGED else verdict
         rows.append(
