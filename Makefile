@@ -12,7 +12,7 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload restart roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training test-headset validate witness check clean help setup setup-test setup-training setup-witness
+.PHONY: demo test test-training test-headset validate witness gpu-kit check clean help setup setup-test setup-training setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -47,6 +47,10 @@ validate: setup-test  ## the slow tests, and every benchmark table as JSON
 
 witness: setup-witness  ## our frames against a path tracer through the same eyes
 	$(PYTHON) -m tests.benchmarks.bench_witness $(ARGS)
+
+gpu-kit: setup  ## a folder for a GPU machine without a network; writes out/gpu_kit/
+	@PYTHON=$(PYTHON) PYTHON_VERSION="$(PYTHON_VERSION)" WITH="$(WITH)" \
+	    sh tests/gpu_kit/make.sh $(ARGS)
 
 check: setup  ## lint, formatting and types
 	$(PYTHON) -m ruff check .

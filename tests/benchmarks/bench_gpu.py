@@ -1,6 +1,6 @@
 """A frame on a hardware GPU: its passes, what surrounds them, and what it shows.
 
-    python -m tests.benchmarks.bench_gpu [--quick] [--json]
+    python -m tests.benchmarks.bench_gpu [--quick] [--json] [--views NAME ...]
 
 The courtyard over the whole visual field ("dynamic"), colour and depth in host memory,
 8-bit sRGB in and out, one eye or two of a headset.  "moving": pupil and focus change
@@ -54,6 +54,8 @@ VIEWS = {
     "2 x 1832x1920": ((1832, 1920), 2),
 }
 QUICK_VIEWS = {"192x108": ((192, 108), 1), "2 x 96x100": ((96, 100), 2)}
+QUICK_NAMES = dict(zip(VIEWS, ("192x108", "192x108", "2 x 96x100"), strict=True))
+"""The small view that stands for a large one."""
 PUPIL_MM, FOCUS_DPT = 4.5, 0.5
 REFERENCE = "native engine, same eye and state"
 HOST_STAGES = ("prepare_ms", "psf_plan_ms", "plan_ms", "upload_ms", "readback_ms")
@@ -171,17 +173,25 @@ def clock() -> str:
     return told.stdout.strip() or "not told"
 
 
+def chosen_views(names: list[str], *, is_quick: bool) -> dict:
+    """Sizes and numbers of views, or of the small ones that stand for them."""
+    if not is_quick:
+        return {name: VIEWS[name] for name in names}
+    return {QUICK_NAMES[name]: QUICK_VIEWS[QUICK_NAMES[name]] for name in names}
+
+
 def main() -> None:
     """Run, print, and write tests/benchmarks/results/gpu.json on hardware."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="small frames, few")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
     options = parser.parse_args()
     gpu = Gpu()
     count, warm_s = (3, 0.0) if options.quick else (60, 2.0)
     rows, clocks = [], {}
-    for setting, (size_px, view_count) in (
-        QUICK_VIEWS if options.quick else VIEWS
+    for setting, (size_px, view_count) in chosen_views(
+        options.views, is_quick=options.quick
     ).items():
         for eye in EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
@@ -196,7 +206,8 @@ def main() -> None:
         print(json.dumps(content))
     else:
         print_rows(rows)
-    if not (options.quick or gpu.is_software):
+    is_whole = not options.quick and options.views == list(VIEWS)
+    if is_whole and not gpu.is_software:
         write_report("gpu", content)
 
 

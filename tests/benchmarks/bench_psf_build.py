@@ -1,12 +1,13 @@
 """PSFs a second through the GPU's passes, beside the CPU's engines: speed with error.
 
-    python -m tests.benchmarks.bench_psf_build [--quick] [--whole] [--json]
+    python -m tests.benchmarks.bench_psf_build [--quick] [--whole | --set-only] [--json]
 
 The slices are those of `psf_rates.py`: one pupil and focus of the paper's dynamic grid,
 traced through an estimated eye.  On a hardware GPU, or with --whole, the whole set of
-201,825 PSFs follows, its kernels left on the GPU.  `rates` holds, per build, PSFs
-a second of wall time and of processor time (other programs on the machine hardly change
-the latter), and the operations and bytes that the method needs.
+201,825 PSFs follows, its kernels left on the GPU; with --set-only it stands alone.
+`rates` holds, per build, PSFs a second of wall time and of processor time (other
+programs on the machine hardly change the latter), and the operations and bytes that the
+method needs.
 """
 
 import argparse
@@ -215,12 +216,17 @@ def main() -> None:
     """Print rows and rates, and write tests/benchmarks/results/build.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one slice, only auto")
-    parser.add_argument("--whole", action="store_true", help="the whole set as well")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--whole", action="store_true", help="the whole set as well")
+    how.add_argument("--set-only", action="store_true", help="the whole set, no slice")
     parser.add_argument("--json", action="store_true", help="print only JSON")
     arguments = parser.parse_args()
     gpu, image = Gpu(), make_test_image()
-    rows, rates = slice_rows(gpu, image, quick=arguments.quick)
-    if arguments.whole or not (gpu.is_software or arguments.quick):
+    rows, rates = [], []
+    if not arguments.set_only:
+        rows, rates = slice_rows(gpu, image, quick=arguments.quick)
+    wants_set = arguments.whole or arguments.set_only
+    if wants_set or not (gpu.is_software or arguments.quick):
         rows += whole_set_rows(gpu, image)
     content = report(
         rows, machine={**machine_info(), "gl_renderer": gpu.info["renderer"]}
@@ -232,7 +238,7 @@ def main() -> None:
     print_rows(rows)
     for rate in rates:
         print(rate)
-    if not arguments.quick:
+    if not (arguments.quick or arguments.set_only):
         print(f"written to {write_report('psf_build', content)}")
 
 

@@ -1,6 +1,7 @@
 """From a profile message to the first frame through the new eye, and to the last PSF.
 
 Usage: python -m tests.benchmarks.bench_switch [--quick] [--json] [--mode MODE]
+    [--eyes NAME ...]
 
 A real service in a process of its own, frames of the courtyard streamed to it all the
 time, one after the other; the eyes, pupils, foci and size of `ocufilter demo`.
@@ -264,11 +265,12 @@ def main() -> None:
         "--mode", default=None, help="instead of on-axis and dynamic: one mode"
     )
     parser.add_argument("--size", default="480x270", help="of the frames, px")
+    parser.add_argument("--eyes", nargs="+", choices=EYES, default=list(EYES))
     arguments = parser.parse_args()
     width_px, height_px = (int(part) for part in arguments.size.split("x"))
     frame = scene_view("courtyard", width_px=width_px, height_px=height_px)
     view = RgbdView(frame.color, frame.depth_m, frame.tangents)
-    eyes = ["myopia"] if arguments.quick else list(EYES)
+    eyes = arguments.eyes[:1] if arguments.quick else arguments.eyes
     modes = [arguments.mode] if arguments.mode else ["on-axis", "dynamic"]
     base = path_settings("courtyard", "primitives")
     rows = []
@@ -280,7 +282,7 @@ def main() -> None:
         print(json.dumps(content))
         return
     print_rows(rows)
-    if not arguments.quick:
+    if not arguments.quick and eyes == list(EYES):
         write_report("switch", content)
 
 
