@@ -11,6 +11,7 @@ from typing import Any
 from estimator.threads import MAX_THREADS
 from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES, PSF_ENGINES
+from filter_service.gl_device import checked_gl_device
 from filter_service.log_lines import LOG_FORMATS
 from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
 
@@ -48,6 +49,9 @@ class ServiceConfig:
         What filters frames and, unless ``psf_engine`` says otherwise, computes PSFs:
         a GPU's compute shaders, or compiled loops on all cores.  "auto" takes gl on a
         hardware GPU, else native.
+    gl_device : str
+        The EGL device that OpenGL works on, by its index, which asks for the engine gl;
+        "auto": the first that works, hardware before software.
     psf_engine : "auto", "cpu" or "gpu"
         What computes PSFs, where it shall be another than the engine's.
     max_cameras : int
@@ -105,6 +109,7 @@ class ServiceConfig:
     max_store_mb: int = 2000
     max_stores_mb: int = 4000
     engine: str = "auto"
+    gl_device: str = "auto"
     psf_engine: str = "auto"
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
@@ -136,6 +141,7 @@ class ServiceConfig:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}"
                 )
+        checked_gl_device(self.gl_device)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
@@ -291,6 +297,8 @@ def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
         wanted = type(defaults[name])
         if wanted is float and type(value) is int:
             value = float(value)
+        if name == "gl_device" and type(value) is int:
+            value = str(value)
         if type(value) is not wanted:
             raise ValueError(f"{name} is {value!r}; allowed: {wanted.__name__}")
         typed[name] = value

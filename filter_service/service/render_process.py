@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import FilterError
+from filter_service.gl_device import AUTO, GL_DEVICE_VARIABLE
 from filter_service.service.child import begin
 from filter_service.service.config import ServiceConfig
 from filter_service.service.link import Link
@@ -37,6 +38,8 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
     """Return the real engine with the real PSFs."""
     if config.threads:
         os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
+    if config.gl_device != AUTO:
+        os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # the same
     worker = WorkerHandle(
         niceness=config.build_niceness,
         cancel_grace_s=config.cancel_grace_s,
