@@ -1,9 +1,9 @@
 """The keeper: starts the processes of the service, and starts again what dies.
 
-The door owns the socket, the render process the eyes.  Each outlives the other; a new
-one is given a link to the one that is there.  What stands still for long, stopped from
-outside or hung, is ended and started again.  The keeper itself does nothing else, so
-there is little that could end it.
+The door owns the socket, a render process the eyes, those of one device where there are
+several.  Each outlives the others; a new one is given a link to those that are there.
+What stands still for long, stopped from outside or hung, is ended and started again.
+The keeper itself does nothing else, so there is little that could end it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,9 @@ from filter_service.building.helper_process import (
 from filter_service.service.config import ServiceConfig, changed_while_running
 from filter_service.service.link import Link, LinkClosed
 
-MODULES = {
-    "door": ("filter_service.service.door_process",),
-    "render": ("filter_service.service.render_process",),
-}
+DOOR_MODULE = "filter_service.service.door_process"
+RENDER_MODULE = "filter_service.service.render_process"
+DOOR, RENDER = "door", "render"
 OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
 MAX_RESTARTS = 8
 RESTART_WINDOW_S = 60.0
@@ -70,7 +69,7 @@ class _Child:
 
 
 class Keeper:
-    """Keeps a door and a render process going.
+    """Keeps a door and a render process going, or one for each of several devices.
 
     Parameters
     ----------
@@ -98,10 +97,19 @@ class Keeper:
         self._is_to_read_again = False
         self._endpoint = ""
         self._is_stopping = False
-        self._children = {name: _Child() for name in MODULES}
-        self._standby: _Child | None = None
+        n_devices = len(config.device_names)
+        # The index of each device, by the name of its process.
+        self._devices = (
+            {f"{RENDER} {index}": index for index in range(n_devices)}
+            if n_devices > 1
+            else {RENDER: 0}
+        )
+        self._children = {name: _Child() for name in (DOOR, *self._devices)}
+        self._standbys: dict[str, _Child] = {}
         self._spawned_s = 0.0  # the last process of all
-        self._starts_s: dict[str, deque[float]] = {name: deque() for name in MODULES}
+        self._starts_s: dict[str, deque[float]] = {
+            name: deque() for name in self._children
+        }
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
@@ -128,9 +136,9 @@ class Keeper:
             A process cannot start, or ends again and again.
         """
         try:
-            for name in ("render", "door"):  # the first takes longer
+            for name in (*self._devices, DOOR):  # the last takes least
                 self._start(name)
-            self._join()
+            self._join(DOOR)
             while not self._is_stopping:
                 self._turn()
         finally:
@@ -154,12 +162,12 @@ class Keeper:
             self._listen(name, child)
             self._check_stopped(name, child)
         if self._config.standby:
-            self._keep_standby()
+            for name in self._devices:
+                self._keep_standby(name)
 
     @property
     def _all_children(self) -> list[_Child]:
-        standby = [] if self._standby is None else [self._standby]
-        return [*self._children.values(), *standby]
+        return [*self._children.values(), *self._standbys.values()]
 
     def _start(self, name: str) -> None:
         """Start a process, or let the one that stands by take its place."""
@@ -172,37 +180,38 @@ class Keeper:
                 f"its {name} process was started {MAX_RESTARTS} times within "
                 f"{RESTART_WINDOW_S:g} s and ended each time"
             )
-        if name == "render" and self._standby is not None:
-            self._children[name], self._standby = self._standby, None
-        else:
-            self._children[name] = self._spawned(name)
+        standby = self._standbys.pop(name, None)
+        self._children[name] = standby or self._spawned(name)
 
     def _spawned(self, name: str) -> _Child:
         self._spawned_s = time.monotonic()
         link, theirs = Link.pair()
-        arguments = (str(theirs.fileno()), self._open_workshop)
+        # A new door listens where the one before it did.
+        config = replace(self._config, bind=self._endpoint or self._config.bind)
+        module, arguments = DOOR_MODULE, [str(theirs.fileno())]
+        if name in self._devices:
+            config = config.of_device(self._devices[name])
+            module, arguments = RENDER_MODULE, [*arguments, self._open_workshop, name]
         process = subprocess.Popen(
             # Without -P a file of the current folder would come before every module of
             # its name.
-            [sys.executable, "-P", "-m", *MODULES[name], *arguments],
+            [sys.executable, "-P", "-m", module, *arguments],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
         )
         theirs.close()
-        # A new door listens where the one before it did.
-        bind = self._endpoint or self._config.bind
         child = _Child(process, link)
-        child.tell(("config", replace(self._config, bind=bind)))
+        child.tell(("config", config))
         return child
 
-    def _keep_standby(self) -> None:
+    def _keep_standby(self, name: str) -> None:
         """Have a second process ready to filter, with a worker of its own."""
-        standby = self._standby
+        standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
-            if is_quiet and self._children["render"].is_ready:
-                self._standby = self._spawned("render")
+            if is_quiet and self._children[name].is_ready:
+                self._standbys[name] = self._spawned(name)
             return
         try:
             if standby.link is not None:
@@ -211,7 +220,7 @@ class Keeper:
                 )
             self._check_stopped("standby", standby)
         except LinkClosed:
-            self._standby = None
+            del self._standbys[name]
             self._bury("standby", standby)
 
     def _change_settings(self) -> None:
@@ -229,14 +238,17 @@ class Keeper:
         if others:
             log.warning("for %s the service has to be started again", ", ".join(others))
         if changed:
-            self._children["door"].tell(("config", self._config))
+            self._children[DOOR].tell(("config", self._config))
 
-    def _join(self) -> None:
-        """Give both processes the ends of a new link."""
-        ends = socket.socketpair()
-        for child, theirs in zip(self._children.values(), ends, strict=True):
-            child.tell(("link",), [theirs.fileno()])
-            theirs.close()
+    def _join(self, new: str) -> None:
+        """Give the door, and each render process that it lacks, the ends of a link."""
+        for name, index in self._devices.items():
+            if new in (DOOR, name):
+                ours, theirs = socket.socketpair()
+                self._children[name].tell(("link", index), [ours.fileno()])
+                self._children[DOOR].tell(("link", index), [theirs.fileno()])
+                ours.close()
+                theirs.close()
 
     def _listen(self, name: str, child: _Child) -> None:
         try:
@@ -250,7 +262,7 @@ class Keeper:
                 elif kind == "failed":
                     raise ServiceFailed(rest[0])
                 elif kind == "hung":
-                    self._kill("render")
+                    self._kill_device(rest[0])
         except LinkClosed:
             self._restart(name, child)
 
@@ -264,7 +276,7 @@ class Keeper:
     def _restart(self, name: str, child: _Child) -> None:
         self._bury(name, child)
         self._start(name)
-        self._join()
+        self._join(name)
 
     def _bury(self, name: str, child: _Child) -> None:
         how = "gone"
@@ -273,7 +285,7 @@ class Keeper:
         if child.link is not None:
             child.link.close()
         following = "a new one is started"
-        if name == "render" and self._standby is not None:
+        if name in self._standbys:
             following = "the one that stood by takes over"
         log.error("the %s process %s; %s", name, how, following)
 
@@ -289,13 +301,14 @@ class Keeper:
             log.error("the %s process stands still", name)
             child.process.kill()
 
-    def _kill(self, name: str) -> None:
-        process = self._children[name].process
-        if process is not None:
-            process.kill()
+    def _kill_device(self, index: int) -> None:
+        for name, of_index in self._devices.items():
+            process = self._children[name].process
+            if of_index == index and process is not None:
+                process.kill()
 
     def _end_all(self) -> None:
-        """End both processes: asked first, by force where they take long."""
+        """End all processes: asked first, by force where they take long."""
         for child in self._all_children:
             child.tell(("stop",))
         for child in self._all_children:

@@ -1,6 +1,7 @@
-"""The process that filters: ``python -m`` this, with a link's descriptor and a name.
+"""The process that filters: ``python -m`` this, with a link's descriptor and two names.
 
-The name, ``module:function``, is of what opens the workshop: ``function(config,
+One is its own, for the log.  The other, ``module:function``, is of what opens the
+workshop: ``function(config,
 closing)`` returns it, what reads profiles, and what to call once all is ready.  Tests
 have one of their own.
 """
@@ -57,7 +58,7 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
 
 def main() -> None:
     """Filter frames until the keeper says so."""
-    keeper, config, others = begin("render")
+    keeper, config, others = begin(sys.argv[3])
     module, _, function = sys.argv[2].partition(":")
     open_workshop = getattr(importlib.import_module(module), function)
     with ExitStack() as closing:
