@@ -46,6 +46,7 @@ class Bench(StrEnum):
     HEADSET = "headset"
     ABUSE = "abuse"
     OVERLOAD = "overload"
+    DEVICES = "devices"
     RESTART = "restart"
     ROUNDTRIP = "roundtrip"
 
@@ -75,6 +76,7 @@ BENCH_MODULES = {
     Bench.HEADSET: "tests.benchmarks.bench_headset",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
+    Bench.DEVICES: "tests.benchmarks.bench_devices",
     Bench.RESTART: "tests.benchmarks.bench_restart",
     Bench.ROUNDTRIP: "clients.latency",
 }

@@ -8,7 +8,7 @@ import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame
 from filter_service.errors import FilterError
-from filter_service.messages import Hello, Ping, Share
+from filter_service.messages import Hello, Ping, Share, encode
 from filter_service.service.asking import ask_status
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 from tests.end_to_end.test_lifecycle import wait_until
@@ -86,6 +86,17 @@ def test_each_eye_is_on_its_device_and_all_frames_are_counted(
     pong = raws[0].ask(Ping(1.0))
     assert [device.n_rendered for device in pong.devices] == [6, 6]
     assert (pong.n_rendered, pong.n_sessions, pong.is_ready) == (12, 4, True)
+
+
+def test_devices_filter_side_by_side(start_service, raw_client):
+    service = start_service(devices=TWO, filter_ms=1500)
+    first, second = raw_client(service), raw_client(service)
+    first.begin(mark=1)
+    second.begin(mark=2)
+    for frame_id, raw in enumerate((first, second)):
+        raw.send(encode(small_frame(frame_id)))
+    wait_until(lambda: all(d["is_filtering"] for d in devices_of(service)))
+    assert [raw.receive().frame_id for raw in (first, second)] == [0, 1]
 
 
 class Stream:
