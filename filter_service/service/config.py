@@ -60,7 +60,8 @@ class ServiceConfig:
         ``devices = ["gl:0", "gl:1"]``.  A session is on the one that was least busy at
         its beginning.  Empty: one process, as ``engine`` and ``gl_device`` say.
     psf_engine : "auto", "cpu" or "gpu"
-        What computes PSFs, where it shall be another than the engine's.
+        What computes PSFs, where it shall be another than the engine's.  A GPU is held
+        for about 4 ms at a time, so that frames go on between.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str

@@ -5,12 +5,13 @@
 Clients stream 1280x720 through -2 dpt, each as fast as its frames come back: one alone
 on one of the two engines, one on each, two on each, and for comparison two on one
 engine of two threads.  These take turns, again and again, so that whatever else the
-machine does falls on all.  Time: the period of a client's frames.  Errors: of throughput, how
-far all clients' frames a second are from twice those of one alone in the same round; of
-fairness, how far the slowest client's frames are from an equal share.  The rows of
-"processor" have what a frame takes of it in all processes of the service.  Clients and
-door need the processor, too: where it has no more cores than there are engines, twice
-is out of reach; so the same is measured of engines that sleep for 50 ms.
+machine does falls on all.  Time: the period of a client's frames.  Errors: of
+throughput, how far all clients' frames a second are from twice those of one alone in
+the same round; of fairness, how far the slowest client's frames are from an equal
+share.  The rows of "processor" have what a frame takes of it in all processes of the
+service.  Clients and door need the processor, too: where it has no more cores than
+there are engines, twice is out of reach; so the same is measured of engines that sleep
+for 50 ms.
 
 One killed: the other's period until the first picture of the struck one, and how long
 that takes; error: frames that were not filtered.  Writes results/devices.json.
