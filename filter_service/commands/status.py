@@ -48,6 +48,8 @@ def status(
 def _of_device(device: dict[str, Any]) -> str:
     """Return what a device is, has and does, in one line."""
     is_ready = "ready" if device["is_ready"] else "not ready"
+    if device["is_lost"]:
+        is_ready = "given up"
     return (
         f"{device['name']}: {device['renderer'] or 'not known yet'}, {is_ready}, "
         f"{device['n_sessions']} sessions, busy {device['busy_ratio']:.0%}, "

@@ -58,7 +58,8 @@ class ServiceConfig:
         What filters side by side, a process for each behind the one socket: up to eight
         of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as in
         ``devices = ["gl:0", "gl:1"]``.  A session is on the one that was least busy at
-        its beginning.  Empty: one process, as ``engine`` and ``gl_device`` say.
+        its beginning; a device that cannot be started again is given up.  Empty: one
+        process, as ``engine`` and ``gl_device`` say.
     psf_engine : "auto", "cpu" or "gpu"
         What computes PSFs, where it shall be another than the engine's.  A GPU is held
         for about 4 ms at a time, so that frames go on between.

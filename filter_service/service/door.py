@@ -148,6 +148,8 @@ class Door:
             device = self._devices[message[1]]
             device.frames.lose_held()
             device.render.join(Link.from_descriptor(descriptors[0]))
+        elif message[0] == "lost":
+            self._give_up(self._devices[message[1]])
         elif message[0] == "config":
             self.config = message[1]
             self._limits = self.config.limits
@@ -245,6 +247,10 @@ class Door:
                 session.leave(time.monotonic())
                 self._guests.remember(session)
         device.render.is_ready = True
+        self._greet_who_waits()
+
+    def _greet_who_waits(self) -> None:
+        """Answer those who said hello before all devices had said who they are."""
         if not self._devices.are_known:
             return
         for identity, hello in self._greetings:
@@ -253,6 +259,16 @@ class Door:
             except FilterError as error:
                 self._send(identity, ErrorReply.from_exception(error))
         self._greetings = []
+
+    def _give_up(self, device: ServedDevice) -> None:
+        """End the sessions of a device that is gone; they begin anew on another."""
+        device.give_up()
+        device.frames.lose_held()
+        for session in self._guests:
+            if session.device == device.index:
+                device.frames.lose_waiting(session)
+                self._forget(session, "its device is gone")
+        self._greet_who_waits()
 
     def _open(self, session: Session) -> None:
         """Have the render loop hold the eyes of a session, with their profiles."""

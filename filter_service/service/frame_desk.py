@@ -194,6 +194,15 @@ class FrameDesk:
             self.n_dropped += 1
         return self._send(session.identity, answer)
 
+    def lose_waiting(self, session: Session) -> None:
+        """Answer the frame of a session that can be handed over no more."""
+        waiting, session.waiting = session.waiting, None
+        if waiting is not None:
+            error = RenderFailed("the device that filtered frames is gone")
+            frame = waiting.frame
+            failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
+            self.answer(session, frame, failed)
+
     def lose_held(self) -> None:
         """Answer the frames that are lost with a render loop."""
         for lost in self._render.lose():

@@ -2,8 +2,9 @@
 
 The door owns the socket, a render process the eyes, those of one device where there are
 several.  Each outlives the others; a new one is given a link to those that are there.
-What stands still for long, stopped from outside or hung, is ended and started again.
-The keeper itself does nothing else, so there is little that could end it.
+What stands still for long, stopped from outside or hung, is ended and started again; a
+device that cannot be is given up where others are left.  The keeper itself does nothing
+else, so there is little that could end it.
 """
 
 from __future__ import annotations
@@ -67,6 +68,15 @@ class _Child:
             with suppress(LinkClosed):
                 self.link.send(message, descriptors)
 
+    def end(self) -> str:
+        """End the process, with patience first; return how it ended."""
+        how = "gone"
+        if self.process is not None:
+            how = how_it_ended(end(self.process, STOP_GRACE_S))
+        if self.link is not None:
+            self.link.close()
+        return how
+
 
 class Keeper:
     """Keeps a door and a render process going, or one for each of several devices.
@@ -106,6 +116,7 @@ class Keeper:
         )
         self._children = {name: _Child() for name in (DOOR, *self._devices)}
         self._standbys: dict[str, _Child] = {}
+        self._lost: list[int] = []  # devices that were given up
         self._spawned_s = 0.0  # the last process of all
         self._starts_s: dict[str, deque[float]] = {
             name: deque() for name in self._children
@@ -158,11 +169,11 @@ class Keeper:
         if self._is_to_read_again:
             self._is_to_read_again = False
             self._change_settings()
-        for name, child in self._children.items():
+        for name, child in list(self._children.items()):
             self._listen(name, child)
             self._check_stopped(name, child)
         if self._config.standby:
-            for name in self._devices:
+            for name in list(self._devices):
                 self._keep_standby(name)
 
     @property
@@ -249,6 +260,8 @@ class Keeper:
                 self._children[DOOR].tell(("link", index), [theirs.fileno()])
                 ours.close()
                 theirs.close()
+        for index in self._lost:
+            self._children[DOOR].tell(("lost", index))
 
     def _listen(self, name: str, child: _Child) -> None:
         try:
@@ -260,7 +273,8 @@ class Keeper:
                     self._endpoint = rest[0] or self._endpoint
                     self._tell_ready()
                 elif kind == "failed":
-                    raise ServiceFailed(rest[0])
+                    self._fail(name, rest[0])
+                    return
                 elif kind == "hung":
                     self._kill_device(rest[0])
         except LinkClosed:
@@ -275,15 +289,32 @@ class Keeper:
 
     def _restart(self, name: str, child: _Child) -> None:
         self._bury(name, child)
-        self._start(name)
+        try:
+            self._start(name)
+        except ServiceFailed as error:
+            self._fail(name, str(error))
+            return
         self._join(name)
 
+    def _fail(self, name: str, why: str) -> None:
+        """Give up a device where others are left, once all had been ready.
+
+        Raises
+        ------
+        ServiceFailed
+            The service cannot go on.
+        """
+        if name not in self._devices or len(self._devices) < 2 or self._when_ready:
+            raise ServiceFailed(why)
+        log.error("the %s process is given up: %s", name, why)
+        for child in (self._children.pop(name), self._standbys.pop(name, None)):
+            if child is not None:
+                child.end()
+        self._lost.append(self._devices.pop(name))
+        self._children[DOOR].tell(("lost", self._lost[-1]))
+
     def _bury(self, name: str, child: _Child) -> None:
-        how = "gone"
-        if child.process is not None:
-            how = how_it_ended(end(child.process, STOP_GRACE_S))
-        if child.link is not None:
-            child.link.close()
+        how = child.end()
         following = "a new one is started"
         if name in self._standbys:
             following = "the one that stood by takes over"
@@ -312,9 +343,6 @@ class Keeper:
         for child in self._all_children:
             child.tell(("stop",))
         for child in self._all_children:
-            if child.process is not None:
-                end(child.process, STOP_GRACE_S)
-            if child.link is not None:
-                child.link.close()
+            child.end()
         self._wake_reader.close()
         self._wake_writer.close()

@@ -40,6 +40,8 @@ class ServedDevice:
         What its process says of itself; None until it has.
     memory_mb, stores_mb, is_building
         As that process told last.
+    is_lost : bool
+        It was given up; no session is on it.
     """
 
     def __init__(
@@ -56,7 +58,12 @@ class ServedDevice:
         self.frames = FrameDesk(partial(guests.present_on, index), self.render, send)
         self.server: dict[str, str] | None = None
         self.memory_mb = self.stores_mb = 0.0
-        self.is_building = False
+        self.is_building = self.is_lost = False
+
+    def give_up(self) -> None:
+        """Note that it will not come again."""
+        self.is_lost, self.is_building = True, False
+        self.memory_mb = self.stores_mb = 0.0
 
     def state(self, sessions: Sequence[Session]) -> DeviceState:
         """Return what `pong` says of it; the sessions are those with a client."""
@@ -70,6 +77,7 @@ class ServedDevice:
             is_ready=self.render.is_ready,
             is_filtering=bool(self.render.held),
             is_building=self.is_building or any(s.asks for s in sessions),
+            is_lost=self.is_lost,
             render_silent_s=self.render.silent_s,
         )
 
@@ -123,7 +131,7 @@ class ServedDevices:
         """
         now_s = time.monotonic()
         return min(
-            self._devices,
+            self._left,
             key=lambda device: (
                 not device.render.is_ready,
                 len(self._guests.present_on(device.index)),
@@ -138,19 +146,24 @@ class ServedDevices:
         )
 
     @property
+    def _left(self) -> list[ServedDevice]:
+        """Return those that were not given up: one at least."""
+        return [device for device in self._devices if not device.is_lost]
+
+    @property
     def are_known(self) -> bool:
         """Return whether each has said who it is."""
-        return all(device.server is not None for device in self)
+        return all(device.server is not None for device in self._left)
 
     @property
     def are_ready(self) -> bool:
         """Return whether frames of all sessions can be filtered."""
-        return all(device.render.is_ready for device in self)
+        return all(device.render.is_ready for device in self._left)
 
     @property
     def silent_s(self) -> float:
         """Return since when one of them has given no sign of life."""
-        return max(device.render.silent_s for device in self)
+        return max(device.render.silent_s for device in self._left)
 
     @property
     def memory_mb(self) -> float:

@@ -316,7 +316,8 @@ class ErrorReply(Message):
 class DeviceState(Record):
     """What `pong` says of one of the devices that filter.
 
-    ``busy_ratio`` is the share of the last ten seconds or so in which it filtered.
+    ``busy_ratio`` is the share of the last ten seconds or so in which it filtered.  One
+    that ``is_lost`` was given up: it could not be started again.
     """
 
     name: Word
@@ -328,6 +329,7 @@ class DeviceState(Record):
     is_ready: bool = True
     is_filtering: bool = False
     is_building: bool = False
+    is_lost: bool = False
     render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
 
     def __post_init__(self) -> None:

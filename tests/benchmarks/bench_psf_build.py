@@ -7,7 +7,7 @@ traced through an estimated eye.  On a hardware GPU, or with --whole, the whole 
 201,825 PSFs follows, its kernels left on the GPU.  `rates` holds, per build, PSFs
 a second of wall time and of processor time (other programs on the machine hardly change
 the latter), and the operations and bytes that the method needs.  The rows "hold" have
-how long the device is held at a time: all at once, and in batches as the service builds.
+how long the device is held at a time: all at once, and in batches as a service builds.
 """
 
 import argparse

@@ -225,6 +225,45 @@ def test_none_uses_up_the_memory_of_another(start_service, raw_client):
     assert second.ask(Share(8_000_000)).path
 
 
+def test_a_device_that_does_not_come_again_is_given_up(
+    start_service, raw_client, monkeypatch, tmp_path
+):
+    gone = tmp_path / "gone"
+    monkeypatch.setenv("OCUFILTER_TEST_GONE_FILE", str(gone))
+    service = start_service(devices=["native:1", "native:2"])
+    first, second = Stream(service, 3), Stream(service, 4)
+    gone.touch()
+    os.kill(service.pids()["render 1"], signal.SIGKILL)
+    wait_until(lambda: "the render 1 process is given up" in service.log)
+    assert "no such device" in service.log
+    for _ in range(100):
+        first.turn()
+    first.end()
+    assert (first.others, first.n_seen) == ([], first.n_sent)
+    # The other's session is over, and its client begins anew by itself.
+    end_s = time.monotonic() + TIMEOUT_S
+    while second.n_seen == 0 and time.monotonic() < end_s:
+        second.turn()
+    assert second.n_seen > 0
+    assert [device["is_lost"] for device in devices_of(service)] == [False, True]
+    assert sessions_on(service) == [2, 0]
+    assert ask_status(service.endpoint)["is_ready"]
+    for stream in (first, second):
+        stream.client.close()
+    # A new door is told of it.
+    os.kill(service.pids()["door"], signal.SIGKILL)
+    fresh = raw_client(service)
+    fresh.begin(mark=9)
+    assert fresh.ask(small_frame(1)).colors[0][0, 0, 0] == 9
+
+
+def test_a_device_that_never_comes_ends_the_start(start_service, monkeypatch, tmp_path):
+    (tmp_path / "gone").touch()
+    monkeypatch.setenv("OCUFILTER_TEST_GONE_FILE", str(tmp_path / "gone"))
+    with pytest.raises(RuntimeError, match="no such device"):
+        start_service(devices=["native:1", "native:2"])
+
+
 @pytest.mark.slow
 def test_each_device_has_one_that_stands_by(start_service, monkeypatch):
     monkeypatch.setenv("OCUFILTER_TEST_STANDBY_AFTER_S", "0.5")

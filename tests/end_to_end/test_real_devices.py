@@ -1,8 +1,9 @@
-"""Two native engines of one thread each behind one socket, with real eyes."""
+"""Two engines behind one socket, with real eyes; native ones have a thread each."""
 
 import os
 import signal
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -52,6 +53,25 @@ def device_of(service, client):
     begins = f"session {client.hello().session_id} begins"
     line = next(line for line in service.log.splitlines() if begins in line)
     return int(line.rpartition(" ")[2])
+
+
+def test_a_gpu_and_a_processor_filter_side_by_side():
+    """The pictures of both engines agree, each from the device that was named."""
+    settings = {"devices": ["gl:0", "native:1"]}
+    view, seen, renderers = edge_view(), [], []
+    with (
+        ServiceProcess(settings, start_timeout_s=60.0) as service,
+        ExitStack() as open_,
+    ):
+        for _ in range(2):
+            client = open_.enter_context(
+                FilterClient(service.endpoint, timeout_s=TIMEOUT_S)
+            )
+            client.set_profile(MYOPIA, settings=SETTINGS, views=[view])
+            renderers.append(client.hello().server["renderer"])
+            seen.append(client.filter(view, **SEE).color)
+    assert "native" not in renderers[0] and "native" in renderers[1]
+    np.testing.assert_allclose(seen[0], seen[1], atol=2e-3)
 
 
 @pytest.mark.clock
