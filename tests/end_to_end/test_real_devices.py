@@ -55,16 +55,17 @@ def device_of(service, client):
     return int(line.rpartition(" ")[2])
 
 
+@pytest.mark.slow
 def test_a_gpu_and_a_processor_filter_side_by_side():
     """The pictures of both engines agree, each from the device that was named."""
     settings = {"devices": ["gl:0", "native:1"]}
     view, seen, renderers = edge_view(), [], []
     with (
         ServiceProcess(settings, start_timeout_s=60.0) as service,
-        ExitStack() as open_,
+        ExitStack() as all_,
     ):
         for _ in range(2):
-            client = open_.enter_context(
+            client = all_.enter_context(
                 FilterClient(service.endpoint, timeout_s=TIMEOUT_S)
             )
             client.set_profile(MYOPIA, settings=SETTINGS, views=[view])
