@@ -83,7 +83,8 @@ class ServiceProcess:
     def pids(self) -> dict[str, int]:
         """Return the processes of the service by name: keeper, door, render (Linux).
 
-        With a second process that filters, the one that stands by is `standby`.
+        With a second process that filters, the one that stands by is `standby`; those
+        of several devices are `render 0` and so on.
         """
         keeper = self.process.pid
         found = {"keeper": keeper}
@@ -95,8 +96,10 @@ class ServiceProcess:
                 continue
             module = next((w for w in words if w.endswith(b"_process")), b"")
             name = module.decode().rpartition(".")[2].removesuffix("_process")
+            if name == "render":
+                name = words[-2].decode()  # its last argument; an empty word follows
             if name in found:
-                name = "standby"  # the older one filters
+                name = name.replace("render", "standby")  # the older one filters
             if name:
                 found[name] = child
         return found

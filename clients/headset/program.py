@@ -152,31 +152,42 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         stack.callback(seeing.close)
         is_told = options.gaze_range is not None
         eyes = _Eyes(settings, is_told, look, seeing, profiles)
+        controls = Controls(profiles, eyes.change, say)
         viewer = Viewer(
             lambda: _runtime(options, context, size_px, pictures),
             scenery,
             seeing,
             look,
-            Controls(profiles, eyes.change, say),
+            controls,
             read_keys=stack.enter_context(TerminalKeys()).pressed,
             say=say,
             on_session=eyes.begin,
         )
-        took_s = _view(viewer, options)
+        took_s = _view(viewer, controls, options)
         if options.out is not None:
             pictures.write(options.out)
         return _report(options, viewer.log, took_s, seeing)
 
 
-def _view(viewer: Viewer, options: argparse.Namespace) -> float:
+def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> float:
     """Show until the end, or until a signal; return how long it took, in s."""
     if sys.stdin is not None and sys.stdin.isatty():
         say(HELP)
     started_s = time.monotonic()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def end(*_: object) -> None:
+        # Not by an exception: one that is raised in a call from C is lost.
+        controls.is_over = True
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)  # again: at once
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
     try:
         viewer.run(max_frames=options.frames, limit_s=options.seconds)
     except KeyboardInterrupt:
+        controls.is_over = True
+    if controls.is_over:
         say("ended")
     return time.monotonic() - started_s
 

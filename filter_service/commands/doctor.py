@@ -29,6 +29,9 @@ def _print_report(report: dict) -> None:
         say(f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}")
     for name, value in report["gl"]["limits"].items():
         say(f"      {name}: {value}")
+    for device in report["gl"]["devices"]:
+        said = device["renderer"] or f"no context: {device['error']}"
+        say(f"      EGL device {device['index']} ({device['name']}): {said}")
     works = [name for name, ok in report["works"].items() if ok]
     fails = [name for name, ok in report["works"].items() if not ok]
     say("works here: " + (", ".join(works) or "nothing"))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from estimator.threads import thread_count
 from filter_service.gl.hardware import is_software_renderer
+from filter_service.gl_device import GL_DEVICE_VARIABLE, is_device_named
 from filter_service.threads import UNSAFE_THREADING_LAYER
 
 SERVICE_PACKAGES = (
@@ -80,8 +81,8 @@ def examine() -> dict:
     -------
     report : dict
         Plain JSON: ``ok`` (the service can run), ``works`` by purpose, ``checks``,
-        ``install`` (commands), ``machine``, ``gl``, ``native`` (the compiled loops),
-        ``threading_layer``,
+        ``install`` (commands), ``machine``, ``gl`` (with the
+        ``devices`` of EGL), ``native`` (the compiled loops), ``threading_layer``,
         ``networks`` (each with its weights' size and expected error), ``packages``.
     """
     gl = run_probe("gl")
@@ -112,7 +113,8 @@ def examine() -> dict:
         "checks": [asdict(check) for check in checks],
         "install": install_commands(checks),
         "machine": machine(),
-        "gl": gl.get("info", {}) | {"limits": gl.get("limits", {})},
+        "gl": gl.get("info", {})
+        | {"limits": gl.get("limits", {}), "devices": gl_devices()},
         "native": native.get("name"),
         "threading_layer": threads.get("layer"),
         "networks": networks.get("cards", {}),
@@ -120,7 +122,22 @@ def examine() -> dict:
     }
 
 
-def run_probe(name: str, timeout_s: float = PROBE_TIMEOUT_S) -> dict:
+def gl_devices() -> list[dict]:
+    """Return the devices of EGL, each with its ``renderer`` or the ``error`` it gave.
+
+    Each is tried in a process of its own: a broken driver may take it along.
+    """
+    devices = run_probe("devices").get("devices", [])
+    for device in devices:
+        found = run_probe("gl", gl_device=str(device["index"]))
+        device["renderer"] = found.get("info", {}).get("renderer")
+        device["error"] = found.get("error")
+    return devices
+
+
+def run_probe(
+    name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
+) -> dict:
     """Run one probe in its own process; ``error`` says why it gave no answer."""
     command = [sys.executable, "-m", "filter_service.commands.doctor_probes", name]
     try:
@@ -130,6 +147,7 @@ def run_probe(name: str, timeout_s: float = PROBE_TIMEOUT_S) -> dict:
             text=True,
             timeout=timeout_s,
             check=False,
+            env=os.environ | ({GL_DEVICE_VARIABLE: gl_device} if gl_device else {}),
         )
     except subprocess.TimeoutExpired:
         return {"error": f"no answer within {timeout_s:g} s"}
@@ -265,6 +283,10 @@ def check_native(native: dict) -> Check:
 def check_engine(gl: dict, native: dict) -> Check:
     """Say which engine filters frames unless told otherwise, and why."""
     renderer = gl.get("info", {}).get("renderer", "")
+    if is_device_named():
+        said = f"{GL_DEVICE_VARIABLE} names its device"
+        fix = "" if renderer else f"unset {GL_DEVICE_VARIABLE}"
+        return Check("engine", bool(renderer), f"gl: {said}", fix)
     if renderer and not is_software_renderer(renderer):
         return Check("engine", True, f"gl: {renderer} is a hardware GPU")
     lacks = f"{renderer} is software" if renderer else "no OpenGL"

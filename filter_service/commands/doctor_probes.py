@@ -2,7 +2,9 @@
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
-    python -m filter_service.commands.doctor_probes gl|shaders|native|threads|networks
+    python -m filter_service.commands.doctor_probes NAME
+
+Names are those of `PROBES`.
 """
 
 import json
@@ -52,10 +54,29 @@ def probe_gl() -> dict:
     buffer.release()
     info = gpu.context.info
     return {
-        "info": {key: gpu.info[key] for key in ("renderer", "version", "vendor")},
+        "info": {
+            key: gpu.info[key] for key in ("renderer", "version", "vendor", "device")
+        },
         "limits": {key: info[key] for key in LIMITS},
         "compute_correct": bool((after == before * before + 1).all()),
         "gl_error": gpu.context.error,
+    }
+
+
+def probe_devices() -> dict:
+    """List the devices of EGL; whether they give contexts, `probe_gl` finds out."""
+    from filter_service.gl.egl_devices import egl_devices
+
+    return {
+        "devices": [
+            {
+                "index": device.index,
+                "name": device.name,
+                "is_software": device.is_software,
+                "extensions": list(device.extensions),
+            }
+            for device in egl_devices()
+        ]
     }
 
 
@@ -152,6 +173,7 @@ def probe_networks() -> dict:
 
 PROBES = {
     "gl": probe_gl,
+    "devices": probe_devices,
     "shaders": probe_shaders,
     "native": probe_native,
     "threads": probe_threads,

@@ -47,6 +47,7 @@ class Bench(StrEnum):
     HOST = "host"
     ABUSE = "abuse"
     OVERLOAD = "overload"
+    DEVICES = "devices"
     RESTART = "restart"
     ROUNDTRIP = "roundtrip"
 
@@ -77,6 +78,7 @@ BENCH_MODULES = {
     Bench.HOST: "tests.benchmarks.bench_host",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
+    Bench.DEVICES: "tests.benchmarks.bench_devices",
     Bench.RESTART: "tests.benchmarks.bench_restart",
     Bench.ROUNDTRIP: "clients.latency",
 }

@@ -26,6 +26,20 @@ def serve(
             help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
         ),
     ] = None,
+    gl_device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="INDEX",
+            help="EGL device of the shaders, of those that doctor lists; or auto.",
+        ),
+    ] = None,
+    devices: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="A process for each: gl:0,gl:1 or native:4,native:4.",
+        ),
+    ] = None,
     keep_eyes: Annotated[
         Path | None,
         typer.Option(
@@ -57,6 +71,8 @@ def serve(
         config,
         bind=bind,
         engine=engine,
+        gl_device=gl_device,
+        devices=devices,
         ready_file=ready_file,
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )

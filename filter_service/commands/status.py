@@ -1,7 +1,7 @@
 """`ocufilter status`: what a running service says of itself."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -41,3 +41,17 @@ def status(
     for name in ("is_filtering", "is_building"):
         print(f"  {name:<16} {'yes' if found[name] else 'no'}")
     print(f"  {'render_silent_s':<16} {found['render_silent_s']:.2f}")
+    for index, device in enumerate(found["devices"]):
+        print(f"  {f'device {index}':<16} {_of_device(device)}")
+
+
+def _of_device(device: dict[str, Any]) -> str:
+    """Return what a device is, has and does, in one line."""
+    is_ready = "ready" if device["is_ready"] else "not ready"
+    if device["is_lost"]:
+        is_ready = "given up"
+    return (
+        f"{device['name']}: {device['renderer'] or 'not known yet'}, {is_ready}, "
+        f"{device['n_sessions']} sessions, busy {device['busy_ratio']:.0%}, "
+        f"{device['n_rendered']} frames, {device['memory_mb']:.0f} MB"
+    )

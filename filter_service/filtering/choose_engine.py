@@ -9,6 +9,7 @@ from typing import Any
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.gl.hardware import may_have_gpu
+from filter_service.gl_device import is_device_named
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def open_engine(
     Parameters
     ----------
     choice : "auto", "gl" or "native"
-        "auto" takes gl on a hardware GPU, else native.
+        "auto" takes gl on a hardware GPU, or where one device is named, else native.
     closing : ExitStack
         Ends it.
     warm_up : bool
@@ -62,6 +63,8 @@ def open_engine(
         return _native(closing, "as asked")
     if choice == "gl":
         return _gl(closing, "as asked", warm_up=warm_up)
+    if is_device_named():
+        return _gl(closing, "its device is named", warm_up=warm_up)
     return _automatic(closing, warm_up=warm_up)
 
 

@@ -1,6 +1,8 @@
 """OpenGL: one owner of the context.
 
+choose_device  on which device the context is opened
 copying        copies of large images by several threads
+egl_devices    which there are
 gpu            context, buffers, textures, programs
 hardware       which renderers are a GPU
 shader_source  shader text: includes, defines, line numbers

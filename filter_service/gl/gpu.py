@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
+from filter_service.gl.choose_device import open_on_device
 from filter_service.gl.copying import copy_bytes
 from filter_service.gl.hardware import is_software_renderer
 from filter_service.gl.shader_source import legend, load_shader
 from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_storage
+from filter_service.gl_device import checked_gl_device, wanted_gl_device
 
 Buffer = moderngl.Buffer
 Query = moderngl.Query
@@ -52,29 +54,29 @@ _IMAGE_BARRIERS = (
 class Gpu:
     """A standalone EGL context with named, grow-only storage buffers.
 
+    Parameters
+    ----------
+    device : str, optional
+        "auto", or the index of an EGL device; else what the environment asks for.
+
     Attributes
     ----------
     info : dict
-        Renderer, version, and the limits that the renderer plans with.
+        Renderer, version, index of the EGL device, and the limits that the renderer
+        plans with.
     is_software : bool
         Whether a CPU does the work.
     """
 
-    def __init__(self) -> None:
-        try:
-            self.context = moderngl.create_context(
-                standalone=True, require=430, backend="egl"
-            )
-        except Exception as error:
-            raise RenderFailed(
-                f"no OpenGL 4.3 context through EGL ({error}); "
-                "run 'ocufilter doctor' to see what is missing"
-            ) from error
+    def __init__(self, device: str | None = None) -> None:
+        choice = wanted_gl_device() if device is None else checked_gl_device(device)
+        self.context, index = open_on_device(choice, _context_on)
         info = self.context.info
         self.info = {
             "renderer": info["GL_RENDERER"],
             "version": info["GL_VERSION"],
             "vendor": info["GL_VENDOR"],
+            "device": index,
             "max_storage_block_bytes": info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"],
         }
         self.is_software = is_software_renderer(self.info["renderer"])
@@ -405,6 +407,12 @@ class _Read(NamedTuple):
 
     fence: int
     targets: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]
+
+
+def _context_on(index: int) -> moderngl.Context:
+    return moderngl.create_context(
+        standalone=True, require=430, backend="egl", device_index=index
+    )
 
 
 def _bytes_of(array: NDArray) -> NDArray[np.uint8]:

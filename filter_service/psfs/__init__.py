@@ -6,6 +6,7 @@ wide_primaries       kernels of primaries of two wavelengths
 psf_engine           on the CPU or the GPU
 gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers
+gpu_build_pace       how much of it at a time
 gpu_build_passes     their passes
 gpu_build_records    their records
 boxes                what kernels are cut to

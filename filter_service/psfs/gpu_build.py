@@ -5,6 +5,9 @@ do that part on the CPU in threads while the GPU works.  Everything is core Open
 at most 16 KiB of shared memory, 256 threads a group, 5 storage blocks a pass.  What a
 wave method would need a longer FFT than 1024 samples for is computed on the CPU.
 
+Frames are filtered on the same GPU by another process: PSFs are queued in batches of
+about 4 ms, see `gpu_build_pace`.
+
 On a software renderer the passes take two to four times the processor time of
 `estimator.psf.compute`, whose compiled loops a builder should prefer there.
 """
@@ -31,6 +34,7 @@ from estimator.psf.kernel_types import KernelBuffer, empty_buffer
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.threads import thread_count
 from filter_service.gl.gpu import Gpu
+from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.gpu_build_passes import PsfPasses
 from filter_service.psfs.gpu_build_records import (
     FIELD_BYTES,
@@ -236,6 +240,7 @@ def gpu_psf_batch(
     max_radius_px: int = 255,
     min_energy_ratio: float = MIN_ENERGY_RATIO,
     workers: int | None = None,
+    pace: Pace | None = None,
 ) -> PsfBatch:
     """Point-spread functions of many wavefronts, integrated over pixels, on the GPU.
 
@@ -250,6 +255,9 @@ def gpu_psf_batch(
         its own limit.
     workers : int, optional
         Threads of the survey; as many as the process may use where it is None.
+    pace : Pace, optional
+        What is known of the device's speed from calls before; it says how long the
+        device is held at a time.
 
     Returns
     -------
@@ -275,7 +283,7 @@ def gpu_psf_batch(
         "max_radius_px": max_radius_px,
         "min_energy_ratio": min_energy_ratio,
     }
-    passes = PsfPasses(gpu)
+    passes = PsfPasses(gpu, pace or Pace())
     batches = []
     for block in _prepare(gpu, zernike_um, options, accuracy, workers):
         output = empty_buffer(block.plan.radius_px, block.plan.geometric_ratio)

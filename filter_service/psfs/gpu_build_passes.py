@@ -1,5 +1,7 @@
 """Dispatches of the passes that build PSFs, over jobs of `gpu_build_records`."""
 
+from collections.abc import Hashable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,11 @@ from filter_service.psfs.gpu_build_constants import (
     RAY_ROWS,
     fft_defines,
 )
+from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.gpu_build_records import Chunk, Jobs
+
+READ_COUNT = 1 << 23
+"""Elements that are fetched at a time: 32 MiB, 3 ms at 10 GB/s."""
 
 
 def _groups(count: int, size: int) -> int:
@@ -21,14 +27,21 @@ def _groups(count: int, size: int) -> int:
 class PsfPasses:
     """The buffers and passes of one caller; the context must be current.
 
+    Parameters
+    ----------
+    gpu : Gpu
+    pace : Pace
+        How much of it is queued at a time.
+
     Attributes
     ----------
     kernels, totals : Buffer
         What the passes write.
     """
 
-    def __init__(self, gpu: Gpu):
+    def __init__(self, gpu: Gpu, pace: Pace):
         self._gpu = gpu
+        self._pace = pace
         self.kernels: Buffer | None = None
         self.totals: Buffer | None = None
 
@@ -63,18 +76,25 @@ class PsfPasses:
         most = max(c.stripe_count for c in jobs.chunks)
         buffers["PSF_STRIPES"] = gpu.storage("psf_stripes", 4 * max(most, 1))
         for chunk in jobs.chunks:
-            self._waves_of(chunk, buffers, jobs.is_apodised)
+            works = np.ones(chunk.count)  # all have the same lengths
+            for first, count in self._parts(("waves", *chunk.lengths), works):
+                self._waves_of(chunk, first, count, buffers, jobs.is_apodised)
 
-    def _waves_of(self, chunk: Chunk, buffers: dict, is_apodised: bool) -> None:
+    def _parts(self, kind: Hashable, works: NDArray) -> Iterator[tuple[int, int]]:
+        return self._pace.parts(kind, works, self._gpu.context.finish)
+
+    def _waves_of(
+        self, chunk: Chunk, first: int, count: int, buffers: dict, is_apodised: bool
+    ) -> None:
         length_x, length_y = chunk.lengths
-        first = {"first_record": chunk.first}
+        first_of = {"first_record": chunk.first + first}
 
         def run(name, groups, defines, uniforms, *bindings) -> None:
             self._gpu.dispatch(
                 name,
-                (groups, chunk.count),
+                (groups, count),
                 buffers={b: buffers[b] for b in bindings},
-                uniforms={**first, **uniforms},
+                uniforms={**first_of, **uniforms},
                 defines={**DEFINES, **defines},
             )
 
@@ -118,50 +138,65 @@ class PsfPasses:
             "PSF_TOTALS": self.totals,
         }
         for chunk in jobs.chunks:
-            self._rays_of(chunk, buffers, jobs.is_apodised, diffraction)
+            grid = jobs.records["grid"][chunk.first : chunk.first + chunk.count]
+            works = np.square(grid[:, 0].astype(np.float64))  # its cells
+            for first, count in self._parts(("rays", diffraction), works):
+                if first == 0:
+                    self._clear_images(chunk, buffers)
+                self._rays_of(
+                    *(chunk, first, count, buffers, jobs.is_apodised, diffraction)
+                )
 
-    def _rays_of(self, chunk: Chunk, buffers, is_apodised, diffraction) -> None:
+    def _clear_images(self, chunk: Chunk, buffers: dict) -> None:
         n_quads = _groups(chunk.scratch_count, 4)
-        first = {"first_record": chunk.first}
+        self._gpu.dispatch(
+            "psf_ray_clear",
+            (_groups(n_quads, CLEAR_THREADS), 1),
+            buffers={"PSF_IMAGES": buffers["PSF_IMAGES"]},
+            uniforms={"n_quads": n_quads},
+            defines=DEFINES,
+        )
 
-        def run(name, groups, uniforms, bindings, **variant) -> None:
+    def _rays_of(
+        self, chunk: Chunk, first: int, count: int, buffers, is_apodised, diffraction
+    ) -> None:
+        uniforms = {"first_record": chunk.first + first}
+
+        def run(name, groups, bindings, **variant) -> None:
             self._gpu.dispatch(
                 name,
-                groups,
+                (groups, count),
                 buffers={f"PSF_{b}": buffers[f"PSF_{b}"] for b in bindings},
                 uniforms=uniforms,
                 defines={**DEFINES, **variant},
             )
 
-        clear = (_groups(n_quads, CLEAR_THREADS), 1)
-        run("psf_ray_clear", clear, {"n_quads": n_quads}, ("IMAGES",))
         n_cells, n_points = chunk.largest
         run(
             "psf_ray_splat",
-            (_groups(n_cells, RAY_ROWS), chunk.count),
-            first,
+            _groups(n_cells, RAY_ROWS),
             ("RECORDS", "IMAGES"),
             **({"APODISED": 1} if is_apodised else {}),
         )
         if diffraction:
             run(
                 "psf_ray_edge",
-                (_groups(n_points, RAY_ROWS), chunk.count),
-                first,
+                _groups(n_points, RAY_ROWS),
                 ("RECORDS", "TABLES", "IMAGES"),
             )
         run(
             "psf_ray_pixels",
-            (1, chunk.count),
-            first,
+            1,
             ("RECORDS", "IMAGES", "KERNELS", "TOTALS"),
             **({"DIFFRACTING": 1} if diffraction else {}),
         )
 
     def read_kernels(self, out: NDArray[np.float32]) -> None:
-        """Fill an array with the slab's kernels; waits for the GPU."""
-        if out.size:
-            self._gpu.read_into((self.kernels, 0, out))
+        """Fill an array with the slab's kernels; waits for the GPU, part by part."""
+        self._pace.flush(self._gpu.context.finish)
+        for start in range(0, out.size, READ_COUNT):
+            part = out[start : start + READ_COUNT]
+            self._gpu.read_into((self.kernels, 4 * start, part))
 
     def read_totals(self, count: int) -> NDArray[np.float64]:
         """Light (P,) in the discs of a block's kernels."""

@@ -10,6 +10,7 @@ from filter_service.errors import RenderFailed
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.hardware import may_have_gpu
 from filter_service.psfs.gpu_build import gpu_psf_batch
+from filter_service.psfs.gpu_build_pace import Pace
 
 CPU_BATCH = 768
 GPU_BATCH = 8192
@@ -68,9 +69,13 @@ def psf_engine(choice: str = "auto") -> PsfEngine:
     if choice == "auto" and gpu.is_software:
         gpu.close()
         return CPU
-    return PsfEngine("gpu", partial(_computed_on, gpu), GPU_BATCH)
+    return PsfEngine("gpu", partial(_computed_on, gpu, Pace()), GPU_BATCH)
 
 
-def _computed_on(gpu: Gpu, *arguments, diffraction: bool = True, **options) -> PsfBatch:
+def _computed_on(
+    gpu: Gpu, pace: Pace, *arguments, diffraction: bool = True, **options
+) -> PsfBatch:
     with gpu.context:
-        return gpu_psf_batch(gpu, *arguments, diffraction=diffraction, **options)
+        return gpu_psf_batch(
+            gpu, *arguments, diffraction=diffraction, pace=pace, **options
+        )

@@ -3,10 +3,13 @@
 launch          starting: signals, the line that says it is ready
 keeper          starts the processes, and starts again what dies or stands still
 child           what those processes have in common
+devices         what filters side by side, as the settings name it
 door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
 gate            who may connect to it
+served_devices  the devices as the door knows them
+load            how busy one was of late
 metrics         counters for Prometheus
 patience        how many wrong messages are answered
 asking          a question to a running service

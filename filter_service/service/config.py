@@ -8,10 +8,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from estimator.threads import MAX_THREADS
+from estimator.threads import MAX_THREADS, thread_count
 from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES, PSF_ENGINES
+from filter_service.gl_device import checked_gl_device
 from filter_service.log_lines import LOG_FORMATS
+from filter_service.service.devices import check_devices, device_named
 from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
@@ -43,13 +45,24 @@ class ServiceConfig:
         A profile that needs more memory for its PSFs is refused.
     max_stores_mb : int
         What the PSFs of all clients may take together: those that no frame has used
-        for longest make room, and are prepared again when they are wanted.
+        for longest make room, and are prepared again when they are wanted.  Of several
+        devices each has so much.
     engine : "auto", "gl" or "native"
         What filters frames and, unless ``psf_engine`` says otherwise, computes PSFs:
         a GPU's compute shaders, or compiled loops on all cores.  "auto" takes gl on a
         hardware GPU, else native.
+    gl_device : str
+        The EGL device that OpenGL works on, by its index, which asks for the engine gl;
+        "auto": the first that works, hardware before software.
+    devices : tuple of str
+        What filters side by side, a process for each behind the one socket: up to eight
+        of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as in
+        ``devices = ["gl:0", "gl:1"]``.  A session is on the one that was least busy at
+        its beginning; a device that cannot be started again is given up.  Empty: one
+        process, as ``engine`` and ``gl_device`` say.
     psf_engine : "auto", "cpu" or "gpu"
-        What computes PSFs, where it shall be another than the engine's.
+        What computes PSFs, where it shall be another than the engine's.  A GPU is held
+        for about 4 ms at a time, so that frames go on between.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
@@ -59,7 +72,8 @@ class ServiceConfig:
         What that folder may hold; those unused for longest go.
     threads : int
         Of everything that is computed on the processor; 0 takes the cores that this
-        process may use, capped by a container's quota.
+        process may use, capped by a container's quota.  Several devices share them,
+        those apart that name a number of their own.
     build_niceness : int
         Of what is computed after a profile's first PSFs, so that the render loop wins
         where cores are few.
@@ -76,9 +90,11 @@ class ServiceConfig:
         it, may take: then it is taken for hung, and started again.
     standby : bool
         A second process that filters stands by: after a fault of the first, frames go
-        on a second sooner.  It takes some hundred megabytes.
+        on a second sooner.  It takes some hundred megabytes, for each of several
+        devices.
     max_image_mb : int
-        Images of all frames and results that the service holds.
+        Images of all frames and results that the service holds; of several devices each
+        has an equal part.
     shared_memory : bool
         Offer memory that images lie in to clients of this user on this machine.
     max_socket_mb : int
@@ -105,6 +121,8 @@ class ServiceConfig:
     max_store_mb: int = 2000
     max_stores_mb: int = 4000
     engine: str = "auto"
+    gl_device: str = "auto"
+    devices: tuple[str, ...] = ()
     psf_engine: str = "auto"
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
@@ -136,10 +154,31 @@ class ServiceConfig:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}"
                 )
+        checked_gl_device(self.gl_device)
+        check_devices(self.devices, engine=self.engine, gl_device=self.gl_device)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}; allowed: {low} to {high}")
+
+    @property
+    def device_names(self) -> tuple[str, ...]:
+        """Return what the devices are called: that of one alone after its engine."""
+        return self.devices or (self.engine,)
+
+    def of_device(self, index: int) -> ServiceConfig:
+        """Return the settings of one device's process: of one alone the same."""
+        if not self.devices:
+            return self
+        device = device_named(self.devices[index])
+        share = max(1, (self.threads or thread_count()) // len(self.devices))
+        return replace(
+            self,
+            devices=(),
+            engine=device.engine,
+            gl_device=device.gl_device,
+            threads=device.threads or share,
+        )
 
     @property
     def limits(self) -> Limits:
@@ -273,6 +312,14 @@ def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConf
     return ServiceConfig(**_typed(settings))
 
 
+def _words(name: str, value: object) -> tuple[str, ...]:
+    """Return words that stand in a list, or between commas."""
+    words = [w.strip() for w in value.split(",")] if isinstance(value, str) else value
+    if isinstance(words, list | tuple) and all(type(word) is str for word in words):
+        return tuple(words)
+    raise ValueError(f"{name} is {value!r}; allowed: a list of texts")
+
+
 def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings with the types of their fields."""
     defaults = {field.name: field.default for field in fields(ServiceConfig)}
@@ -291,6 +338,10 @@ def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
         wanted = type(defaults[name])
         if wanted is float and type(value) is int:
             value = float(value)
+        if name == "gl_device" and type(value) is int:
+            value = str(value)
+        if name == "devices":
+            value = _words(name, value)
         if type(value) is not wanted:
             raise ValueError(f"{name} is {value!r}; allowed: {wanted.__name__}")
         typed[name] = value

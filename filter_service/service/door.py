@@ -1,8 +1,9 @@
 """The door: the process that owns the socket, the sessions and their credit.
 
 It checks every message, answers what it can by itself, and hands frames and profiles
-to the render loop over a link, one at a time, or a small one beside a large one: the
-newest frame of each client, clients by time used.  Images go through shared memory.  It
+to a render loop over a link, one at a time, or a small one beside a large one: the
+newest frame of each client, clients by time used.  Where several devices filter, each
+has such a loop, and a session is on one of them.  Images go through shared memory.  It
 renders nothing, so that it answers while a frame is rendered, however long that takes.
 """
 
@@ -54,6 +55,7 @@ from filter_service.service.metrics import serve_metrics
 from filter_service.service.patience import Patience
 from filter_service.service.process_info import resident_memory_mb
 from filter_service.service.render_end import RenderEnd
+from filter_service.service.served_devices import ServedDevice, ServedDevices
 from filter_service.service.session import EyeProfiles, Session
 from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
@@ -80,14 +82,12 @@ class Door:
         self.config = config
         self._limits = config.limits
         self._keeper = keeper
-        self._render = RenderEnd(config.max_image_mb * MB)
-        self._render_mb = self._stores_mb = 0.0
-        self._is_building = False
-        self._server: dict[str, str] | None = None
-        self._greetings: list[tuple[bytes, Hello]] = []  # until the renderer is known
+        self._greetings: list[tuple[bytes, Hello]] = []  # until renderers are known
         self._guests = Guests()
         self._patience = Patience()
-        self._frames = FrameDesk(self._guests, self._render, self._send)
+        self._devices = ServedDevices(
+            *(config.device_names, config.max_image_mb * MB, self._guests, self._send)
+        )
         self._n_faults = 0
         now_s = time.monotonic()
         self._next_alive_s = now_s + config.alive_interval_s
@@ -99,25 +99,36 @@ class Door:
             keys=KeyRing(config.keys_dir) if config.keys_dir else None,
         )
         self.endpoint = self._mailbox.endpoint
-        self._sharing = Sharing(config, self.endpoint, self._render)
+        self._sharing = Sharing(config, self.endpoint, self._render_of)
         if config.metrics_port:
             serve_metrics(config.metrics_port, self.metrics)
 
     def metrics(self) -> dict[str, float]:
         """Return the values of `METRICS`; another thread asks."""
+        desks = [device.frames for device in self._devices]
         return {
-            "ocufilter_ready": float(self._render.is_ready),
+            "ocufilter_ready": float(self._devices.are_ready),
             "ocufilter_sessions": len(self._guests.present),
             "ocufilter_sessions_away": len(self._guests.away),
-            "ocufilter_frames_filtered_total": self._frames.n_rendered,
-            "ocufilter_frames_dropped_total": self._frames.n_dropped,
-            "ocufilter_filter_seconds_total": self._frames.filtered_s,
+            "ocufilter_frames_filtered_total": sum(d.n_rendered for d in desks),
+            "ocufilter_frames_dropped_total": sum(d.n_dropped for d in desks),
+            "ocufilter_filter_seconds_total": sum(d.filtered_s for d in desks),
             "ocufilter_messages_unheard_total": self._patience.n_unheard,
             "ocufilter_faults_total": self._n_faults,
-            "ocufilter_memory_bytes": MB * (resident_memory_mb() + self._render_mb),
-            "ocufilter_psfs_bytes": MB * self._stores_mb,
-            "ocufilter_render_silent_seconds": self._render.silent_s,
+            "ocufilter_memory_bytes": MB * self._memory_mb,
+            "ocufilter_psfs_bytes": MB * sum(d.stores_mb for d in self._devices),
+            "ocufilter_render_silent_seconds": self._devices.silent_s,
         }
+
+    @property
+    def _memory_mb(self) -> float:
+        return resident_memory_mb() + self._devices.memory_mb
+
+    def _render_of(self, session: Session) -> RenderEnd:
+        return self._devices.of(session).render
+
+    def _frames_of(self, session: Session) -> FrameDesk:
+        return self._devices.of(session).frames
 
     # The loop
 
@@ -134,29 +145,34 @@ class Door:
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
         """Do what the keeper says; return whether to go on."""
         if message[0] == "link":
-            self._frames.lose_held()
-            self._render.join(Link.from_descriptor(descriptors[0]))
+            device = self._devices[message[1]]
+            device.frames.lose_held()
+            device.render.join(Link.from_descriptor(descriptors[0]))
+        elif message[0] == "lost":
+            self._give_up(self._devices[message[1]])
         elif message[0] == "config":
             self.config = message[1]
             self._limits = self.config.limits
         return bool(message[0] != "stop")
 
     def _turn(self) -> None:
-        readable, writable = self._render.descriptors()
+        readable, writable = self._devices.descriptors()
         readable = readable | {self._keeper.fileno()}
         if self._keeper.has_unsent:
             writable = writable | {self._keeper.fileno()}
         self._mailbox.watch(readable, writable)
         self._mailbox.wait(self._wait_s())
         self._keeper.flush()
-        self._listen_to_render()
+        for device in self._devices:
+            self._listen_to(device)
         self._take_in_messages()
-        self._frames.hand_over_one()
+        for device in self._devices:
+            device.frames.hand_over_one()
         self._tidy()
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
-        soon_s = self._frames.wait_s(now_s)
+        soon_s = self._devices.wait_s(now_s)
         if soon_s is not None:
             return soon_s
         due_s = min(self._next_alive_s, self._next_trim_s)
@@ -171,55 +187,72 @@ class Door:
     def _tidy(self) -> None:
         """Do what is due now and then."""
         now_s = time.monotonic()
-        self._frames.tidy()
+        for device in self._devices:
+            device.frames.tidy()
         self._probe_clients()
         for session in self._guests.away:
             if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
                 self._forget(session, "its client did not come back")
         if now_s >= self._next_trim_s:
             self._next_trim_s = now_s + TRIM_INTERVAL_S
-            if self._frames.is_idle:
-                self._render.trim()
-        if self._render.is_up and self._render.stuck_s > self.config.frame_limit_s:
-            limit_s = self.config.frame_limit_s
+            for device in self._devices:
+                if device.frames.is_idle:
+                    device.render.trim()
+        for device in self._devices:
+            self._end_if_stuck(device)
+
+    def _end_if_stuck(self, device: ServedDevice) -> None:
+        limit_s = self.config.frame_limit_s
+        if device.render.is_up and device.render.stuck_s > limit_s:
             log.error("the process that filters frames is stuck for %g s", limit_s)
-            self._render.excuse()
-            self._keeper.send(("hung",))
+            device.render.excuse()
+            self._keeper.send(("hung", device.index))
 
-    # The render loop
+    # The render loops
 
-    def _listen_to_render(self) -> None:
+    def _listen_to(self, device: ServedDevice) -> None:
         try:
-            for kind, *rest in self._render.receive():
+            for kind, *rest in device.render.receive():
                 if kind == "answer":
-                    self._frames.take_answer(*rest)
+                    device.frames.take_answer(*rest)
                 elif kind == "tell":
                     self._pass_on(*rest)
                 elif kind == "state":
-                    self._render_mb, self._stores_mb, self._is_building = rest
+                    device.memory_mb, device.stores_mb, device.is_building = rest
                 elif kind == "here":
-                    self._begin_with(*rest)
+                    self._begin_with(device, *rest)
         except LinkClosed:
-            self._frames.lose_held()
+            device.frames.lose_held()
 
     def _begin_with(
-        self, server: dict[str, str], eyes: list[tuple[Any, ...]], may_rest: bool
+        self,
+        device: ServedDevice,
+        server: dict[str, str],
+        eyes: list[tuple[Any, ...]],
+        may_rest: bool,
     ) -> None:
         """Learn which eyes there are; bring both sides to the same sessions."""
-        self._server, self._render.may_rest = server, may_rest
+        device.server, device.render.may_rest = server, may_rest
         known, held = {s.key for s in self._guests}, {key for key, *_ in eyes}
         for session in self._guests:
-            if session.key not in held:
+            if session.device == device.index and session.key not in held:
                 self._open(session)
         for key, session_id, profiles in eyes:
             if key not in known:  # a door before this one knew its client
                 session = Session(session_id, None, "", self.config.credit, key=key)
+                session.device = device.index
                 for name, (profile_id, generation) in profiles.items():
                     eye = session.eye(name)
                     eye.profile_id, eye.generation = profile_id, generation
                 session.leave(time.monotonic())
                 self._guests.remember(session)
-        self._render.is_ready = True
+        device.render.is_ready = True
+        self._greet_who_waits()
+
+    def _greet_who_waits(self) -> None:
+        """Answer those who said hello before all devices had said who they are."""
+        if not self._devices.are_known:
+            return
         for identity, hello in self._greetings:
             try:
                 self._greet(identity, hello)
@@ -227,15 +260,26 @@ class Door:
                 self._send(identity, ErrorReply.from_exception(error))
         self._greetings = []
 
+    def _give_up(self, device: ServedDevice) -> None:
+        """End the sessions of a device that is gone; they begin anew on another."""
+        device.give_up()
+        device.frames.lose_held()
+        for session in self._guests:
+            if session.device == device.index:
+                device.frames.lose_waiting(session)
+                self._forget(session, "its device is gone")
+        self._greet_who_waits()
+
     def _open(self, session: Session) -> None:
         """Have the render loop hold the eyes of a session, with their profiles."""
         generations = {name: eye.generation for name, eye in session.eyes.items()}
-        self._render.tell("open", session.key, session.session_id, generations)
+        render = self._render_of(session)
+        render.tell("open", session.key, session.session_id, generations)
         for eye in session.eyes.values():
             profile = eye.asked_profile or eye.profile
             if profile is not None:
                 eye.asked_profile = profile
-                self._render.tell("profile", session.key, profile)
+                render.tell("profile", session.key, profile)
 
     def _pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
         """Tell a session what the render loop says of the profile of an eye."""
@@ -280,7 +324,8 @@ class Door:
                 log.exception("fault %d: a refusal failed", self._n_faults)
                 self._end_session(received[0])
         for session, frame in superseded:
-            self._frames.answer(session, frame, Dropped(frame.frame_id, "superseded"))
+            dropped = Dropped(frame.frame_id, "superseded")
+            self._frames_of(session).answer(session, frame, dropped)
 
     def _take_in(
         self,
@@ -300,7 +345,8 @@ class Door:
             request = decode_request(parts, self._limits)
             if isinstance(request, Frame):
                 session = self._session_at(identity)
-                older = self._frames.take_in(session, request, received_s)
+                frames = self._frames_of(session)
+                older = frames.take_in(session, request, received_s)
                 superseded += [(session, older)] if older is not None else []
             else:
                 self._handle(identity, request)
@@ -349,18 +395,19 @@ class Door:
         return session
 
     def _pong(self, ping: Ping) -> Pong:
-        asked = any(session.asks for session in self._guests.present)
+        states = self._devices.states()
         return Pong(
             t=ping.t,
             server_time_s=time.monotonic(),
-            memory_mb=resident_memory_mb() + self._render_mb,
+            memory_mb=self._memory_mb,
             n_sessions=len(self._guests.present),
-            n_rendered=self._frames.n_rendered,
-            n_dropped=self._frames.n_dropped,
-            is_building=self._is_building or asked,
-            is_ready=self._render.is_ready,
-            is_filtering=bool(self._render.held),
-            render_silent_s=self._render.silent_s,
+            n_rendered=sum(state.n_rendered for state in states),
+            n_dropped=sum(device.frames.n_dropped for device in self._devices),
+            is_building=any(state.is_building for state in states),
+            is_ready=self._devices.are_ready,
+            is_filtering=any(state.is_filtering for state in states),
+            render_silent_s=self._devices.silent_s,
+            devices=states,
         )
 
     def _send(self, identity: bytes, reply: Reply) -> Tracker | None:
@@ -375,7 +422,7 @@ class Door:
     # Sessions
 
     def _greet(self, identity: bytes, hello: Hello) -> None:
-        if self._server is None:  # it is about to say who it is
+        if not self._devices.are_known:  # one is about to say who it is
             self._greetings.append((identity, hello))
             return
         session, is_resumed = self._guests.at(identity), False
@@ -393,7 +440,7 @@ class Door:
             transports.append("shm")
         welcome = Welcome(
             session.session_id,
-            self._server,
+            self._devices.of(session).server or {},
             self._limits,
             session.credit,
             tuple(transports),
@@ -416,9 +463,13 @@ class Door:
                 f"{len(self._guests)} clients are being served",
                 allowed=f"{most} clients",
             )
-        session = self._guests.begin(identity, hello.client, self.config.credit)
+        device = self._devices.least_busy()
+        session = self._guests.begin(
+            identity, hello.client, self.config.credit, device=device.index
+        )
         self._open(session)
-        log.info("session %d begins (%r)", session.session_id, hello.client)
+        where = f" on device {device.index}" if len(self._devices) > 1 else ""
+        log.info("session %d begins (%r)%s", session.session_id, hello.client, where)
         return session
 
     def _take_profile(self, session: Session, request: ProfileRequest) -> None:
@@ -439,7 +490,7 @@ class Door:
         request, eye.next_profile = eye.next_profile, None
         if request is not None:
             eye.asked_profile = request
-            self._render.tell("profile", session.key, request)
+            self._render_of(session).tell("profile", session.key, request)
 
     def _probe_clients(self, *, is_due: bool = False) -> None:
         """Send every client a sign of life; who is gone is found out by that."""
@@ -468,11 +519,11 @@ class Door:
         self._guests.remove(session)
         self._end_sharing(session)
         session.identity = None
-        self._frames.forget(session)
-        self._render.tell("close", session.key)
+        self._frames_of(session).forget(session)
+        self._render_of(session).tell("close", session.key)
         log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
 
     def _end_sharing(self, session: Session) -> None:
         """Give up the memory of a client that is gone."""
         self._sharing.end(session)
-        self._frames.leave(session)
+        self._frames_of(session).leave(session)

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from filter_service.errors import OutOfMemory, RenderFailed
 from filter_service.messages import Dropped, ErrorReply, Frame, Reply, Result
-from filter_service.service.guests import Guests
+from filter_service.service.load import Load
 from filter_service.service.mailbox import Tracker
 from filter_service.service.places import check_places
 from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
@@ -33,7 +33,8 @@ class FrameDesk:
 
     Parameters
     ----------
-    guests : Guests
+    sessions : callable
+        Returns those that have a client and live on its device.
     render : RenderEnd
     send : callable
         ``send(identity, reply)`` returns what tracks a large one.
@@ -43,17 +44,20 @@ class FrameDesk:
     n_rendered, n_dropped : int
     filtered_s : float
         What filtering has taken in all.
+    load : Load
+        What it took of late.
     """
 
     def __init__(
         self,
-        guests: Guests,
+        sessions: Callable[[], Sequence[Session]],
         render: RenderEnd,
         send: Callable[[bytes, Reply], Tracker | None],
     ) -> None:
         self.n_rendered = self.n_dropped = 0
         self.filtered_s = 0.0
-        self._guests = guests
+        self.load = Load()
+        self._sessions = sessions
         self._render = render
         self._send = send
         self._turns: Turns[str] = Turns()
@@ -61,7 +65,7 @@ class FrameDesk:
 
     def wait_s(self, now_s: float) -> float | None:
         """Return how soon a frame may be handed over; None where none waits."""
-        takeable = [s for s in self._guests.present if self._is_takeable(s)]
+        takeable = [s for s in self._sessions() if self._is_takeable(s)]
         if any(self._is_ready(session, now_s) for session in takeable):
             return 0.0
         return SOON_S if takeable else None
@@ -69,7 +73,7 @@ class FrameDesk:
     @property
     def is_idle(self) -> bool:
         """Return whether no frame waits or is being filtered."""
-        waits = any(session.waiting for session in self._guests.present)
+        waits = any(session.waiting for session in self._sessions())
         return not waits and not self._render.held
 
     def tidy(self) -> None:
@@ -119,7 +123,7 @@ class FrameDesk:
         now_s = time.monotonic()
         ready = {
             s.key: s
-            for s in self._guests.present
+            for s in self._sessions()
             if self._is_takeable(s) and self._is_ready(s, now_s)
         }
         key = self._turns.next_of(ready)
@@ -155,6 +159,7 @@ class FrameDesk:
             return
         self._turns.note(held.session.key, used_s, ended_s)
         self.filtered_s += used_s
+        self.load.note(used_s, ended_s)
         if isinstance(reply, Result):
             reply = completed(reply, held, started_s, blocks_bytes)
         elif isinstance(reply, Dropped):
@@ -188,6 +193,15 @@ class FrameDesk:
         else:
             self.n_dropped += 1
         return self._send(session.identity, answer)
+
+    def lose_waiting(self, session: Session) -> None:
+        """Answer the frame of a session that can be handed over no more."""
+        waiting, session.waiting = session.waiting, None
+        if waiting is not None:
+            error = RenderFailed("the device that filtered frames is gone")
+            frame = waiting.frame
+            failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
+            self.answer(session, frame, failed)
 
     def lose_held(self) -> None:
         """Answer the frames that are lost with a render loop."""

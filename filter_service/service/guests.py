@@ -41,9 +41,15 @@ class Guests:
         """Return the session with a key."""
         return next((session for session in self if session.key == key), None)
 
-    def begin(self, identity: bytes, client: str, credit: int) -> Session:
-        """Return a new session."""
-        session = Session(self._next_id, identity, client, credit)
+    def present_on(self, device: int) -> list[Session]:
+        """Return the sessions on a device that have a client."""
+        return [s for s in self._present.values() if s.device == device]
+
+    def begin(
+        self, identity: bytes, client: str, credit: int, *, device: int = 0
+    ) -> Session:
+        """Return a new session on a device."""
+        session = Session(self._next_id, identity, client, credit, device=device)
         self._next_id += 1
         self._present[identity] = session
         return session

@@ -1,9 +1,10 @@
 """The keeper: starts the processes of the service, and starts again what dies.
 
-The door owns the socket, the render process the eyes.  Each outlives the other; a new
-one is given a link to the one that is there.  What stands still for long, stopped from
-outside or hung, is ended and started again.  The keeper itself does nothing else, so
-there is little that could end it.
+The door owns the socket, a render process the eyes, those of one device where there are
+several.  Each outlives the others; a new one is given a link to those that are there.
+What stands still for long, stopped from outside or hung, is ended and started again; a
+device that cannot be is given up where others are left.  The keeper itself does nothing
+else, so there is little that could end it.
 """
 
 from __future__ import annotations
@@ -29,10 +30,9 @@ from filter_service.building.helper_process import (
 from filter_service.service.config import ServiceConfig, changed_while_running
 from filter_service.service.link import Link, LinkClosed
 
-MODULES = {
-    "door": ("filter_service.service.door_process",),
-    "render": ("filter_service.service.render_process",),
-}
+DOOR_MODULE = "filter_service.service.door_process"
+RENDER_MODULE = "filter_service.service.render_process"
+DOOR, RENDER = "door", "render"
 OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
 MAX_RESTARTS = 8
 RESTART_WINDOW_S = 60.0
@@ -68,9 +68,18 @@ class _Child:
             with suppress(LinkClosed):
                 self.link.send(message, descriptors)
 
+    def end(self) -> str:
+        """End the process, with patience first; return how it ended."""
+        how = "gone"
+        if self.process is not None:
+            how = how_it_ended(end(self.process, STOP_GRACE_S))
+        if self.link is not None:
+            self.link.close()
+        return how
+
 
 class Keeper:
-    """Keeps a door and a render process going.
+    """Keeps a door and a render process going, or one for each of several devices.
 
     Parameters
     ----------
@@ -98,10 +107,20 @@ class Keeper:
         self._is_to_read_again = False
         self._endpoint = ""
         self._is_stopping = False
-        self._children = {name: _Child() for name in MODULES}
-        self._standby: _Child | None = None
+        n_devices = len(config.device_names)
+        # The index of each device, by the name of its process.
+        self._devices = (
+            {f"{RENDER} {index}": index for index in range(n_devices)}
+            if n_devices > 1
+            else {RENDER: 0}
+        )
+        self._children = {name: _Child() for name in (DOOR, *self._devices)}
+        self._standbys: dict[str, _Child] = {}
+        self._lost: list[int] = []  # devices that were given up
         self._spawned_s = 0.0  # the last process of all
-        self._starts_s: dict[str, deque[float]] = {name: deque() for name in MODULES}
+        self._starts_s: dict[str, deque[float]] = {
+            name: deque() for name in self._children
+        }
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
@@ -128,9 +147,9 @@ class Keeper:
             A process cannot start, or ends again and again.
         """
         try:
-            for name in ("render", "door"):  # the first takes longer
+            for name in (*self._devices, DOOR):  # the last takes least
                 self._start(name)
-            self._join()
+            self._join(DOOR)
             while not self._is_stopping:
                 self._turn()
         finally:
@@ -150,16 +169,16 @@ class Keeper:
         if self._is_to_read_again:
             self._is_to_read_again = False
             self._change_settings()
-        for name, child in self._children.items():
+        for name, child in list(self._children.items()):
             self._listen(name, child)
             self._check_stopped(name, child)
         if self._config.standby:
-            self._keep_standby()
+            for name in list(self._devices):
+                self._keep_standby(name)
 
     @property
     def _all_children(self) -> list[_Child]:
-        standby = [] if self._standby is None else [self._standby]
-        return [*self._children.values(), *standby]
+        return [*self._children.values(), *self._standbys.values()]
 
     def _start(self, name: str) -> None:
         """Start a process, or let the one that stands by take its place."""
@@ -172,37 +191,38 @@ class Keeper:
                 f"its {name} process was started {MAX_RESTARTS} times within "
                 f"{RESTART_WINDOW_S:g} s and ended each time"
             )
-        if name == "render" and self._standby is not None:
-            self._children[name], self._standby = self._standby, None
-        else:
-            self._children[name] = self._spawned(name)
+        standby = self._standbys.pop(name, None)
+        self._children[name] = standby or self._spawned(name)
 
     def _spawned(self, name: str) -> _Child:
         self._spawned_s = time.monotonic()
         link, theirs = Link.pair()
-        arguments = (str(theirs.fileno()), self._open_workshop)
+        # A new door listens where the one before it did.
+        config = replace(self._config, bind=self._endpoint or self._config.bind)
+        module, arguments = DOOR_MODULE, [str(theirs.fileno())]
+        if name in self._devices:
+            config = config.of_device(self._devices[name])
+            module, arguments = RENDER_MODULE, [*arguments, self._open_workshop, name]
         process = subprocess.Popen(
             # Without -P a file of the current folder would come before every module of
             # its name.
-            [sys.executable, "-P", "-m", *MODULES[name], *arguments],
+            [sys.executable, "-P", "-m", module, *arguments],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
         )
         theirs.close()
-        # A new door listens where the one before it did.
-        bind = self._endpoint or self._config.bind
         child = _Child(process, link)
-        child.tell(("config", replace(self._config, bind=bind)))
+        child.tell(("config", config))
         return child
 
-    def _keep_standby(self) -> None:
+    def _keep_standby(self, name: str) -> None:
         """Have a second process ready to filter, with a worker of its own."""
-        standby = self._standby
+        standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
-            if is_quiet and self._children["render"].is_ready:
-                self._standby = self._spawned("render")
+            if is_quiet and self._children[name].is_ready:
+                self._standbys[name] = self._spawned(name)
             return
         try:
             if standby.link is not None:
@@ -211,7 +231,7 @@ class Keeper:
                 )
             self._check_stopped("standby", standby)
         except LinkClosed:
-            self._standby = None
+            del self._standbys[name]
             self._bury("standby", standby)
 
     def _change_settings(self) -> None:
@@ -229,14 +249,19 @@ class Keeper:
         if others:
             log.warning("for %s the service has to be started again", ", ".join(others))
         if changed:
-            self._children["door"].tell(("config", self._config))
+            self._children[DOOR].tell(("config", self._config))
 
-    def _join(self) -> None:
-        """Give both processes the ends of a new link."""
-        ends = socket.socketpair()
-        for child, theirs in zip(self._children.values(), ends, strict=True):
-            child.tell(("link",), [theirs.fileno()])
-            theirs.close()
+    def _join(self, new: str) -> None:
+        """Give the door, and each render process that it lacks, the ends of a link."""
+        for name, index in self._devices.items():
+            if new in (DOOR, name):
+                ours, theirs = socket.socketpair()
+                self._children[name].tell(("link", index), [ours.fileno()])
+                self._children[DOOR].tell(("link", index), [theirs.fileno()])
+                ours.close()
+                theirs.close()
+        for index in self._lost:
+            self._children[DOOR].tell(("lost", index))
 
     def _listen(self, name: str, child: _Child) -> None:
         try:
@@ -248,9 +273,10 @@ class Keeper:
                     self._endpoint = rest[0] or self._endpoint
                     self._tell_ready()
                 elif kind == "failed":
-                    raise ServiceFailed(rest[0])
+                    self._fail(name, rest[0])
+                    return
                 elif kind == "hung":
-                    self._kill("render")
+                    self._kill_device(rest[0])
         except LinkClosed:
             self._restart(name, child)
 
@@ -263,17 +289,34 @@ class Keeper:
 
     def _restart(self, name: str, child: _Child) -> None:
         self._bury(name, child)
-        self._start(name)
-        self._join()
+        try:
+            self._start(name)
+        except ServiceFailed as error:
+            self._fail(name, str(error))
+            return
+        self._join(name)
+
+    def _fail(self, name: str, why: str) -> None:
+        """Give up a device where others are left, once all had been ready.
+
+        Raises
+        ------
+        ServiceFailed
+            The service cannot go on.
+        """
+        if name not in self._devices or len(self._devices) < 2 or self._when_ready:
+            raise ServiceFailed(why)
+        log.error("the %s process is given up: %s", name, why)
+        for child in (self._children.pop(name), self._standbys.pop(name, None)):
+            if child is not None:
+                child.end()
+        self._lost.append(self._devices.pop(name))
+        self._children[DOOR].tell(("lost", self._lost[-1]))
 
     def _bury(self, name: str, child: _Child) -> None:
-        how = "gone"
-        if child.process is not None:
-            how = how_it_ended(end(child.process, STOP_GRACE_S))
-        if child.link is not None:
-            child.link.close()
+        how = child.end()
         following = "a new one is started"
-        if name == "render" and self._standby is not None:
+        if name in self._standbys:
             following = "the one that stood by takes over"
         log.error("the %s process %s; %s", name, how, following)
 
@@ -289,19 +332,17 @@ class Keeper:
             log.error("the %s process stands still", name)
             child.process.kill()
 
-    def _kill(self, name: str) -> None:
-        process = self._children[name].process
-        if process is not None:
-            process.kill()
+    def _kill_device(self, index: int) -> None:
+        for name, of_index in self._devices.items():
+            process = self._children[name].process
+            if of_index == index and process is not None:
+                process.kill()
 
     def _end_all(self) -> None:
-        """End both processes: asked first, by force where they take long."""
+        """End all processes: asked first, by force where they take long."""
         for child in self._all_children:
             child.tell(("stop",))
         for child in self._all_children:
-            if child.process is not None:
-                end(child.process, STOP_GRACE_S)
-            if child.link is not None:
-                child.link.close()
+            child.end()
         self._wake_reader.close()
         self._wake_writer.close()

@@ -1,6 +1,7 @@
-"""The process that filters: ``python -m`` this, with a link's descriptor and a name.
+"""The process that filters: ``python -m`` this, with a link's descriptor and two names.
 
-The name, ``module:function``, is of what opens the workshop: ``function(config,
+One is its own, for the log.  The other, ``module:function``, is of what opens the
+workshop: ``function(config,
 closing)`` returns it, what reads profiles, and what to call once all is ready.  Tests
 have one of their own.
 """
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import FilterError
+from filter_service.gl_device import AUTO, GL_DEVICE_VARIABLE
 from filter_service.service.child import begin
 from filter_service.service.config import ServiceConfig
 from filter_service.service.link import Link
@@ -37,6 +39,8 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
     """Return the real engine with the real PSFs."""
     if config.threads:
         os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
+    if config.gl_device != AUTO:
+        os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # the same
     worker = WorkerHandle(
         niceness=config.build_niceness,
         cancel_grace_s=config.cancel_grace_s,
@@ -54,7 +58,7 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
 
 def main() -> None:
     """Filter frames until the keeper says so."""
-    keeper, config, others = begin("render")
+    keeper, config, others = begin(sys.argv[3])
     module, _, function = sys.argv[2].partition(":")
     open_workshop = getattr(importlib.import_module(module), function)
     with ExitStack() as closing:

@@ -56,6 +56,8 @@ class Session:
         Frames it may have unanswered.
     key : str
         With which it may come back.
+    device : int
+        Index of the device that its eyes are on.
     """
 
     session_id: int
@@ -63,6 +65,7 @@ class Session:
     client: str
     credit: int
     key: str = field(default_factory=new_key)
+    device: int = 0
     n_unanswered: int = 0
     waiting: WaitingFrame | None = None
     unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # large replies

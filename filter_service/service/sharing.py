@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.messages import Share, Shared, Unshare
 from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
@@ -21,12 +23,17 @@ class Sharing:
     config : ServiceConfig
     endpoint : str
         Where clients connect.
-    render : RenderEnd
-        Which owns the memory.
+    render_of : callable
+        Returns the end of a session's device, which owns the memory.
     """
 
-    def __init__(self, config: ServiceConfig, endpoint: str, render: RenderEnd) -> None:
-        self._render = render
+    def __init__(
+        self,
+        config: ServiceConfig,
+        endpoint: str,
+        render_of: Callable[[Session], RenderEnd],
+    ) -> None:
+        self._render_of = render_of
         self._limits = config.limits
         is_local = endpoint.startswith("ipc://") or any(
             endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
@@ -46,7 +53,7 @@ class Sharing:
                 reason=f"{request.size_bytes} bytes are more than a frame has"
             )
         try:
-            slot = self._render.share(request.size_bytes)
+            slot = self._render_of(session).share(request.size_bytes)
         except OutOfMemory as error:
             return Shared(reason=str(error))
         session.shared[slot.number] = slot
@@ -65,10 +72,10 @@ class Sharing:
                 field="slot",
                 allowed="a slot of this session that no frame uses",
             )
-        self._render.drop(session.shared.pop(request.slot))
+        self._render_of(session).drop(session.shared.pop(request.slot))
 
     def end(self, session: Session) -> None:
         """Give up the memory of a client that is gone."""
         for slot in session.shared.values():
-            self._render.drop(slot)
+            self._render_of(session).drop(slot)
         session.shared, session.lent = {}, set()

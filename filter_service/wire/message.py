@@ -18,6 +18,7 @@ Part = bytes | bytearray | memoryview
 MAX_ID = 2**53 - 1  # ids survive a trip through a double, as in JSON or JavaScript
 MAX_NOTES = 8
 MAX_NOTE_BYTES = 200
+MAX_DEVICES = 8
 
 Id = Annotated[int, Meta(ge=0, le=MAX_ID)]
 Count = Id

@@ -22,6 +22,7 @@ from filter_service.wire.images import (
     image_from_part,
 )
 from filter_service.wire.message import (
+    MAX_DEVICES,
     MAX_NOTE_BYTES,
     MAX_NOTES,
     Count,
@@ -53,6 +54,7 @@ MAX_TEXT_BYTES = 1600
 MAX_ALLOWED_BYTES = 1000
 MAX_SERVER_BYTES = 160
 MAX_STAGE_BYTES = 100
+MAX_RENDERER_BYTES = 80
 
 
 def _clipped(reply: Message, /, **limits: int) -> None:
@@ -311,10 +313,36 @@ class ErrorReply(Message):
 
 
 @dataclass(frozen=True)
+class DeviceState(Record):
+    """What `pong` says of one of the devices that filter.
+
+    ``busy_ratio`` is the share of the last ten seconds or so in which it filtered.  One
+    that ``is_lost`` was given up: it could not be started again.
+    """
+
+    name: Word
+    renderer: Text = ""
+    n_sessions: Count = 0
+    busy_ratio: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    n_rendered: Count = 0
+    memory_mb: Megabytes = 0.0
+    is_ready: bool = True
+    is_filtering: bool = False
+    is_building: bool = False
+    is_lost: bool = False
+    render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
+
+    def __post_init__(self) -> None:
+        """Cut the renderer's name to what a header of many devices holds."""
+        object.__setattr__(self, "renderer", clip(self.renderer, MAX_RENDERER_BYTES))
+
+
+@dataclass(frozen=True)
 class Pong(Message):
     """The answer to ping, with the state of the service.
 
-    ``render_silent_s`` is since when the loop that filters has given no sign of life.
+    ``render_silent_s`` is since when the loop that filters has given no sign of life:
+    of several, the one that is silent for longest.
     """
 
     t: Moment
@@ -327,6 +355,7 @@ class Pong(Message):
     is_ready: bool = True
     is_filtering: bool = False
     render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
+    devices: Annotated[tuple[DeviceState, ...], Meta(max_length=MAX_DEVICES)] = ()
 
     type_name: ClassVar[str] = "pong"
 

@@ -7,12 +7,14 @@ traced through an estimated eye.  On a hardware GPU, or with --whole, the whole 
 201,825 PSFs follows, its kernels left on the GPU; with --set-only it stands alone.
 `rates` holds, per build, PSFs a second of wall time and of processor time (other
 programs on the machine hardly change the latter), and the operations and bytes that the
-method needs.
+method needs.  The rows "hold" have how long the device is held at a time: all at once,
+and in batches as a service builds.
 """
 
 import argparse
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from estimator.psf.compute import compute_psf_batch, plan_psfs
 from estimator.psf.reference import reference_kernel
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.gpu_build import gpu_psf_batch
+from filter_service.psfs.gpu_build_pace import HOLD_S, Pace
 from filter_service.psfs.gpu_build_records import kernel_starts, plan_rays, plan_waves
 from tests.benchmarks.harness import (
     Row,
@@ -189,6 +192,33 @@ def slice_rows(gpu: Gpu, image, *, quick: bool) -> tuple[list[Row], list[dict]]:
     return rows, rates
 
 
+def hold_rows(gpu: Gpu, *, quick: bool) -> list[Row]:
+    """Return how long batches hold the device, and whether they change a kernel."""
+    rows = []
+    for eye, pupil_mm in CASES[:1] if quick else CASES:
+        part = traced_slices(eye, [pupil_mm], [0.0])[0]
+        kernels = {}
+        for name, hold_s in (("at once", 1e9), ("in batches", HOLD_S)):
+            pace = Pace(hold_s)
+            options = {"max_radius_px": MAX_RADIUS_PX, "pace": pace, **part.options}
+            gpu_psf_batch(gpu, part.zernike_um, **options)  # compiles, and learns
+            pace.holds_s.clear()
+            batch = gpu_psf_batch(gpu, part.zernike_um, **options)
+            kernels[name] = batch.flat_kernels
+            change = float(np.abs(batch.flat_kernels - kernels["at once"]).max())
+            errors = {
+                "longest_hold_ms": 1e3 * max(pace.holds_s),
+                "kernels_changed": change,
+            }
+            setting = f"slice {pupil_mm:g} mm"
+            n, holds_s = len(pace.holds_s), np.array(pace.holds_s)
+            rows += [
+                replace(row, p95_ms=float(f"{1e3 * np.quantile(holds_s, 0.95):.4g}"))
+                for row in _rows(f"hold, {name}", eye, setting, n, holds_s, errors)
+            ]
+    return [replace(row, reference="the same at once") for row in rows]
+
+
 def whole_set_rows(gpu: Gpu, image, eye: str = "emmetropia") -> list[Row]:
     """Time of all 25 slices as one call."""
     slices = traced_slices(eye, PUPILS_MM, FOCUSES_DPT)
@@ -225,6 +255,7 @@ def main() -> None:
     rows, rates = [], []
     if not arguments.set_only:
         rows, rates = slice_rows(gpu, image, quick=arguments.quick)
+        rows += hold_rows(gpu, quick=arguments.quick)
     wants_set = arguments.whole or arguments.set_only
     if wants_set or not (gpu.is_software or arguments.quick):
         rows += whole_set_rows(gpu, image)

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from filter_service.building.worker_handle import WorkerHandle
+from filter_service.errors import RenderFailed
 from filter_service.filtering.workshop import Workshop
 from filter_service.service import keeper
 from filter_service.service.config import load_config
@@ -13,10 +14,16 @@ from filter_service.service.launch import run
 from tests.end_to_end.doubles import EngineDouble, read_profile
 
 FILTER_MS = "OCUFILTER_TEST_FILTER_MS"
+GONE_FILE = "OCUFILTER_TEST_GONE_FILE"
+"""While there is a file of that name, a device of two threads cannot be started."""
+
 STANDBY_AFTER_S = "OCUFILTER_TEST_STANDBY_AFTER_S"
 
 
 def open_workshop(config, closing):
+    gone = os.environ.get(GONE_FILE)
+    if gone and config.threads == 2 and Path(gone).exists():
+        raise RenderFailed("the double has no such device")
     worker = WorkerHandle(
         "tests.end_to_end.doubles:build",
         config.build_niceness,

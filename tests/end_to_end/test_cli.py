@@ -79,6 +79,8 @@ def test_doctor_reports_a_machine_that_can_serve():
     assert report["threading_layer"] in ("omp", "tbb")
     assert report["gl"]["renderer"]
     assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
+    works = [d for d in report["gl"]["devices"] if d["error"] is None]
+    assert report["gl"]["renderer"] in [device["renderer"] for device in works]
     checks = {check["name"]: check["ok"] for check in report["checks"]}
     assert checks["compute"] and checks["shaders"] and checks["networks"]
     assert set(report["networks"]) == set(NETWORK_NAMES)
@@ -93,6 +95,18 @@ def test_doctor_without_opengl_says_that_the_service_works_and_the_demo_does_not
     engine = next(check for check in report["checks"] if check["name"] == "engine")
     assert engine["detail"].startswith("native: no OpenGL")
     assert any("apt-get install" in command for command in report["install"])
+
+
+def test_a_device_that_is_not_there_is_refused_with_those_that_are(scene):
+    folder, _ = scene
+    arguments = filter_arguments(folder, *IDENTITY, "--engine", "gl")
+    finished = run(*arguments, OCUFILTER_GL_DEVICE="7")
+    assert finished.returncode != 0
+    said = " ".join(finished.stderr.split())
+    assert "gl_device is 7; allowed: auto, or a device of EGL: 0 (" in said
+    refused = run("serve", "--gl-device", "7", "--bind", "tcp://127.0.0.1:*")
+    assert refused.returncode == 1
+    assert "gl_device is 7; allowed: auto" in " ".join(refused.stderr.split())
 
 
 def test_a_picture_needs_no_opengl(scene):

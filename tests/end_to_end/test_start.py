@@ -16,7 +16,7 @@ from filter_service.service.link import Link
 
 keeper, end = Link.pair()
 keeper.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
-sys.argv[1:] = [str(end.detach()), keeping.OPEN_WORKSHOP]
+sys.argv[1:] = [str(end.detach()), keeping.OPEN_WORKSHOP, keeping.RENDER]
 send = Link.send
 
 def report(link, message, descriptors=()):

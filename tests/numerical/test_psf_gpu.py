@@ -23,6 +23,7 @@ from filter_service.psfs import (
 from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.gpu_build import gpu_psf_batch
+from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.psf_engine import psf_engine
 from tests.grid_specs import grid_spec
 from tests.numerical.psf_cases import (
@@ -366,6 +367,19 @@ def test_results_do_not_depend_on_how_a_call_is_cut(gpu, monkeypatch):
     np.testing.assert_array_equal(cut.offset_count, whole.offset_count)
     np.testing.assert_allclose(cut.flat_kernels, whole.flat_kernels, atol=1e-9)
     np.testing.assert_allclose(cut.lost_energy_ratio, whole.lost_energy_ratio)
+
+
+@pytest.mark.parametrize("hold_s", [1e-9, 0.002])
+def test_results_do_not_depend_on_the_pace(gpu, hold_s):
+    """At the shorter every PSF waits for the one before it."""
+    zernike_um, options = _mixed_batch()
+    whole = gpu_psf_batch(gpu, zernike_um, pace=Pace(1e9), **options)
+    pace = Pace(hold_s)
+    for _ in range(2):
+        paced = gpu_psf_batch(gpu, zernike_um, pace=pace, **options)
+        np.testing.assert_allclose(paced.flat_kernels, whole.flat_kernels, atol=1e-9)
+        np.testing.assert_allclose(paced.lost_energy_ratio, whole.lost_energy_ratio)
+    assert hold_s > 1e-6 or pace.n_batches >= 2 * len(zernike_um)
 
 
 def test_refusals_name_the_psf_of_the_call(gpu, monkeypatch):

@@ -122,6 +122,14 @@ def test_the_engine_that_will_be_chosen_is_named_with_the_reason(gl, native, say
     assert check.ok == (says != "neither")
 
 
+def test_a_named_device_asks_for_gl(monkeypatch):
+    monkeypatch.setenv("OCUFILTER_GL_DEVICE", "0")
+    check = check_engine(LLVMPIPE, NATIVE)
+    assert check.ok and check.detail.startswith("gl: OCUFILTER_GL_DEVICE")
+    check = check_engine({"error": "no such device"}, NATIVE)
+    assert not check.ok and check.fix == "unset OCUFILTER_GL_DEVICE"
+
+
 def test_a_wheel_s_missing_packages_are_installed_with_pip(monkeypatch):
     monkeypatch.setattr(doctor_checks, "IN_CHECKOUT", False)
     versions = {"pyrender": None, "trimesh": "1", "imageio": None, "glfw": None}

@@ -1,0 +1,101 @@
+"""On which EGL device a context is opened: the one named, or the first that works."""
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+from filter_service.errors import RenderFailed
+from filter_service.gl.egl_devices import EglDevice, egl_devices
+from filter_service.gl_device import AUTO, BACKEND_VARIABLE
+
+Context = TypeVar("Context")
+
+ADVICE = "run 'ocufilter doctor' to see what is missing"
+
+log = logging.getLogger("ocufilter")
+
+
+def open_on_device(
+    choice: str, open_context: Callable[[int], Context]
+) -> tuple[Context, int]:
+    """Return a context, and the index of its device.
+
+    Parameters
+    ----------
+    choice : str
+        "auto" takes the first that works, hardware before software; an index that one.
+    open_context : callable
+        ``open_context(index)`` raises where the device gives no context.
+
+    Raises
+    ------
+    RenderFailed
+        None works, or not the one named; says which there are.
+    """
+    devices = egl_devices()
+    with _without_backend_variable():
+        if choice != AUTO:
+            return _open_named(int(choice), devices, open_context)
+        return _open_first(devices, open_context)
+
+
+def _open_named(
+    index: int, devices: Sequence[EglDevice], open_context: Callable[[int], Context]
+) -> tuple[Context, int]:
+    there_are = ", ".join(map(str, devices)) or "none that EGL lists"
+    if devices and index >= len(devices):
+        raise RenderFailed(
+            f"gl_device is {index}; allowed: auto, or a device of EGL: {there_are}"
+        )
+    try:
+        return open_context(index), index
+    except Exception as error:
+        raise RenderFailed(
+            f"gl_device {index} gives no OpenGL 4.3 context through EGL "
+            f"({_one_line(error)}); devices: {there_are}; {ADVICE}"
+        ) from error
+
+
+def _open_first(
+    devices: Sequence[EglDevice], open_context: Callable[[int], Context]
+) -> tuple[Context, int]:
+    failed: list[str] = []
+    last: Exception | None = None
+    # Without a list the backend says best what is wrong.
+    for device in by_preference(devices) or [EglDevice(0, "first")]:
+        try:
+            context = open_context(device.index)
+        except Exception as error:
+            failed.append(f"device {device}: {_one_line(error)}")
+            last = error
+            continue
+        for text in failed:
+            log.warning("no OpenGL 4.3 context on EGL %s", text)
+        if failed:
+            log.warning("OpenGL works on EGL device %s instead", device)
+        return context, device.index
+    raise RenderFailed(
+        f"no OpenGL 4.3 context through EGL ({'; '.join(failed)}); {ADVICE}"
+    ) from last
+
+
+def by_preference(devices: Sequence[EglDevice]) -> list[EglDevice]:
+    """Return hardware before software, else in EGL's order."""
+    return sorted(devices, key=lambda device: device.is_software)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextmanager
+def _without_backend_variable() -> Iterator[None]:
+    """Hide the variable that would win over the index; it was looked at before."""
+    said = os.environ.pop(BACKEND_VARIABLE, None)
+    try:
+        yield
+    finally:
+        if said is not None:
+            os.environ[BACKEND_VARIABLE] = said

@@ -1,0 +1,99 @@
+"""The devices that EGL lists: GPUs, and the software renderer among them."""
+
+import ctypes
+import ctypes.util
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+EGL_VENDOR, EGL_EXTENSIONS, EGL_RENDERER_EXT = 0x3053, 0x3055, 0x335F
+EGL_DRM_RENDER_NODE_FILE_EXT = 0x3377
+SOFTWARE_EXTENSION = "EGL_MESA_device_software"
+NAME_EXTENSION = "EGL_EXT_device_query_name"
+NODE_EXTENSION = "EGL_EXT_device_drm_render_node"
+
+LIBRARY_VARIABLE = "GLCONTEXT_LINUX_LIBEGL"
+"""Names the library to the package that opens contexts, and so here."""
+
+_pointer, _int = ctypes.c_void_p, ctypes.c_int
+_QUERY_DEVICES = ctypes.CFUNCTYPE(
+    ctypes.c_uint, _int, _pointer, ctypes.POINTER(ctypes.c_int)
+)
+_QUERY_STRING = ctypes.CFUNCTYPE(ctypes.c_char_p, _pointer, _int)
+
+
+@dataclass(frozen=True)
+class EglDevice:
+    """What EGL tells of a device before anything is opened on it.
+
+    Attributes
+    ----------
+    index : int
+    name : str
+        As well as EGL knows it.
+    extensions : tuple of str
+    """
+
+    index: int
+    name: str
+    extensions: tuple[str, ...] = ()
+
+    @property
+    def is_software(self) -> bool:
+        """Whether a processor does the work."""
+        return SOFTWARE_EXTENSION in self.extensions
+
+    def __str__(self) -> str:
+        """Return index and name."""
+        return f"{self.index} ({self.name})"
+
+
+def egl_devices() -> list[EglDevice]:
+    """Return the devices in EGL's order; none where EGL has no such list."""
+    address_of = _address_of()
+    addresses = [
+        address_of(name) for name in (b"eglQueryDevicesEXT", b"eglQueryDeviceStringEXT")
+    ]
+    if not all(addresses):
+        return []
+    query, text_of = _QUERY_DEVICES(addresses[0]), _QUERY_STRING(addresses[1])
+    count = ctypes.c_int(0)
+    if not query(0, None, ctypes.byref(count)) or count.value < 1:
+        return []
+    handles = (_pointer * count.value)()
+    if not query(count.value, handles, ctypes.byref(count)):
+        return []
+    return [
+        _described(index, lambda what, h=handle: text_of(h, what))
+        for index, handle in enumerate(handles[: count.value])
+    ]
+
+
+def _address_of() -> Callable[[bytes], int | None]:
+    """Return what finds a function of EGL; it finds none where there is no EGL."""
+    library = os.environ.get(LIBRARY_VARIABLE) or ctypes.util.find_library("EGL")
+    try:
+        address_of = ctypes.CDLL(library or "libEGL.so.1").eglGetProcAddress
+    except (OSError, AttributeError):
+        return lambda name: None
+    address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
+    return address_of
+
+
+def _described(index: int, text_of: Callable[[int], bytes | None]) -> EglDevice:
+    """Ask for what the device's extensions allow to ask for."""
+
+    def text(what: int) -> str:
+        return (text_of(what) or b"").decode(errors="replace")
+
+    extensions = tuple(text(EGL_EXTENSIONS).split())
+    words = []
+    if NAME_EXTENSION in extensions:
+        words += [text(EGL_VENDOR), text(EGL_RENDERER_EXT)]
+    if SOFTWARE_EXTENSION in extensions:
+        words.append("software")
+    elif NODE_EXTENSION in extensions:
+        words.append(text(EGL_DRM_RENDER_NODE_FILE_EXT))
+    if "EGL_NV_device_cuda" in extensions and not any(words):
+        words.append("NVIDIA")
+    return EglDevice(index, " ".join(filter(None, words)) or "no name", extensions)

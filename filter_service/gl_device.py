@@ -1,0 +1,51 @@
+"""Which EGL device OpenGL works on, as a user names it.
+
+The setting ``gl_device`` of the service reaches the processes that it starts through
+the environment, where every command reads it too.
+"""
+
+from __future__ import annotations
+
+import os
+
+GL_DEVICE_VARIABLE = "OCUFILTER_GL_DEVICE"
+BACKEND_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
+"""What the package that opens contexts reads by itself."""
+
+AUTO = "auto"
+
+
+def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
+    """Return ``auto`` or the index of a device, as text.
+
+    Raises
+    ------
+    ValueError
+        It is neither.
+    """
+    if wanted == AUTO or (wanted.isascii() and wanted.isdecimal()):
+        return wanted
+    raise ValueError(
+        f"{name} is {wanted!r}; allowed: auto, or the index of an EGL device, "
+        "0 or more, as `ocufilter doctor` lists them"
+    )
+
+
+def is_device_named() -> bool:
+    """Return whether the environment names one device, which asks for OpenGL."""
+    return wanted_gl_device() != AUTO and bool(os.environ.get(GL_DEVICE_VARIABLE))
+
+
+def wanted_gl_device() -> str:
+    """Return what the environment asks for.
+
+    Raises
+    ------
+    ValueError
+        The variable holds neither ``auto`` nor an index.
+    """
+    for variable in (GL_DEVICE_VARIABLE, BACKEND_VARIABLE):
+        wanted = os.environ.get(variable, "")
+        if wanted:
+            return checked_gl_device(wanted, variable)
+    return AUTO
