@@ -40,6 +40,7 @@ export class FilterClient {
     this.nextFrameId = 0;
     this.nextProfileId = 0;
     this.waiting = []; // { accepts, resolve, reject, timer }
+    this.notes = new Set(); // told of every reply
     this.socket = new Dealer({
       linger: 0,
       immediate: true,
@@ -83,19 +84,26 @@ export class FilterClient {
       "the profile to be accepted",
       ours,
     );
-    await this.send(request);
-    let missing = (await accepted).n_cameras;
-    let ready = null;
-    while (missing > 0) {
-      ready = await this.await_(
-        (reply) => ours(reply) && reply.type === "ready",
-        "the eye to be ready",
-        ours,
-        12 * this.timeoutMs,
-      );
-      missing -= ready.is_complete ? 1 : 0;
+    // An eye may be ready before we have read how many cameras it is made for.
+    const isReady = (reply) => ours(reply) && reply.type === "ready";
+    const arrived = [];
+    const note = (reply) => isReady(reply) && arrived.push(reply);
+    this.notes.add(note);
+    try {
+      await this.send(request);
+      let missing = (await accepted).n_cameras;
+      let ready = null;
+      while (missing > 0) {
+        if (!arrived.length) {
+          await this.await_(isReady, "the eye to be ready", ours, 12 * this.timeoutMs);
+        }
+        ready = arrived.shift();
+        missing -= ready.is_complete ? 1 : 0;
+      }
+      return ready;
+    } finally {
+      this.notes.delete(note);
     }
-    return ready;
   }
 
   // Resolves with the result's header and its pictures, `colors`, one for each view.
@@ -209,6 +217,7 @@ export class FilterClient {
 
   hand(reply) {
     const isError = reply.type === "error";
+    for (const note of this.notes) note(reply);
     const found = this.waiting.find((waiting) =>
       isError ? waiting.concerns(reply) : waiting.accepts(reply),
     );
