@@ -12,7 +12,7 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training test-headset validate witness gpu-kit check clean help setup setup-test setup-training setup-witness
+.PHONY: demo test test-training test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -52,13 +52,19 @@ gpu-kit: setup  ## a folder for a GPU machine without a network; writes out/gpu_
 	@PYTHON=$(PYTHON) PYTHON_VERSION="$(PYTHON_VERSION)" WITH="$(WITH)" \
 	    sh tests/gpu_kit/make.sh $(ARGS)
 
-check: setup  ## lint, formatting and types
+gl-witness: setup-test  ## the renderer on two OpenGL drivers, and Vulkan's layers on it
+	@sh tests/gl_witness/setup.sh drivers
+	$(PYTHON) -m tests.gl_witness $(ARGS)
+
+check: setup  ## lint, formatting, types, and every shader through glslang
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+	@sh tests/gl_witness/setup.sh glslang || test $$? -eq 77
+	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv .witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .witness .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list

@@ -113,7 +113,7 @@ def gl_engine(gpu):
     return Engine("gl", gpu)
 
 
-def _uses_gl(item):
+def uses_gl(item):
     """Whether a test needs the OpenGL context."""
     call = getattr(item, "callspec", None)
     if call is not None and "engine" in call.params:
@@ -124,14 +124,14 @@ def _uses_gl(item):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Make the context current before any fixture: pyrender's tests leave theirs."""
-    if _uses_gl(item) and SESSION_GPU in item.config.stash:
+    if uses_gl(item) and SESSION_GPU in item.config.stash:
         item.config.stash[SESSION_GPU].context.__enter__()
 
 
 @pytest.fixture(autouse=True)
 def clean_gl_errors(request):
     """Fail a test that starts or ends with an OpenGL error pending."""
-    if not _uses_gl(request.node):
+    if not uses_gl(request.node):
         yield
         return
     context = request.getfixturevalue("gpu").context

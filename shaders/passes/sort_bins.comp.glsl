@@ -54,6 +54,7 @@ void finish(uint first, uint my_first, uint my_end, bool odd) {
         uint place = read_item(i, first, odd) & uint((1 << SORT_INDEX_BITS) - 1);
         write_item(i, first, odd, entries[first + place]);
     }
+    memoryBarrierBuffer();
     barrier();  // no entry is overwritten before it is read
     for (uint i = my_first; i < my_end; ++i)
         entries[first + i] = read_item(i, first, !odd);

@@ -10,6 +10,7 @@ from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
+from tests.shader_variants import Kind, renderer_variants
 
 INNER = {"clipped", "bracket", "channel_taps", "number_used", "mapped_reach", "moves"}
 INNER |= {"layer_blur_px", "_steps", "_between"}
@@ -33,6 +34,8 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
     compiled = gpu.program_count
     sorts = sum(name == "sort_bins" for name, *_ in gpu._programs)
     assert sorts == 2 * (len(SORT_CAPACITIES) + 1)
+    known = renderer_variants(Kind(gpu.is_software, gpu.atlas_is_buffer))
+    assert set(gpu._programs) == {(v.name, *v.defines) for v in known}
     bench = Bench(
         Engine("gl", gpu),
         {"kind": "preset", "name": "myopia"},

@@ -1,0 +1,163 @@
+"""Every variant of a pass that the code may ask OpenGL for, found without OpenGL.
+
+A `Gpu` without a driver notes what is dispatched while the renderer filters the frames
+of `compile_passes` and the builder of PSFs works through every length that it has.
+"""
+
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from filter_service import constants
+from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Buffer, Gpu
+from filter_service.psfs.gpu_build_constants import FFT_RADICES
+from filter_service.psfs.gpu_build_pace import Pace
+from filter_service.psfs.gpu_build_passes import PsfPasses
+from filter_service.psfs.gpu_build_records import RECORD, Chunk, Jobs
+from filter_service.rendering.gl.compile_passes import compile_passes
+from filter_service.rendering.gl.renderer import FilterRenderer
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A pass and its defines, as (name, value) in order: the key of `Gpu.program`."""
+
+    name: str
+    defines: tuple[tuple[str, int | float | str], ...]
+
+    def __str__(self):
+        told = [f"{name}={value}" for name, value in self.defines]
+        return f"{self.name}({', '.join(n for n in told if not n.startswith('PSF_'))})"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What of a driver the choice of variants depends on."""
+
+    is_software: bool
+    atlas_is_buffer: bool
+
+
+KINDS = {
+    "software": Kind(is_software=True, atlas_is_buffer=False),
+    "hardware": Kind(is_software=False, atlas_is_buffer=True),
+    "small hardware": Kind(is_software=False, atlas_is_buffer=False),
+}
+"""The last has few or small storage blocks: its atlases are textures."""
+
+
+def all_variants() -> list[Variant]:
+    """Variants of all passes on drivers of every kind, in order."""
+    found: set[Variant] = set()
+    for kind in KINDS.values():
+        found |= renderer_variants(kind)
+    return sorted(found | psf_variants(), key=str)
+
+
+def renderer_variants(kind: Kind) -> set[Variant]:
+    """Variants that frames may need on a driver of a kind."""
+    gpu = _NoGpu(kind)
+    compile_passes(FilterRenderer(gpu))
+    return gpu.asked
+
+
+def psf_variants() -> set[Variant]:
+    """Variants that PSFs may need."""
+    gpu = _NoGpu(KINDS["hardware"])
+    passes = PsfPasses(gpu, _AtOnce())
+    passes.begin(kernel_count=1, total_count=1)
+    for jobs in _every_job():
+        passes.waves(jobs)
+        for diffraction in (False, True):
+            passes.rays(jobs, diffraction=diffraction)
+    return gpu.asked
+
+
+def _every_job() -> Iterator[Jobs]:
+    chunks = [Chunk(0, 1, (length, length), 1, (1, 1)) for length in FFT_RADICES]
+    for is_apodised in (False, True):
+        yield Jobs(
+            members=np.zeros(1, np.int64),
+            records=np.zeros(1, RECORD),
+            chunks=chunks,
+            filter_weights=np.zeros(1, np.float32),
+            is_apodised=is_apodised,
+        )
+
+
+class _AtOnce(Pace):
+    """Queues all PSFs together: nothing is timed."""
+
+    def parts(self, kind, works, finish):
+        yield 0, len(works)
+
+
+class _NoGpu(Gpu):
+    """A `Gpu` whose memory holds nothing and whose passes do nothing but be noted."""
+
+    def __init__(self, kind: Kind):
+        self.context = _Anything()
+        self.info = {"renderer": "none"}
+        self.is_software = kind.is_software
+        self.atlas_is_buffer = kind.atlas_is_buffer
+        self.max_block_bytes = 1 << 30
+        self.asked: set[Variant] = set()
+        self._owners, self._uniforms, self._queries = {}, {}, []
+
+    def storage(self, name, n_bytes):
+        return _Memory(name, n_bytes)
+
+    def write(self, buffer, data, *, offset=0):
+        pass
+
+    def pages(self, n_words):
+        return _Anything()
+
+    def write_pages(self, pages, first_line, lines):
+        pass
+
+    def atlas(self, name, n_texels):
+        if self.atlas_is_buffer:
+            return self.storage(f"{name} atlas", ATLAS_TEXEL_BYTES * n_texels)
+        return _Anything()
+
+    def begin_read(self, *parts):
+        """All pairs of cell and interval are used, so that kernels are made."""
+        for buffer, _, out in parts:
+            out.reshape(-1).view(np.uint8)[:] = 255 if buffer.name == "USED" else 0
+        return lambda: None
+
+    def program(self, name, **defines):
+        self.asked.add(Variant(name, tuple(sorted(defines.items()))))
+        return _Anything()
+
+    def take_query(self):
+        return _Anything()
+
+    def check(self, where):
+        pass
+
+
+class _Memory(Buffer):
+    """A buffer by its name and size alone."""
+
+    def __init__(self, name: str, n_bytes: int):
+        self.name, self.n_bytes = name, n_bytes
+
+    @property
+    def size(self):
+        return self.n_bytes
+
+    def bind_to_storage_buffer(self, binding=0, *, offset=0, size=-1):
+        assert binding in constants.BINDINGS.values()
+
+
+class _Anything(nullcontext):
+    """Stands for OpenGL's own objects: takes every call."""
+
+    elapsed = 0
+
+    def __getattr__(self, name):
+        return lambda *arguments, **options: None
