@@ -16,8 +16,6 @@ common with the passes; its own error against the dense reference is in live.jso
 
 import argparse
 import json
-import shutil
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,6 +33,7 @@ from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.harness import (
     Row,
     machine_info,
+    nvidia_smi,
     print_rows,
     report,
     write_report,
@@ -159,20 +158,6 @@ def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Cas
     )
 
 
-def clock() -> str:
-    """Clocks of the GPU and its memory, as nvidia-smi tells them."""
-    if shutil.which("nvidia-smi") is None:
-        return "not told"
-    query = "--query-gpu=clocks.sm,clocks.mem"
-    told = subprocess.run(
-        ["nvidia-smi", query, "--format=csv,noheader"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return told.stdout.strip() or "not told"
-
-
 def chosen_views(names: list[str], *, is_quick: bool) -> dict:
     """Sizes and numbers of views, or of the small ones that stand for them."""
     if not is_quick:
@@ -197,7 +182,7 @@ def main() -> None:
             case = open_case(gpu, eye, setting, size_px, view_count)
             for is_moving in (True, False):
                 rows += case.rows(is_moving, count, warm_s)
-            clocks[f"{setting} {eye}"] = clock()
+            clocks[f"{setting} {eye}"] = nvidia_smi("clocks.sm,clocks.mem")
             for handle in case.handles:
                 handle.release()
     machine = {**machine_info(), "gl_renderer": gpu.info["renderer"], "clocks": clocks}

@@ -41,6 +41,19 @@ class Row:
     reference: str
 
 
+def nvidia_smi(query: str) -> str:
+    """Return what nvidia-smi tells of a GPU, by the names of its ``--query-gpu``."""
+    if shutil.which("nvidia-smi") is None:
+        return "not told"
+    told = subprocess.run(
+        ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return told.stdout.strip() or "not told"
+
+
 def machine_info() -> dict:
     """Processor, cores in use and versions of the numerical libraries."""
     name = platform.processor()

@@ -7,27 +7,11 @@ Exits with 1 where there is no OpenGL context.
 
 import importlib.util
 import json
-import shutil
-import subprocess
 import sys
 
 from filter_service.errors import RenderFailed
 from filter_service.gl.gpu import Gpu
-from tests.benchmarks.harness import machine_info
-
-
-def device_name() -> str:
-    """Name, memory and driver of the GPU, as nvidia-smi tells them."""
-    if shutil.which("nvidia-smi") is None:
-        return "not told"
-    query = "--query-gpu=name,memory.total,driver_version"
-    told = subprocess.run(
-        ["nvidia-smi", query, "--format=csv,noheader"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return told.stdout.strip() or "not told"
+from tests.benchmarks.harness import machine_info, nvidia_smi
 
 
 def torch_version() -> str:
@@ -56,7 +40,11 @@ def gl_info() -> dict:
 
 def main() -> int:
     """Print; the exit code."""
-    found = {**machine_info(), "device": device_name(), "torch": torch_version()}
+    found = {
+        **machine_info(),
+        "device": nvidia_smi("name,memory.total,driver_version"),
+        "torch": torch_version(),
+    }
     found |= gl_info()
     print(json.dumps(found))
     if "gl_error" in found:

@@ -73,7 +73,7 @@ class Run:
         """
         start_s, notes = time.monotonic(), []
         python = environment.make_environment(
-            kit / "work" / "venv", sorted((kit / "wheels").glob("*.whl"))
+            kit / "unpacked" / "venv", sorted((kit / "wheels").glob("*.whl"))
         )
         missing = environment.missing_modules(python)
         if missing:

@@ -15,7 +15,7 @@ if [ "$found" != "$wanted" ]; then
         "name another in PYTHON, or make the kit with PYTHON_VERSION=$found" >&2
     exit 1
 fi
-tree=$kit/work/tree-$commit
+tree=$kit/unpacked/tree-$commit
 if [ ! -e "$tree/.whole" ]; then
     mkdir -p "$tree"
     tar -xzf "$kit/tree.tar.gz" -C "$tree"

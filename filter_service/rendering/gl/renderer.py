@@ -99,49 +99,9 @@ class FilterRenderer:
             image=image_cells(store.spec, store.plan),
         )
 
-    def render(
-        self,
-        view: RgbdView,
-        handle: GlStore,
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        accumulation: str = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
-        output: str = "linear",
-        gaze_deg: tuple[float, float] | None = None,
-        out: NDArray[Any] | None = None,
-    ) -> FilteredView:
-        """Filter one view through the eye of a loaded store.
-
-        Parameters
-        ----------
-        gaze_deg : (h, v), optional
-            Where the eye looks in the image, clamped to what was prepared with a note;
-            the store's where it is None.
-        render_tolerance : float
-            Errors of merging and layers against the usual; 0 is exact.
-
-        Raises
-        ------
-        BadMessage
-            Arrays or options that cannot be used.
-        CameraMismatch
-            The store is for another camera, see `camera.is_same_camera`.
-        OutOfGpuMemory, RenderFailed
-        """
-        return self.begin(
-            view,
-            handle,
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            accumulation=accumulation,
-            merge=merge,
-            render_tolerance=render_tolerance,
-            output=output,
-            gaze_deg=gaze_deg,
-        )()
+    def render(self, view: RgbdView, handle: GlStore, **options: Any) -> FilteredView:
+        """Filter one view through the eye of a loaded store; options as of `begin`."""
+        return self.begin(view, handle, **options)()
 
     def begin(
         self,
@@ -159,8 +119,25 @@ class FilterRenderer:
     ) -> Callable[[], FilteredView]:
         """Have the GPU begin with a view; call what is returned for the answer.
 
-        Others may be begun between, the other eye's say.  Arguments and what it raises:
-        as of `render`.
+        Others may be begun between, the other eye's say.
+
+        Parameters
+        ----------
+        gaze_deg : (h, v), optional
+            Where the eye looks in the image, clamped to what was prepared with a note;
+            the store's where it is None.
+        render_tolerance : float
+            Errors of merging and layers against the usual; 0 is exact.
+        out : array, optional
+            Not used: pictures come through memory of the driver's.
+
+        Raises
+        ------
+        BadMessage
+            Arrays or options that cannot be used.
+        CameraMismatch
+            The store is for another camera, see `camera.is_same_camera`.
+        OutOfGpuMemory, RenderFailed
         """
         options = frame_options(
             view,
