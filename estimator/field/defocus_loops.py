@@ -28,6 +28,17 @@ _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 @njit(**_OPTIONS)
+def weights_at(nodes, at):
+    """Weights (n,) of the polynomial through nodes (n,), as `lagrange_weights` has."""
+    weights = np.ones(nodes.size)
+    for i in range(nodes.size):
+        for j in range(nodes.size):
+            if j != i:
+                weights[i] *= (at - nodes[j]) / (nodes[i] - nodes[j])
+    return weights
+
+
+@njit(**_OPTIONS)
 def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     """Total defocus (n,), dpt, of fields and wavelengths at one pupil and focus.
 

@@ -7,12 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.measured_rest import MeasuredRest
-from estimator.field.interpolation import (
-    POWER,
-    FieldInterpolation,
-    FieldValues,
-    lagrange_weights,
-)
+from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
 from estimator.field.peripheral_rest import WIDEST_RATIO
 from estimator.optics.prescription import C20
 from estimator.optics.zernike import N_TERMS, monomial_matrix
@@ -95,8 +90,9 @@ class _Grid:
 
     def used_at(self, accommodation_dpt: float) -> tuple:
         """Return what the loop takes of it, at an accommodation."""
-        at_dpt = np.array([accommodation_dpt])
-        used = lagrange_weights(self._accommodations_dpt, at_dpt)[0]
+        from estimator.field.defocus_loops import weights_at
+
+        used = weights_at(self._accommodations_dpt, float(accommodation_dpt))
         return self._nodes_mm, self._powers, used, self._values
 
 

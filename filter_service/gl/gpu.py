@@ -51,6 +51,17 @@ _IMAGE_BARRIERS = (
 """What comes after a pass and may read what it wrote."""
 
 
+class BufferPart(NamedTuple):
+    """Some bytes of a buffer, for a pass that has them as its own.
+
+    It begins at a multiple of 256 bytes: any device allows that.
+    """
+
+    buffer: Buffer
+    first_byte: int
+    n_bytes: int
+
+
 class Gpu:
     """A standalone EGL context with named, grow-only storage buffers.
 
@@ -329,7 +340,7 @@ class Gpu:
         name: str,
         groups: tuple[int, ...],
         *,
-        buffers: dict[str, moderngl.Buffer],
+        buffers: dict[str, moderngl.Buffer | BufferPart],
         uniforms: dict | None = None,
         defines: dict | None = None,
         images: dict[str, Atlas] | None = None,
@@ -342,7 +353,7 @@ class Gpu:
         ----------
         groups : (x, y) or (x, y, z)
         buffers : dict
-            Binding name without the ``BINDING_`` prefix to buffer.
+            Binding name without the ``BINDING_`` prefix to buffer, or a part of one.
         uniforms : dict, optional
             A uniform that the compiler removed is skipped.
         defines : dict, optional
@@ -361,7 +372,12 @@ class Gpu:
                 defines["ATLAS_IS_BUFFER"] = 1
         program = self.program(name, **defines)
         for binding, buffer in buffers.items():
-            buffer.bind_to_storage_buffer(constants.BINDINGS[f"BINDING_{binding}"])
+            point = constants.BINDINGS[f"BINDING_{binding}"]
+            if isinstance(buffer, BufferPart):
+                whole, first, size = buffer
+                whole.bind_to_storage_buffer(point, offset=first, size=size)
+            else:
+                buffer.bind_to_storage_buffer(point)
         self._set_uniforms(program, uniforms or {})
         for name_of, image in images.items():
             unit = getattr(constants, f"IMAGE_{name_of}")

@@ -13,6 +13,8 @@ map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
+kernel_tables  the same as the passes read it
+table_loops    its compiled loops
 pair_loops     which kernels a frame uses, and the next one will
 srgb           pictures as they are stored, and linear light
 media_effects  what media and spectacles do, where a profile asks for it

@@ -11,15 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import (
-    KERNEL_WORDS,
-    MAX_LEVEL,
-    NODE_WORDS,
-    PART_WORDS,
-    RECIPE_TAPS,
-    RGB,
-)
-from filter_service.psfs.boxes import box_sizes, pack_reach
+from filter_service.constants import RECIPE_TAPS, RGB
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
@@ -180,68 +172,8 @@ def _node_kernels(
     )
 
 
-def node_table(nodes: NodeKernels) -> tuple[NDArray[np.uint32], int]:
-    """Make records (n, 2, 4) of node kernels for blend_psfs; and texels of all."""
-    widths, heights = box_sizes(nodes.reach_px)
-    sizes = widths * heights
-    starts = np.cumsum(sizes) - sizes
-    table = np.zeros((nodes.near.size, NODE_WORDS, 4), dtype=np.uint32)
-    table[:, 0, 0] = nodes.near
-    table[:, 0, 1] = nodes.far
-    table[:, 0, 2] = starts
-    table[:, 0, 3] = pack_reach(nodes.reach_px)
-    table[:, 1, 0] = nodes.peak_ratio.astype(np.float32).view(np.uint32)
-    return table, int(sizes.sum())
-
-
-def kernel_table(
-    kernels: FrameKernels,
-) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Make records (n, 3, 4) of kernels for common/kernels.glsl; texels (n, levels).
-
-    Each is followed by its merged forms: the kernel summed over squares of pixels.
-    """
-    from filter_service.rendering.kernel_loops import fill_levels
-
-    sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
-    starts, scale = np.empty(sizes.shape, np.uint32), np.empty(sizes.shape, np.float32)
-    fill_levels(
-        kernels.reach_px,
-        kernels.spread_px,
-        kernels.peak_ratio,
-        *(sizes, starts, scale),
-    )
-    table = np.empty((kernels.count, KERNEL_WORDS, 4), dtype=np.uint32)
-    table[:, 0, :2] = kernels.spread_px.astype(np.float32).view(np.uint32)
-    table[:, 0, 2] = kernels.radius_px
-    table[:, 0, 3] = pack_reach(kernels.reach_px)
-    table[:, 1] = starts
-    table[:, 2] = scale.view(np.uint32)
-    return table, sizes
-
-
-def part_table(kernels: FrameKernels) -> NDArray[np.uint32]:
-    """Make records (n, 6, 4) for blend_cells: four node kernels, weights and maps."""
-    table = np.empty((kernels.count, PART_WORDS, 4), dtype=np.uint32)
-    table[:, 0] = kernels.parts
-    table[:, 1] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
-    maps = kernels.maps.reshape(kernels.count, 4, 4)
-    table[:, 2:] = maps.astype(np.float32).view(np.uint32)
-    return table
-
-
 def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint32]:
     """Kernel (n_cells, n_intervals) of a pair; 0 where no pixel uses it."""
     index = np.zeros(shape, dtype=np.uint32)
     index[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     return index
-
-
-def work_list(n_texels: NDArray[np.int64], threads: int) -> NDArray[np.uint32]:
-    """Work groups (n, 2) over kernels of different size: kernel, its first texel."""
-    from filter_service.rendering.kernel_loops import fill_work
-
-    groups = int((-(-n_texels // threads)).sum())
-    work = np.empty((groups, 2), np.uint32)
-    fill_work(np.ascontiguousarray(n_texels), threads, work)
-    return work

@@ -8,18 +8,11 @@ import math
 import numpy as np
 from numba import njit
 
-from filter_service.constants import (
-    MAX_LEVEL,
-    MERGE_MIN_SPREAD_PX,
-    NO_LEVEL,
-    RGB,
-    WEIGHT_MAX,
-)
-from filter_service.psfs.read_loops import channel_taps, clipped
+from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.psfs.read_loops import channel_taps
 from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
 
 CORNERS = 4
-MIN_SPREAD_PX = 1e-9
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -188,37 +181,3 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
                 radius_px[k] = max(radius_px[k], widest_px)
                 for side in range(4):
                     reach_px[k, side] = max(reach_px[k, side], side_px[side])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
-    """Texels, first texels and steps (n, levels) of kernels and their merged forms.
-
-    No texels above the level for which a kernel is wide enough at one end.
-    """
-    start = 0
-    for k in range(peak_ratio.size):
-        widest_px = max(spread_px[k, 0], spread_px[k, 1], MIN_SPREAD_PX)
-        steps = math.floor(math.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
-        highest = int(clipped(steps, 0, MAX_LEVEL))
-        width = reach_px[k, 0] + reach_px[k, 1] + 1
-        height = reach_px[k, 2] + reach_px[k, 3] + 1
-        for level in range(MAX_LEVEL + 1):
-            scale[k, level] = min(peak_ratio[k] * 4.0**level, 1.0)
-            starts[k, level], sizes[k, level] = NO_LEVEL, 0
-            if level <= highest:
-                beyond = 2**level - 1
-                sizes[k, level] = (width + beyond) * (height + beyond)
-                starts[k, level] = start
-                start += sizes[k, level]
-        scale[k, 0] = peak_ratio[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_work(n_texels, threads, work):
-    """Kernel and first texel (n, 2) of each work group."""
-    group = 0
-    for kernel in range(n_texels.size):
-        for first in range(0, n_texels[kernel], threads):
-            work[group, 0], work[group, 1] = kernel, first
-            group += 1

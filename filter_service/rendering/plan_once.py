@@ -6,7 +6,7 @@ spends after it is ready; compiling them, once on a machine, 10 s.
 
 import numpy as np
 
-from estimator.field.defocus_loops import N_DEGREES, fill_defocus
+from estimator.field.defocus_loops import N_DEGREES, fill_defocus, weights_at
 from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
@@ -16,11 +16,9 @@ from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
     frame_kernels,
     interval_count,
-    kernel_table,
-    node_table,
-    work_list,
 )
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.kernel_tables import kernel_levels, kernel_tables
 from filter_service.rendering.media_effects import MediaEffects, encoded
 from filter_service.rendering.pair_loops import carry_over, spread, used_pairs
 from filter_service.rendering.perfect_eye import (
@@ -42,9 +40,7 @@ def plan_once() -> None:
     image = image_cells(store.spec, store.plan)
     used = np.ones((image.count, interval_count(layers)), bool)
     kernels = frame_kernels(store.tables, layers, image, used)
-    node_table(kernels.nodes)
-    _, n_texels = kernel_table(kernels)
-    work_list(n_texels[:, 0], SIDE_PX)
+    kernel_tables(kernels, kernel_levels(kernels), used.shape)
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
@@ -70,4 +66,5 @@ def _defocus_once() -> None:
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
     index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))
     fields, added = (index, index, np.ones(1)), (sums, sums, 1.0, sums, 1.0)
+    weights_at(np.zeros(1), 0.0)
     fill_defocus(2.0, grid, grid, fields, added, np.empty(1))

@@ -5,15 +5,16 @@ import numpy as np
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs import layer_loops, read_loops
-from filter_service.rendering import kernel_loops, map_loops, pair_loops
+from filter_service.rendering import kernel_loops, map_loops, pair_loops, table_loops
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants
 
+MODULES = (kernel_loops, map_loops, pair_loops, table_loops, layer_loops, read_loops)
 INNER = {"clipped", "bracket", "channel_taps", "number_used", "mapped_reach", "moves"}
-INNER |= {"layer_blur_px", "_steps", "_between"}
+INNER |= {"layer_blur_px", "_steps", "_between", "box", "packed"}
 INNER |= {"carry_over", "spread"}  # a software renderer needs none; see `plan_once`
 """Called by other loops alone: where those are read from disk, they are not."""
 
@@ -22,7 +23,7 @@ def compiled_loops():
     """How often each loop that plans frames has been compiled or read from disk."""
     return {
         name: len(loop.signatures)
-        for module in (kernel_loops, map_loops, pair_loops, layer_loops, read_loops)
+        for module in MODULES
         for name, loop in vars(module).items()
         if hasattr(loop, "signatures") and name not in INNER
     }

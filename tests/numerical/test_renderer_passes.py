@@ -8,6 +8,7 @@ from filter_service.rendering import frame_kernels, reference
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.kernel_tables import kernel_levels
 from filter_service.rendering.pair_loops import used_pairs
 from tests.numerical.synthetic import Bench, depth_scene, texture
 
@@ -100,7 +101,7 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
     view = bench.view(texture(rng, 101, 150), depth_scene())
     kernels = made_kernels(bench, view, pupil_diameter_mm=3.3, focus_dpt=7.0)
     expected = reference.kernel_pairs(bench.store, kernels)
-    table, _ = frame_kernels.kernel_table(kernels)
+    stored = kernel_levels(kernels)
     line = atlas_line(bench.gpu, "kernels 0")
     largest, levels = expected.shape[2] // 2, set()
     assert kernels.count > (1 if mode == "on-axis" else 50)
@@ -110,12 +111,14 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
             slice(largest - to_top, largest + to_bottom + 1),
             slice(largest - to_left, largest + to_right + 1),
         )
-        steps = table[k, 2].view(np.float32) / constants.WEIGHT_MAX
+        steps = stored.scale[k] / constants.WEIGHT_MAX
         height, width = to_top + to_bottom + 1, to_left + to_right + 1
         # half a step of the kernel, of up to four node kernels, and float32 sums
         nodes = kernels.nodes.peak_ratio[kernels.parts[k]] / constants.WEIGHT_MAX
         rounding = 0.501 * float((nodes * kernels.weight_ratio[k]).sum())
-        for level, (offset, step) in enumerate(zip(table[k, 1], steps, strict=True)):
+        for level, (offset, step) in enumerate(
+            zip(stored.starts[k], steps, strict=True)
+        ):
             if offset == constants.NO_LEVEL:
                 break
             edge = 2**level

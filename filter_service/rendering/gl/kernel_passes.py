@@ -5,27 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import (
-    BITS_PER_WORD,
-    MAX_LAYERS,
-    MAX_LEVEL,
-    THREADS,
-    USED_PARTS,
-)
+from filter_service.constants import BITS_PER_WORD, MAX_LAYERS, USED_PARTS
 from filter_service.errors import GridTooLarge
-from filter_service.gl.gpu import Atlas, Buffer, Gpu, Pages
+from filter_service.gl.gpu import Atlas, BufferPart, Gpu, Pages
 from filter_service.gl.stage_timer import StageTimer
-from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     frame_kernels,
     interval_count,
-    kernel_table,
-    node_table,
-    pair_index,
-    part_table,
-    work_list,
 )
 from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
 from filter_service.rendering.gl.strip import grid_of
@@ -35,9 +23,19 @@ from filter_service.rendering.image_cells import (
     can_coarsen,
     check_texels,
 )
+from filter_service.rendering.kernel_tables import (
+    LEVEL_WORK,
+    NODE_WORK,
+    KernelLevels,
+    KernelTables,
+    kernel_levels,
+    kernel_tables,
+)
 
 MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
+
+_WORD_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class KernelSet:
 
     kernels: FrameKernels
     texel_count: int
-    buffers: dict[str, Buffer]
+    buffers: dict[str, BufferPart]
     atlas: Atlas
     have: NDArray[np.bool_]
 
@@ -145,121 +143,94 @@ class KernelMaker:
             return kept
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
-            if kept is not None:
-                used = self._with_those_before(store, layers, image, used, kept.have)
-            kernels = frame_kernels(store.tables, layers, image, used)
-            table, sizes = _records(kernels, store, image)
+            planned = None
+            if kept is not None:  # the next frame may use those of the last
+                planned = _plan_if_they_fit(store, layers, image, used | kept.have)
+            plan = planned or _plan(store, layers, image, used)
+            tables = kernel_tables(plan.kernels, plan.levels, used.shape)
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(kernels, table, sizes, pages, used)
+            self._set = self._blend(plan, tables, pages)
         self._made_for = (pages, layers, image)
         return self._set
 
-    @staticmethod
-    def _with_those_before(
-        store: PsfStore,
-        layers: FrameLayers,
-        image: ImageCells,
-        used: NDArray[np.bool_],
-        have: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
-        """Add the pairs of the frame before, if they fit: the next may use them."""
-        try:
-            both = used | have
-            _records(frame_kernels(store.tables, layers, image, both), store, image)
-        except KernelsTooLarge:
-            return used
-        return both
-
-    def _blend(
-        self,
-        kernels: FrameKernels,
-        table: NDArray[np.uint32],
-        sizes: NDArray[np.int64],
-        pages: Pages,
-        used: NDArray[np.bool_],
-    ) -> KernelSet:
+    def _blend(self, plan: "_Plan", tables: KernelTables, pages: Pages) -> KernelSet:
         gpu = self._gpu
-        nodes, node_texels = node_table(kernels.nodes)
-        texels = int(sizes.sum())
-        node_atlas = gpu.atlas("nodes", node_texels)
+        node_atlas = gpu.atlas("nodes", tables.node_texel_count)
         gpu.claim(self._memory, self)
-        atlas = gpu.atlas(self._memory, texels)
-        buffers = {
-            "NODES": gpu.upload("NODES", nodes),
-            "RECIPES": gpu.upload("RECIPES", kernels.nodes.recipes),
-            "KERNELS": gpu.upload(f"KERNELS {self._slot}", table),
-            "PARTS": gpu.upload("PARTS", part_table(kernels)),
-            "KERNEL_OF": gpu.upload(
-                f"KERNEL_OF {self._slot}", pair_index(kernels, used.shape)
-            ),
+        atlas = gpu.atlas(self._memory, plan.levels.texel_count)
+        memory = gpu.upload(f"KERNELS {self._slot}", tables.words)
+        parts = {
+            name: BufferPart(memory, _WORD_BYTES * first, _WORD_BYTES * count)
+            for name, (first, count) in tables.parts.items()
         }
-        node_widths, node_heights = box_sizes(kernels.nodes.reach_px)
-        self._run(
-            "blend_psfs",
-            node_widths * node_heights,
-            {name: buffers[name] for name in ("NODES", "RECIPES")},
+
+        def run(name: str, work: str, *bindings: str, **options) -> None:
+            count = tables.parts[work][1] // 2
+            if not count:
+                return
+            gpu.dispatch(
+                name,
+                grid_of(count),
+                buffers={"WORK": parts[work], **{key: parts[key] for key in bindings}},
+                uniforms={"group_count": count, **options.pop("uniforms", {})},
+                **options,
+            )
+
+        run(
+            *("blend_psfs", NODE_WORK, "NODES", "RECIPES"),
             images={"NODES": node_atlas},
             textures={"STORE": pages},
         )
-        self._run(
-            "blend_cells",
-            sizes[:, 0],
-            {name: buffers[name] for name in ("NODES", "PARTS", "KERNELS")},
+        run(
+            *("blend_cells", LEVEL_WORK[0], "NODES", "PARTS", "KERNELS"),
             images={"ATLAS": atlas},
             textures={"NODES": node_atlas},
         )
-        for level in range(1, MAX_LEVEL + 1):
-            self._run(
-                "merge_psfs",
-                sizes[:, level],
-                {"KERNELS": buffers["KERNELS"]},
+        for level, work in enumerate(LEVEL_WORK[1:], start=1):
+            run(
+                *("merge_psfs", work, "KERNELS"),
                 images={"ATLAS": atlas},
                 uniforms={"level": level},
             )
-        kept = {name: buffers[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(kernels, texels, kept, atlas, used)
-
-    def _run(
-        self,
-        name: str,
-        n_texels: NDArray,
-        buffers: dict,
-        *,
-        uniforms: dict | None = None,
-        **bindings,
-    ) -> None:
-        work = work_list(n_texels, THREADS)
-        if not len(work):
-            return
-        self._gpu.dispatch(
-            name,
-            grid_of(len(work)),
-            buffers={**buffers, "WORK": self._gpu.upload("WORK", work)},
-            uniforms={"group_count": len(work), **(uniforms or {})},
-            **bindings,
-        )
+        kept = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
+        return KernelSet(plan.kernels, plan.levels.texel_count, kept, atlas, plan.used)
 
 
-def _records(
-    kernels: FrameKernels, store: PsfStore, image: ImageCells
-) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the records of kernels, and how many texels they have.
+@dataclass(frozen=True)
+class _Plan:
+    """Kernels for the used pairs, and how large they are."""
+
+    used: NDArray[np.bool_]
+    kernels: FrameKernels
+    levels: KernelLevels
+
+
+def _plan(
+    store: PsfStore, layers: FrameLayers, image: ImageCells, used: NDArray[np.bool_]
+) -> _Plan:
+    """Plan kernels for pairs.
 
     Raises
     ------
     KernelsTooLarge
-        Larger cells would have fewer.
+        Larger cells would have fewer texels.
     """
-    widths, heights = box_sizes(kernels.reach_px)
-    check_texels(int((widths * heights).sum()), image, store.spec)
-    table, sizes = kernel_table(kernels)
-    n_texels = int(sizes.sum())
-    if n_texels > MAX_KERNEL_TEXELS and can_coarsen(image):
+    kernels = frame_kernels(store.tables, layers, image, used)
+    levels = kernel_levels(kernels)
+    check_texels(int(levels.sizes[:, 0].sum()), image, store.spec)
+    if levels.texel_count > MAX_KERNEL_TEXELS and can_coarsen(image):
         raise KernelsTooLarge(
-            f"the frame's kernels need {n_texels} texels; allowed are "
+            f"the frame's kernels need {levels.texel_count} texels; allowed are "
             f"{MAX_KERNEL_TEXELS}",
         )
-    return table, sizes
+    return _Plan(used, kernels, levels)
+
+
+def _plan_if_they_fit(*arguments) -> _Plan | None:
+    try:
+        return _plan(*arguments)
+    except KernelsTooLarge:
+        return None
 
 
 def words_per_cell(layers: FrameLayers) -> int:

@@ -1,0 +1,129 @@
+"""A frame's kernels as the passes read them: one piece of memory, sent at once.
+
+Its loops are loaded when a frame first needs them, as those of the plan are.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    KERNEL_WORDS,
+    MAX_LEVEL,
+    NODE_WORDS,
+    PART_WORDS,
+    THREADS,
+)
+from filter_service.rendering.frame_kernels import FrameKernels, pair_index
+
+PART_ALIGNMENT_WORDS = 64
+"""256 bytes: OpenGL lets a part of a buffer begin there, whatever the device."""
+
+NODE_WORK = "node work"
+LEVEL_WORK = tuple(f"work of level {level}" for level in range(MAX_LEVEL + 1))
+
+
+@dataclass(frozen=True)
+class KernelLevels:
+    """How large the kernels of a frame are.
+
+    Attributes
+    ----------
+    sizes, starts, scale : (n, levels)
+        Texels of a kernel and of it summed over squares of 2, 4 and 8 pixels, where
+        they begin, and the steps that they are stored in.
+    texel_count : int
+        Of all.
+    """
+
+    sizes: NDArray[np.int64]
+    starts: NDArray[np.uint32]
+    scale: NDArray[np.float32]
+    texel_count: int
+
+
+@dataclass(frozen=True)
+class KernelTables:
+    """All records of a frame's kernels.
+
+    Attributes
+    ----------
+    words : (n,), uint32
+    parts : dict
+        By name, first word and number of words: ``NODES`` (n, 2, 4) and ``RECIPES``
+        for blend_psfs, ``PARTS`` (n, 6, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
+        ``KERNEL_OF`` (n_cells, n_intervals), and the work groups (n, 2) of each pass,
+        kernel and first texel.
+    node_texel_count : int
+    """
+
+    words: NDArray[np.uint32]
+    parts: dict[str, tuple[int, int]]
+    node_texel_count: int
+
+    def of(self, name: str) -> NDArray[np.uint32]:
+        """Return the words of a part."""
+        first, count = self.parts[name]
+        return self.words[first : first + count]
+
+
+def kernel_levels(kernels: FrameKernels) -> KernelLevels:
+    """Return how large kernels are, with their merged forms."""
+    from filter_service.rendering.table_loops import fill_levels
+
+    sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
+    starts, scale = np.empty(sizes.shape, np.uint32), np.empty(sizes.shape, np.float32)
+    texel_count = fill_levels(
+        *(kernels.reach_px, kernels.spread_px, kernels.peak_ratio),
+        *(sizes, starts, scale),
+    )
+    return KernelLevels(sizes, starts, scale, texel_count)
+
+
+def kernel_tables(
+    kernels: FrameKernels, levels: KernelLevels, shape: tuple[int, int]
+) -> KernelTables:
+    """Write the records of kernels that serve pairs (n_cells, n_intervals)."""
+    from filter_service.rendering.table_loops import (
+        count_groups,
+        fill_nodes,
+        fill_records,
+    )
+
+    nodes = kernels.nodes
+    groups = np.empty(MAX_LEVEL + 2, np.int64)
+    node_texel_count = count_groups(nodes.reach_px, levels.sizes, THREADS, groups)
+    counts = {
+        "NODES": nodes.near.size * NODE_WORDS * 4,
+        "RECIPES": nodes.recipes.size,
+        "KERNELS": kernels.count * KERNEL_WORDS * 4,
+        "PARTS": kernels.count * PART_WORDS * 4,
+        "KERNEL_OF": shape[0] * shape[1],
+        **dict(zip((NODE_WORK, *LEVEL_WORK), (2 * groups).tolist(), strict=True)),
+    }
+    parts, end = {}, 0
+    for name, count in counts.items():
+        parts[name] = end, count
+        end += -(-count // PART_ALIGNMENT_WORDS) * PART_ALIGNMENT_WORDS
+    words = np.empty(end, np.uint32)
+    tables = KernelTables(words, parts, node_texel_count)
+    floats = words.view(np.float32)
+    first = {name: at for name, (at, _) in parts.items()}
+    fill_nodes(
+        *(words, floats, first["NODES"]),
+        (nodes.near, nodes.far, nodes.reach_px, nodes.peak_ratio),
+        *(THREADS, first[NODE_WORK]),
+    )
+    fill_records(
+        *(words, floats, (first["KERNELS"], first["PARTS"])),
+        (
+            *(kernels.spread_px, kernels.radius_px, kernels.reach_px),
+            *(kernels.parts, kernels.weight_ratio, kernels.maps),
+        ),
+        (levels.sizes, levels.starts, levels.scale),
+        *(THREADS, np.array([first[name] for name in LEVEL_WORK])),
+    )
+    tables.of("RECIPES")[:] = nodes.recipes.ravel()
+    tables.of("KERNEL_OF")[:] = pair_index(kernels, shape).ravel()
+    return tables

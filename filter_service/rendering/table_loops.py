@@ -1,0 +1,127 @@
+"""Compiled loops that write a frame's kernels as the passes read them."""
+
+import math
+
+from numba import njit
+
+from filter_service.constants import (
+    KERNEL_WORDS,
+    MAX_LEVEL,
+    MERGE_MIN_SPREAD_PX,
+    NO_LEVEL,
+    NODE_WORDS,
+    PART_WORDS,
+)
+from filter_service.psfs.read_loops import clipped
+
+MIN_SPREAD_PX = 1e-9
+VECTOR = 4
+"""Words of a uvec4."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def box(reach_px, k):
+    """Width and height of a kernel's box."""
+    width = reach_px[k, 0] + reach_px[k, 1] + 1
+    return width, reach_px[k, 2] + reach_px[k, 3] + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def packed(reach_px, k):
+    """Four reaches as the bytes of a word."""
+    across = reach_px[k, 0] | reach_px[k, 1] << 8
+    return across | reach_px[k, 2] << 16 | reach_px[k, 3] << 24
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
+    """Texels, first texels and steps (n, levels) of kernels and their merged forms.
+
+    No texels above the level for which a kernel is wide enough at one end.  Returns
+    the texels of all.
+    """
+    start = 0
+    for k in range(peak_ratio.size):
+        widest_px = max(spread_px[k, 0], spread_px[k, 1], MIN_SPREAD_PX)
+        steps = math.floor(math.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
+        highest = int(clipped(steps, 0, MAX_LEVEL))
+        width, height = box(reach_px, k)
+        for level in range(MAX_LEVEL + 1):
+            scale[k, level] = min(peak_ratio[k] * 4.0**level, 1.0)
+            starts[k, level], sizes[k, level] = NO_LEVEL, 0
+            if level <= highest:
+                beyond = 2**level - 1
+                sizes[k, level] = (width + beyond) * (height + beyond)
+                starts[k, level] = start
+                start += sizes[k, level]
+        scale[k, 0] = peak_ratio[k]
+    return start
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_groups(node_reach_px, sizes, threads, counts):
+    """Work groups (1 + levels) of node kernels and of each level; texels of nodes."""
+    counts[:] = 0
+    texels = 0
+    for k in range(node_reach_px.shape[0]):
+        width, height = box(node_reach_px, k)
+        texels += width * height
+        counts[0] += (width * height + threads - 1) // threads
+    for k in range(sizes.shape[0]):
+        for level in range(MAX_LEVEL + 1):
+            counts[1 + level] += (sizes[k, level] + threads - 1) // threads
+    return texels
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_nodes(words, floats, first, nodes, threads, work):
+    """Write records of node kernels from a word on, work groups from another."""
+    near, far, reach_px, peak_ratio = nodes
+    start = 0
+    for k in range(near.size):
+        at = first + k * NODE_WORDS * VECTOR
+        words[at : at + NODE_WORDS * VECTOR] = 0
+        words[at], words[at + 1], words[at + 2] = near[k], far[k], start
+        words[at + 3] = packed(reach_px, k)
+        floats[at + VECTOR] = peak_ratio[k]
+        width, height = box(reach_px, k)
+        start += width * height
+        for texel in range(0, width * height, threads):
+            words[work], words[work + 1] = k, texel
+            work += 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_records(words, floats, firsts, kernels, levels, threads, works):
+    """Write records of kernels and of their parts, and the work groups of each level.
+
+    Parameters
+    ----------
+    words, floats : (n,)
+        The same memory.
+    firsts : (2,)
+        Words that records and parts begin at.
+    kernels : spread_px, radius_px, reach_px, parts, weights, maps
+    levels : sizes, starts, scale
+    works : (levels,)
+        Words that the groups begin at; afterwards, that they end at.
+    """
+    spread_px, radius_px, reach_px, parts, weight_ratio, maps = kernels
+    sizes, starts, scale = levels
+    for k in range(radius_px.size):
+        at = firsts[0] + k * KERNEL_WORDS * VECTOR
+        floats[at], floats[at + 1] = spread_px[k, 0], spread_px[k, 1]
+        words[at + 2], words[at + 3] = radius_px[k], packed(reach_px, k)
+        for level in range(MAX_LEVEL + 1):
+            words[at + VECTOR + level] = starts[k, level]
+            floats[at + 2 * VECTOR + level] = scale[k, level]
+            for texel in range(0, sizes[k, level], threads):
+                words[works[level]], words[works[level] + 1] = k, texel
+                works[level] += 2
+        at = firsts[1] + k * PART_WORDS * VECTOR
+        for j in range(VECTOR):
+            words[at + j] = parts[k, j]
+            floats[at + VECTOR + j] = weight_ratio[k, j]
+            to = at + (2 + j) * VECTOR
+            floats[to], floats[to + 1] = maps[k, j, 0, 0], maps[k, j, 0, 1]
+            floats[to + 2], floats[to + 3] = maps[k, j, 1, 0], maps[k, j, 1, 1]
