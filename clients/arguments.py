@@ -7,9 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from estimator import profile_body
+
 
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
-    """Return a profile from JSON text, a JSON file, or the name of a preset.
+    """Return a profile from JSON text, a file, or the name of a preset.
+
+    A file is one of ``.json``, ``.abp`` and ``.csv``.  A name is the service's to know.
 
     Raises
     ------
@@ -19,13 +23,15 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     if text.lstrip().startswith("{"):
         return read_object(option, text)
     path = Path(text)
-    if path.suffix != ".json":
+    if path.suffix.lower() not in (".json", ".abp", ".csv") and not path.is_file():
         return {"kind": "preset", "name": text}
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{option} {path}: {error.strerror}") from None
-    return read_object(f"{option} {path}", text)
+        body = profile_body(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{option} {path}: {error}") from None
+    if not isinstance(body, dict):
+        raise ValueError(f"{option} {path} is {body!r}; allowed: a JSON object")
+    return body
 
 
 def read_object(option: str, text: str) -> dict[str, Any]:

@@ -319,7 +319,9 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rate-hz", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument(
-        "--profile", default=DEFAULT_PROFILE, help="preset, JSON text or .json file"
+        "--profile",
+        default=DEFAULT_PROFILE,
+        help="preset, JSON, or a .json, .abp or .csv file",
     )
     parser.add_argument(
         "--right-profile",

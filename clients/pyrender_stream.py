@@ -17,12 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clients.arguments import size_px_argument
+from clients.arguments import read_profile, size_px_argument
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.natural import (
@@ -57,26 +56,6 @@ FRAMES_PER_ROUND = 60
 MAX_LOOK_AROUND_DEG = 30.0
 STRAIGHT_AHEAD = (0.0, 0.0)
 NATURAL_RANGES = {"pupil_range_mm": (2.0, 8.0), "focus_range_dpt": (0.0, 8.5)}
-
-
-def profile_body(name_or_file: str) -> dict[str, Any]:
-    """Return the profile of a preset's name or of a JSON file.
-
-    Raises
-    ------
-    ValueError
-        The file holds no JSON object.
-    """
-    path = Path(name_or_file)
-    if not path.is_file():
-        return {"kind": "preset", "name": name_or_file}
-    try:
-        body = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON: {error}") from None
-    if not isinstance(body, dict):
-        raise ValueError(f"{path} holds {type(body).__name__}; allowed: an object")
-    return body
 
 
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
@@ -219,7 +198,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
     parser.add_argument("--scene", default="courtyard", choices=sorted(SCENE_BUILDERS))
     parser.add_argument(
-        "--profile", default="myopia", help="a preset's name or a JSON file"
+        "--profile",
+        default="myopia",
+        help="a preset's name, JSON, or a .json, .abp or .csv file",
     )
     parser.add_argument(
         "--size", default="480x270", type=size_px_argument, metavar="WxH"
@@ -296,7 +277,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         if show is not None:
             show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
         client.set_profile(
-            profile_body(options.profile),
+            read_profile(options.profile),
             settings=settings,
             views=[view_of(first)],
         )

@@ -5,6 +5,7 @@ from .eye.parameters import EyeParameters as EyeParameters
 from .field.eye_optics import EyeOptics as EyeOptics
 from .field.prepare import prepare_eye as prepare_eye
 from .profiles.files import load_profile as load_profile
+from .profiles.files import profile_body as profile_body
 from .profiles.parse import EyeProfile as EyeProfile
 from .profiles.parse import parse_profile as parse_profile
 from .profiles.parse import preset_names as preset_names

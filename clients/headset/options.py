@@ -37,7 +37,7 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         "--supersampling", type=int, default=2, help="samples per pixel and axis"
     )
     eyes = parser.add_argument_group("the eyes")
-    what = "a preset's name, JSON, or a .json file"
+    what = "a preset's name, JSON, or a .json, .abp or .csv file"
     eyes.add_argument(
         "--profile", default="myopia", help=f"of both eyes: {what} (default: myopia)"
     )
@@ -89,16 +89,15 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         help="no headset: a head that looks around, and pictures for --out",
     )
     where.add_argument(
-        "--size", default="448x504", metavar="WxH", help="with --simulated: of each eye"
+        "--size", metavar="WxH", help="with --simulated: of each eye (default: 448x504)"
     )
     where.add_argument(
-        "--rate-hz", type=float, default=72.0, help="with --simulated: frames a second"
-    )
-    where.add_argument(
-        "--scale",
+        "--rate-hz",
         type=float,
-        default=1.0,
-        help="of the headset's own picture size, 0.1 to 2",
+        help="with --simulated: frames a second (default: 72)",
+    )
+    where.add_argument(
+        "--scale", type=float, help="of the headset's own picture size, 0.1 to 2"
     )
     where.add_argument(
         "--validate", action="store_true", help="load OpenXR's core validation layer"
@@ -108,7 +107,22 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
     end.add_argument("--seconds", type=float)
     end.add_argument("--out", type=Path, metavar="DIR", help="for the last pictures")
     end.add_argument("--json", action="store_true", help="print one JSON object")
-    return parser.parse_args(argv)
+    options = parser.parse_args(argv)
+    _settle_where(parser, options)
+    return options
+
+
+def _settle_where(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuse what the place cannot heed, and fill in what was left open."""
+    defaults = {"size": "448x504", "rate_hz": 72.0, "scale": 1.0, "validate": False}
+    elsewhere = ("scale", "validate") if options.simulated else ("size", "rate_hz")
+    for name in elsewhere:
+        if getattr(options, name) not in (None, False):
+            which = "is for a headset" if options.simulated else "needs --simulated"
+            parser.error(f"--{name.replace('_', '-')} {which}")
+    for name, value in defaults.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
 
 
 def settings_of(options: argparse.Namespace) -> FilterSettings:

@@ -30,7 +30,7 @@ class KernelLevels:
 
     Attributes
     ----------
-    sizes, starts, scale : (n, levels)
+    sizes, starts, step_ratio : (n, levels)
         Texels of a kernel and of it summed over squares of 2, 4 and 8 pixels, where
         they begin, and the steps that they are stored in.
     texel_count : int
@@ -39,7 +39,7 @@ class KernelLevels:
 
     sizes: NDArray[np.int64]
     starts: NDArray[np.uint32]
-    scale: NDArray[np.float32]
+    step_ratio: NDArray[np.float32]
     texel_count: int
 
 
@@ -73,12 +73,13 @@ def kernel_levels(kernels: FrameKernels) -> KernelLevels:
     from filter_service.rendering.table_loops import fill_levels
 
     sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
-    starts, scale = np.empty(sizes.shape, np.uint32), np.empty(sizes.shape, np.float32)
+    starts = np.empty(sizes.shape, np.uint32)
+    step_ratio = np.empty(sizes.shape, np.float32)
     texel_count = fill_levels(
         *(kernels.reach_px, kernels.spread_px, kernels.peak_ratio),
-        *(sizes, starts, scale),
+        *(sizes, starts, step_ratio),
     )
-    return KernelLevels(sizes, starts, scale, texel_count)
+    return KernelLevels(sizes, starts, step_ratio, texel_count)
 
 
 def kernel_tables(
@@ -121,7 +122,7 @@ def kernel_tables(
             *(kernels.spread_px, kernels.radius_px, kernels.reach_px),
             *(kernels.parts, kernels.weight_ratio, kernels.maps),
         ),
-        (levels.sizes, levels.starts, levels.scale),
+        (levels.sizes, levels.starts, levels.step_ratio),
         *(THREADS, np.array([first[name] for name in LEVEL_WORK])),
     )
     tables.of("RECIPES")[:] = nodes.recipes.ravel()

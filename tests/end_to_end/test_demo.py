@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from clients import demo, pyrender_stream, sheet, video
-from clients.arguments import read_size_px
+from clients.arguments import read_profile, read_size_px
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
-from clients.pyrender_stream import path_settings, profile_body
+from clients.pyrender_stream import path_settings
 from clients.scenes.catalogue import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.progress import INTERVAL_S
@@ -212,7 +212,7 @@ def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
     ) as service:
         arguments = ["--endpoint", service.endpoint, "--size", "64x36", "--frames", "4"]
         monkeypatch.setattr(
-            pyrender_stream, "profile_body", lambda name: {"kind": "double", "mark": 1}
+            pyrender_stream, "read_profile", lambda name: {"kind": "double", "mark": 1}
         )
         assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
         assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
@@ -229,14 +229,39 @@ def test_bad_size_is_refused_with_what_is_allowed(text):
         read_size_px(text)
 
 
-def test_profile_is_a_preset_or_a_json_file(tmp_path):
-    assert profile_body("myopia") == {"kind": "preset", "name": "myopia"}
+ABP = "Ap = 5.0\nWa = 555\nZ[2, 0] = 1.5  # um\n"
+
+
+def test_profile_is_a_preset_json_or_a_file(tmp_path):
+    assert read_profile("myopia") == {"kind": "preset", "name": "myopia"}
+    assert read_profile('{"kind": "double"}') == {"kind": "double"}
     path = tmp_path / "eye.json"
     path.write_text('{"kind": "prescription", "sphere_dpt": -2}')
-    assert profile_body(str(path)) == {"kind": "prescription", "sphere_dpt": -2}
-    path.write_text("[1, 2]")
-    with pytest.raises(ValueError, match="list; allowed: an object"):
-        profile_body(str(path))
-    path.write_text("{")
-    with pytest.raises(ValueError, match="is not JSON"):
-        profile_body(str(path))
+    assert read_profile(str(path)) == {"kind": "prescription", "sphere_dpt": -2}
+    path.with_suffix(".ABP").write_text(ABP)
+    found = read_profile(str(path.with_suffix(".ABP")))
+    assert (found["pupil_diameter_mm"], found["zernike_um"]) == (5.0, {"2,0": 1.5})
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        (
+            "eye.json",
+            "[1, 2]",
+            r"--left .*eye.json is \[1, 2\]; allowed: a JSON object",
+        ),
+        ("eye.json", "{", "--left .*not JSON"),
+        ("eye.abp", "Q = 1", "--left .*line 1': cannot read 'Q = 1'"),
+        ("eye.txt", "{}", "--left .*eye.txt.* allowed: a preset"),
+    ],
+)
+def test_a_profile_that_is_none_is_named_with_its_option(tmp_path, name, text, words):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(ValueError, match=words):
+        read_profile(str(path), "--left")
+    path.unlink()
+    if path.suffix != ".txt":  # a name, as of a preset
+        with pytest.raises(ValueError, match=r"--left .*does not exist"):
+            read_profile(str(path), "--left")

@@ -132,7 +132,7 @@ def test_a_program_of_ones_own_renders(tmp_path):
         (("--pupil-mm", "30"), "0.5 to 9"),
         (("--gaze-range", "a,b"), "H,V"),
         (("--settings", '{"nonsense": 1}'), "nonsense"),
-        (("--scale", "9"), "0.1 to 2"),
+        (("--scale", "0.5"), "--scale is for a headset"),
         (("--white-cd-m2", "-1"), "white_cd_m2"),
         (("--profile", "{broken"), "no JSON"),
         (("--left", "{broken"), "--left"),

@@ -188,7 +188,7 @@ def test_tables_equal_the_plain_statement(case):
     )
     np.testing.assert_array_equal(levels.sizes, sizes)
     np.testing.assert_array_equal(levels.starts, starts)
-    np.testing.assert_array_equal(levels.scale, scale)
+    np.testing.assert_array_equal(levels.step_ratio, scale)
     assert levels.texel_count == sizes.sum()
     tables = kernel_tables(kernels, levels, used.shape)
     expected = plan_twin.tables(kernels, (sizes, starts, scale), used.shape, THREADS)

@@ -111,7 +111,7 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
             slice(largest - to_top, largest + to_bottom + 1),
             slice(largest - to_left, largest + to_right + 1),
         )
-        steps = stored.scale[k] / constants.WEIGHT_MAX
+        steps = stored.step_ratio[k] / constants.WEIGHT_MAX
         height, width = to_top + to_bottom + 1, to_left + to_right + 1
         # half a step of the kernel, of up to four node kernels, and float32 sums
         nodes = kernels.nodes.peak_ratio[kernels.parts[k]] / constants.WEIGHT_MAX

@@ -8,6 +8,7 @@ from fnmatch import fnmatch
 
 import pytest
 
+import estimator
 import filter_service
 from tests.source_tree import (
     PACKAGES,
@@ -19,6 +20,9 @@ from tests.source_tree import (
 
 FACE = tuple(f"filter_service.{name}" for name in filter_service.__all__)
 """What `filter_service` shows to researchers and clients."""
+
+EYE_FACE = tuple(f"estimator.{name}" for name in estimator.__all__)
+"""What `estimator` shows to them."""
 
 MAY_IMPORT = {
     "estimator": ("estimator",),
@@ -34,6 +38,7 @@ MAY_IMPORT = {
         "filter_service.settings",
         "estimator.dynamics",  # of an eye that looks
         *FACE,
+        *EYE_FACE,
     ),
 }
 """Ours that each package may import, as dotted prefixes."""
