@@ -10,8 +10,9 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.field.eye_optics import EyeOptics
 from estimator.psf.compute import PsfTooLarge
 from filter_service.building.jobs import BuildJob, BuiltStore, Store
-from filter_service.building.preview import is_worthwhile, preview_spec
+from filter_service.building.preview import is_worthwhile, preview_ranges, preview_spec
 from filter_service.building.read_profile import unknown_profile
+from filter_service.building.used_ranges import UsedRanges
 from filter_service.errors import (
     BuildCancelled,
     BuildFailed,
@@ -115,7 +116,11 @@ def _built(
             raise BuildCancelled("a newer profile took over")
 
     def result(
-        store: Store, notes: tuple[str, ...], *, is_complete: bool
+        store: Store,
+        notes: tuple[str, ...],
+        *,
+        is_complete: bool,
+        ranges: UsedRanges | None = None,
     ) -> BuiltStore:
         return BuiltStore(
             store=store,
@@ -124,6 +129,7 @@ def _built(
             memory_mb=store.memory_mb,
             notes=notes,
             is_complete=is_complete,
+            ranges=ranges,
         )
 
     profile = job.profile
@@ -164,7 +170,8 @@ def _built(
                 progress=lambda part, stage: progress(done, PREVIEW_STAGE),
                 cancelled=cancelled,
             )
-            yield result(store, notes, is_complete=False)
+            good_for = preview_ranges(first_spec)
+            yield result(store, notes, is_complete=False, ranges=good_for)
     report(0.0, "plan")
     plan = plan or plan_cache(eye, spec)
     go_on()

@@ -56,7 +56,8 @@ class Store(Protocol):
 class BuiltStore:
     """What came out of a job.
 
-    A store that is not complete is a preview; a complete one follows.
+    A store that is not complete is a preview; a complete one follows.  ``ranges`` are
+    those that a preview is good for, None where they are the job's.
     """
 
     store: Store
@@ -65,6 +66,7 @@ class BuiltStore:
     memory_mb: float
     notes: tuple[str, ...] = ()
     is_complete: bool = True
+    ranges: UsedRanges | None = None
 
 
 Build = Callable[..., Iterator[BuiltStore]]

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from filter_service.building.jobs import LookAt
+from filter_service.building.used_ranges import UsedRanges
 from filter_service.planning.grid import GridSpec
+
+PUPIL_ROOM_MM, FOCUS_ROOM_DPT = 0.1, 0.05
+"""So far from its one state a preview is as good as it is there: 1 arcmin of blur."""
 
 MIN_WHOLE_S = 0.3
 """A store that is predicted to take less to build is built at once: with the 0.2 to
@@ -35,6 +39,18 @@ def preview_spec(spec: GridSpec, look_at: LookAt | None) -> GridSpec:
         mode="dynamic" if spec.follows_field else spec.settings.mode,
         grid="planned",
         tolerance="loose",
+    )
+
+
+def preview_ranges(spec: GridSpec) -> UsedRanges:
+    """Return what frames may ask of a preview of such a grid."""
+    settings = spec.settings
+    pupil_mm, focus_dpt = settings.pupil_range_mm[0], settings.focus_range_dpt[0]
+    return UsedRanges(
+        (pupil_mm - PUPIL_ROOM_MM, pupil_mm + PUPIL_ROOM_MM),
+        (focus_dpt - FOCUS_ROOM_DPT, focus_dpt + FOCUS_ROOM_DPT),
+        settings.object_range_dpt,
+        settings.object_planes_dpt,
     )
 
 

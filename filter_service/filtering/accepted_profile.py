@@ -19,8 +19,9 @@ class PreparedStore:
     """A loaded store and the camera it was built for.
 
     ``is_complete`` is false for a preview, which a complete store will replace.
-    ``ranges`` are those of a stream that it was built for, None for all that the
-    settings allow; ``failed`` are such that could not be built, with the reason.
+    ``ranges`` are those of a stream that it was built for, of a preview its one state,
+    None for all that the settings allow; ``failed`` are such that could not be built,
+    with the reason.
     ``behind`` is the complete store that a preview of more stands before.
     ``used_s`` is when a frame last went through it, or when it was put in place.
     """

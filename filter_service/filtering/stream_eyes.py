@@ -199,7 +199,7 @@ class StreamEyes:
         self, eye: AcceptedProfile, prepared: PreparedStore
     ) -> Wanted | None:
         """Return more of a store where frames leave it."""
-        if prepared.ranges is None:
+        if prepared.ranges is None or not prepared.is_complete:
             return None
         build_s, settings = prepared.build_s, eye.settings
         if not self.use.leaves(prepared.ranges, build_s, settings):
@@ -232,7 +232,10 @@ class StreamEyes:
                 f"what this frame asks for could not be prepared: {reason}"
                 for prepared in used
                 if not self._holds(eye, prepared)
-                for reason in prepared.failed.values()
+                for reason in (
+                    *prepared.failed.values(),
+                    *filter(None, [eye.failure_for(prepared.camera)]),
+                )
             )
         )
 

@@ -263,7 +263,7 @@ class Workshop:
                 wanted.camera,
                 loaded,
                 built.is_complete,
-                wanted.ranges if built.is_complete else None,
+                wanted.ranges if built.is_complete else built.ranges,
                 built.build_ms / MS_PER_S,
                 memory_mb=built.memory_mb,
             ),

@@ -3,7 +3,7 @@
 import pytest
 
 from filter_service.building.jobs import LookAt
-from filter_service.building.preview import is_worthwhile, preview_spec
+from filter_service.building.preview import is_worthwhile, preview_ranges, preview_spec
 from filter_service.messages import Camera
 from tests.grid_specs import grid_spec
 
@@ -32,6 +32,10 @@ def test_a_preview_is_for_what_the_last_frame_looked_at(look_at, pupil_mm, focus
     assert spec.settings.focus_range_dpt == (focus_dpt, focus_dpt)
     assert spec.settings.object_range_dpt == (0.0, 3.0)
     assert not spec.settings.chromatic
+    near = preview_ranges(spec)
+    assert near.pupil_mm == pytest.approx((pupil_mm - 0.1, pupil_mm + 0.1))
+    assert near.focus_dpt == pytest.approx((focus_dpt - 0.05, focus_dpt + 0.05))
+    assert near.object_dpt == (0.0, 3.0)
 
 
 def test_a_preview_follows_the_field_where_the_whole_does():

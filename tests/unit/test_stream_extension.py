@@ -69,7 +69,10 @@ class PreviewedStream(Stream):
         self.whole = self.eye.store_for(CAMERA)
         self.frame(6.0, 3.0)
         self.wanted = self.eyes.next_build()
-        self.preview = PreparedStore(CAMERA, Store(), is_complete=False)
+        near_state = UsedRanges((5.9, 6.1), (2.9, 3.1), (0.0, 10.0))
+        self.preview = PreparedStore(
+            CAMERA, Store(), is_complete=False, ranges=near_state
+        )
         self.eyes.put_in_place(self.eye, self.preview)
 
 
@@ -83,6 +86,28 @@ def test_a_preview_of_more_shows_what_was_not_there_and_nothing_else():
         stream.eye, PreparedStore(CAMERA, Store(), ranges=stream.wanted.ranges)
     )
     assert stream.eyes.retired == [stream.preview.store, stream.whole.store]
+
+
+def test_a_preview_is_prepared_for_its_own_state_alone():
+    stream = PreviewedStream()
+    seen = stream.frame(6.05, 3.0)
+    assert (seen.is_complete, seen.is_prepared) == (False, True)
+    elsewhere = stream.frame(6.0, 5.0)
+    assert elsewhere.stores == (stream.preview.store,), "the best there is"
+    assert (elsewhere.is_complete, elsewhere.is_prepared) == (False, False)
+
+
+def test_nothing_extends_a_preview_that_is_all_there_is():
+    stream = Stream()
+    only = UsedRanges((3.9, 4.1), (0.0, 0.1), (0.0, 10.0))
+    preview = PreparedStore(CAMERA, Store(), is_complete=False, ranges=only)
+    stream.eyes.put_in_place(stream.eye, preview)
+    stream.frame(6.0, 3.0)
+    assert not stream.eyes.next_build().extends, "the whole is to come"
+    stream.eyes.fail_build(stream.eye, CAMERA, GridTooLarge("too large", field="x"))
+    seen = stream.frame(6.0, 3.0)
+    assert stream.eyes.next_build() is None
+    assert seen.is_prepared and "too large" in seen.notes[0], "nobody waits for it"
 
 
 def test_an_eye_was_ready_while_more_of_it_is_previewed():
