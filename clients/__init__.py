@@ -17,7 +17,8 @@ Importing this loads nothing but names.
     demo             two scenes through six eyes
     latency          how long a frame takes
     socket_floor     and its bytes alone
-    scenes/          two scenes
+    scenes/          two scenes, a letter chart
+    figures/         figures of an eye, for reports and pages
 """
 
 import lazy_loader

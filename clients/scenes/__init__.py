@@ -1,1 +1,1 @@
-"""The two test scenes, built in code from numpy arrays: no files, no downloads."""
+"""Two test scenes and a letter chart, built in code: no files, no downloads."""

@@ -2,6 +2,7 @@ from .curves import FieldAcuity as FieldAcuity
 from .curves import acuity_over_field as acuity_over_field
 from .curves import acuity_through_focus as acuity_through_focus
 from .predict import Acuity as Acuity
+from .predict import log_mar_of as log_mar_of
 from .predict import predict_acuity as predict_acuity
 from .retina import retina_log_mar as retina_log_mar
 from .retina import retina_nyquist_cpd as retina_nyquist_cpd

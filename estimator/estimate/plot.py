@@ -73,7 +73,9 @@ def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None
     focused = found.focused(focus_dpt)
     figure = Figure(figsize=(11.0, 5.2), layout="constrained")
     section, bars = figure.subplots(1, 2, width_ratios=(3, 2))
-    _draw_section(section, focused.surfaces, found.profile.pupil_diameter_mm)
+    draw_section(
+        section, focused.surfaces, pupil_diameter_mm=found.profile.pupil_diameter_mm
+    )
     section.set_title(
         f"{found.name}: {focused.parameters.eye_length_mm:.2f} mm long, "
         f"M {found.refraction_dpt:+.2f} dpt, focus {focused.focus_dpt:.2f} dpt"
@@ -82,7 +84,14 @@ def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None
     figure.savefig(path, dpi=130)
 
 
-def _draw_section(axes, eye: EyeSurfaces, pupil_diameter_mm: float) -> None:
+def draw_section(axes, eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
+    """Draw the vertical section of an eye and rays from infinity into matplotlib axes.
+
+    Parameters
+    ----------
+    pupil_diameter_mm : float
+        Of the bundle of rays before the cornea.
+    """
     for surface, half_height_mm in zip(eye.surfaces, HALF_HEIGHTS_MM, strict=True):
         line = surface_line_mm(surface, half_height_mm=half_height_mm)
         axes.plot(line[:, 0], line[:, 1], color="0.2", lw=1.3)

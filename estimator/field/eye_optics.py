@@ -46,6 +46,9 @@ class EyeOptics(Protocol):
     ) -> float:
         """Distance that is then really sharpest, dpt: the eye's reach has ends."""
 
+    def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
+        """Far point and near point through a pupil, dpt."""
+
     def accommodation_range_dpt(
         self,
         focus_range_dpt: tuple[float, float],

@@ -1,0 +1,120 @@
+"""How much of a wavefront belongs to each radial order, and to each term."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from clients.figures.study import EyeStudy
+from clients.figures.style import (
+    BLUE,
+    GREEN,
+    INK,
+    SMALL_PT,
+    SOFT,
+    dress,
+    legend,
+    new_figure,
+    with_grid,
+)
+from estimator import nm_from_index, rescale_pupil
+
+ORDERS = (2, 3, 4, 5, 6)
+LEAST_TOP_UM = 0.1
+"""Of an axis: less is no aberration to speak of."""
+
+FIRST_SEEN, FIRST_HIGHER = 2, 3
+"""Lowest order that blurs, and that spectacles leave."""
+
+
+def order_range(order: int) -> slice:
+    """Return where the terms of a radial order stand."""
+    first = order * (order + 1) // 2
+    return slice(first, first + order + 1)
+
+
+def rms_by_order_um(zernike_um: NDArray[np.float64]) -> dict[int, float]:
+    """Return the root mean square of each order, 2 to 6, µm.
+
+    That of all together is the root of the sum of their squares.
+    """
+    return {n: float(np.linalg.norm(zernike_um[order_range(n)])) for n in ORDERS}
+
+
+def rms_um(zernike_um: NDArray[np.float64], *, from_order: int = FIRST_HIGHER) -> float:
+    """Return the root mean square of an order and all above it, µm."""
+    return float(np.linalg.norm(zernike_um[order_range(from_order).start :]))
+
+
+def on_circle_um(study: EyeStudy, radius_mm: float) -> NDArray[np.float64]:
+    """Return a study's measured wavefront on a smaller circle (28,)."""
+    ratio = radius_mm / study.found.zernike_radius_mm
+    return rescale_pupil(study.measured_um, radius_ratio=min(ratio, 1.0))
+
+
+def draw_rms_by_order(
+    axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str] = ()
+) -> None:
+    """Draw the higher orders of one eye or several, on the smallest of their circles.
+
+    The second order, which is much larger, is written.
+    """
+    radius_mm = min(study.found.zernike_radius_mm for study in studies)
+    names = [*(str(n) for n in ORDERS[1:]), "3-6"]
+    width, places = 0.8 / len(studies), np.arange(len(names))
+    seconds = []
+    for k, (study, color) in enumerate(zip(studies, (BLUE, GREEN), strict=False)):
+        wavefront_um = on_circle_um(study, radius_mm)
+        by_order = rms_by_order_um(wavefront_um)
+        values = [*(by_order[n] for n in ORDERS[1:]), rms_um(wavefront_um)]
+        at = places + (k - 0.5 * (len(studies) - 1)) * width
+        label = labels[k] if labels else None
+        bars = axes.bar(at, values, width * 0.92, color=color, label=label)
+        axes.bar_label(
+            bars, [f"{v:.2f}" for v in values], fontsize=SMALL_PT, color=INK, padding=1
+        )
+        seconds.append(f"{by_order[2]:.2f} µm")
+    axes.set_xticks(places, names)
+    axes.margins(y=0.18)
+    axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
+    note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)}"
+    dress(axes, title="RMS by radial order", x=f"radial order\n{note}", y="RMS, µm")
+    axes.xaxis.label.set_fontsize(SMALL_PT)
+    if labels:
+        legend(axes, loc="upper left")
+
+
+def rms_by_order_figure(studies: Sequence[EyeStudy], **options) -> Figure:
+    """Return `draw_rms_by_order` as a figure."""
+    figure = new_figure(62.0, 56.0)
+    draw_rms_by_order(figure.subplots(), studies, **options)
+    return figure
+
+
+def draw_terms(axes: Axes, study: EyeStudy) -> None:
+    """Draw each coefficient of the higher orders: as measured, and of the eye found."""
+    index = np.arange(order_range(FIRST_HIGHER).start, study.measured_um.size)
+    measured, eye = study.measured_um[index], study.found.zernike_um[index]
+    axes.bar(index - 0.2, measured, 0.4, color=SOFT, label="measured or assumed")
+    axes.bar(index + 0.2, eye, 0.4, color=BLUE, label="of the eye found")
+    names = [
+        "{},{:+d}".format(*nm_from_index(int(j))).replace("+0", "0") for j in index
+    ]
+    axes.set_xticks(index, names, rotation=90)
+    reach_um = max(1.1 * np.abs([measured, eye]).max(), LEAST_TOP_UM)
+    axes.set_ylim(-reach_um, reach_um)
+    dress(axes, title="Coefficients by order and frequency", x="n, m", y="µm, RMS")
+    axes.axhline(0.0, color=SOFT, linewidth=0.6)
+    with_grid(axes)
+    legend(axes)
+
+
+def terms_figure(study: EyeStudy) -> Figure:
+    """Return `draw_terms` as a figure."""
+    figure = new_figure(180.0, 55.0)
+    draw_terms(figure.subplots(), study)
+    return figure

@@ -1,0 +1,119 @@
+"""What an eye makes of a point of light, as pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from numpy.typing import NDArray
+
+from clients.figures.study import PUPILS_MM, TILTS, EyeStudy, PupilWavefront
+from clients.figures.style import SMALL_PT, TEXT_PT, bare, new_figure
+from clients.figures.wavefront import in_circle, wavefront_values_um
+from estimator import compute_psfs
+
+SIDE_PX = 161
+LEAST_SIDE_ARCMIN = 20.0
+ROOM_RATIO = 1.25
+"""Side of the picture over the diameter of the blur."""
+
+ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
+SLOPE_COUNT = 81
+"""Places across a pupil at which its light's directions are looked at."""
+
+DECADES = 2.0
+"""Of light, from white to black."""
+
+NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
+
+
+def ray_directions_mrad(wavefront: PupilWavefront) -> NDArray[np.float64]:
+    """Return where the pupil sends its light (n, 2), x and y, by ray optics."""
+    radius_mm = wavefront.circle_diameter_mm / 2.0
+    values_um = wavefront_values_um(wavefront.zernike_um, from_order=1, n=SLOPE_COUNT)
+    step_mm = 2.0 * radius_mm / (SLOPE_COUNT - 1)
+    down, right = np.gradient(values_um, step_mm)
+    slopes = np.stack([right, -down], axis=-1).reshape(-1, 2)
+    return slopes[in_circle(SLOPE_COUNT).ravel()]
+
+
+def centred(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
+    """Return it with its blur about the middle, and the blur's radius, arcmin."""
+    slopes = ray_directions_mrad(wavefront)
+    middle = (slopes.min(axis=0) + slopes.max(axis=0)) / 2.0
+    zernike_um = wavefront.zernike_um.copy()
+    # Z(1,±1) is 2 x / r or 2 y / r, and tilt moves a point by its slope.
+    zernike_um[TILTS] -= 0.5 * wavefront.circle_diameter_mm / 2.0 * middle[::-1]
+    reach_mrad = np.linalg.norm(slopes - middle, axis=1).max()
+    return replace(wavefront, zernike_um=zernike_um), reach_mrad * ARCMIN_PER_MRAD
+
+
+def psf_picture(
+    wavefront: PupilWavefront, *, side_arcmin: float
+) -> NDArray[np.float64]:
+    """Return the light of a point (161, 161), top row first; its sum is 1."""
+    found = compute_psfs(
+        wavefront.zernike_um[None],
+        pupil_diameter_mm=wavefront.circle_diameter_mm,
+        pupil_ellipse=wavefront.pupil_ellipse,
+        wavelength_nm=wavefront.wavelength_nm,
+        pixel_pitch_mrad=side_arcmin / SIDE_PX / ARCMIN_PER_MRAD,
+        radius_px=SIDE_PX // 2,
+        method="fourier",  # a mix with rays shows its seams on a logarithmic scale
+        accuracy="fine",
+    )
+    return found[0].kernel
+
+
+def draw_psf(
+    axes: Axes, wavefront: PupilWavefront, *, side_arcmin: float, title: str = ""
+) -> None:
+    """Draw one point, two decades of light, with a scale."""
+    kernel = psf_picture(wavefront, side_arcmin=side_arcmin)
+    light = np.log10(np.maximum(kernel / kernel.max(), 10.0**-DECADES))
+    half = side_arcmin / 2.0
+    axes.imshow(
+        light, cmap="inferno", vmin=-DECADES, vmax=0.0,
+        extent=(-half, half, -half, half), interpolation="bilinear",
+    )  # fmt: skip
+    bare(axes, title=title)
+    _draw_scale(axes, side_arcmin)
+
+
+def _draw_scale(axes: Axes, side_arcmin: float) -> None:
+    length = max(a for a in NICE_ARCMIN if a <= 0.4 * side_arcmin)
+    left, low = -0.45 * side_arcmin, -0.43 * side_arcmin
+    axes.plot([left, left + length], [low, low], color="white", linewidth=1.5)
+    axes.text(
+        left, low + 0.03 * side_arcmin, f"{length}′", color="white", fontsize=SMALL_PT,
+        va="bottom",
+    )  # fmt: skip
+
+
+def draw_psfs(panel: FigureBase, study: EyeStudy) -> None:
+    """Draw a far point through 3 and 5 mm: as the eye sees it, and best corrected."""
+    states = [study.wavefront(pupil_mm) for pupil_mm in PUPILS_MM]
+    rows = {
+        "as it is": states,
+        "best corrected": [state.best_corrected() for state in states],
+    }
+    grid = panel.subplots(2, 2)
+    for across, (name, wavefronts) in zip(grid, rows.items(), strict=True):
+        pictures = [centred(wavefront) for wavefront in wavefronts]
+        reach_arcmin = max(reach for _, reach in pictures)
+        side_arcmin = max(LEAST_SIDE_ARCMIN, 2.0 * ROOM_RATIO * reach_arcmin)
+        for axes, (wavefront, _) in zip(across, pictures, strict=True):
+            draw_psf(axes, wavefront, side_arcmin=side_arcmin)
+        across[0].set_ylabel(name, fontsize=TEXT_PT)
+    for axes, state in zip(grid[0], states, strict=True):
+        axes.set_title(f"{state.circle_diameter_mm:.3g} mm", fontsize=TEXT_PT)
+
+
+def psfs_figure(study: EyeStudy) -> Figure:
+    """Return `draw_psfs` as a figure."""
+    figure = new_figure(80.0, 80.0)
+    draw_psfs(figure, study)
+    return figure

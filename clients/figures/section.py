@@ -1,0 +1,30 @@
+"""The eye that was found, cut vertically, with rays."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from clients.figures.study import FIELD_PUPIL_MM, EyeStudy
+from clients.figures.style import dress, new_figure
+from estimator import draw_section
+
+
+def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
+    """Draw an eye that looks far away, with rays from there, without its correction."""
+    focused = study.found.focused(0.0)
+    draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM)
+    length_mm = focused.parameters.eye_length_mm
+    dress(
+        axes,
+        title=f"Vertical section, {length_mm:.2f} mm long",
+        x="mm into the eye",
+        y="mm, up",
+    )
+
+
+def cross_section_figure(study: EyeStudy) -> Figure:
+    """Return `draw_cross_section` as a figure."""
+    figure = new_figure(90.0, 65.0)
+    draw_cross_section(figure.subplots(), study)
+    return figure

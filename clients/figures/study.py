@@ -1,0 +1,216 @@
+"""One eye made ready for its figures: estimated once, traced once, asked often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import (
+    EstimatedEye,
+    EyeOptics,
+    EyeProfile,
+    FieldTable,
+    Transfer,
+    estimate_eye,
+    field_table,
+    load_profile,
+    optical_transfer,
+    parse_profile,
+    prepare_eye,
+)
+
+PUPILS_MM = (3.0, 5.0)
+"""In daylight, and at dusk."""
+
+WAVELENGTH_NM = 555.0
+FOCUS_RANGE_DPT = (-30.0, 20.0)
+"""Relaxed, also of the most far-sighted, to as near as any eye can accommodate for."""
+
+SECOND_ORDER = slice(3, 6)
+TILTS = slice(1, 3)
+FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)
+FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
+FIELD_PUPIL_MM = 4.0
+
+Profile = EyeProfile | Mapping[str, Any] | str | Path
+Report = Callable[[float, str], None]
+
+
+def profile_of(profile: Profile) -> EyeProfile:
+    """Return a profile of any form: parsed, a map, a preset's name or a file.
+
+    Raises
+    ------
+    ValueError
+        Names the field, the bad value and what is allowed.
+    """
+    if isinstance(profile, EyeProfile):
+        return profile
+    if isinstance(profile, Mapping):
+        return parse_profile(profile)
+    return load_profile(profile)
+
+
+@dataclass(frozen=True)
+class PupilWavefront:
+    """What a point looks like from within: a wavefront and its pupil.
+
+    Attributes
+    ----------
+    zernike_um : (28,)
+        On the circle of ``circle_diameter_mm``, in the plane of the entrance pupil.
+    pupil_ellipse : (5,)
+        Pupil within the circle: centre x, y and semi-axes, mm, and angle, rad.
+    """
+
+    zernike_um: NDArray[np.float64]
+    circle_diameter_mm: float
+    pupil_ellipse: NDArray[np.float64]
+    wavelength_nm: float
+
+    def best_corrected(self) -> PupilWavefront:
+        """Return it with a lens for the sphere and cylinder of this pupil."""
+        zernike_um = self.zernike_um.copy()
+        zernike_um[SECOND_ORDER] = 0.0
+        return replace(self, zernike_um=zernike_um)
+
+    def transfer(self) -> Transfer:
+        """Return its optical transfer function.
+
+        Raises
+        ------
+        ValueError
+            A wavefront too steep to be resolved.
+        """
+        zernike_um = self.zernike_um.copy()
+        zernike_um[TILTS] = 0.0  # where the picture lies does not matter
+        return optical_transfer(
+            zernike_um,
+            zernike_radius_mm=self.circle_diameter_mm / 2.0,
+            wavelength_nm=self.wavelength_nm,
+            pupil_ellipse=self.pupil_ellipse,
+        )
+
+
+@dataclass(frozen=True)
+class EyeStudy:
+    """One eye: what was said of it, the eye that was found, and its light on the axis.
+
+    Attributes
+    ----------
+    profile : EyeProfile
+        As it came.
+    found : EstimatedEye
+    optics : EyeOptics
+        On the axis, at 555 nm, in all its states of focus.
+    notes : tuple of str
+        What was measured and what is assumed, in sentences.
+    """
+
+    profile: EyeProfile
+    found: EstimatedEye
+    optics: EyeOptics
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, profile: Profile, *, progress: Report | None = None) -> Self:
+        """Estimate and trace an eye.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with a fraction and a stage.
+
+        Raises
+        ------
+        ValueError
+            A profile that is wrong, or an eye that light does not pass.
+        """
+        parsed = profile_of(profile)
+        optics, notes = prepare_eye(
+            parsed,
+            pupil_diameters_mm=PUPILS_MM,
+            focus_range_dpt=FOCUS_RANGE_DPT,
+            wavelengths_nm=(WAVELENGTH_NM,),
+            progress=progress,
+        )
+        return cls(parsed, estimate_eye(parsed), optics, notes)
+
+    @property
+    def name(self) -> str:
+        """Return the profile's name."""
+        return self.profile.name
+
+    @cached_property
+    def measured_um(self) -> NDArray[np.float64]:
+        """Return what the eye was estimated from (28,), at the cornea, no correction.
+
+        On the circle of ``found.zernike_radius_mm``; of a prescription with the typical
+        aberrations that were added; of an eye that is given, its own.
+        """
+        return self.found.zernike_um - self.found.residual_um
+
+    def wavefront(
+        self,
+        pupil_diameter_mm: float,
+        *,
+        object_dpt: float = 0.0,
+        focus_dpt: float = 0.0,
+    ) -> PupilWavefront:
+        """Return what a point makes in the pupil, through the worn correction.
+
+        Parameters
+        ----------
+        object_dpt : float
+            Distance of the point, dpt.
+        focus_dpt : float
+            Where the eye looks: it accommodates for that as well as it can.
+        """
+        pupil_mm = self.optics.usable_pupil_mm(pupil_diameter_mm)
+        used_dpt = self.optics.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+        state = {
+            "pupil_diameter_mm": pupil_mm,
+            "accommodation_dpt": used_dpt,
+            "wavelength_nm": WAVELENGTH_NM,
+        }
+        total_dpt = self.optics.total_defocus_dpt(**state)
+        total_dpt = total_dpt + self.optics.vergence.vergence_dpt(object_dpt)
+        seen = self.optics.wavefronts(
+            h_deg=0.0, v_deg=0.0, **state, total_defocus_dpt=total_dpt
+        )
+        return PupilWavefront(
+            zernike_um=seen.zernike_um[0],
+            circle_diameter_mm=float(seen.circle_diameter_mm[0]),
+            pupil_ellipse=seen.pupil_ellipse[0],
+            wavelength_nm=WAVELENGTH_NM,
+        )
+
+    @cached_property
+    def field(self) -> FieldTable:
+        """Return the relaxed eye over 60 x 40 deg, through the worn correction."""
+        across, up = np.meshgrid(FIELD_H_DEG, FIELD_V_DEG)
+        return field_table(
+            self.profile,
+            h_deg=across.ravel(),
+            v_deg=up.ravel(),
+            pupil_diameter_mm=self.optics.usable_pupil_mm(FIELD_PUPIL_MM),
+            wavelength_nm=WAVELENGTH_NM,
+        )
+
+    @cached_property
+    def far_accommodation_dpt(self) -> float:
+        """Return by how much M changes through 4 mm when the eye looks far away."""
+        pupil_mm = self.optics.usable_pupil_mm(FIELD_PUPIL_MM)
+        used_dpt = self.optics.accommodation_dpt(0.0, pupil_diameter_mm=pupil_mm)
+        relaxed_dpt, seen_dpt = self.optics.total_defocus_dpt(
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=np.array([0.0, used_dpt]),
+            wavelength_nm=WAVELENGTH_NM,
+        ).tolist()
+        return relaxed_dpt - seen_dpt

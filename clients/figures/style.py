@@ -1,0 +1,85 @@
+"""How all figures look: sizes, colours, one type; never matplotlib's global settings.
+
+Figures are made without pyplot, which is not safe in threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+INK, SOFT, GRID = "#1b2430", "#5b6775", "#d9dee4"
+BLUE, ORANGE, GREEN, RED = "#1f5fa8", "#d9731a", "#2c8a57", "#b3262e"
+PUPIL_COLORS = (BLUE, ORANGE)
+"""Of the small and the large pupil."""
+
+TEXT_PT, SMALL_PT, TITLE_PT = 8.0, 7.0, 9.0
+LINE_PT = 1.5
+MM_PER_INCH = 25.4
+DIVERGING, SEQUENTIAL = "RdBu_r", "cividis"
+
+
+def new_figure(width_mm: float, height_mm: float) -> Figure:
+    """Return an empty figure of a size on paper."""
+    size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
+    return Figure(figsize=size, layout="constrained", facecolor="white")
+
+
+def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
+    """Give axes their words and the looks of all figures."""
+    if title:
+        axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left")
+    axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
+    axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
+    axes.tick_params(labelsize=SMALL_PT, colors=SOFT, width=0.6, length=2.5)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(SOFT)
+        spine.set_linewidth(0.6)
+
+
+def with_grid(axes: Axes) -> None:
+    """Draw faint lines to read values by."""
+    axes.set_axisbelow(True)
+    axes.grid(color=GRID, linewidth=0.5)
+
+
+def legend(axes: Axes, **options) -> None:
+    """Explain lines."""
+    axes.legend(fontsize=SMALL_PT, labelcolor=INK, frameon=False, **options)
+
+
+def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
+    """Explain lines under the axes, where no curve can run: words to their looks."""
+    lines = [
+        Line2D([], [], **({"linewidth": LINE_PT} | looks)) for looks in entries.values()
+    ]
+    axes.legend(
+        lines, list(entries), fontsize=SMALL_PT, labelcolor=INK, frameon=False,
+        loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, columnspacing=1.2,
+        handlelength=1.6, borderaxespad=0.0,
+    )  # fmt: skip
+
+
+def bare(axes: Axes, *, title: str = "") -> None:
+    """Leave a picture's axes without ticks and spines."""
+    dress(axes, title=title)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def color_bar(axes: Axes, drawn, *, label: str) -> None:
+    """Explain colours beside axes."""
+    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.02, aspect=18)
+    bar.set_label(label, fontsize=SMALL_PT, color=INK)
+    bar.ax.tick_params(labelsize=SMALL_PT, colors=SOFT, width=0.6, length=2.5)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
+    bar.outline.set_linewidth(0.4)

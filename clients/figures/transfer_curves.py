@@ -1,0 +1,105 @@
+"""Contrast that an eye's optics pass on, by spatial frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from clients.figures.study import PUPILS_MM, WAVELENGTH_NM, EyeStudy
+from clients.figures.style import (
+    BLUE,
+    GREEN,
+    INK,
+    LINE_PT,
+    PUPIL_COLORS,
+    SOFT,
+    dress,
+    legend_below,
+    new_figure,
+    with_grid,
+)
+from estimator import perfect_transfer
+
+FREQUENCY_CPD = np.linspace(0.0, 60.0, 121)
+CORRECTED: dict = {"linestyle": "-", "linewidth": LINE_PT}
+AS_IT_IS: dict = {"linestyle": "--", "linewidth": LINE_PT}
+PERFECT: dict = {"linestyle": ":", "linewidth": 0.8}
+
+
+def modulation(
+    study: EyeStudy,
+    pupil_diameter_mm: float,
+    *,
+    is_corrected: bool = False,
+    at_cpd: NDArray[np.float64] = FREQUENCY_CPD,
+) -> NDArray[np.float64]:
+    """Return the modulation transfer (n,) of a far object, mean over all directions.
+
+    Parameters
+    ----------
+    is_corrected : bool
+        With a lens for the sphere and cylinder of this pupil.
+    at_cpd : (n,)
+    """
+    wavefront = study.wavefront(pupil_diameter_mm)
+    seen = wavefront.best_corrected() if is_corrected else wavefront
+    return seen.transfer().modulation(at_cpd)
+
+
+def draw_mtf(axes: Axes, study: EyeStudy) -> None:
+    """Draw transfer functions through 3 and 5 mm, and those of perfect pupils."""
+    colors = dict(zip(PUPILS_MM, PUPIL_COLORS, strict=True))
+    for pupil_mm, color in colors.items():
+        _draw_states(axes, study, pupil_mm, color)
+        axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=color, **PERFECT)
+    looks = {f"{pupil_mm:g} mm": {"color": c} for pupil_mm, c in colors.items()}
+    _finish(axes, looks, "Contrast passed on (MTF), far object, 555 nm")
+
+
+def draw_mtf_of_several(
+    axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str], pupil_mm: float
+) -> None:
+    """Draw the transfer functions of several eyes through one pupil."""
+    colors = dict(zip(labels, (BLUE, GREEN), strict=False))
+    for study, color in zip(studies, colors.values(), strict=True):
+        _draw_states(axes, study, pupil_mm, color)
+    axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=SOFT, **PERFECT)
+    looks = {label: {"color": color} for label, color in colors.items()}
+    _finish(axes, looks, f"Contrast passed on (MTF), far object, {pupil_mm:g} mm")
+
+
+def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> None:
+    for is_corrected, looks in ((True, CORRECTED), (False, AS_IT_IS)):
+        values = modulation(study, pupil_mm, is_corrected=is_corrected)
+        axes.plot(FREQUENCY_CPD, values, color=color, **looks)
+
+
+def _perfect(pupil_mm: float) -> NDArray[np.float64]:
+    return perfect_transfer(
+        FREQUENCY_CPD, pupil_diameter_mm=pupil_mm, wavelength_nm=WAVELENGTH_NM
+    )
+
+
+def _finish(axes: Axes, looks: dict, title: str) -> None:
+    dress(axes, title=title, x="cycles per degree", y="modulation")
+    axes.set_xlim(0.0, FREQUENCY_CPD[-1])
+    axes.set_ylim(0.0, 1.0)
+    with_grid(axes)
+    styles = {
+        "best corrected": CORRECTED,
+        "as it is": AS_IT_IS,
+        "no aberrations": PERFECT,
+    }
+    black = {name: {"color": INK} | style for name, style in styles.items()}
+    legend_below(axes, looks | black)
+
+
+def mtf_figure(study: EyeStudy) -> Figure:
+    """Return `draw_mtf` as a figure."""
+    figure = new_figure(90.0, 65.0)
+    draw_mtf(figure.subplots(), study)
+    return figure

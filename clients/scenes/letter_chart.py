@@ -1,0 +1,175 @@
+"""A letter chart as charts for the acuity are: five Sloan letters a row, in logMAR.
+
+A letter of logMAR L is 5 · 10^L minutes of arc high, its strokes a fifth of that.
+Letters stand one letter apart, a row stands above the next by the height of the next
+(Ferris et al., Am. J. Ophthalmol. 94:91, 1982).  The chart is a white plane that faces
+the camera, black ink on it, at one distance: by angle it looks the same at each.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.scenes.geometry import srgb_from_linear
+from clients.scenes.sloan_letters import SLOAN_LETTERS, UNITS
+from filter_service import Camera, RgbdView
+
+LOG_MAR_ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(14))
+"""Of usual charts, 1.0 to -0.3."""
+
+ROWS_OF_LETTERS = (
+    *("NCKZO", "RHSDK", "DOVHR", "CZRHS", "ONHRC", "DKSNV", "ZSOKN"),
+    *("CKDNR", "SRZKD", "HZOVC", "NVDOK", "VHCNO", "SVHCZ", "OZDVK"),
+)
+ARCMIN_PER_DEG = 60.0
+LOG_MAR_LIMITS = (-1.0, 2.5)
+
+SAMPLES = 6
+"""Per pixel and axis, of a letter's edge."""
+
+
+@dataclass(frozen=True)
+class ChartRow:
+    """One row of letters in the picture.
+
+    Attributes
+    ----------
+    y_px : float
+        Of the row's middle, from the picture's top.
+    """
+
+    letters: str
+    log_mar: float
+    height_px: float
+    y_px: float
+
+
+@dataclass(frozen=True)
+class LetterChart:
+    """A chart as a camera sees it, and where its rows are."""
+
+    view: RgbdView
+    rows: tuple[ChartRow, ...]
+
+
+def letter_height(log_mar: float) -> float:
+    """Return the height of a letter on a plane one unit away: twice a tangent."""
+    half_deg = UNITS * 10.0**log_mar / ARCMIN_PER_DEG / 2.0
+    return 2.0 * math.tan(math.radians(half_deg))
+
+
+def letter_chart(
+    camera: Camera,
+    *,
+    distance_m: float,
+    log_mar: Sequence[float] = LOG_MAR_ROWS,
+    letters: Sequence[str] = ROWS_OF_LETTERS,
+) -> LetterChart:
+    """Draw a chart in the middle of a camera's picture.
+
+    Parameters
+    ----------
+    distance_m : float
+        From the eye to the chart's plane; inf is allowed.
+    log_mar : sequence of float
+        Of each row, from above.
+    letters : sequence of str
+        Of each row, Sloan letters; begun anew where there are more rows.
+
+    Raises
+    ------
+    ValueError
+        A distance that is not positive, an unknown letter, a size out of range, or rows
+        that the camera does not see whole.
+    """
+    _check(distance_m, log_mar, letters)
+    texts = [letters[k % len(letters)] for k in range(len(log_mar))]
+    sizes = [letter_height(value) for value in log_mar]
+    middles = _middles(sizes)
+    _check_fits(camera, texts, sizes, middles)
+    ink = np.zeros((camera.height_px, camera.width_px))
+    for text, size, middle in zip(texts, sizes, middles, strict=True):
+        for k, letter in enumerate(text):
+            left = (2 * k - (len(text) - 0.5)) * size
+            _draw(ink, camera, letter, size, left, middle - 0.5 * size)
+    return LetterChart(
+        view=_view(camera, ink, distance_m),
+        rows=tuple(
+            _row(camera, *row)
+            for row in zip(texts, log_mar, sizes, middles, strict=True)
+        ),
+    )
+
+
+def _check(distance_m, log_mar, letters) -> None:
+    if not distance_m > 0.0:
+        raise ValueError(f"distance_m {distance_m:g}: allowed is above 0")
+    low, high = LOG_MAR_LIMITS
+    for value in log_mar:
+        if not low <= value <= high:
+            raise ValueError(f"log_mar {value:g}: allowed is {low:g} to {high:g}")
+    unknown = sorted(set("".join(letters)) - set(SLOAN_LETTERS))
+    if unknown or not letters or not len(log_mar):
+        allowed = "".join(SLOAN_LETTERS)
+        raise ValueError(f"letters {''.join(unknown)!r}: allowed are rows of {allowed}")
+
+
+def _middles(sizes: Sequence[float]) -> list[float]:
+    """Return the height of each row's middle, the chart's middle being 0."""
+    gaps = [*sizes[1:], 0.0]
+    whole = sum(sizes) + sum(gaps)
+    tops = np.concatenate([[0.0], np.cumsum(np.add(sizes, gaps))[:-1]])
+    return [
+        whole / 2.0 - top - size / 2.0 for top, size in zip(tops, sizes, strict=True)
+    ]
+
+
+def _check_fits(camera: Camera, texts, sizes, middles) -> None:
+    left, right, up, down = camera.tangents
+    widths = [(len(t) - 0.5) * s for t, s in zip(texts, sizes, strict=True)]
+    above, below = middles[0] + sizes[0] / 2.0, middles[-1] - sizes[-1] / 2.0
+    if max(widths) > min(-left, right) or above > up or below < down:
+        wanted = (2 * math.degrees(math.atan(t)) for t in (max(widths), above))
+        raise ValueError(
+            "the chart takes {:.1f} x {:.1f} deg, more than the camera sees: allowed "
+            "are fewer or smaller rows".format(*wanted)
+        )
+
+
+def _row(camera: Camera, text, log_mar, size, middle) -> ChartRow:
+    up = camera.tangents[2]
+    per_px = camera.pixel_pitch_mrad[1] / 1000.0
+    return ChartRow(text, log_mar, size / per_px, (up - middle) / per_px)
+
+
+def _draw(ink: NDArray, camera: Camera, letter: str, size, left, bottom) -> None:
+    """Add the share of ink to the pixels that a letter covers; tangents, y up."""
+    pitch_x, pitch_y = (pitch / 1000.0 for pitch in camera.pixel_pitch_mrad)
+    edge_left, _, edge_up, _ = camera.tangents
+    columns = _pixels(left - edge_left, size, pitch_x, camera.width_px)
+    rows = _pixels(edge_up - bottom - size, size, pitch_y, camera.height_px)
+    places = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    x = edge_left + (columns[:, None] + places).ravel() * pitch_x - left
+    y = edge_up - (rows[:, None] + places).ravel() * pitch_y - bottom
+    units = UNITS / size
+    drawn = SLOAN_LETTERS[letter](x[None, :] * units, y[:, None] * units)
+    drawn &= (np.abs(x / size - 0.5) <= 0.5) & (np.abs(y / size - 0.5) <= 0.5)[:, None]
+    shares = drawn.reshape(rows.size, SAMPLES, columns.size, SAMPLES).mean(axis=(1, 3))
+    ink[np.ix_(rows, columns)] += shares
+
+
+def _pixels(start: float, size: float, pitch: float, count: int) -> NDArray[np.int64]:
+    first, last = math.floor(start / pitch), math.floor((start + size) / pitch)
+    return np.arange(max(first, 0), min(last + 1, count))
+
+
+def _view(camera: Camera, ink: NDArray, distance_m: float) -> RgbdView:
+    grey = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
+    return RgbdView(
+        color=np.repeat(grey[..., None], 3, axis=2),
+        depth_m=np.full(grey.shape, distance_m, np.float32),
+        tangents=camera.tangents,
+    )

@@ -1,0 +1,199 @@
+"""The figures' numbers, against what they stand for."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from clients.figures import (
+    EyeStudy,
+    accommodated_log_mar,
+    cross_section_figure,
+    field_maps_figure,
+    modulation,
+    mtf_figure,
+    psfs_figure,
+    rms_by_order_figure,
+    rms_by_order_um,
+    rms_um,
+    terms_figure,
+    through_focus_log_mar,
+    wavefront_map_figure,
+)
+from clients.figures.field_maps import blur_arcmin
+from clients.figures.psfs import centred, psf_picture, ray_directions_mrad
+from clients.figures.study import FIELD_H_DEG, FIELD_V_DEG
+from estimator import load_profile
+from tests.source_tree import ROOT
+
+MYOPE = {
+    "kind": "prescription",
+    "sphere_dpt": -2.0,
+    "cylinder_dpt": -1.0,
+    "axis_deg": 30.0,
+    "higher_order": "none",
+}
+
+
+@pytest.fixture(scope="module")
+def perfect():
+    return EyeStudy.of("emmetropia")
+
+
+@pytest.fixture(scope="module")
+def myope():
+    return EyeStudy.of(MYOPE)
+
+
+@pytest.fixture(scope="module")
+def cone():
+    return EyeStudy.of("keratoconus")
+
+
+def test_rms_by_order_is_that_of_the_coefficients():
+    zernike_um = load_profile("keratoconus").zernike_um
+    by_order = rms_by_order_um(zernike_um)
+    third = math.hypot(0.4966, 0.6013, 0.132, 0.3414)
+    assert by_order[2] == pytest.approx(math.hypot(0.179, 2.809, 0.2337))
+    assert by_order[3] == pytest.approx(third)
+    higher = math.sqrt(sum(by_order[n] ** 2 for n in (3, 4, 5, 6)))
+    assert rms_um(zernike_um) == pytest.approx(higher)
+
+
+@pytest.mark.parametrize("pupil_mm", [3.0, 5.0])
+def test_a_perfect_eye_passes_on_what_diffraction_lets(perfect, pupil_mm):
+    cpd = np.linspace(0.0, 60.0, 13)
+    ratio = cpd / (math.radians(1.0) * pupil_mm * 1e-3 / 555e-9)
+    expected = 2 / np.pi * (np.arccos(ratio) - ratio * np.sqrt(1 - ratio**2))
+    found = modulation(perfect, pupil_mm, is_corrected=True, at_cpd=cpd)
+    assert found == pytest.approx(expected, abs=0.01)
+
+
+def test_the_middle_of_the_field_is_the_prescription(myope):
+    middle = FIELD_H_DEG.size * FIELD_V_DEG.size // 2
+    m_dpt, j0_dpt, j45_dpt = myope.field.power_dpt[middle]
+    assert m_dpt == pytest.approx(-2.5, abs=0.01)
+    # Thibos 1997, the axis of the examiner mirrored: 30 becomes 150
+    assert j0_dpt == pytest.approx(0.5 * math.cos(math.radians(300)), abs=0.01)
+    assert j45_dpt == pytest.approx(0.5 * math.sin(math.radians(300)), abs=0.01)
+    blur_mrad = math.sqrt(2.5**2 + 0.5**2) * 2.0 / math.sqrt(2)
+    expected = math.degrees(blur_mrad / 1000) * 60
+    assert blur_arcmin(myope)[middle] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_far_sighted_eye_accommodates_before_it_is_blurred():
+    eye = EyeStudy.of(
+        {"kind": "prescription", "sphere_dpt": 2.0, "higher_order": "none"}
+    )
+    middle = FIELD_H_DEG.size * FIELD_V_DEG.size // 2
+    assert eye.far_accommodation_dpt == pytest.approx(
+        2.0 / (1 - 0.00305 * 2.0), abs=0.02
+    )
+    assert eye.field.power_dpt[middle, 0] == pytest.approx(2.0, abs=0.02)
+    assert blur_arcmin(eye)[middle] < 0.5
+
+
+def test_rays_of_defocus_fill_a_disc(myope):
+    wavefront = myope.wavefront(4.0)
+    slopes, reach_arcmin = ray_directions_mrad(wavefront), centred(wavefront)[1]
+    # far light meets 2 mm of an eye of -2 and -3 dpt, at the entrance pupil
+    strongest_mrad = 2.0 * 3.0 / (1 + 0.00305 * 3.0)
+    assert np.linalg.norm(slopes, axis=1).max() == pytest.approx(
+        strongest_mrad, rel=0.02
+    )
+    assert reach_arcmin == pytest.approx(
+        math.degrees(strongest_mrad / 1e3) * 60, rel=0.02
+    )
+
+
+def test_a_point_lies_in_the_middle_of_its_picture_with_all_its_light(cone):
+    wavefront, reach_arcmin = centred(cone.wavefront(5.0))
+    kernel = psf_picture(wavefront, side_arcmin=2.5 * reach_arcmin)
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-3)
+    rows, columns = np.nonzero(kernel > 0.05 * kernel.max())
+    middle = (len(kernel) - 1) / 2
+    for places in (rows, columns):
+        assert abs((places.min() + places.max()) / 2 - middle) < 0.12 * len(kernel)
+
+
+def test_acuity_gets_worse_with_defocus_and_is_kept_by_accommodation(perfect):
+    distances_dpt = np.array([0.0, 1.0, 2.0, 4.0])
+    far = through_focus_log_mar(perfect, 4.0, distances_dpt)
+    assert np.all(np.diff(far) > 0.05)
+    near = accommodated_log_mar(perfect, 4.0, distances_dpt, far)
+    assert near == pytest.approx(np.full(4, far[0]), abs=0.1)
+
+
+def test_beyond_the_near_point_accommodation_does_not_help():
+    old = EyeStudy.of({"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70})
+    distances_dpt = np.array([0.0, 2.5])
+    far = through_focus_log_mar(old, 3.0, distances_dpt)
+    near = accommodated_log_mar(old, 3.0, distances_dpt, far)
+    assert near == pytest.approx(far, abs=0.02)
+    assert near[1] > 0.3
+
+
+def test_a_map_faces_the_person_and_has_the_wavefronts_height(cone):
+    figure = wavefront_map_figure(cone)
+    values = figure.axes[1].images[0].get_array()
+    side = values.shape[0]
+    # vertical trefoil, coma and tetrafoil are even in x: what differs from left to
+    # right is C(3,1), C(3,3) and the like; the examiner sees +x on the left
+    difference = float(
+        values[side // 2, side // 10] - values[side // 2, -side // 10 - 1]
+    )
+    x = 1 - 2 * (side // 10) / (side - 1)
+    z31 = math.sqrt(8) * (3 * x**3 - 2 * x)
+    z33 = math.sqrt(8) * x**3
+    z51 = math.sqrt(12) * (10 * x**5 - 12 * x**3 + 3 * x)
+    z53 = math.sqrt(12) * (5 * x**5 - 4 * x**3)
+    z55 = math.sqrt(12) * x**5
+    terms = (z31, 0.132), (z33, -0.3414), (z51, -0.0116), (z53, 0.0226), (z55, -0.0151)
+    expected = 2 * sum(value * um for value, um in terms)
+    assert difference == pytest.approx(expected, abs=0.05)
+    texts = {text.get_text(): text.get_position()[0] for text in figure.axes[1].texts}
+    assert texts["T"] < 0 < texts["N"]  # of a right eye
+
+
+def test_rms_bars_are_of_the_smaller_circle(perfect, cone):
+    axes = rms_by_order_figure([cone, perfect], labels=["a", "b"]).axes[0]
+    heights = [bar.get_height() for bar in axes.patches]
+    found = rms_by_order_um(cone.measured_um)
+    assert heights[:4] == pytest.approx([found[n] for n in (3, 4, 5, 6)], abs=1e-9)
+    assert heights[5:] == pytest.approx(np.zeros(5), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("figure_of", "axes_count"),
+    [
+        (wavefront_map_figure, 4),  # two of them are colour bars
+        (psfs_figure, 4),
+        (mtf_figure, 1),
+        (field_maps_figure, 8),
+        (cross_section_figure, 1),
+        (terms_figure, 1),
+    ],
+)
+def test_figures_of_a_left_eye_are_drawn(figure_of, axes_count, tmp_path):
+    figure = figure_of(EyeStudy.of("cataract"))
+    assert len(figure.axes) == axes_count
+    figure.savefig(tmp_path / "figure.svg")
+    assert (tmp_path / "figure.svg").stat().st_size > 5000
+
+
+def test_figures_work_without_pyplot():
+    script = (
+        "import sys\n"
+        "from clients.figures import EyeStudy, mtf_figure\n"
+        "mtf_figure(EyeStudy.of('myopia'))\n"
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    finished = subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=False)
+    assert finished.returncode == 0
+
+
+def test_a_bad_profile_is_named():
+    with pytest.raises(ValueError, match="nobody"):
+        EyeStudy.of("nobody")
