@@ -18,6 +18,7 @@ Importing this loads nothing but names.
     latency          how long a frame takes
     socket_floor     and its bytes alone
     scenes/          two scenes, a letter chart
+    report/          `ocufilter report`
     figures/         figures of an eye, for reports and pages
 """
 

@@ -13,7 +13,8 @@ orders          RMS by radial order, coefficients
 psfs            what becomes of a point of light
 transfer_curves  contrast by spatial frequency
 field_maps      refraction and blur over the visual field
-acuity_curves   what can be read at each distance
+acuity          what can be read at each distance
+acuity_curves   and as curves
 section         the eye, cut, with rays
 """
 

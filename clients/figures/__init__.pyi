@@ -1,9 +1,10 @@
-from .acuity_curves import accommodated_log_mar as accommodated_log_mar
-from .acuity_curves import acuity_log_mar as acuity_log_mar
+from .acuity import AcuityByDistance as AcuityByDistance
+from .acuity import accommodated_log_mar as accommodated_log_mar
+from .acuity import acuity_log_mar as acuity_log_mar
+from .acuity import through_focus_log_mar as through_focus_log_mar
 from .acuity_curves import draw_acuity_of_several as draw_acuity_of_several
 from .acuity_curves import draw_through_focus_acuity as draw_through_focus_acuity
 from .acuity_curves import through_focus_acuity_figure as through_focus_acuity_figure
-from .acuity_curves import through_focus_log_mar as through_focus_log_mar
 from .field_maps import draw_field_maps as draw_field_maps
 from .field_maps import field_maps_figure as field_maps_figure
 from .orders import draw_rms_by_order as draw_rms_by_order

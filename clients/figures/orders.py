@@ -79,7 +79,7 @@ def draw_rms_by_order(
         )
         seconds.append(f"{by_order[2]:.2f} µm")
     axes.set_xticks(places, names)
-    axes.margins(y=0.18)
+    axes.margins(y=0.5 if labels else 0.18)  # above the bars there are words
     axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
     note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)}"
     dress(axes, title="RMS by radial order", x=f"radial order\n{note}", y="RMS, µm")

@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.figures.acuity import AcuityByDistance, acuity_by_distance
 from estimator import (
     EstimatedEye,
     EyeOptics,
@@ -190,6 +191,17 @@ class EyeStudy:
             pupil_ellipse=seen.pupil_ellipse[0],
             wavelength_nm=WAVELENGTH_NM,
         )
+
+    def acuity(self, pupil_diameter_mm: float) -> AcuityByDistance:
+        """Return what is read at each distance through a pupil; kept, as it is slow."""
+        if pupil_diameter_mm not in self._acuity:
+            found = acuity_by_distance(self, pupil_diameter_mm)
+            self._acuity[pupil_diameter_mm] = found
+        return self._acuity[pupil_diameter_mm]
+
+    @cached_property
+    def _acuity(self) -> dict[float, AcuityByDistance]:
+        return {}
 
     @cached_property
     def field(self) -> FieldTable:

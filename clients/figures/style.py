@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
 INK, SOFT, GRID = "#1b2430", "#5b6775", "#d9dee4"
 BLUE, ORANGE, GREEN, RED = "#1f5fa8", "#d9731a", "#2c8a57", "#b3262e"
@@ -20,6 +21,8 @@ PUPIL_COLORS = (BLUE, ORANGE)
 
 TEXT_PT, SMALL_PT, TITLE_PT = 8.0, 7.0, 9.0
 LINE_PT = 1.5
+LEGEND_DOWN_PT = 27.0
+"""From an axis to what explains its lines: its numbers and its words are between."""
 MM_PER_INCH = 25.4
 DIVERGING, SEQUENTIAL = "RdBu_r", "cividis"
 
@@ -59,9 +62,12 @@ def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
     lines = [
         Line2D([], [], **({"linewidth": LINE_PT} | looks)) for looks in entries.values()
     ]
+    down = ScaledTranslation(0.0, -LEGEND_DOWN_PT / 72.0, axes.figure.dpi_scale_trans)
+    below = axes.transAxes + down
     axes.legend(
         lines, list(entries), fontsize=SMALL_PT, labelcolor=INK, frameon=False,
-        loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, columnspacing=1.2,
+        loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, columnspacing=1.2,
+        bbox_transform=below,
         handlelength=1.6, borderaxespad=0.0,
     )  # fmt: skip
 

@@ -118,18 +118,31 @@ def headset(context: typer.Context) -> None:
 
     ocufilter headset --left myopia --right keratoconus
     """
-    program = "clients.headset.program"
-    if {"-h", "--help"} & set(context.args):
+    _become("clients.headset.program", context.args)
+
+
+def report(context: typer.Context) -> None:
+    """Write a report of one eye, or of one before and after, as HTML or PDF.
+
+    Its options: `ocufilter report --help`.
+
+    ocufilter report keratoconus -o eye.html
+    """
+    _become("clients.report.program", context.args)
+
+
+def _become(program: str, arguments: list[str]) -> None:
+    """Take a program's options for its own; it says what they are."""
+    folder = _folder_to_start_in(program)
+    if {"-h", "--help"} & set(arguments):
         command = [sys.executable, "-m", program, "--help"]
-        folder = _folder_to_start_in(program)
         say(subprocess.check_output(command, cwd=folder, text=True).rstrip())
-    else:  # it takes this process's place: signals are its own
-        command = [sys.executable, "-m", program, *context.args]
-        folder = _folder_to_start_in(program)
-        if folder is not None:
-            os.chdir(folder)
-        sys.stdout.flush()
-        os.execv(sys.executable, command)
+        return
+    if folder is not None:
+        os.chdir(folder)
+    sys.stdout.flush()
+    # It takes this process's place: signals are its own.
+    os.execv(sys.executable, [sys.executable, "-m", program, *arguments])
 
 
 def bench(

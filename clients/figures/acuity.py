@@ -1,0 +1,113 @@
+"""What an eye may read at each distance, as its optics let it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import log_mar_of
+
+if TYPE_CHECKING:
+    from clients.figures.study import EyeStudy, PupilWavefront
+
+STEP_COUNT, WITHIN_COUNT = 11, 3
+"""Distances of a curve, and of its part within the eye's reach."""
+
+NEAREST_DPT = 5.0
+PAST_FAR_POINT_DPT = 2.0
+HIGHEST_DPT = 20.0
+
+
+@dataclass(frozen=True)
+class AcuityByDistance:
+    """Acuity through one pupil, logMAR; infinite where the blur is too wide to tell.
+
+    Attributes
+    ----------
+    object_dpt : (n,)
+        Distances, far to near.
+    far_log_mar, near_log_mar : (n,)
+        Of the eye that goes on looking far, and that accommodates for each distance.
+    """
+
+    object_dpt: NDArray[np.float64]
+    far_log_mar: NDArray[np.float64]
+    near_log_mar: NDArray[np.float64]
+
+
+def acuity_by_distance(study: EyeStudy, pupil_diameter_mm: float) -> AcuityByDistance:
+    """Return the acuity of an eye from far to 20 cm, or past its far point."""
+    object_dpt = distances_dpt(study, pupil_diameter_mm)
+    far = through_focus_log_mar(study, pupil_diameter_mm, object_dpt)
+    near = accommodated_log_mar(study, pupil_diameter_mm, object_dpt, far)
+    return AcuityByDistance(object_dpt, far, near)
+
+
+def acuity_log_mar(wavefront: PupilWavefront) -> float:
+    """Return the acuity of a wavefront; infinite where it is too steep to be told."""
+    try:
+        return log_mar_of(wavefront.transfer())
+    except ValueError:
+        return np.inf
+
+
+def distances_dpt(study: EyeStudy, pupil_diameter_mm: float) -> NDArray[np.float64]:
+    """Return the distances (n,) of a curve: far to 20 cm, and past the far point."""
+    pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
+    far_dpt, _ = study.optics.focus_limits_dpt(pupil_mm)
+    nearest = min(max(NEAREST_DPT, far_dpt + PAST_FAR_POINT_DPT), HIGHEST_DPT)
+    even = np.linspace(0.0, np.ceil(nearest), STEP_COUNT)
+    has_peak = 0.0 < far_dpt < nearest
+    return np.union1d(even, [far_dpt]) if has_peak else even
+
+
+def through_focus_log_mar(
+    study: EyeStudy, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the acuity (n,) of an eye that looks far, logMAR, at distances (n,)."""
+    return np.array(
+        [
+            acuity_log_mar(study.wavefront(pupil_diameter_mm, object_dpt=distance_dpt))
+            for distance_dpt in object_dpt.tolist()
+        ]
+    )
+
+
+def accommodated_log_mar(
+    study: EyeStudy,
+    pupil_diameter_mm: float,
+    object_dpt: NDArray[np.float64],
+    far_log_mar: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the acuity (n,) of an eye that accommodates for each distance, logMAR.
+
+    Within the eye's reach it changes slowly: it is told at three distances and drawn
+    through them.
+
+    Parameters
+    ----------
+    far_log_mar : (n,)
+        Of the same eye that looks far: beyond its far point it is no better.
+    """
+    pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
+    far_dpt, near_dpt = study.optics.focus_limits_dpt(pupil_mm)
+
+    def seen(distances: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array(
+            [
+                acuity_log_mar(study.wavefront(pupil_mm, object_dpt=d, focus_dpt=d))
+                for d in distances.tolist()
+            ]
+        )
+
+    found = far_log_mar.copy()
+    is_near = object_dpt > near_dpt
+    found[is_near] = seen(object_dpt[is_near])
+    within = object_dpt[(object_dpt >= max(far_dpt, 0.0)) & ~is_near]
+    if within.size:
+        told = np.unique(np.linspace(within[0], within[-1], WITHIN_COUNT))
+        found[np.isin(object_dpt, within)] = np.interp(within, told, seen(told))
+    return found

@@ -1,0 +1,89 @@
+"""What a report is made of, whatever it is written as: rows of blocks under titles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import FigureBase
+from numpy.typing import NDArray
+
+PAGE_WIDTH_MM, PAGE_HEIGHT_MM = 210.0, 297.0
+MARGIN_MM = 12.0
+CONTENT_WIDTH_MM = PAGE_WIDTH_MM - 2.0 * MARGIN_MM
+GAP_MM = 5.0
+"""Between the blocks of a row."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text; the first column is what a row is about."""
+
+    title: str
+    rows: tuple[tuple[str, ...], ...]
+    head: tuple[str, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure, drawn where it is needed; ``alt`` says in words what it shows."""
+
+    draw: Callable[[FigureBase], None]
+    height_mm: float
+    alt: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image (height, width, 3) of sRGB, and what it is."""
+
+    image: NDArray[np.uint8]
+    caption: str
+
+
+@dataclass(frozen=True)
+class Words:
+    """Paragraphs, or the points of a list."""
+
+    paragraphs: tuple[str, ...]
+    title: str = ""
+    is_list: bool = False
+
+
+Block = Table | Plot | Picture | Words
+
+
+@dataclass(frozen=True)
+class Row:
+    """Blocks beside each other, and how they share the width."""
+
+    blocks: tuple[Block, ...]
+    widths: tuple[float, ...] = ()
+
+    @property
+    def widths_mm(self) -> tuple[float, ...]:
+        """Return the width of each block on paper."""
+        shares = self.widths or (1.0,) * len(self.blocks)
+        free_mm = CONTENT_WIDTH_MM - GAP_MM * (len(self.blocks) - 1)
+        return tuple(free_mm * share / sum(shares) for share in shares)
+
+
+@dataclass(frozen=True)
+class Section:
+    """Rows under a title."""
+
+    title: str
+    rows: tuple[Row, ...]
+    starts_page: bool = False
+
+
+@dataclass(frozen=True)
+class Document:
+    """A report: its title, what stands beside it, its sections, its last line."""
+
+    title: str
+    subtitle: str
+    sections: tuple[Section, ...]
+    footer: str

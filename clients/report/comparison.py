@@ -1,0 +1,203 @@
+"""The report of two eyes, or of one before and after: surgery, lenses, years."""
+
+from __future__ import annotations
+
+from matplotlib.figure import FigureBase
+
+from clients.figures import (
+    EyeStudy,
+    draw_acuity_of_several,
+    draw_mtf_of_several,
+    draw_psfs,
+    draw_rms_by_order,
+    draw_wavefront_map,
+)
+from clients.figures.orders import FIRST_HIGHER, on_circle_um
+from clients.figures.study import PUPILS_MM
+from clients.figures.style import TITLE_PT
+from clients.report.blocks import Block, Document, Picture, Plot, Row, Section, Table
+from clients.report.charts import DISTANCES_M
+from clients.report.content import (
+    DAY_MM,
+    DUSK_MM,
+    NOT_A_DEVICE,
+    REFRACTION_ROWS,
+    VISION_ROWS,
+    acuity_words,
+    chart_row,
+    details,
+    on_axes,
+    pupil_word,
+    refraction_words,
+    signed,
+    sources,
+    subtitle,
+)
+from clients.report.facts import EyeFacts
+from clients.report.sources import Citations
+
+NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
+
+
+def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
+    """Return the report of two eyes: what differs first, then each of them."""
+    cite = Citations()
+    cite("csoba", "osa", "vectors")
+    of_each = [
+        section
+        for facts in (before, after)
+        for section in details(facts, cite, name=facts.label)
+    ]
+    return Document(
+        title=f"Eye report: {before.label} → {after.label}",
+        subtitle=f"{subtitle(before.study)} → {subtitle(after.study)}",
+        sections=(
+            _difference(before, after),
+            _curves(before, after),
+            *of_each,
+            sources(cite),
+        ),
+        footer=NOT_A_DEVICE,
+    )
+
+
+def _difference(before: EyeFacts, after: EyeFacts) -> Section:
+    studies, labels = (before.study, after.study), (before.label, after.label)
+    pairs = list(zip(studies, labels, strict=True))
+    tables = _refraction_table(before, after), _vision_table(before, after)
+    bars = on_axes(
+        lambda axes: draw_rms_by_order(axes, studies, labels=labels),
+        50.0,
+        "Root mean square by radial order, before and after",
+    )
+    return Section(
+        "Before and after",
+        (
+            Row(tables, (1.0, 1.6)),
+            Row((*(_map(*pair, studies) for pair in pairs), bars)),
+            Row(tuple(_psfs(*pair) for pair in pairs)),
+            _charts(before, after, DAY_MM),
+        ),
+    )
+
+
+def _psfs(study: EyeStudy, label: str) -> Plot:
+    def draw(panel: FigureBase) -> None:
+        draw_psfs(panel, study)
+        panel.suptitle(label, fontsize=TITLE_PT)
+
+    return Plot(draw, 64.0, f"Point-spread functions: {label}")
+
+
+def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
+    """Return the higher orders of one eye on the smaller of both circles."""
+    radius_mm = min(other.found.zernike_radius_mm for other in studies)
+    return on_axes(
+        lambda axes: draw_wavefront_map(
+            axes,
+            on_circle_um(study, radius_mm),
+            radius_mm=radius_mm,
+            eye_side=study.profile.eye_side,
+            from_order=FIRST_HIGHER,
+            title=f"{label}, orders 3 to 6",
+        ),
+        50.0,
+        f"Map of the higher orders: {label}",
+    )
+
+
+def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
+    pairs = [facts.numbers["eye"]["refraction"] for facts in (before, after)]
+    rows = [
+        (
+            word,
+            *(refraction_words(pair, name) for pair in pairs),
+            "" if name == "axis_deg" else signed(pairs[1][name] - pairs[0][name]),
+        )
+        for word, name in REFRACTION_ROWS.items()
+    ]
+    worn_dpt = [
+        facts.numbers["eye"]["refraction_through_correction_dpt"]
+        for facts in (before, after)
+    ]
+    if any(facts.study.profile.correction for facts in (before, after)):
+        change = signed(worn_dpt[1] - worn_dpt[0])
+        rows.append(("M as worn, dpt", *map(signed, worn_dpt), change))
+    return Table(
+        "Refraction of the eyes found",
+        tuple(rows),
+        head=("at the cornea", "before", "after", "change"),
+        note=f"Before: {before.label}; after: {after.label}. Relaxed, 555 nm.",
+    )
+
+
+def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
+    of_pupils = list(
+        zip(before.numbers["pupils"], after.numbers["pupils"], strict=True)
+    )
+    pupils = [
+        f"{pupil_word(numbers)} {when}"
+        for pair in of_pupils
+        for when, numbers in zip(("before", "after"), pair, strict=True)
+    ]
+    head = ("far object, 555 nm", *pupils)
+    rows = tuple(
+        (word, *(words(numbers) for pair in of_pupils for numbers in pair))
+        for word, words in VISION_ROWS.items()
+    )
+    return Table(
+        "Vision on the axis",
+        rows,
+        head=head,
+        note="Acuity in logMAR, and as a decimal. * wider than the pupil measured.",
+    )
+
+
+def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
+    """Return near and far charts of both through one pupil."""
+    pictures: list[Block] = []
+    for facts in (before, after):
+        if not facts.charts:
+            return chart_row(facts, pupil_mm)
+        for distance_m, where in ((NEAR_M, "40 cm"), (FAR_M, "6 m")):
+            log_mar = facts.chart_log_mar[pupil_mm, distance_m]
+            pictures.append(
+                Picture(
+                    facts.charts[pupil_mm, distance_m],
+                    f"{facts.label}, {where}, {pupil_mm:g} mm: {acuity_words(log_mar)}",
+                )
+            )
+    return Row(tuple(pictures))
+
+
+def _curves(before: EyeFacts, after: EyeFacts) -> Section:
+    studies, labels = (before.study, after.study), (before.label, after.label)
+    mtfs = tuple(
+        on_axes(
+            lambda axes, pupil_mm=pupil_mm: draw_mtf_of_several(
+                axes, studies, labels=labels, pupil_mm=pupil_mm
+            ),
+            64.0,
+            f"Modulation transfer of both, {pupil_mm:g} mm",
+        )
+        for pupil_mm in PUPILS_MM
+    )
+    acuities = tuple(
+        on_axes(
+            lambda axes, pupil_mm=pupil_mm: draw_acuity_of_several(
+                axes, studies, labels=labels, pupil_mm=pupil_mm
+            ),
+            64.0,
+            f"Acuity of both by distance, {pupil_mm:g} mm",
+        )
+        for pupil_mm in PUPILS_MM
+    )
+    return Section(
+        "Contrast and acuity, before and after",
+        (
+            Row(mtfs),
+            Row(acuities),
+            _charts(before, after, DUSK_MM),
+        ),
+        starts_page=True,
+    )

@@ -1,0 +1,108 @@
+"""All that a report tells of one eye, computed before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.figures import EyeStudy
+from clients.figures.study import PUPILS_MM, Profile, Report
+from clients.report.charts import DISTANCES_M, Chart, charts_of
+from clients.report.numbers import chart_numbers, eye_numbers
+from filter_service import FilterError
+
+NUMBERS_AT, CHARTS_AT = 0.1, 0.5
+"""Progress at which they begin."""
+
+
+@dataclass(frozen=True)
+class EyeFacts:
+    """One eye's study, numbers and pictures.
+
+    Attributes
+    ----------
+    label : str
+        What the eye is called in this report.
+    charts : dict
+        Pictures (height, width, 3) by pupil, mm, and distance, m; empty where they
+        could not be made, which ``chart_problem`` then explains.
+    """
+
+    study: EyeStudy
+    label: str
+    numbers: dict[str, Any]
+    charts: dict[Chart, NDArray[np.uint8]] = field(default_factory=dict)
+    chart_problem: str = ""
+
+    @property
+    def chart_log_mar(self) -> dict[Chart, float | None]:
+        """Return the acuity that is predicted for each chart."""
+        return {
+            (asked_mm, entry["distance_m"]): entry["log_mar"]
+            for asked_mm, entry in zip(
+                np.repeat(PUPILS_MM, len(DISTANCES_M)).tolist(),
+                self.numbers["charts"],
+                strict=True,
+            )
+        }
+
+
+def facts_of(
+    profile: Profile,
+    *,
+    label: str = "",
+    has_charts: bool = True,
+    progress: Report | None = None,
+) -> EyeFacts:
+    """Compute all that a report tells of an eye.
+
+    Parameters
+    ----------
+    label : str
+        Instead of the profile's name.
+    has_charts : bool
+        Whether letter charts are filtered, which takes most of the time.
+    progress : callable, optional
+        Called with a fraction and a stage.
+
+    Raises
+    ------
+    ValueError
+        A profile that is wrong, or an eye that light does not pass.
+    """
+
+    def say(done: float, stage: str) -> None:
+        if progress is not None:
+            progress(done, stage)
+
+    say(0.0, "eye")
+    study = EyeStudy.of(profile)
+    say(NUMBERS_AT, "numbers")
+    numbers = eye_numbers(study)
+    numbers["charts"] = [
+        chart_numbers(study, pupil_mm, distance_m)
+        for pupil_mm in PUPILS_MM
+        for distance_m in DISTANCES_M
+    ]
+    charts, problem = _charts(study, has_charts, say)
+    return EyeFacts(study, label or study.name, numbers, charts, problem)
+
+
+def _charts(
+    study: EyeStudy, has_charts: bool, say: Callable[[float, str], None]
+) -> tuple[dict[Chart, NDArray[np.uint8]], str]:
+    if not has_charts:
+        return {}, "not asked for"
+    say(CHARTS_AT, "letter charts")
+
+    def along(done: float) -> None:
+        say(CHARTS_AT + (1.0 - CHARTS_AT) * done, "letter charts")
+
+    try:
+        return charts_of(study, progress=along), ""
+    except FilterError as error:  # the rest of the report stands without them
+        return {}, str(error)

@@ -1,0 +1,146 @@
+"""A report as one HTML file: nothing outside of it is needed, and it prints on A4."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html import escape
+
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from clients.figures.style import new_figure
+from clients.report.blocks import (
+    Block,
+    Document,
+    Picture,
+    Plot,
+    Row,
+    Section,
+    Table,
+    Words,
+)
+
+JPEG_QUALITY = 88
+
+STYLE = """
+@page { size: A4; margin: 12mm; }
+* { box-sizing: border-box; }
+body { font: 9.5pt/1.35 "DejaVu Sans", Verdana, system-ui, sans-serif; color: #1b2430;
+  background: #eef1f4; margin: 0; }
+main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm; }
+header { border-bottom: 1.5pt solid #1f5fa8; margin-bottom: 4mm; }
+h1 { font-size: 16pt; margin: 0; }
+header p { margin: 1mm 0 2mm; color: #4c5866; }
+h2 { font-size: 12pt; color: #1f5fa8; margin: 4mm 0 1.5mm; }
+h3 { font-size: 9.5pt; margin: 0 0 1mm; }
+section:first-of-type h2 { display: none; }
+.row { display: grid; gap: 5mm; margin-bottom: 3mm; align-items: start; }
+table { border-collapse: collapse; width: 100%; font-size: 8pt; }
+th, td { text-align: left; vertical-align: top; padding: .5mm 1.5mm .5mm 0;
+  border-bottom: .4pt solid #d9dee4; font-variant-numeric: tabular-nums; }
+th { color: #4c5866; font-weight: 600; border-bottom-color: #4c5866; }
+.note, figcaption, .plain { font-size: 7.5pt; color: #4c5866; margin: 1mm 0 0; }
+ul { margin: 0; padding-left: 4mm; font-size: 8pt; }
+figure { margin: 0; }
+figure img { display: block; width: 100%; height: auto; }
+figure.picture img { border: .4pt solid #d9dee4; }
+footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
+  font-size: 7.5pt; color: #4c5866; }
+@media (max-width: 700px) { .row { grid-template-columns: 1fr !important; }
+  main { padding: 5mm; } }
+@media print { body { background: #fff; } main { padding: 0; max-width: none; }
+  section.page { break-before: page; } section.page h2 { margin-top: 0; }
+  .row, table, figure { break-inside: avoid; } }
+"""
+
+
+def html_of(document: Document) -> str:
+    """Return a document as the text of an HTML file."""
+    sections = "\n".join(_section(section) for section in document.sections)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(document.title)}</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<body>\n<main>\n<header><h1>{escape(document.title)}</h1>"
+        f"<p>{escape(document.subtitle)}</p></header>\n{sections}\n"
+        f"<footer>{escape(document.footer)}</footer>\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _section(section: Section) -> str:
+    rows = "\n".join(_row(row) for row in section.rows)
+    kind = ' class="page"' if section.starts_page else ""
+    return f"<section{kind}>\n<h2>{escape(section.title)}</h2>\n{rows}\n</section>"
+
+
+def _row(row: Row) -> str:
+    columns = " ".join(f"{width_mm:.1f}fr" for width_mm in row.widths_mm)
+    blocks = "\n".join(
+        _block(block, width_mm)
+        for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)
+    )
+    return (
+        f'<div class="row" style="grid-template-columns:{columns}">\n{blocks}\n</div>'
+    )
+
+
+def _block(block: Block, width_mm: float) -> str:
+    if isinstance(block, Table):
+        return _table(block)
+    if isinstance(block, Words):
+        return _words(block)
+    if isinstance(block, Picture):
+        return _picture(block)
+    return _plot(block, width_mm)
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in table.head)
+    rows = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+        for row in table.rows
+    )
+    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
+    top = f"<thead><tr>{head}</tr></thead>" if head else ""
+    return (
+        f"<div><h3>{escape(table.title)}</h3><table>{top}<tbody>\n{rows}\n</tbody>"
+        f"</table>{note}</div>"
+    )
+
+
+def _words(words: Words) -> str:
+    title = f"<h3>{escape(words.title)}</h3>" if words.title else ""
+    if words.is_list:
+        items = "".join(f"<li>{escape(text)}</li>" for text in words.paragraphs)
+        return f"<div>{title}<ul>{items}</ul></div>"
+    texts = "".join(f'<p class="plain">{escape(text)}</p>' for text in words.paragraphs)
+    return f"<div>{title}{texts}</div>"
+
+
+def _picture(picture: Picture) -> str:
+    caption = escape(picture.caption)
+    return (
+        f'<figure class="picture"><img alt="{caption}" src="{_jpeg(picture.image)}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _plot(plot: Plot, width_mm: float) -> str:
+    figure = new_figure(width_mm, plot.height_mm)
+    plot.draw(figure)
+    return f'<figure><img alt="{escape(plot.alt)}" src="{_svg(figure)}"></figure>'
+
+
+def _svg(figure: Figure) -> str:
+    """Return a figure as text within text: its ids meet no other figure's."""
+    written = io.BytesIO()
+    figure.savefig(written, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(written.getvalue()).decode()
+
+
+def _jpeg(image: NDArray) -> str:
+    written = io.BytesIO()
+    Image.fromarray(image).save(written, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode()

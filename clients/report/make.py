@@ -1,0 +1,111 @@
+"""From profiles to a report: as text of an HTML file, as a file, as numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from clients.figures.study import Profile, Report
+from clients.report.blocks import Document
+from clients.report.comparison import comparison_document
+from clients.report.content import eye_document
+from clients.report.facts import EyeFacts, facts_of
+from clients.report.html_page import html_of
+from clients.report.pdf_pages import write_pdf
+
+SUFFIXES = (".html", ".pdf")
+WRITING_AT = 0.85
+"""Progress at which eyes are done and writing begins."""
+
+
+def report_html(
+    profile: Profile,
+    after: Profile | None = None,
+    *,
+    label: str = "",
+    after_label: str = "",
+    has_charts: bool = True,
+    progress: Report | None = None,
+) -> str:
+    """Return the report of an eye, or of two, as the text of one HTML file.
+
+    Letter charts go through the process's `EyeFilter`s: call it in the thread that uses
+    them, or without charts.
+
+    Parameters
+    ----------
+    profile, after : EyeProfile, mapping, preset's name or file
+        With ``after``, what differs comes first.
+    label, after_label : str
+        What the eyes are called, instead of their profiles' names.
+    has_charts : bool
+        Whether letter charts are filtered, which takes half of the time.
+    progress : callable, optional
+        Called with a fraction and a stage.
+
+    Raises
+    ------
+    ValueError
+        A profile that is wrong, or an eye that light does not pass.
+    """
+    eyes = eyes_of(
+        [profile] if after is None else [profile, after],
+        labels=(label, after_label),
+        has_charts=has_charts,
+        progress=progress,
+    )
+    text = html_of(document_of(eyes))
+    if progress is not None:
+        progress(1.0, "writing")
+    return text
+
+
+def eyes_of(
+    profiles: list[Profile],
+    *,
+    labels: tuple[str, ...] = ("", ""),
+    has_charts: bool = True,
+    progress: Report | None = None,
+) -> list[EyeFacts]:
+    """Return all that a report tells of one eye or two."""
+    share = WRITING_AT / len(profiles)
+
+    def along(k: int) -> Report | None:
+        if progress is None:
+            return None
+        return lambda done, stage: progress((k + done) * share, stage)
+
+    eyes = [
+        facts_of(profile, label=label, has_charts=has_charts, progress=along(k))
+        for k, (profile, label) in enumerate(zip(profiles, labels, strict=False))
+    ]
+    if progress is not None:
+        progress(WRITING_AT, "writing")
+    return eyes
+
+
+def document_of(eyes: list[EyeFacts]) -> Document:
+    """Return the document of one eye, or of two that are compared."""
+    return eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
+
+
+def write_report(eyes: list[EyeFacts], path: Path) -> None:
+    """Write a report as ``.html`` or ``.pdf``.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    document = document_of(eyes)
+    if path.suffix.lower() == ".pdf":
+        write_pdf(document, path)
+    else:
+        path.write_text(html_of(document), encoding="utf-8")
+
+
+def report_numbers(eyes: list[EyeFacts]) -> dict[str, Any]:
+    """Return the numbers of a report, ready for JSON."""
+    if len(eyes) == 1:
+        return eyes[0].numbers
+    return {"before": eyes[0].numbers, "after": eyes[1].numbers}

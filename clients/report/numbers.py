@@ -1,0 +1,224 @@
+"""The numbers of a report, by name and with their units: what `--json` prints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.figures import EyeStudy, PupilWavefront, acuity_log_mar, rms_by_order_um
+from clients.figures.orders import rms_um
+from clients.figures.study import PUPILS_MM, TILTS
+from estimator import (
+    EyeProfile,
+    Prescription,
+    nm_from_index,
+    power_vector,
+    power_vector_from_zernike,
+    predict_acuity,
+    prescription_from_power_vector,
+    rescale_pupil,
+)
+
+PRESCRIBED_PUPIL_MM = 4.0
+"""Pupil through which a refraction is told, where one as wide was measured."""
+
+TOLD_CPD = (10.0, 20.0, 30.0)
+FIELD_TOLD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
+
+
+@dataclass(frozen=True)
+class Refraction:
+    """Refraction at the cornea: power vector and minus cylinder, dpt; axis in deg."""
+
+    m_dpt: float
+    j0_dpt: float
+    j45_dpt: float
+
+    @property
+    def prescription(self) -> Prescription:
+        """Return it with a minus cylinder and the axis as the examiner writes it."""
+        return prescription_from_power_vector(self.m_dpt, self.j0_dpt, self.j45_dpt)
+
+    def written(self) -> str:
+        """Return it as people write it."""
+        return written(self.prescription)
+
+    def as_mapping(self) -> dict[str, float]:
+        """Return all of its numbers."""
+        lens = self.prescription
+        return {
+            "sphere_dpt": lens.sphere_dpt,
+            "cylinder_dpt": lens.cylinder_dpt,
+            "axis_deg": lens.axis_deg,
+            "M_dpt": self.m_dpt,
+            "J0_dpt": self.j0_dpt,
+            "J45_dpt": self.j45_dpt,
+        }
+
+
+def written(lens: Prescription) -> str:
+    """Return a lens as people write it: sphere, cylinder, axis."""
+    text = f"{_signed(lens.sphere_dpt)} dpt sph"
+    if abs(lens.cylinder_dpt) >= 0.005:
+        text += f" {_signed(lens.cylinder_dpt)} cyl x {lens.axis_deg:.0f}°"
+    return text
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "−") if abs(value) >= 0.005 else "0.00"
+
+
+def refraction_pupil_mm(study: EyeStudy) -> float:
+    """Return the pupil that refractions are told through."""
+    return min(PRESCRIBED_PUPIL_MM, 2.0 * study.found.zernike_radius_mm)
+
+
+def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> Refraction:
+    """Return the refraction of coefficients on the study's circle, at 555 nm."""
+    radius_mm = study.found.zernike_radius_mm
+    told_mm = refraction_pupil_mm(study) / 2.0
+    on_told = rescale_pupil(zernike_um, radius_ratio=told_mm / radius_mm)
+    m, j0, j45 = power_vector_from_zernike(on_told, zernike_radius_mm=told_mm)
+    whole, _, _ = power_vector_from_zernike(
+        study.found.zernike_um, zernike_radius_mm=radius_mm
+    )
+    to_555_dpt = study.found.accommodating.bare_refraction_dpt - whole
+    return Refraction(m + to_555_dpt, j0, j45)
+
+
+def worn_refraction(profile: EyeProfile) -> Refraction | None:
+    """Return what a worn correction does at the cornea; None where none is worn."""
+    if profile.correction is None:
+        return None
+    return Refraction(*power_vector(profile.correction))
+
+
+def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
+    """Return what a wavefront lets through and lets be read."""
+    zernike_um = seen.zernike_um.copy()
+    zernike_um[TILTS] = 0.0
+    try:
+        found = predict_acuity(
+            zernike_um,
+            zernike_radius_mm=seen.circle_diameter_mm / 2.0,
+            wavelength_nm=seen.wavelength_nm,
+            pupil_ellipse=seen.pupil_ellipse,
+        )
+    except ValueError:  # too steep for transfer functions
+        return {"log_mar": None, "visual_strehl_ratio": None, "modulation": None}
+    modulation = seen.transfer().modulation(np.array(TOLD_CPD))
+    return {
+        "log_mar": found.log_mar,
+        "visual_strehl_ratio": found.visual_strehl_ratio,
+        "modulation": {
+            f"{cpd:g}_cpd": float(v)
+            for cpd, v in zip(TOLD_CPD, modulation, strict=True)
+        },
+    }
+
+
+def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
+    """Return what one pupil makes of a far object, as it is and best corrected."""
+    seen = study.wavefront(pupil_diameter_mm)
+    higher_um = rms_um(seen.zernike_um)
+    far_dpt, near_dpt = study.optics.focus_limits_dpt(seen.circle_diameter_mm)
+    return {
+        "pupil_diameter_mm": seen.circle_diameter_mm,
+        "is_beyond_measured": is_beyond_measured(study, seen.circle_diameter_mm),
+        "higher_order_rms_um": higher_um,
+        "far_point_dpt": far_dpt,
+        "near_point_dpt": near_dpt,
+        "as_it_is": state_numbers(seen),
+        "best_corrected": state_numbers(seen.best_corrected()),
+    }
+
+
+def is_beyond_measured(study: EyeStudy, pupil_diameter_mm: float) -> bool:
+    """Return whether a pupil is wider than what was measured."""
+    return pupil_diameter_mm > study.profile.max_pupil_diameter_mm + 1e-6
+
+
+def chart_numbers(
+    study: EyeStudy, pupil_diameter_mm: float, distance_m: float
+) -> dict[str, float]:
+    """Return what is read of a chart by an eye that accommodates for it."""
+    at_dpt = 1.0 / distance_m
+    seen = study.wavefront(pupil_diameter_mm, object_dpt=at_dpt, focus_dpt=at_dpt)
+    usable_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
+    log_mar = acuity_log_mar(seen)
+    return {
+        "pupil_diameter_mm": usable_mm,
+        "distance_m": distance_m,
+        "focus_dpt": study.optics.reachable_focus_dpt(
+            at_dpt, pupil_diameter_mm=usable_mm
+        ),
+        "log_mar": log_mar if np.isfinite(log_mar) else None,
+    }
+
+
+def eye_numbers(study: EyeStudy) -> dict[str, Any]:
+    """Return the numbers of one eye, ready for JSON."""
+    profile, found = study.profile, study.found
+    measured, of_eye = (
+        refraction_of(study, zernike_um)
+        for zernike_um in (study.measured_um, found.zernike_um)
+    )
+    worn = worn_refraction(profile)
+    length_mm = found.parameters.eye_length_mm
+    return {
+        "profile": {
+            "name": profile.name,
+            "kind": profile.kind,
+            "eye_side": profile.eye_side,
+            "age_years": profile.age_years,
+        },
+        "measured": {
+            "refraction": measured.as_mapping(),
+            "refraction_pupil_mm": refraction_pupil_mm(study),
+            "zernike_um": _named(study.measured_um),
+            "zernike_radius_mm": found.zernike_radius_mm,
+            "wavelength_nm": found.wavelength_nm,
+            "rms_by_order_um": {
+                str(n): v for n, v in rms_by_order_um(study.measured_um).items()
+            },
+            "higher_order_rms_um": rms_um(study.measured_um),
+        },
+        "eye": {
+            "refraction": of_eye.as_mapping(),
+            "mean_abs_error_um": found.mean_abs_error_um,
+            "rms_error_um": float(np.linalg.norm(found.residual_um[3:])),
+            "eye_length_mm": length_mm,
+            "amplitude_dpt": found.amplitude_dpt,
+            "refraction_through_correction_dpt": found.refraction_dpt,
+            "on_bound": list(found.on_bound),
+        },
+        "correction": worn.as_mapping() if worn else None,
+        "pupils": [pupil_numbers(study, pupil_mm) for pupil_mm in PUPILS_MM],
+        "field": _field_numbers(study),
+        "notes": [*study.notes],
+    }
+
+
+def _named(zernike_um: NDArray[np.float64]) -> dict[str, float]:
+    return {
+        "{},{}".format(*nm_from_index(j)): value
+        for j, value in enumerate(zernike_um.tolist())
+        if j > 0
+    }
+
+
+def _field_numbers(study: EyeStudy) -> list[dict[str, float]]:
+    """Return the relaxed refraction along the horizontal meridian."""
+    table = study.field
+    on_meridian = np.isin(table.h_deg, FIELD_TOLD_DEG) & (table.v_deg == 0.0)
+    return [
+        {"h_deg": h, "v_deg": 0.0, "M_dpt": m, "J0_dpt": j0, "J45_dpt": j45}
+        for h, (m, j0, j45) in zip(
+            table.h_deg[on_meridian].tolist(),
+            table.power_dpt[on_meridian].tolist(),
+            strict=True,
+        )
+    ]

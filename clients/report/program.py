@@ -1,0 +1,126 @@
+"""Write a report of one eye, or of an eye before and after, to judge and to file.
+
+    ocufilter report keratoconus -o eye.html
+    ocufilter report eye.json -o eye.pdf
+    ocufilter report before.json after.json -o surgery.pdf
+
+A profile is a preset's name, or a .json, .abp or .csv file.  The first page is the
+summary: refraction, acuity, wavefront, point images, contrast, a letter chart near and
+far.  Behind it: the visual field, acuity by distance, the eye found, what of all this
+was measured and what is assumed, and the papers it stands on.  The HTML file needs
+nothing beside it and prints on A4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from clients.figures.study import profile_of
+from clients.report.make import SUFFIXES, eyes_of, report_numbers, write_report
+from filter_service.errors import FilterError
+from filter_service.progress import Progress
+
+
+def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(
+        prog="ocufilter report",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("profile", help="preset's name, or .json, .abp or .csv file")
+    parser.add_argument(
+        "after", nargs="?", help="the eye afterwards: after surgery, with spectacles"
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="OUT", help="file to write: .html or .pdf"
+    )
+    parser.add_argument("--name", default="", help="what the eye is called")
+    parser.add_argument("--after-name", default="", help="and the eye afterwards")
+    parser.add_argument(
+        "--no-charts", action="store_true", help="leave out the letter charts (faster)"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the numbers as one JSON object"
+    )
+    return parser.parse_args(argv)
+
+
+def run(options: argparse.Namespace) -> str:
+    """Write what is asked for; return what there is to print.
+
+    Raises
+    ------
+    ValueError
+        A profile or file name that cannot be used.
+    """
+    _check_out(options)
+    sources = [options.profile] + ([options.after] if options.after else [])
+    profiles = [profile_of(source) for source in sources]  # all faults before any work
+    labels = tuple(
+        name or _called(source)
+        for name, source in zip(
+            (options.name, options.after_name), sources, strict=False
+        )
+    )
+    started_s = time.monotonic()
+    with Progress(quiet=options.json) as progress:
+        task = progress.task("Report", total=1.0, unit="%")
+        eyes = eyes_of(
+            list(profiles),
+            labels=labels,
+            has_charts=not options.no_charts and options.out is not None,
+            progress=task.update,
+        )
+        if options.out is not None:
+            write_report(eyes, options.out)
+        task.update(1.0, "written")
+    if options.json:
+        return json.dumps(report_numbers(eyes), allow_nan=False)
+    for eye in eyes:
+        if eye.chart_problem and not options.no_charts:
+            print(f"note: no letter charts: {eye.chart_problem}", file=sys.stderr)
+    return f"{options.out}: {', '.join(labels)}, {time.monotonic() - started_s:.1f} s"
+
+
+def _check_out(options: argparse.Namespace) -> None:
+    out = options.out
+    if out is None:
+        if not options.json:
+            raise ValueError("--out is missing: allowed is a .html or .pdf file")
+        return
+    if out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out '{out}': allowed is a .html or .pdf file")
+    if not out.absolute().parent.is_dir():
+        raise ValueError(f"--out '{out}': there is no folder {out.parent}")
+
+
+def _called(source: str) -> str:
+    """Return a file's name without its ending; a preset's as it is."""
+    return Path(source).stem if Path(source).suffix else source
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit code."""
+    options = arguments_of(argv)
+    try:
+        sys.stdout.write(run(options) + "\n")
+    except KeyboardInterrupt:
+        return 130
+    except (FilterError, ValueError) as error:
+        bad_input = isinstance(error, ValueError)
+        print(f"report: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2 if bad_input else 1
+    except OSError as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

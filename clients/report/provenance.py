@@ -1,0 +1,149 @@
+"""What of a report was measured or entered, what is typical of people, and of whom."""
+
+from __future__ import annotations
+
+from clients.figures import EyeStudy
+from clients.figures.study import PUPILS_MM
+from clients.report.blocks import Table
+from clients.report.numbers import is_beyond_measured, written
+from clients.report.sources import Citations
+
+WELL_DETERMINED = 0.5
+"""Share of the prior's variance that a measurement must take away."""
+
+MEASURED, TYPICAL, STATED = "measured", "assumed", "entered"
+
+
+def provenance_table(study: EyeStudy, cite: Citations) -> Table:
+    """Return what each part of the eye comes from."""
+    rows = (
+        _refraction(study),
+        _higher_orders(study, cite),
+        _pupils(study),
+        _periphery(study, cite),
+        _accommodation(study, cite),
+        _shape(study, cite),
+        ("Colour", TYPICAL, f"longitudinal colour of measured eyes {cite('colour')}"),
+        _media(study, cite),
+        _nerves(cite),
+        _worn(study),
+    )
+    return Table(
+        "What is known of this eye, and what is assumed",
+        tuple(row for row in rows if row),
+        head=("part", "", "where it comes from"),
+    )
+
+
+def _refraction(study: EyeStudy) -> tuple[str, ...]:
+    profile = study.profile
+    if profile.kind == "prescription":
+        return ("Refraction", STATED, "the prescription, as powers at the cornea")
+    if profile.eye is not None:
+        return ("Refraction", STATED, "traced through the eye that the profile gives")
+    return ("Refraction", MEASURED, f"second order of {_measurement(study)}")
+
+
+def _measurement(study: EyeStudy) -> str:
+    profile = study.profile
+    text = (
+        f"the measured wavefront ({profile.pupil_diameter_mm:g} mm, "
+        f"{profile.wavelength_nm:g} nm)"
+    )
+    others = len(profile.measurements) - 1
+    return f"{text} and {others} more" if others > 0 else text
+
+
+def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    profile = study.profile
+    if profile.eye is not None:
+        return ("Higher orders", STATED, "of the eye that the profile gives")
+    if profile.kind != "prescription":
+        return ("Higher orders", MEASURED, f"orders 3 to 6 of {_measurement(study)}")
+    if profile.higher_order == "none":
+        return ("Higher orders", STATED, "none, as the profile asks for")
+    whose = "a young adult"
+    if profile.age_years is not None:
+        whose = f"people of {profile.age_years:g} years"
+    text = f"mean size in {whose}; this eye's own differ {cite('typical', 'growth')}"
+    return ("Higher orders", TYPICAL, text)
+
+
+def _pupils(study: EyeStudy) -> tuple[str, ...]:
+    beyond = [p for p in PUPILS_MM if is_beyond_measured(study, p)]
+    if not beyond:
+        return ()
+    pupils = " and ".join(f"{p:g}" for p in beyond)
+    text = (
+        f"wider than the {study.profile.max_pupil_diameter_mm:g} mm measured: the eye "
+        "model's rim, with the measured remainder stretched"
+    )
+    return (f"Pupil of {pupils} mm", TYPICAL, text)
+
+
+def _periphery(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if study.profile.periphery == "model":
+        return ("Visual field", TYPICAL, "the periphery of the eye model")
+    count = sum(not m.is_on_axis for m in study.profile.measurements)
+    people = f"people with such an axis {cite('periphery')}"
+    known = [note for note in study.field.notes if "known to" in note]
+    spread = known[0].partition("; ")[2] if known else ""
+    tail = f"; {spread}" if spread else ""
+    if count:
+        text = f"{count} directions of the profile; between them {people}{tail}"
+        return ("Visual field", MEASURED, text)
+    return ("Visual field", TYPICAL, f"most probable in {people}{tail}")
+
+
+def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    profile, amplitude_dpt = study.profile, study.found.amplitude_dpt
+    if profile.age_years is None and not profile.add_dpt:
+        text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt"
+        return ("Accommodation", TYPICAL, text)
+    known = []
+    if profile.age_years is not None:
+        known.append(f"age of {profile.age_years:g} years {cite('amplitude')}")
+    if profile.add_dpt:
+        known.append(f"addition of {profile.add_dpt:g} dpt")
+    text = f"{amplitude_dpt:.1f} dpt, by {' and '.join(known)}"
+    return ("Accommodation", TYPICAL, text)
+
+
+def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if study.profile.eye is not None:
+        return ("Shape of the eye", STATED, "the 45 parameters of the profile")
+    ratios = study.found.determined_ratio.values()
+    count = sum(ratio > WELL_DETERMINED for ratio in ratios)
+    text = (
+        f"{count} of 45 parameters follow from the wavefront for the most part; the "
+        f"others are those of a mean eye of this refraction {cite('csoba', 'length')}"
+    )
+    return ("Shape of the eye", TYPICAL, text)
+
+
+def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    haze = study.profile.straylight
+    if haze is None:
+        return ("Straylight", "left out", "the profile asks for none")
+    if haze.log_s is None:
+        return ("Straylight", TYPICAL, f"by age and pigment {cite('straylight')}")
+    text = f"log s {haze.log_s:g} at 7° {cite('straylight', 'cataract')}"
+    return ("Straylight", STATED, text + "; in the letter charts alone")
+
+
+def _nerves(cite: Citations) -> tuple[str, ...]:
+    text = (
+        "a template observer with a young adult's retina and nerves reads what the "
+        f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in it"
+    )
+    return ("Acuity", "predicted", text)
+
+
+def _worn(study: EyeStudy) -> tuple[str, ...]:
+    lens = study.profile.correction
+    if lens is None:
+        return ()
+    where = (
+        f"{lens.vertex_mm:g} mm before the cornea" if lens.vertex_mm else "a contact"
+    )
+    return ("Correction worn", STATED, f"{written(lens)}, {where}")
