@@ -7,6 +7,7 @@
 or part of one where it needs several axes.
 
 study           `EyeStudy`: one eye, estimated and traced once
+pupil_wavefront  one wavefront, and what its optics pass on
 style           sizes, colours, type
 wavefront       maps of a wavefront
 orders          RMS by radial order, coefficients

@@ -15,10 +15,10 @@ from .orders import rms_um as rms_um
 from .orders import terms_figure as terms_figure
 from .psfs import draw_psfs as draw_psfs
 from .psfs import psfs_figure as psfs_figure
+from .pupil_wavefront import PupilWavefront as PupilWavefront
 from .section import cross_section_figure as cross_section_figure
 from .section import draw_cross_section as draw_cross_section
 from .study import EyeStudy as EyeStudy
-from .study import PupilWavefront as PupilWavefront
 from .transfer_curves import draw_mtf as draw_mtf
 from .transfer_curves import draw_mtf_of_several as draw_mtf_of_several
 from .transfer_curves import modulation as modulation

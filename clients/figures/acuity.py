@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator import log_mar_of
-
-if TYPE_CHECKING:
-    from clients.figures.study import EyeStudy, PupilWavefront
+from clients.figures.pupil_wavefront import PupilWavefront
+from estimator import EyeOptics, log_mar_of
 
 STEP_COUNT, WITHIN_COUNT = 11, 3
 """Distances of a curve, and of its part within the eye's reach."""
@@ -19,6 +17,23 @@ STEP_COUNT, WITHIN_COUNT = 11, 3
 NEAREST_DPT = 5.0
 PAST_FAR_POINT_DPT = 2.0
 HIGHEST_DPT = 20.0
+
+
+class Seeing(Protocol):
+    """What is asked of an eye: an `EyeStudy`."""
+
+    @property
+    def optics(self) -> EyeOptics:
+        """On the axis, in all its states of focus."""
+
+    def wavefront(
+        self,
+        pupil_diameter_mm: float,
+        *,
+        object_dpt: float = 0.0,
+        focus_dpt: float = 0.0,
+    ) -> PupilWavefront:
+        """Return what a point makes in the pupil."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +53,7 @@ class AcuityByDistance:
     near_log_mar: NDArray[np.float64]
 
 
-def acuity_by_distance(study: EyeStudy, pupil_diameter_mm: float) -> AcuityByDistance:
+def acuity_by_distance(study: Seeing, pupil_diameter_mm: float) -> AcuityByDistance:
     """Return the acuity of an eye from far to 20 cm, or past its far point."""
     object_dpt = distances_dpt(study, pupil_diameter_mm)
     far = through_focus_log_mar(study, pupil_diameter_mm, object_dpt)
@@ -54,7 +69,7 @@ def acuity_log_mar(wavefront: PupilWavefront) -> float:
         return np.inf
 
 
-def distances_dpt(study: EyeStudy, pupil_diameter_mm: float) -> NDArray[np.float64]:
+def distances_dpt(study: Seeing, pupil_diameter_mm: float) -> NDArray[np.float64]:
     """Return the distances (n,) of a curve: far to 20 cm, and past the far point."""
     pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
     far_dpt, _ = study.optics.focus_limits_dpt(pupil_mm)
@@ -65,7 +80,7 @@ def distances_dpt(study: EyeStudy, pupil_diameter_mm: float) -> NDArray[np.float
 
 
 def through_focus_log_mar(
-    study: EyeStudy, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
+    study: Seeing, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the acuity (n,) of an eye that looks far, logMAR, at distances (n,)."""
     return np.array(
@@ -77,7 +92,7 @@ def through_focus_log_mar(
 
 
 def accommodated_log_mar(
-    study: EyeStudy,
+    study: Seeing,
     pupil_diameter_mm: float,
     object_dpt: NDArray[np.float64],
     far_log_mar: NDArray[np.float64],

@@ -26,7 +26,7 @@ from clients.figures.style import (
 WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
 ACCOMMODATING: dict = {"linestyle": "-", "linewidth": LINE_PT}
 LOOKING_FAR: dict = {"linestyle": "--", "linewidth": LINE_PT}
-MARKS = {0.0: "far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
+MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
 def draw_through_focus_acuity(axes: Axes, study: EyeStudy) -> None:

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
-from clients.figures.study import PUPILS_MM, TILTS, EyeStudy, PupilWavefront
+from clients.figures.pupil_wavefront import TILTS, PupilWavefront
+from clients.figures.study import PUPILS_MM, EyeStudy
 from clients.figures.style import SMALL_PT, TEXT_PT, bare, new_figure
 from clients.figures.wavefront import in_circle, wavefront_values_um
 from estimator import compute_psfs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.figures.acuity import AcuityByDistance, acuity_by_distance
+from clients.figures.pupil_wavefront import PupilWavefront
 from estimator import (
     EstimatedEye,
     EyeOptics,
     EyeProfile,
     FieldTable,
-    Transfer,
     estimate_eye,
     field_table,
     load_profile,
-    optical_transfer,
     parse_profile,
     prepare_eye,
 )
@@ -33,8 +32,6 @@ WAVELENGTH_NM = 555.0
 FOCUS_RANGE_DPT = (-30.0, 20.0)
 """Relaxed, also of the most far-sighted, to as near as any eye can accommodate for."""
 
-SECOND_ORDER = slice(3, 6)
-TILTS = slice(1, 3)
 FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)
 FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
 FIELD_PUPIL_MM = 4.0
@@ -56,47 +53,6 @@ def profile_of(profile: Profile) -> EyeProfile:
     if isinstance(profile, Mapping):
         return parse_profile(profile)
     return load_profile(profile)
-
-
-@dataclass(frozen=True)
-class PupilWavefront:
-    """What a point looks like from within: a wavefront and its pupil.
-
-    Attributes
-    ----------
-    zernike_um : (28,)
-        On the circle of ``circle_diameter_mm``, in the plane of the entrance pupil.
-    pupil_ellipse : (5,)
-        Pupil within the circle: centre x, y and semi-axes, mm, and angle, rad.
-    """
-
-    zernike_um: NDArray[np.float64]
-    circle_diameter_mm: float
-    pupil_ellipse: NDArray[np.float64]
-    wavelength_nm: float
-
-    def best_corrected(self) -> PupilWavefront:
-        """Return it with a lens for the sphere and cylinder of this pupil."""
-        zernike_um = self.zernike_um.copy()
-        zernike_um[SECOND_ORDER] = 0.0
-        return replace(self, zernike_um=zernike_um)
-
-    def transfer(self) -> Transfer:
-        """Return its optical transfer function.
-
-        Raises
-        ------
-        ValueError
-            A wavefront too steep to be resolved.
-        """
-        zernike_um = self.zernike_um.copy()
-        zernike_um[TILTS] = 0.0  # where the picture lies does not matter
-        return optical_transfer(
-            zernike_um,
-            zernike_radius_mm=self.circle_diameter_mm / 2.0,
-            wavelength_nm=self.wavelength_nm,
-            pupil_ellipse=self.pupil_ellipse,
-        )
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ def modulation(
 ) -> NDArray[np.float64]:
     """Return the modulation transfer (n,) of a far object, mean over all directions.
 
+    NaN where the wavefront is too steep to tell: there, hardly any is left.
+
     Parameters
     ----------
     is_corrected : bool
@@ -47,7 +49,10 @@ def modulation(
     """
     wavefront = study.wavefront(pupil_diameter_mm)
     seen = wavefront.best_corrected() if is_corrected else wavefront
-    return seen.transfer().modulation(at_cpd)
+    try:
+        return seen.transfer().modulation(at_cpd)
+    except ValueError:
+        return np.full(at_cpd.shape, np.nan)
 
 
 def draw_mtf(axes: Axes, study: EyeStudy) -> None:

@@ -60,14 +60,14 @@ class Row:
     """Blocks beside each other, and how they share the width."""
 
     blocks: tuple[Block, ...]
-    widths: tuple[float, ...] = ()
+    width_ratio: tuple[float, ...] = ()
 
     @property
     def widths_mm(self) -> tuple[float, ...]:
         """Return the width of each block on paper."""
-        shares = self.widths or (1.0,) * len(self.blocks)
+        ratios = self.width_ratio or (1.0,) * len(self.blocks)
         free_mm = CONTENT_WIDTH_MM - GAP_MM * (len(self.blocks) - 1)
-        return tuple(free_mm * share / sum(shares) for share in shares)
+        return tuple(free_mm * share / sum(ratios) for share in ratios)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from clients.figures import (
     draw_through_focus_acuity,
     draw_wavefront_maps,
 )
-from clients.figures.study import PUPILS_MM
+from clients.figures.study import PUPILS_MM, WAVELENGTH_NM
 from clients.report.blocks import (
     Block,
     Document,
@@ -183,6 +183,9 @@ def _refraction_note(facts: EyeFacts) -> str:
         f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
         f"{fit['rms_error_um']:.1g} µm RMS."
     )
+    light_nm = facts.study.found.wavelength_nm
+    if light_nm != WAVELENGTH_NM:
+        note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's colour."
     lens = facts.study.profile.correction
     if lens is not None:
         note += (

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from clients.figures import EyeStudy, PupilWavefront, acuity_log_mar, rms_by_order_um
 from clients.figures.orders import rms_um
-from clients.figures.study import PUPILS_MM, TILTS
+from clients.figures.pupil_wavefront import TILTS
+from clients.figures.study import PUPILS_MM, WAVELENGTH_NM
 from estimator import (
     EyeProfile,
     Prescription,
+    chromatic_refraction_dpt,
     nm_from_index,
     power_vector,
     power_vector_from_zernike,
@@ -82,14 +84,25 @@ def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> Refractio
     told_mm = refraction_pupil_mm(study) / 2.0
     on_told = rescale_pupil(zernike_um, radius_ratio=told_mm / radius_mm)
     m, j0, j45 = power_vector_from_zernike(on_told, zernike_radius_mm=told_mm)
-    whole, _, _ = power_vector_from_zernike(
-        study.found.zernike_um, zernike_radius_mm=radius_mm
+    measured_nm = study.found.wavelength_nm
+    to_555_dpt = chromatic_refraction_dpt(WAVELENGTH_NM) - chromatic_refraction_dpt(
+        measured_nm
     )
-    to_555_dpt = study.found.accommodating.bare_refraction_dpt - whole
-    return Refraction(m + to_555_dpt, j0, j45)
+    return Refraction(m + float(to_555_dpt), j0, j45)
 
 
-def worn_refraction(profile: EyeProfile) -> Refraction | None:
+def worn_refraction_dpt(study: EyeStudy) -> float:
+    """Return M of the relaxed eye through what it wears, at its entrance pupil."""
+    return float(
+        study.optics.total_defocus_dpt(
+            pupil_diameter_mm=refraction_pupil_mm(study),
+            accommodation_dpt=0.0,
+            wavelength_nm=WAVELENGTH_NM,
+        )
+    )
+
+
+def worn_lens(profile: EyeProfile) -> Refraction | None:
     """Return what a worn correction does at the cornea; None where none is worn."""
     if profile.correction is None:
         return None
@@ -162,11 +175,7 @@ def chart_numbers(
 def eye_numbers(study: EyeStudy) -> dict[str, Any]:
     """Return the numbers of one eye, ready for JSON."""
     profile, found = study.profile, study.found
-    measured, of_eye = (
-        refraction_of(study, zernike_um)
-        for zernike_um in (study.measured_um, found.zernike_um)
-    )
-    worn = worn_refraction(profile)
+    worn = worn_lens(profile)
     length_mm = found.parameters.eye_length_mm
     return {
         "profile": {
@@ -175,30 +184,34 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
             "eye_side": profile.eye_side,
             "age_years": profile.age_years,
         },
-        "measured": {
-            "refraction": measured.as_mapping(),
-            "refraction_pupil_mm": refraction_pupil_mm(study),
-            "zernike_um": _named(study.measured_um),
-            "zernike_radius_mm": found.zernike_radius_mm,
-            "wavelength_nm": found.wavelength_nm,
-            "rms_by_order_um": {
-                str(n): v for n, v in rms_by_order_um(study.measured_um).items()
-            },
-            "higher_order_rms_um": rms_um(study.measured_um),
-        },
+        "measured": measured_numbers(study),
         "eye": {
-            "refraction": of_eye.as_mapping(),
+            "refraction": refraction_of(study, found.zernike_um).as_mapping(),
             "mean_abs_error_um": found.mean_abs_error_um,
             "rms_error_um": float(np.linalg.norm(found.residual_um[3:])),
             "eye_length_mm": length_mm,
             "amplitude_dpt": found.amplitude_dpt,
-            "refraction_through_correction_dpt": found.refraction_dpt,
+            "refraction_through_correction_dpt": worn_refraction_dpt(study),
             "on_bound": list(found.on_bound),
         },
         "correction": worn.as_mapping() if worn else None,
         "pupils": [pupil_numbers(study, pupil_mm) for pupil_mm in PUPILS_MM],
         "field": _field_numbers(study),
         "notes": [*study.notes],
+    }
+
+
+def measured_numbers(study: EyeStudy) -> dict[str, Any]:
+    """Return what the eye was estimated from, typical aberrations included."""
+    by_order = rms_by_order_um(study.measured_um)
+    return {
+        "refraction": refraction_of(study, study.measured_um).as_mapping(),
+        "refraction_pupil_mm": refraction_pupil_mm(study),
+        "zernike_um": _named(study.measured_um),
+        "zernike_radius_mm": study.found.zernike_radius_mm,
+        "wavelength_nm": study.found.wavelength_nm,
+        "rms_by_order_um": {str(n): value for n, value in by_order.items()},
+        "higher_order_rms_um": rms_um(study.measured_um),
     }
 
 

@@ -114,7 +114,8 @@ class _Pages:
                 if self._y_mm + height_mm > BOTTOM_MM:
                     self._new_page()
                 self._row(part, height_mm)
-                self._y_mm += height_mm + ROW_GAP_MM
+                self._y_mm += height_mm
+            self._y_mm += ROW_GAP_MM
 
     def _row(self, row: Row, height_mm: float) -> None:
         left_mm = MARGIN_MM

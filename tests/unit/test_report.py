@@ -1,0 +1,273 @@
+"""What a report says: its numbers, where they come from, and how it is written."""
+
+import json
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from clients.figures import EyeStudy
+from clients.report import report_numbers
+from clients.report.blocks import Document, Picture, Row, Section, Table, Words
+from clients.report.charts import picture_side_px
+from clients.report.facts import EyeFacts, facts_of
+from clients.report.html_page import html_of
+from clients.report.make import document_of
+from clients.report.numbers import Refraction, measured_numbers
+from clients.report.pdf_text import column_widths_mm, lines_of, width_mm
+from clients.report.program import main
+from clients.report.provenance import provenance_table
+from clients.report.sources import SOURCES, Citations
+
+SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
+MYOPE = {
+    "kind": "prescription",
+    "eye_side": "OS",
+    "age_years": 60,
+    **SPECTACLES,
+    "vertex_mm": 12.0,
+}
+AT_CORNEA = [power / (1 - 0.012 * power) for power in (-4.0, -5.0)]
+
+
+@pytest.fixture(scope="module")
+def myope() -> EyeFacts:
+    return facts_of(MYOPE, label="A. Myope", has_charts=False)
+
+
+@pytest.fixture(scope="module")
+def corrected() -> EyeFacts:
+    lens = {**SPECTACLES, "vertex_mm": 12.0}
+    return facts_of(MYOPE | {"correction": lens}, label="worn", has_charts=False)
+
+
+def test_the_refraction_is_what_was_entered_at_the_cornea(myope):
+    for of_whom in ("measured", "eye"):
+        found = myope.numbers[of_whom]["refraction"]
+        assert found["sphere_dpt"] == pytest.approx(AT_CORNEA[0], abs=0.01)
+        cylinder_dpt = AT_CORNEA[1] - AT_CORNEA[0]
+        assert found["cylinder_dpt"] == pytest.approx(cylinder_dpt, abs=0.01)
+        assert found["axis_deg"] == pytest.approx(20.0, abs=0.5)
+        assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
+    assert myope.numbers["eye"]["rms_error_um"] < 0.02
+    assert myope.numbers["eye"]["amplitude_dpt"] == 0.0  # at 60
+
+
+def test_far_point_and_near_point_of_a_presbyope_meet(myope):
+    pupil = myope.numbers["pupils"][0]
+    assert pupil["near_point_dpt"] == pytest.approx(pupil["far_point_dpt"], abs=1e-6)
+    m_dpt = -sum(AT_CORNEA) / 2
+    assert pupil["far_point_dpt"] == pytest.approx(
+        m_dpt / (1 + 0.00305 * m_dpt), abs=0.1
+    )
+
+
+def test_spectacles_bring_the_acuity_of_the_best_correction(corrected, myope):
+    assert corrected.numbers["correction"]["M_dpt"] == pytest.approx(
+        sum(AT_CORNEA) / 2, abs=1e-9
+    )
+    assert corrected.numbers["eye"]["refraction_through_correction_dpt"] == (
+        pytest.approx(0.0, abs=0.15)
+    )
+    with_lens, bare = (facts.numbers["pupils"][0] for facts in (corrected, myope))
+    best = with_lens["best_corrected"]["log_mar"]
+    assert with_lens["as_it_is"]["log_mar"] == pytest.approx(best, abs=0.07)
+    assert bare["as_it_is"]["log_mar"] > 1.0
+    assert bare["best_corrected"]["log_mar"] == pytest.approx(best, abs=0.02)
+
+
+def test_rms_by_order_and_coefficients_are_the_profiles():
+    given = {"2,0": 1.0, "3,-1": 0.3, "3,3": -0.4, "4,0": 0.2, "6,-2": 0.05}
+    profile = {
+        "kind": "zernike",
+        "pupil_diameter_mm": 6.0,
+        "wavelength_nm": 555.0,
+        "zernike_um": given,
+    }
+    measured = measured_numbers(EyeStudy.of(profile))
+    by_order = measured["rms_by_order_um"]
+    expected = {"2": 1.0, "3": 0.5, "4": 0.2, "5": 0.0, "6": 0.05}
+    assert by_order == pytest.approx(expected, abs=1e-9)
+    assert measured["higher_order_rms_um"] == pytest.approx(math.hypot(0.5, 0.2, 0.05))
+    for name, value_um in given.items():
+        assert measured["zernike_um"][name] == pytest.approx(value_um, abs=1e-9)
+
+
+def test_an_axis_is_written_as_the_examiner_does():
+    text = Refraction(-2.25, 0.25 * math.cos(2.0), 0.25 * math.sin(2.0)).written()
+    assert text == "−2.00 dpt sph −0.50 cyl x 123°"
+    assert Refraction(1.0, 0.0, 0.0).written() == "+1.00 dpt sph"
+
+
+def _rows(profile) -> dict[str, tuple[str, str]]:
+    table = provenance_table(EyeStudy.of(profile), Citations())
+    return {row[0]: row[1:] for row in table.rows}
+
+
+def test_what_is_assumed_is_told_from_what_was_measured():
+    entered = _rows(MYOPE)
+    assert entered["Refraction"][0] == "entered"
+    assert entered["Higher orders"][0] == "assumed"
+    assert "60 years" in entered["Higher orders"][1]
+    assert "+-" in entered["Visual field"][1]
+    none = _rows(MYOPE | {"higher_order": "none"})
+    assert none["Higher orders"][1].startswith("none")
+
+
+def test_a_pupil_wider_than_the_measured_one_is_named():
+    rows = _rows("post_lasik")
+    assert rows["Higher orders"][0] == "measured"
+    assert rows["Pupil of 5 mm"][0] == "assumed"
+    assert "3 mm measured" in rows["Pupil of 5 mm"][1]
+    assert "age not given" in rows["Accommodation"][1]
+
+
+def test_haze_and_the_worn_lens_are_told():
+    lens = {"sphere_dpt": -1.0, "vertex_mm": 12.0}
+    rows = _rows({"kind": "preset", "name": "cataract", "correction": lens})
+    assert "log s 1.22" in rows["Straylight"][1]
+    assert rows["Correction worn"][1] == "−1.00 dpt sph, 12 mm before the cornea"
+
+
+def test_citations_are_numbered_as_they_come_and_exist():
+    cite = Citations()
+    assert cite("acuity", "osa") == "[1, 2]"
+    assert cite("osa", "chart") == "[2, 3]"
+    listed = cite.listed()
+    assert listed[1] == f"[2] {SOURCES['osa']}."
+    assert len(listed) == 3
+
+
+class _Balance(HTMLParser):
+    VOID = ("meta", "img", "br")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.links, self.images = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.links += [v for k, v in attrs if k in ("src", "href")]
+        self.images += [dict(attrs)] if tag == "img" else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_html_is_one_file_that_names_what_its_pictures_show(myope):
+    text = html_of(document_of([myope]))
+    found = _Balance()
+    found.feed(text)
+    assert not found.open
+    assert found.links and all(link.startswith("data:image/") for link in found.links)
+    assert all(image["alt"] for image in found.images)
+    assert not re.search(r"url\(|@import|<script|<link", text)
+    assert "A. Myope" in text and "left eye (OS), 60 years" in text
+    sphere = f"{AT_CORNEA[0]:.2f}".replace("-", "−")
+    assert text.count(f"<td>{sphere}</td>") >= 2
+    assert "No letter charts: not asked for." in text
+    cited = {n for mark in re.findall(r"\[([\d, ]+)\]", text) for n in mark.split(", ")}
+    assert cited == {str(n + 1) for n in range(len(cited))}
+
+
+def test_what_a_profile_is_called_cannot_break_the_page():
+    table = Table("<b>", (("<b>&</b>",),), note="<b>")
+    section = Section("<b>", (Row((table, Words(("<b>",)))),))
+    text = html_of(Document("<b>", "<b>", (section,), "<b>"))
+    assert "<b>" not in text and "&lt;b&gt;&amp;&lt;/b&gt;" in text
+
+
+def test_two_eyes_make_one_document(myope, corrected, tmp_path):
+    document = document_of([myope, corrected])
+    assert document.title == "Eye report: A. Myope → worn"
+    table = document.sections[0].rows[0].blocks[0]
+    m_row = dict((row[0], row) for row in table.rows)["M as worn, dpt"]
+    assert float(m_row[3].replace("−", "-")) == pytest.approx(
+        -sum(AT_CORNEA) / 2, abs=0.15
+    )
+    both = report_numbers([myope, corrected])
+    assert json.loads(json.dumps(both, allow_nan=False))["after"]["correction"]
+
+
+def test_lines_fit_and_keep_all_words():
+    text = "the quick brown fox jumps over the lazy dog and then some more"
+    lines = lines_of(text, 30.0, 8.0)
+    assert " ".join(lines) == text
+    assert len(lines) > 2 and all(width_mm(line, 8.0) <= 30.0 for line in lines)
+
+
+def test_columns_fill_the_width_and_the_widest_gives_way():
+    narrow = column_widths_mm((("a", "bb"),), 60.0, 8.0, 3.0)
+    assert sum(narrow) == pytest.approx(60.0)
+    wide = column_widths_mm((("short", "long words " * 20),), 60.0, 8.0, 3.0)
+    assert sum(wide) == pytest.approx(60.0)
+    assert wide[0] == pytest.approx(width_mm("short", 8.0) + 3.0)
+
+
+def test_blocks_share_a_row_by_their_widths():
+    row = Row((Words(("a",)), Table("t", (("b",),))), (2.0, 1.0))
+    first, second = row.widths_mm
+    assert first == pytest.approx(2 * second)
+    assert first + second == pytest.approx(186.0 - 5.0)
+
+
+def test_charts_of_a_strong_blur_have_fewer_pixels():
+    sharp = picture_side_px(EyeStudy.of("emmetropia"), 5.0, (1.0,))
+    profile = {"kind": "prescription", "sphere_dpt": -20.0, "higher_order": "none"}
+    blurred = picture_side_px(EyeStudy.of(profile), 5.0, (6.0,))
+    assert sharp == 860
+    # 20 dpt at 2.5 mm from the pupil's middle, at the entrance pupil, less 1/6 dpt
+    reach_arcmin = math.degrees((20 / (1 + 0.00305 * 20) - 1 / 6) * 2.5e-3) * 60
+    assert blurred == pytest.approx(190 * 8.2 * 60 / reach_arcmin, rel=0.03)
+
+
+def test_charts_that_exist_are_shown_with_what_is_read(myope):
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    charts = {(p, d): grey for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+    shown = EyeFacts(myope.study, "x", myope.numbers, charts)
+    row = document_of([shown]).sections[0].rows[3]
+    assert all(isinstance(block, Picture) for block in row.blocks)
+    log_mar = shown.chart_log_mar[3.0, 6.0]
+    assert row.blocks[2].caption == (
+        f"6 m, 3 mm: logMAR {log_mar:+.2f} ({10**-log_mar:.2f})"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["nobody", "-o", "eye.html"],
+            "report: profile field 'profile': 'nobody' is not known",
+        ),
+        (["myopia"], "report: --out is missing: allowed is a .html or .pdf file"),
+        (["myopia", "-o", "eye.docx"], "allowed is a .html or .pdf file"),
+        (["myopia", "-o", "nowhere/eye.pdf"], "there is no folder nowhere"),
+        (["myopia", "gone.json", "-o", "eye.pdf"], "file 'gone.json' does not exist"),
+    ],
+)
+def test_bad_input_is_one_line_and_no_file(
+    arguments, said, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    written = capsys.readouterr()
+    assert written.out == ""
+    assert said in written.err and written.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_a_pdf_and_prints_the_numbers_alone(capsys, tmp_path):
+    profile, out = tmp_path / "eye.json", tmp_path / "eye.pdf"
+    profile.write_text(json.dumps(MYOPE))
+    assert main([str(profile), "-o", str(out), "--no-charts", "--json"]) == 0
+    written = capsys.readouterr()
+    assert written.err == ""
+    found = json.loads(written.out)["eye"]["refraction"]
+    assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
+    content = out.read_bytes()
+    assert content.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type /Page\b", content)) == 3
