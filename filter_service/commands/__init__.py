@@ -10,7 +10,6 @@ keys             who may connect to it
 eyes             whose PSFs are kept on disk
 prepare          loops compiled ahead
 filter_image     one picture
-image_files      pictures and depth in files
 plan_text        a plan in words
 estimate         an eye from a profile
 wavefront        its aberrations

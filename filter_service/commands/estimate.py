@@ -62,7 +62,7 @@ def estimate(
     from estimator.estimate.estimation import estimate_eye
     from estimator.networks.card import DamagedWeights, WeightsMissing
     from estimator.profiles.files import load_profile
-    from filter_service.commands.image_files import check_output
+    from filter_service.image_files import check_output
 
     if plot is not None:
         check_output(plot, (".png",))

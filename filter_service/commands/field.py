@@ -69,7 +69,7 @@ def field(
 
     from estimator.field.field_table import field_table
     from estimator.profiles.files import load_profile
-    from filter_service.commands.image_files import check_output
+    from filter_service.image_files import check_output
 
     if plot is not None:
         check_output(plot, (".png",))

@@ -133,7 +133,7 @@ def filter_image(
     check_range("--render-tolerance", render_tolerance, (0.0, MAX_RENDER_TOLERANCE))
 
     from estimator.profiles.files import load_profile
-    from filter_service.commands import image_files
+    from filter_service import image_files
     from filter_service.filtering import one_image
 
     image_files.check_output(out)
@@ -175,7 +175,7 @@ def filter_image(
 
 def _output(out: Path, *, half: bool) -> Output:
     """Light as a file of this name holds it."""
-    from filter_service.commands.image_files import LINEAR_SUFFIXES
+    from filter_service.image_files import LINEAR_SUFFIXES
 
     linear = out.suffix.lower() in LINEAR_SUFFIXES
     if half and not linear:
@@ -192,7 +192,7 @@ def _read_view(
     depth_scale: float | None,
     hidden_paths: tuple[Path | None, Path | None] = (None, None),
 ) -> "RgbdView":
-    from filter_service.commands.image_files import read_color, read_depth
+    from filter_service.image_files import read_color, read_depth
     from filter_service.rgbd_view import RgbdView
 
     color = read_color(color_path)
@@ -221,7 +221,7 @@ def _read_hidden(
     depth_scale: float | None,
 ) -> tuple["NDArray | None", "NDArray | None"]:
     """Colour and depth of the hidden layer; None for both where there is none."""
-    from filter_service.commands.image_files import read_color, read_depth
+    from filter_service.image_files import read_color, read_depth
 
     if color_path is None and depth_path is None:
         return None, None

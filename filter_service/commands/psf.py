@@ -114,7 +114,7 @@ def psf(
     check_range("--h-deg", h_deg, FIELD_LIMITS_DEG)
     check_range("--v-deg", v_deg, FIELD_LIMITS_DEG)
 
-    from filter_service.commands.image_files import check_output
+    from filter_service.image_files import check_output
 
     check_output(out, (".npy", ".png"))
     is_traced = h_deg != 0.0 or v_deg != 0.0 or explicit_body(eye) is not None
@@ -251,7 +251,7 @@ def _facts(computed: "Psf", state: _State) -> dict:
 def _write(out: Path, computed: "Psf", *, pixel_arcmin: float) -> None:
     import numpy as np
 
-    from filter_service.commands.image_files import write_image
+    from filter_service.image_files import write_image
     from filter_service.psfs.picture import draw_psf
 
     if out.suffix.lower() == ".npy":

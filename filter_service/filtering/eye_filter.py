@@ -214,6 +214,15 @@ class EyeFilter:
         """Let builds go on where no frames come, or where the workshop is another's."""
         self.workshop.advance()
 
+    def forget(self) -> None:
+        """Have the next frame filtered as if it were the first.
+
+        Frames leave what saves time in those that follow, which differ by it where
+        kernels are so large that cells of the field had to be made wider.  With this
+        and ``prepare="ranges"`` a picture does not depend on the frames before it.
+        """
+        self.workshop.engine.forget()
+
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
         """Return when the newest eye is complete for all cameras it was asked for.
 

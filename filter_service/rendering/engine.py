@@ -60,6 +60,9 @@ class FrameEngine(Protocol):
     def trim(self) -> None:
         """Give back memory that frames use again, after a while without any."""
 
+    def forget(self) -> None:
+        """Forget what frames left, so that the next is filtered as the first."""
+
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Have a function called in the middle of frames, where this engine can.
 

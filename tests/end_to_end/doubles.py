@@ -55,6 +55,9 @@ class EngineDouble:
     def trim(self):
         """Nothing is held."""
 
+    def forget(self):
+        """No frame leaves anything."""
+
     def call_between(self, function, interval_s):
         """Frames are not long here."""
         return False

@@ -36,6 +36,8 @@ MAY_IMPORT = {
         "filter_service.keys",  # a client's own
         "filter_service.slots",  # memory shared with the service
         "filter_service.settings",
+        "filter_service.image_files",  # pictures and depth in files
+        "estimator.profile_body",  # a profile as plain values
         "estimator.dynamics",  # of an eye that looks
         *FACE,
         *EYE_FACE,
@@ -141,6 +143,8 @@ HOME = {
     "pyglet": ("clients/*",),
     "imageio": ("clients/*",),
     "imageio_ffmpeg": ("clients/*",),  # videos
+    "av": ("clients/batch/video_*.py",),  # frames of videos, exactly
+    "ray": ("clients/batch/ray_pool.py",),  # many machines
     "matplotlib": (
         "clients/*",
         "tests/*",  # plots of measurements
@@ -148,9 +152,9 @@ HOME = {
         "estimator/field/plot.py",  # `ocufilter field --plot`
         "training/learning_curve.py",
     ),
-    "OpenEXR": ("filter_service/commands/image_files.py",),
+    "OpenEXR": ("filter_service/image_files.py",),
     "PIL": (
-        "filter_service/commands/image_files.py",
+        "filter_service/image_files.py",
         "filter_service/psfs/picture.py",
         "clients/*",  # captions, textures, contact sheet
     ),

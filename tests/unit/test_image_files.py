@@ -5,7 +5,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from filter_service.commands.image_files import (
+from filter_service.image_files import (
     check_output,
     read_color,
     read_depth,

@@ -63,6 +63,10 @@ class FilterRenderer:
         """
         self._kept.drop_released()
 
+    def forget(self) -> None:
+        """Forget what frames left of their states; the buffers stay."""
+        self._kept.forget()
+
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Do without: no frame keeps a GPU for long."""
         return False

@@ -38,6 +38,11 @@ class NativeLanes:
         self._main.trim()
         self._other.trim()
 
+    def forget(self) -> None:
+        """Forget what frames left of their states."""
+        self._main.forget()
+        self._other.forget()
+
     def close(self) -> None:
         """End the threads; the engine is of no use after."""
         self._main.close()

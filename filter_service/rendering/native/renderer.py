@@ -79,6 +79,10 @@ class NativeRenderer:
         self._arrays = Arrays()
         self._kept = KeptStates()
 
+    def forget(self) -> None:
+        """Forget what frames left of their states; the memory stays."""
+        self._kept = KeptStates()
+
     def close(self) -> None:
         """End the threads; the renderer is of no use after."""
         self._end()
