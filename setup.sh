@@ -146,7 +146,7 @@ install_packages() {
     compile_beside
     say "installing the other packages meanwhile"
     $pip install -c constraints.txt setuptools
-    $pip install -c constraints.txt --no-build-isolation -e '.[clients,dev]'
+    $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,dev]'
     # apart and without its dependencies: it pins a PyOpenGL that is too old
     $pip install --no-deps pyrender==0.1.45
     say "the packages are installed"

@@ -9,6 +9,7 @@ Importing this loads nothing but names.
     shared_memory    memory that it shares with a service on the same machine
     service_process  a service of one's own
     hello            the smallest client
+    batch/           data sets through people's eyes
     headset/         a scene in an OpenXR headset, each eye with its own profile
     natural          an eye that follows light and distance
     frame_log        what became of a stream's frames

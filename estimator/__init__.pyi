@@ -29,4 +29,5 @@ from .profiles.parse import parse_profile as parse_profile
 from .profiles.parse import preset_names as preset_names
 from .psf.compute import compute_psf_batch as compute_psf_batch
 from .psf.compute import compute_psfs as compute_psfs
+from .threads import thread_count as thread_count
 from .wavefront.aberrations import wavefront_aberrations as wavefront_aberrations

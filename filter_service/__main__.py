@@ -14,7 +14,7 @@ from filter_service.commands.field import field
 from filter_service.commands.filter_image import filter_image
 from filter_service.commands.keys import keys
 from filter_service.commands.prepare import prepare
-from filter_service.commands.programs import bench, demo, headset, report
+from filter_service.commands.programs import batch, bench, demo, headset, report
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
 from filter_service.commands.status import status
@@ -47,7 +47,7 @@ app.command()(psf)
 app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )(bench)
-for program in (headset, report):
+for program in (headset, batch, report):
     app.command(
         context_settings={
             "allow_extra_args": True,

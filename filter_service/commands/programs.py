@@ -49,6 +49,7 @@ class Bench(StrEnum):
     OVERLOAD = "overload"
     DEVICES = "devices"
     RESTART = "restart"
+    BATCH = "batch"
     ROUNDTRIP = "roundtrip"
 
 
@@ -80,6 +81,7 @@ BENCH_MODULES = {
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
     Bench.DEVICES: "tests.benchmarks.bench_devices",
     Bench.RESTART: "tests.benchmarks.bench_restart",
+    Bench.BATCH: "tests.benchmarks.bench_batch",
     Bench.ROUNDTRIP: "clients.latency",
 }
 
@@ -129,6 +131,16 @@ def report(context: typer.Context) -> None:
     ocufilter report keratoconus -o eye.html
     """
     _become("clients.report.program", context.args)
+
+
+def batch(context: typer.Context) -> None:
+    """Filter data sets: folders and videos of colour and depth, on all cores.
+
+    Its options and the layouts it reads: `ocufilter batch --help`.
+
+    ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
+    """
+    _become("clients.batch.program", context.args)
 
 
 def _become(program: str, arguments: list[str]) -> None:

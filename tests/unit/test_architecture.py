@@ -38,6 +38,8 @@ MAY_IMPORT = {
         "filter_service.settings",
         "filter_service.image_files",  # pictures and depth in files
         "estimator.profile_body",  # a profile as plain values
+        "estimator.parse_profile",  # and whether it is one
+        "estimator.thread_count",
         "estimator.dynamics",  # of an eye that looks
         *FACE,
         *EYE_FACE,

@@ -1,0 +1,134 @@
+"""What a batch would do, how long it would take, and what a million frames would cost.
+
+The first frames are filtered for it on one core and thrown away.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clients.batch.manifest import LINES, Manifest
+from clients.batch.run import Batch, missing_units
+from clients.batch.work import Unit, UnitRunner
+
+MEASURED_FRAMES = 6
+"""Of each profile, the first of them to warm up."""
+
+SECONDS_PER_HOUR = 3600.0
+MILLION = 1_000_000
+
+
+def dry_run(
+    batch: Batch, *, n_cores: int, price_per_core_hour: float | None
+) -> dict[str, Any]:
+    """Return what `ocufilter batch --dry-run` says."""
+    n_all = len(batch.frames) * len(batch.job.profiles)
+    n_missing = n_all
+    if (batch.out / LINES).is_file():
+        with Manifest(batch.out, batch.described()) as manifest:
+            units = missing_units(batch, manifest)
+        n_missing = sum(len(unit.frames) for unit in units)
+    measured = [_measured(batch, profile) for profile in batch.job.profiles]
+    ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
+    mean_ms = float(np.mean(ms)) if ms else math.nan
+    sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
+    core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
+    report = {
+        "layout": batch.layout,
+        "frames": len(batch.frames),
+        "profiles": measured,
+        "pictures": n_all,
+        "pictures_missing": n_missing,
+        "cores": n_cores,
+        "ms_per_picture_and_core": _known(mean_ms, 2),
+        "seconds": _known(n_missing * mean_ms / 1e3 / n_cores, 1),
+        "output_mb": _known(n_missing * float(np.mean(sizes)) / 1e6, 1)
+        if sizes
+        else None,
+        "core_hours_per_million": _known(core_hours, 2),
+    }
+    if price_per_core_hour is not None:
+        report["price_per_million"] = _known(core_hours * price_per_core_hour, 2)
+    return report
+
+
+def _known(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _measured(batch: Batch, profile: str) -> dict[str, Any]:
+    """Filter the first frames through a profile, on this process's one thread."""
+    frames = batch.frames[:MEASURED_FRAMES]
+    times_ms, sizes, errors, notes = [], [], [], []
+    build_s = 0.0
+    with tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder:
+        runner = UnitRunner(batch.job, Path(folder))
+        try:
+            for number, frame in enumerate(frames):
+                segment = Path(f"{number}.mkv") if batch.job.is_video else None
+                unit = Unit(number, profile, (frame,), segment)
+                started_s = time.perf_counter()
+                (record,) = runner.run(unit)
+                took_ms = 1e3 * (time.perf_counter() - started_s)
+                if not record["ok"]:
+                    errors.append(record["error"])
+                    continue
+                notes += record["notes"]
+                sizes.append(record["bytes"])
+                if "build" not in record["ms"]:
+                    times_ms.append(took_ms)
+            build_s = runner.build_s
+        finally:
+            runner.close()
+    return {
+        "profile": profile,
+        "measured_frames": len(times_ms),
+        "build_s": round(build_s, 2),
+        "ms_per_frame": round(float(np.median(times_ms)), 2) if times_ms else None,
+        "bytes_per_frame": round(float(np.mean(sizes))) if sizes else None,
+        "errors": errors,
+        "notes": list(dict.fromkeys(notes)),
+    }
+
+
+def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[str]:
+    """Return the report as lines for a person."""
+    lines = [
+        f"{report['frames']} frames of the layout {report['layout']}, "
+        f"{len(report['profiles'])} profiles: {report['pictures']} pictures, "
+        f"{report['pictures_missing']} of them to be made"
+    ]
+    for one in report["profiles"]:
+        took = one["ms_per_frame"]
+        told = (
+            "no frame measured"
+            if took is None
+            else f"{took:.1f} ms a frame on one core ({one['measured_frames']} "
+            f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
+        )
+        lines.append(f"  {one['profile']}: {told}; PSFs {one['build_s']:.1f} s")
+        lines += [f"    error: {text}" for text in one["errors"]]
+        lines += [f"    note: {text}" for text in one["notes"]]
+    if report["seconds"] is not None:
+        lines.append(
+            f"about {_duration(report['seconds'])} on {report['cores']} cores, "
+            f"{report['output_mb']:g} MB"
+        )
+        cost = f"a million pictures: {report['core_hours_per_million']:g} core-hours"
+        if price_per_core_hour is not None:
+            cost += f", {report['price_per_million']:g} at {price_per_core_hour:g} each"
+        lines.append(cost)
+    return lines
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"

@@ -1,0 +1,75 @@
+"""Pictures that depend on their frame, eye and settings, and on nothing before them.
+
+`EyeFilter` is made for streams: a first preview, PSFs that grow with what is asked, and
+states that are kept from frame to frame.  Here each eye and camera is prepared whole
+before its first frame, and what frames leave is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from clients.batch.job import Job
+from filter_service import Camera, EyeFilter, Filtered, FilterError, RgbdView
+
+BUILD_LIMIT_S = 600.0
+
+
+class ExactFilter:
+    """Filters frames through the eyes of a job; one eye and camera is kept at a time.
+
+    Not the nearest camera but the very one: a store that serves a camera which differs
+    by a hair would make pictures depend on which of them came first.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._key: tuple[str, Camera] | None = None
+        self._filter: EyeFilter | None = None
+        self._failure: FilterError | None = None
+        self.build_s = 0.0
+
+    def close(self) -> None:
+        """Give up what is held."""
+        if self._filter is not None:
+            self._filter.close()
+        self._filter = self._key = self._failure = None
+
+    def see(
+        self, profile: str, view: RgbdView, *, pupil_mm: float, focus_dpt: float
+    ) -> Filtered:
+        """Return a frame as seen through a profile.
+
+        Raises
+        ------
+        FilterError
+            The eye cannot be prepared for this camera, or the frame not be filtered.
+        """
+        if self._key != (profile, view.camera):
+            self._prepare(profile, view.camera)
+        if self._failure is not None or self._filter is None:
+            raise self._failure or RuntimeError("the filter is closed")
+        self._filter.forget()
+        seen = self._filter.filter(
+            view,
+            pupil_diameter_mm=pupil_mm,
+            focus_dpt=focus_dpt,
+            output=self._job.output,
+            render_tolerance=self._job.render_tolerance,
+        )
+        assert seen.is_complete  # `wait` has seen to it
+        return seen
+
+    def _prepare(self, profile: str, camera: Camera) -> None:
+        self.close()
+        self._key = profile, camera
+        body: Mapping[str, Any] = self._job.profiles[profile]
+        self._filter = EyeFilter(
+            body, camera, self._job.settings, engine=self._job.engine
+        )
+        try:
+            ready = self._filter.wait(BUILD_LIMIT_S)
+            self.build_s += ready.build_ms / 1e3
+        except FilterError as error:
+            self._failure = error

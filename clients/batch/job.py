@@ -1,0 +1,138 @@
+"""What a batch does: everything that decides its pictures, as plain values too."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+from clients.batch.states import States
+from filter_service import FilterSettings, Output
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+FORMATS = ("png", "npy", "exr", "ffv1", "h264")
+LINEAR_FORMATS = ("npy", "exr")
+VIDEO_FORMATS = ("ffv1", "h264")
+
+Format = Literal["png", "npy", "exr", "ffv1", "h264"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What decides the pictures of a batch, whoever makes them in which order.
+
+    Attributes
+    ----------
+    profiles : mapping of names to profiles as JSON objects
+    settings : FilterSettings
+    states : States
+    format : one of `FORMATS`
+    half : bool
+        Half floats in the place of floats.
+    engine : "native" or "gl"
+    render_tolerance : float
+    rate_hz : float
+        Of video outputs.
+    """
+
+    profiles: Mapping[str, Mapping[str, Any]]
+    settings: FilterSettings
+    states: States
+    format: Format = "png"
+    half: bool = False
+    engine: Literal["native", "gl"] = "native"
+    render_tolerance: float = 1.0
+    rate_hz: float = 30.0
+
+    @property
+    def output(self) -> Output:
+        """Return the light that files of the format hold."""
+        if self.format not in LINEAR_FORMATS:
+            return "srgb8"
+        return "linear16" if self.half else "linear"
+
+    @property
+    def is_video(self) -> bool:
+        """Return whether each profile's pictures become one video."""
+        return self.format in VIDEO_FORMATS
+
+    def described(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "profiles": {name: dict(body) for name, body in self.profiles.items()},
+            "settings": self.settings.fields(),
+            "states": self.states.described(),
+            "format": self.format,
+            "half": self.half,
+            "engine": self.engine,
+            "render_tolerance": self.render_tolerance,
+            "rate_hz": self.rate_hz if self.is_video else None,
+        }
+
+
+def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
+    """Return the settings of a batch: all PSFs are prepared before the first frame.
+
+    Parameters
+    ----------
+    given : mapping
+        Fields of `FilterSettings`; ranges that lack are those of the states.
+
+    Raises
+    ------
+    ValueError
+        A setting that is none, or with which pictures would depend on what was before.
+    """
+    fixed = {"prepare": "ranges"}
+    usual = {
+        "pupil_range_mm": states.pupil_range_mm,
+        "focus_range_dpt": states.focus_range_dpt,
+    }
+    for name, value in fixed.items():
+        if given.get(name, value) != value:
+            raise ValueError(
+                f"--settings: {name} is {given[name]!r}; allowed in a batch: {value!r}"
+            )
+    if given.get("accuracy") == "balanced":
+        raise ValueError(
+            "--settings: accuracy is 'balanced', which goes by the speed of the "
+            "machine; allowed in a batch: 'exact' or 'fast'"
+        )
+    try:
+        return FilterSettings(**{**usual, **given, **fixed})
+    except TypeError as error:
+        raise ValueError(f"--settings: {error}") from None
+
+
+def code_version() -> dict[str, str | None]:
+    """Return the version of the package, and the commit of a checkout if known."""
+    try:
+        package = version("ocufilter")
+    except PackageNotFoundError:
+        package = "unknown"
+    return {"version": package, "commit": _commit()}
+
+
+def _commit() -> str | None:
+    if shutil.which("git") is None or not (CHECKOUT / ".git").exists():
+        return None
+    answer = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return answer.stdout.strip() or None
+
+
+def fingerprint(plain: Mapping[str, Any]) -> str:
+    """Return a hash of plain values."""
+    text = json.dumps(plain, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,116 @@
+"""Folders of colour and depth images that belong together by their names.
+
+color/0001.png      depth/0001.exr       any names of folders below
+0001_color.png      0001_depth.npy       beside each other, with a word
+0001.jpg            0001.npy             or told apart by what they are
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from clients.batch.source import Optics, Scaled, SourceFrame
+from filter_service.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left", "frames")
+DEPTH_FOLDERS = ("depth", "depths", "depth_m", "depthmap", "depthmaps")
+COLOR_WORDS = ("colors", "color", "colour", "rgb", "image", "img")
+DEPTH_WORDS = ("sync_depth", "depth", "z")
+
+
+def _at_an_end(words: tuple[str, ...]) -> re.Pattern:
+    any_of = "|".join(words)
+    return re.compile(rf"^({any_of})[-_.]|[-_.]({any_of})$")
+
+
+_COLOR_WORD, _DEPTH_WORD = _at_an_end(COLOR_WORDS), _at_an_end(DEPTH_WORDS)
+
+
+def pair_frames(
+    source: Path, depth: Path | None, optics: Optics, scaled: Scaled
+) -> list[SourceFrame]:
+    """Return the pairs of a folder, or of it and a folder of depth.
+
+    A file without a partner is a frame with a fault.
+
+    Raises
+    ------
+    ValueError
+        Which files are depth cannot be told, or two have the same name.
+    """
+    colors, depths = _colors_and_depths(source, depth)
+    frames = []
+    for name in sorted(colors.keys() | depths.keys()):
+        color, depth_file = colors.get(name), depths.get(name)
+        fault = None
+        if color is None or depth_file is None:
+            lacking = "colour" if color is None else "depth"
+            fault = f"'{color or depth_file}': no {lacking} of the name '{name}'"
+        frames.append(
+            SourceFrame(
+                name,
+                color or depth_file,
+                depth_file or color,
+                optics,
+                scaled,
+                fault=fault,
+            )
+        )
+    return frames
+
+
+def _colors_and_depths(
+    source: Path, depth: Path | None
+) -> tuple[dict[str, Path], dict[str, Path]]:
+    color_folder = _sub_folder(source, COLOR_FOLDERS)
+    depth_folder = depth or _sub_folder(source, DEPTH_FOLDERS)
+    if depth_folder is not None:
+        if not depth_folder.is_dir():
+            raise ValueError(f"--depth '{depth_folder}': allowed: a folder of images")
+        return (
+            _named(images_in(color_folder or source, COLOR_SUFFIXES), _COLOR_WORD),
+            _named(images_in(depth_folder, DEPTH_SUFFIXES), _DEPTH_WORD),
+        )
+    files = images_in(source, (*COLOR_SUFFIXES, *DEPTH_SUFFIXES))
+    depths = [path for path in files if _DEPTH_WORD.search(path.stem.lower())]
+    colors = [path for path in files if path not in set(depths)]
+    if not depths:  # told apart by what they are
+        depths = [path for path in files if path.suffix.lower() not in _PICTURES]
+        colors = [path for path in files if path.suffix.lower() in _PICTURES]
+        if len(depths) != len(colors):
+            raise ValueError(
+                f"'{source}': which files are depth cannot be told; allowed: folders "
+                f"such as color/ and depth/, names that end in _depth, or --depth DIR"
+            )
+    return _named(colors, _COLOR_WORD), _named(depths, _DEPTH_WORD)
+
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
+
+
+def images_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the files of a folder with these endings, by name."""
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".")
+    )
+
+
+def _sub_folder(source: Path, names: tuple[str, ...]) -> Path | None:
+    return next((source / name for name in names if (source / name).is_dir()), None)
+
+
+def _named(paths: list[Path], word: re.Pattern) -> dict[str, Path]:
+    """Return files by their names without the word that says what they are."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        match = word.search(path.stem.lower())
+        name = path.stem
+        if match is not None:
+            name = (name[: match.start()] + name[match.end() :]) or path.stem
+        if name in found:
+            raise ValueError(f"'{path}' and '{found[name]}': both are called '{name}'")
+        found[name] = path
+    return found

@@ -1,0 +1,207 @@
+"""What a batch did: a line for each frame while it runs, a summary when it is done.
+
+    manifest.jsonl   the job; then a line for each frame, and again where it was redone:
+                     the last one counts
+    manifest.json    the job, counts, failures and notes
+
+Lines are appended whole by one process; one that a power cut left unfinished is cut
+off.  A frame without a line is done again, whatever files of it there are.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from clients.batch.job import fingerprint
+from clients.batch.whole_files import is_unchanged, write_whole
+from clients.batch.work import Record
+
+LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+SYNC_S = 2.0
+"""So much work may a power cut undo."""
+
+
+class ManifestDiffers(ValueError):
+    """The folder holds the results of another job."""
+
+
+class Manifest:
+    """The lines of an output folder, read and appended to.
+
+    Parameters
+    ----------
+    out : Path
+        A folder that is there.
+    job : mapping
+        What decides the pictures, as plain values.
+
+    Raises
+    ------
+    ManifestDiffers
+        The folder's manifest is of another job; names what differs.
+    ValueError
+        It is none.
+    """
+
+    def __init__(self, out: Path, job: Mapping[str, Any]) -> None:
+        self._out = out
+        self._path = out / LINES
+        self._places: dict[tuple[str, str], int] = {}  # of lines, in bytes
+        self._synced_s = time.monotonic()
+        self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            self._read(job)
+        except BaseException:
+            os.close(self._file)
+            raise
+
+    def __enter__(self) -> Self:
+        """Return the manifest."""
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Close its file."""
+        os.fsync(self._file)
+        os.close(self._file)
+
+    def _read(self, job: Mapping[str, Any]) -> None:
+        end = 0
+        with self._path.open("rb") as file:
+            for line in file:
+                if not line.endswith(b"\n"):
+                    break
+                record = _parsed(line, self._path)
+                if end == 0:
+                    _check_same(record, job)
+                elif record.get("kind") == "frame":
+                    self._places[record["profile"], record["frame"]] = end
+                end += len(line)
+        os.ftruncate(self._file, end)
+        if end == 0:
+            self._write({"kind": "job", "fingerprint": fingerprint(job), **job})
+
+    def append(self, record: Record) -> None:
+        """Add a line for a frame."""
+        self._places[record["profile"], record["frame"]] = self._write(record)
+
+    def _write(self, record: Record) -> int:
+        place = os.lseek(self._file, 0, os.SEEK_END)
+        line = json.dumps(record, allow_nan=False).encode() + b"\n"
+        written = os.write(self._file, line)
+        if written != len(line):  # a full disk: no half line stays
+            os.ftruncate(self._file, place)
+            raise OSError(
+                f"'{self._path}': {written} of {len(line)} bytes were written"
+            )
+        now_s = time.monotonic()
+        if now_s - self._synced_s > SYNC_S:
+            os.fsync(self._file)
+            self._synced_s = now_s
+        return place
+
+    def record(self, profile: str, frame: str) -> Record | None:
+        """Return the last line of a frame; None where there is none."""
+        place = self._places.get((profile, frame))
+        return None if place is None else self._at(place)
+
+    def _at(self, place: int) -> Record:
+        parts = []
+        while not parts or b"\n" not in parts[-1]:
+            size = sum(map(len, parts))
+            parts.append(os.pread(self._file, 4096, place + size))
+        return json.loads(b"".join(parts).split(b"\n", 1)[0])
+
+    def records(self) -> Iterator[Record]:
+        """Yield the last line of each frame, by profile and name."""
+        for key in sorted(self._places):
+            yield self._at(self._places[key])
+
+    def is_done(self, profile: str, frame: str, files: tuple[Path, ...]) -> bool:
+        """Return whether a frame has its picture, made from files as they are now."""
+        record = self.record(profile, frame)
+        if record is None or not record["ok"]:
+            return False
+        path = self._out / record["file"]
+        if not path.is_file() or path.stat().st_size != record["bytes"]:
+            return False
+        return len(files) == len(record["inputs"]) and all(
+            is_unchanged(path, told)
+            for path, told in zip(files, record["inputs"], strict=True)
+        )
+
+
+def _parsed(line: bytes, path: Path) -> Record:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        record = None
+    if not isinstance(record, dict):
+        raise ValueError(f"'{path}': a line is no JSON object: {line[:60]!r}")
+    return record
+
+
+def _check_same(found: Record, job: Mapping[str, Any]) -> None:
+    if found.get("fingerprint") == fingerprint(job):
+        return
+    wanted = json.loads(json.dumps(job))  # lists for tuples, as in the file
+    for name in sorted({*wanted, *found} - {"kind", "fingerprint"}):
+        if found.get(name) != wanted.get(name):
+            before, now = _first_difference(name, found.get(name), wanted.get(name))
+            raise ManifestDiffers(
+                f"{now[0]} is {_short(now[1])}, and was {_short(before[1])} when this "
+                "folder was begun; allowed: the same, another folder, or --overwrite"
+            )
+    raise ManifestDiffers("the folder's manifest is of another job")
+
+
+def _first_difference(name: str, before: Any, now: Any) -> tuple:
+    """Go down to the field that differs."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in sorted({*before, *now}):
+            if before.get(key) != now.get(key):
+                inner = f"{name}.{key}"
+                return _first_difference(inner, before.get(key), now.get(key))
+    return (name, before), (name, now)
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
+    """Write the summary, whole."""
+    text = json.dumps(summary, indent=1, allow_nan=False) + "\n"
+
+    def write(path: Path) -> None:
+        path.write_text(text, encoding="utf-8")
+
+    write_whole(out / SUMMARY, write)
+
+
+def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
+    """Return counts, failures and notes of the frames that are wanted."""
+    n_done, failures = Counter[str](), []
+    notes, pixels = Counter[str](), Counter[str]()
+    for record in manifest.records():
+        if (record["profile"], record["frame"]) not in wanted:
+            continue
+        if not record["ok"]:
+            failures.append({k: record[k] for k in ("profile", "frame", "error")})
+            continue
+        n_done[record["profile"]] += 1
+        notes.update(record["notes"])
+        for name in ("missing_depth_count", "clamped_depth_count", "overflow_count"):
+            pixels[name] += record[name]
+    return {
+        "frames_done": dict(n_done),
+        "failures": failures,
+        **pixels,
+        "notes": [{"note": note, "frames": n} for note, n in notes.most_common()],
+    }

@@ -1,0 +1,292 @@
+"""What `ocufilter batch` is told: its command line, read and checked."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from clients.arguments import read_object
+from clients.batch.job import FORMATS, LINEAR_FORMATS, Job, batch_settings
+from clients.batch.layouts import LAYOUTS, Told, list_frames, optics_of
+from clients.batch.run import Batch
+from clients.batch.source import SourceFrame
+from clients.batch.states import CENTER, States, read_states
+from estimator import parse_profile, profile_body, thread_count
+from filter_service.settings import (
+    MAX_PUPIL_MM,
+    MAX_RENDER_TOLERANCE,
+    MAX_VERGENCE_DPT,
+    MIN_PUPIL_MM,
+)
+
+DESCRIPTION = """\
+Folders and videos of colour and depth, as people see them: each frame through each
+profile, on all cores.  Started again after whatever happened, it does what is missing.
+
+  ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
+  ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o seen
+  ocufilter batch walk.mp4 --depth walk_depth.mkv --fov-deg 60 -p myopia \\
+      --format h264 -o seen
+"""
+
+LAYOUT_HELP = """\
+layouts, found by what is in the folder:
+  tum         TUM RGB-D: rgb/, depth/, their lists; depth / 5000, camera of the driver
+  nyu         NYU depth v2: N_colors.png with N_depth.png, rgb_N.jpg with
+              sync_depth_N.png (mm), or raw dumps r-*.ppm with d-*.pgm
+  middlebury  im0.png, disp0.pfm, calib.txt of one scene or of a folder of scenes
+  pairs       color/ and depth/, or NAME_color with NAME_depth; depth as PNG of 16 bits,
+              float TIFF, NPY, EXR, PFM; wants --fov-deg or --intrinsics
+  video       colour in a video, depth in another of 16-bit grey, or in a folder
+
+results: OUT/PROFILE/FRAME.png, or OUT/PROFILE.mkv; OUT/manifest.jsonl has a line for
+each frame, OUT/manifest.json the whole.  Exit codes: 0 done, 1 some frames failed,
+2 bad input.
+"""
+
+_NAME = re.compile(r"[^\w.+-]+")
+
+
+def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(
+        prog="ocufilter batch",
+        description=DESCRIPTION,
+        epilog=LAYOUT_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="folder or video")
+    parser.add_argument(
+        *("-o", "--out"), type=Path, required=True, metavar="DIR", help="output folder"
+    )
+    parser.add_argument(
+        *("-p", "--profile"),
+        action="append",
+        required=True,
+        metavar="P",
+        help="a preset's name, or a .json, .abp or .csv file; again for more. "
+        "NAME=P gives its folder another name",
+    )
+    _add_source(parser.add_argument_group("what is read"))
+    _add_eye(parser.add_argument_group("the eye"))
+    _add_results(parser.add_argument_group("what is written"))
+    _add_machines(parser.add_argument_group("on what"))
+    return parser.parse_args(argv)
+
+
+def _add_source(group) -> None:
+    group.add_argument(
+        "--layout", default="auto", choices=LAYOUTS, help="default: what is found"
+    )
+    group.add_argument(
+        "--depth", type=Path, metavar="PATH", help="folder or video of depth"
+    )
+    group.add_argument(
+        "--depth-scale", type=float, metavar="M", help="metres per unit of its numbers"
+    )
+    group.add_argument("--fov-deg", type=float, help="vertical field of view, deg")
+    group.add_argument(
+        "--intrinsics", metavar="FX,FY,CX,CY", help="camera in px, instead"
+    )
+    group.add_argument("--limit", type=int, metavar="N", help="the first N frames only")
+
+
+def _add_eye(group) -> None:
+    group.add_argument(
+        "--pupil-mm", type=float, default=4.0, help="entrance pupil (default: 4)"
+    )
+    group.add_argument(
+        "--focus-dpt",
+        default="0",
+        metavar="DPT|center",
+        help="distance looked at, or the depth of the frame's middle (default: 0, far)",
+    )
+    group.add_argument(
+        "--states",
+        type=Path,
+        metavar="CSV",
+        help="columns frame, pupil_mm, focus_dpt: a line for each frame",
+    )
+    group.add_argument(
+        "--settings",
+        default="{}",
+        metavar="JSON",
+        help='of the filter, as {"mode": "quality", "object_range_dpt": [0, 5]}',
+    )
+    group.add_argument(
+        "--render-tolerance",
+        type=float,
+        default=1.0,
+        help="errors of rendering against the usual; 0 is exact (default: 1)",
+    )
+
+
+def _add_results(group) -> None:
+    group.add_argument(
+        "--format",
+        default="png",
+        choices=FORMATS,
+        help="png: sRGB; npy, exr: linear light; ffv1: video without loss; h264",
+    )
+    group.add_argument("--half", action="store_true", help="half floats in npy or exr")
+    group.add_argument(
+        "--fps", type=float, help="of videos (default: as the input, else 30)"
+    )
+    group.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="remove what another job left in the folder",
+    )
+    group.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say what would be done, how long it would take, what it would cost",
+    )
+    group.add_argument(
+        "--price-per-core-hour", type=float, metavar="X", help="for --dry-run"
+    )
+    group.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_machines(group) -> None:
+    group.add_argument(
+        "--workers", type=int, help="processes (default: one for each core)"
+    )
+    group.add_argument(
+        "--threads", type=int, help="of each worker (default: cores / workers)"
+    )
+    group.add_argument(
+        "--engine",
+        default="native",
+        choices=("native", "gl"),
+        help="native: the processor, the same bytes everywhere; gl: a GPU, with one "
+        "worker unless told otherwise",
+    )
+    group.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="workers of a Ray cluster that share INPUT and OUT: auto, an address, or "
+        "local (extra batch-ray)",
+    )
+
+
+def batch_of(options: argparse.Namespace) -> Batch:
+    """Return the batch that the command line tells of.
+
+    Raises
+    ------
+    ValueError
+        Names the option, the value and what is allowed.
+    """
+    _check(options)
+    told = Told(
+        options.depth,
+        optics_of(options.fov_deg, options.intrinsics),
+        options.depth_scale,
+    )
+    layout, frames = list_frames(options.input, options.layout, told)
+    frames = frames[: options.limit]
+    states = _states(options, [frame.name for frame in frames])
+    job = Job(
+        profiles=read_profiles(options.profile),
+        settings=batch_settings(read_object("--settings", options.settings), states),
+        states=states,
+        format=options.format,
+        half=options.half,
+        engine=options.engine,
+        render_tolerance=options.render_tolerance,
+        rate_hz=_rate_hz(options, frames),
+    )
+    return Batch(job, layout, options.input, frames, options.out)
+
+
+def workers_and_threads(options: argparse.Namespace) -> tuple[int, int]:
+    """Return how many processes, and how many threads each.
+
+    A process for each core: it does more frames than one process with as many threads
+    (`ocufilter bench batch`), for all of a frame's work runs beside that of others.
+    """
+    n_cores = thread_count()
+    n_workers = options.workers or (1 if options.engine == "gl" else n_cores)
+    return n_workers, options.threads or max(1, n_cores // n_workers)
+
+
+def _check(options: argparse.Namespace) -> None:
+    limits: Mapping[str, tuple[float, float]] = {
+        "pupil_mm": (MIN_PUPIL_MM, MAX_PUPIL_MM),
+        "render_tolerance": (0.0, MAX_RENDER_TOLERANCE),
+        "limit": (1, float("inf")),
+        "fps": (0.1, 1000.0),
+        "workers": (1, 1024),
+        "threads": (1, 256),
+        "price_per_core_hour": (0.0, float("inf")),
+        "depth_scale": (1e-9, 1e9),
+    }
+    for name, (low, high) in limits.items():
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} {value:g}: allowed is {low:g} to {high:g}")
+    if options.half and options.format not in LINEAR_FORMATS:
+        raise ValueError("--half: allowed with --format npy or exr")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"--out '{options.out}': allowed is a folder")
+
+
+def _states(options: argparse.Namespace, names: Sequence[str]) -> States:
+    focus_dpt: float | None = None
+    if options.focus_dpt != CENTER:
+        try:
+            focus_dpt = float(options.focus_dpt)
+        except ValueError:
+            focus_dpt = float("nan")
+        if not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
+            raise ValueError(
+                f"--focus-dpt '{options.focus_dpt}': allowed is 0 to "
+                f"{MAX_VERGENCE_DPT:g}, or {CENTER}"
+            )
+    listed = None
+    if options.states is not None:
+        if not options.states.is_file():
+            raise ValueError(f"--states '{options.states}': no such file")
+        listed = read_states(options.states, names)
+    states = States(options.pupil_mm, focus_dpt, listed)
+    states.check(names)
+    return states
+
+
+def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return profiles by the names of their folders.
+
+    Raises
+    ------
+    ValueError
+        A profile that is wrong, or two of one name.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        name, _, what = text.rpartition("=")
+        body = profile_body(what)
+        parse_profile(body)
+        name = name or (what if body.get("kind") == "preset" else Path(what).stem)
+        name = _NAME.sub("_", name).lstrip(".")
+        if not name or name in found:
+            raise ValueError(
+                f"--profile '{text}': the name '{name}' is taken or empty; allowed: "
+                "NAME=PROFILE with another"
+            )
+        found[name] = body
+    return found
+
+
+def _rate_hz(options: argparse.Namespace, frames: Sequence[SourceFrame]) -> float:
+    if options.fps is not None:
+        return float(options.fps)
+    if frames[0].color_index is None:
+        return 30.0
+    from clients.batch.video_reading import frames_per_second
+
+    return frames_per_second(frames[0].color)

@@ -1,0 +1,142 @@
+"""Workers on this machine, a process each; one that dies is replaced."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+
+from clients.batch.job import Job
+from clients.batch.work import Record, Unit, failed_records
+
+THREADS_VARIABLE = "OCUFILTER_THREADS"
+MAX_DEATHS = 2
+"""Processes that die at the same frame: by then it is the frame."""
+
+END_LIMIT_S = 5.0
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A process, the pipe to it, and what it is at."""
+
+    process: subprocess.Popen[bytes]
+    pipe: Connection
+    unit: Unit | None = None
+    pending: list[str] = field(default_factory=list)
+
+
+class ProcessPool:
+    """Runs units on processes, each with so many threads of the engine."""
+
+    def __init__(self, job: Job, out: Path, *, n_workers: int, n_threads: int) -> None:
+        self._setup = job, out
+        self._n_workers, self._n_threads = n_workers, n_threads
+        self._workers: list[_Worker] = []
+        self._deaths: Counter[tuple[str, str]] = Counter()
+
+    def run(self, units: Sequence[Unit]) -> Iterator[Record]:
+        """Yield the records of units as frames are done, in no order."""
+        waiting = deque(units)
+        try:
+            while True:
+                self._give_out(waiting)
+                busy = {w.pipe: w for w in self._workers if w.unit is not None}
+                if not busy:
+                    return
+                for pipe in wait(list(busy)):
+                    yield from self._receive(busy[pipe], waiting)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End the workers: between two frames, or by force after some seconds."""
+        for worker in self._workers:
+            worker.pipe.close()
+        for worker in self._workers:
+            try:
+                worker.process.wait(END_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                worker.process.kill()
+                worker.process.wait()
+        self._workers = []
+
+    def _give_out(self, waiting: deque[Unit]) -> None:
+        while waiting:
+            worker = next((w for w in self._workers if w.unit is None), None)
+            if worker is None:
+                if len(self._workers) == self._n_workers:
+                    return
+                worker = self._start()
+            unit = waiting.popleft()
+            worker.unit, worker.pending = unit, [frame.name for frame in unit.frames]
+            try:
+                worker.pipe.send(unit)
+            except OSError:  # it died meanwhile: reading from it says so
+                return
+
+    def _start(self) -> _Worker:
+        ours, theirs = socket.socketpair()
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "clients.batch.worker", str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            env={
+                **os.environ,
+                THREADS_VARIABLE: str(self._n_threads),
+                "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path),
+            },
+        )
+        theirs.close()
+        worker = _Worker(process, Connection(ours.detach()))
+        worker.pipe.send(self._setup)
+        self._workers.append(worker)
+        return worker
+
+    def _receive(self, worker: _Worker, waiting: deque[Unit]) -> Iterator[Record]:
+        try:
+            kind, content = worker.pipe.recv()
+        except (EOFError, OSError):
+            yield from self._after_death(worker, waiting)
+            return
+        if kind == "record":
+            worker.pending.remove(content["frame"])
+            yield content
+        else:
+            worker.unit, worker.pending = None, []
+
+    def _after_death(self, worker: _Worker, waiting: deque[Unit]) -> Iterator[Record]:
+        """Have the rest of a unit done again; give up the frame that kills workers."""
+        worker.pipe.close()
+        how = _how_it_ended(worker.process.wait())
+        self._workers.remove(worker)
+        unit, pending = worker.unit, worker.pending
+        if unit is None or not pending:
+            return
+        key = unit.profile, pending[0]
+        self._deaths[key] += 1
+        if self._deaths[key] >= MAX_DEATHS:
+            # a segment is whole or not: all of its frames
+            names = pending if unit.segment is not None else pending[:1]
+            reason = f"the process that filtered it {how}, {MAX_DEATHS} times"
+            yield from failed_records(unit, names, reason)
+            pending = pending[len(names) :]
+        if pending:
+            rest = tuple(frame for frame in unit.frames if frame.name in pending)
+            waiting.appendleft(Unit(unit.number, unit.profile, rest, unit.segment))
+
+
+def _how_it_ended(code: int) -> str:
+    if code >= 0:
+        return f"ended with code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"

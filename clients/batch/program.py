@@ -1,0 +1,142 @@
+"""`ocufilter batch`: data sets of colour and depth through people's eyes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from clients.batch.dry_run import dry_run, lines_of
+from clients.batch.manifest import Manifest
+from clients.batch.options import arguments_of, batch_of, workers_and_threads
+from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
+from clients.batch.run import Batch, Pool, only_one, prepare_folder, run_batch
+from filter_service import EyeFilter
+from filter_service.errors import FilterError
+from filter_service.progress import Progress
+
+SHOWN_FAILURES = 10
+INSTALL = f"{sys.executable} -m pip install"
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Do the batch; return its summary.
+
+    Raises
+    ------
+    ValueError
+        Bad input; names it.
+    FilterError
+        The engine does not work here.
+    """
+    n_workers, n_threads = workers_and_threads(options)
+    batch = batch_of(options)
+    if options.dry_run:
+        os.environ[THREADS_VARIABLE] = "1"
+        price = options.price_per_core_hour
+        return dry_run(batch, n_cores=n_workers * n_threads, price_per_core_hour=price)
+    with EyeFilter(engine=batch.job.engine):
+        pass  # it works on this machine
+    prepare_folder(batch, overwrite=options.overwrite)
+    pool = _pool(options, batch, n_workers, n_threads)
+    with (
+        only_one(batch.out),
+        Manifest(batch.out, batch.described()) as manifest,
+        Progress("batch", quiet=options.json) as progress,
+    ):
+        task = progress.task(
+            ", ".join(batch.job.profiles),
+            total=len(batch.frames) * len(batch.job.profiles),
+        )
+        return run_batch(
+            batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)
+        )
+
+
+def _pool(
+    options: argparse.Namespace, batch: Batch, n_workers: int, n_threads: int
+) -> Pool:
+    if options.ray is None:
+        return ProcessPool(
+            batch.job, batch.out, n_workers=n_workers, n_threads=n_threads
+        )
+    from clients.batch.ray_pool import RayPool
+
+    return RayPool(
+        batch.job,
+        batch.out.absolute(),
+        address=options.ray,
+        n_workers=options.workers,
+        n_threads=options.threads or 1,
+    )
+
+
+def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[str]:
+    """Return the summary as lines for a person."""
+    this_run = summary["this_run"]
+    n_all, n_failed = summary["frames"], len(summary["failures"])
+    lines = [
+        f"{options.out}: {n_all - n_failed} of {n_all} pictures, "
+        f"{this_run['frames']} of them in this run, in {this_run['seconds']:.1f} s"
+    ]
+    for kind in ("missing", "clamped"):
+        if count := summary.get(f"{kind}_depth_count"):
+            lines.append(f"note: {count} pixels with {kind} depth")
+    lines += [f"note: {n['frames']} frames: {n['note']}" for n in summary["notes"]]
+    return lines
+
+
+def failure_lines(summary: dict[str, Any]) -> list[str]:
+    """Return what failed, the first of many."""
+    failures = summary.get("failures", [])
+    lines = [
+        f"batch: {one['profile']}, {one['frame']}: {one['error']}"
+        for one in failures[:SHOWN_FAILURES]
+    ]
+    if failures:
+        lines.append(f"batch: {len(failures)} pictures failed; the manifest names them")
+    return lines
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit code."""
+    options = arguments_of(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        summary = run(options)
+    except KeyboardInterrupt:
+        print("batch: stopped; the same command goes on with it", file=sys.stderr)
+        return 130
+    except ModuleNotFoundError as error:
+        if error.name not in ("av", "ray"):
+            raise
+        extra = "batch" if error.name == "av" else "batch-ray"
+        print(
+            f"batch: {error.name} is not installed: {INSTALL} 'ocufilter[{extra}]'",
+            file=sys.stderr,
+        )
+        return 1
+    except ValueError as error:
+        print(f"batch: {error}", file=sys.stderr)
+        return 2
+    except (FilterError, OSError) as error:
+        print(f"batch: {error}", file=sys.stderr)
+        return 1
+    if options.json:
+        lines = [json.dumps(summary, allow_nan=False)]
+    elif options.dry_run:
+        lines = lines_of(summary, options.price_per_core_hour)
+    else:
+        lines = report_lines(summary, options)
+    sys.stdout.write("\n".join(lines) + "\n")
+    failures = failure_lines(summary)
+    sys.stderr.writelines(f"{line}\n" for line in failures)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,250 @@
+"""From a list of frames to a folder of pictures: what is missing is done, and told."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from clients.batch.job import Job, code_version
+from clients.batch.manifest import (
+    LINES,
+    SUMMARY,
+    Manifest,
+    summary_of,
+    write_summary,
+)
+from clients.batch.source import SourceFrame
+from clients.batch.whole_files import content_of, remove_parts, write_whole
+from clients.batch.work import Record, Unit
+
+UNIT_FRAMES = 16
+"""That a worker is given at once: few enough for all to end together, and enough that
+handing out takes no time."""
+
+SEGMENT_FRAMES = 48
+"""Of a video; it decides its bytes, so it does not go by the number of workers."""
+
+SEGMENTS = ".segments"
+LOCK = ".lock"
+
+
+class Pool(Protocol):
+    """What runs units."""
+
+    def run(self, units: Sequence[Unit]) -> Iterator[Record]:
+        """Yield the records of units as frames are done, in any order."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Frames to be filtered, and where to.
+
+    Attributes
+    ----------
+    job : Job
+    layout : str
+    source : Path
+        Folder or video of the frames.
+    frames : sequence of SourceFrame
+    out : Path
+    """
+
+    job: Job
+    layout: str
+    source: Path
+    frames: Sequence[SourceFrame]
+    out: Path
+
+    def described(self) -> dict[str, Any]:
+        """Return what decides the pictures, as plain values."""
+        return {
+            "made_by": code_version(),
+            "source": {
+                "name": self.source.resolve().name,
+                "layout": self.layout,
+                "videos": self._videos(),
+            },
+            **self.job.described(),
+        }
+
+    def _videos(self) -> dict[str, str]:
+        """Hashes of the videos that frames come from."""
+        paths = {
+            path
+            for frame in self.frames
+            for path in {frame.color, frame.depth} - set(frame.files)
+            if frame.fault is None
+        }
+        return {path.name: content_of(path)["sha256"] for path in sorted(paths)}
+
+
+def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
+    """Make the output folder, or see that it is one of a batch.
+
+    Raises
+    ------
+    ValueError
+        It holds other things.
+    """
+    out = batch.out
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / LINES).exists():
+        others = [path.name for path in out.iterdir() if path.name != LOCK]
+        if others:
+            raise ValueError(
+                f"--out '{out}': holds '{min(others)}' and no {LINES}; allowed: an "
+                "empty folder, or one of an earlier batch"
+            )
+    elif overwrite:
+        _remove_results(batch)
+
+
+def _remove_results(batch: Batch) -> None:
+    """Remove what an earlier batch made, by its manifest."""
+    for line in (batch.out / LINES).read_bytes().splitlines():
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if record.get("file"):
+            (batch.out / record["file"]).unlink(missing_ok=True)
+        for name in record.get("profiles", ()):
+            for suffix in (".mkv", ".mp4"):
+                (batch.out / f"{name}{suffix}").unlink(missing_ok=True)
+    shutil.rmtree(batch.out / SEGMENTS, ignore_errors=True)
+    for name in (SUMMARY, LINES):
+        (batch.out / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def only_one(out: Path) -> Iterator[None]:
+    """Keep a second batch out of a folder.
+
+    Raises
+    ------
+    ValueError
+        There is one at work.
+    """
+    with (out / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"--out '{out}': another batch is at work there") from None
+        yield
+
+
+def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
+    """Return what is to be done, profile by profile."""
+    units: list[Unit] = []
+    for profile in batch.job.profiles:
+        for segment, frames in _parts(batch, profile):
+            missing = [
+                frame
+                for frame in frames
+                if not manifest.is_done(profile, frame.name, frame.files)
+            ]
+            if missing and segment is not None:
+                missing = list(frames)  # whole, or not at all
+            step = SEGMENT_FRAMES if segment is not None else UNIT_FRAMES
+            for start in range(0, len(missing), step):
+                some = tuple(missing[start : start + step])
+                units.append(Unit(len(units), profile, some, segment))
+    return units
+
+
+def _parts(
+    batch: Batch, profile: str
+) -> list[tuple[Path | None, Sequence[SourceFrame]]]:
+    """Return the frames of a profile, of a video in its segments."""
+    if not batch.job.is_video:
+        return [(None, batch.frames)]
+    return [
+        (
+            Path(SEGMENTS) / profile / f"{start:08d}.mkv",
+            batch.frames[start : start + SEGMENT_FRAMES],
+        )
+        for start in range(0, len(batch.frames), SEGMENT_FRAMES)
+    ]
+
+
+def run_batch(
+    batch: Batch,
+    manifest: Manifest,
+    pool: Pool,
+    *,
+    on_done: Callable[[int, int], None] = lambda n_done, n_all: None,
+) -> dict[str, Any]:
+    """Do what is missing; return the summary that is written beside the pictures.
+
+    Parameters
+    ----------
+    on_done : callable
+        Told how many frames there are, and of how many.
+    """
+    remove_parts(batch.out)
+    started_s = time.monotonic()
+    units = missing_units(batch, manifest)
+    wanted = {(p, frame.name) for p in batch.job.profiles for frame in batch.frames}
+    n_missing = sum(len(unit.frames) for unit in units)
+    n_done = len(wanted) - n_missing
+    on_done(n_done, len(wanted))
+    for profile in {unit.profile for unit in units}:
+        video_of(batch, profile).unlink(missing_ok=True)  # it is to be another
+    for record in pool.run(units):
+        manifest.append(record)
+        n_done += 1
+        on_done(n_done, len(wanted))
+    if batch.job.is_video:
+        _join_videos(batch, manifest)
+    took_s = time.monotonic() - started_s
+    summary = {
+        "frames": len(wanted),
+        **summary_of(manifest, wanted),
+        "this_run": {"frames": n_missing, "seconds": round(took_s, 3)},
+    }
+    write_summary(batch.out, {**batch.described(), **summary})
+    return summary
+
+
+def video_of(batch: Batch, profile: str) -> Path:
+    """Return where the video of a profile is."""
+    suffix = ".mp4" if batch.job.format == "h264" else ".mkv"
+    return batch.out / f"{profile}{suffix}"
+
+
+def _join_videos(batch: Batch, manifest: Manifest) -> None:
+    """Put each profile's segments together, where its video is not there.
+
+    They are kept: what was bad and is mended needs only its own segment again.
+    """
+    from clients.batch.video_writing import VIDEO_KINDS, join_segments
+
+    kind, rate_hz = VIDEO_KINDS[batch.job.format], batch.job.rate_hz
+    for profile in batch.job.profiles:
+        target = video_of(batch, profile)
+        if target.is_file():
+            continue
+        segments = [
+            (number * SEGMENT_FRAMES, batch.out / segment)
+            for number, (segment, frames) in enumerate(_parts(batch, profile))
+            if any(_is_ok(manifest, profile, frame) for frame in frames)
+        ]
+        if not segments:
+            continue
+
+        def join(path: Path, segments=segments) -> None:
+            join_segments(path, segments, kind=kind, rate_hz=rate_hz)
+
+        write_whole(target, join)
+
+
+def _is_ok(manifest: Manifest, profile: str, frame: SourceFrame) -> bool:
+    record = manifest.record(profile, frame.name)
+    return record is not None and record["ok"]

@@ -1,0 +1,185 @@
+"""What one frame of a data set is: where its files are, and how they are to be read.
+
+Layouts list such frames; nothing is read before a worker needs it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service import tangents_from_fov
+from filter_service.image_files import METRES_PER_INTEGER_STEP, read_depth
+
+Tangents = tuple[float, float, float, float]
+
+
+class Optics(Protocol):
+    """What is known of the camera."""
+
+    def tangents(self, width_px: int, height_px: int) -> Tangents:
+        """Return those to the left, right, upper and lower edge of an image."""
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """A symmetric camera with square pixels, by its vertical field of view."""
+
+    fov_deg: float
+
+    def tangents(self, width_px: int, height_px: int) -> Tangents:
+        """Return those to the edges."""
+        return tangents_from_fov(self.fov_deg, width_px, height_px)
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A calibrated camera; pixel (0, 0) has its centre at (0, 0)."""
+
+    focal_x_px: float
+    focal_y_px: float
+    center_x_px: float
+    center_y_px: float
+
+    def tangents(self, width_px: int, height_px: int) -> Tangents:
+        """Return those to the edges, half a pixel beyond the last centres."""
+        return (
+            -(self.center_x_px + 0.5) / self.focal_x_px,
+            (width_px - 0.5 - self.center_x_px) / self.focal_x_px,
+            (self.center_y_px + 0.5) / self.focal_y_px,
+            -(height_px - 0.5 - self.center_y_px) / self.focal_y_px,
+        )
+
+
+class DepthForm(Protocol):
+    """What the numbers of a depth file mean."""
+
+    def read(self, path: Path) -> NDArray[np.float32]:
+        """Return the depth in a file, m; 0, negative and NaN are missing."""
+
+    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Return the depth in a frame of a video, m."""
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """Multiples of a unit: without a scale mm for integers, m for floats."""
+
+    depth_scale_m: float | None = None
+
+    def read(self, path: Path) -> NDArray[np.float32]:
+        """Return the depth in a file, m."""
+        return read_depth(path, depth_scale=self.depth_scale_m, option="")
+
+    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Return the depth in a frame of a video, m."""
+        scale_m = self.depth_scale_m or METRES_PER_INTEGER_STEP
+        return (stored * np.float64(scale_m)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Disparity:
+    """Disparities of a stereo pair in px, of which infinity is unknown.
+
+    depth = focal length x baseline / (disparity + offset), as Middlebury has it.
+    """
+
+    focal_px: float
+    baseline_m: float
+    offset_px: float
+
+    def read(self, path: Path) -> NDArray[np.float32]:
+        """Return the depth in a file, m; 0 where the disparity is unknown."""
+        return self._depth_m(read_depth(path, depth_scale=1.0, option=""))
+
+    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Return the depth in a frame of a video, m."""
+        return self._depth_m(stored.astype(np.float32))
+
+    def _depth_m(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+        apart_px = disparity_px.astype(np.float64) + self.offset_px
+        known = np.isfinite(apart_px) & (apart_px > 0.0)
+        depth_m = np.zeros(disparity_px.shape)
+        depth_m[known] = self.focal_px * self.baseline_m / apart_px[known]
+        return depth_m.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One frame of a data set.
+
+    Attributes
+    ----------
+    name : str
+        What it is called in the results: unique, a relative path without a suffix.
+    color, depth : Path
+        Files of one image, or videos.
+    optics, depth_form
+        How they are to be understood.
+    color_index, depth_index : int, optional
+        Numbers of the frame in videos.
+    fault : str, optional
+        Why it cannot be used, where that is known before it is read.
+    """
+
+    name: str
+    color: Path
+    depth: Path
+    optics: Optics
+    depth_form: DepthForm
+    color_index: int | None = None
+    depth_index: int | None = None
+    fault: str | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Return the images that it is read from, without videos."""
+        parts = ((self.color, self.color_index), (self.depth, self.depth_index))
+        return tuple(path for path, index in parts if index is None)
+
+
+class BadFrame(ValueError):
+    """A frame that cannot be used: the error names its file."""
+
+
+def check_sizes(
+    frame: SourceFrame, color: NDArray, depth_m: NDArray[np.float32]
+) -> None:
+    """Refuse colour and depth of different sizes.
+
+    Raises
+    ------
+    BadFrame
+    """
+    if color.shape[:2] != depth_m.shape:
+        raise BadFrame(
+            f"'{frame.depth}': {depth_m.shape[1]}x{depth_m.shape[0]} px; allowed: "
+            f"the size of '{frame.color}', {color.shape[1]}x{color.shape[0]}"
+        )
+
+
+def center_depth_m(depth_m: NDArray[np.float32]) -> float:
+    """Return the median depth of what the middle of an image shows.
+
+    The middle is a tenth of the image's sides; where no depth is known in it, twice
+    and again twice as much; infinity where there is none at all.
+    """
+    height_px, width_px = depth_m.shape
+    for part in (0.1, 0.2, 0.4, 0.8, 1.0):
+        half_y, half_x = (
+            max(1, math.ceil(part * side / 2.0)) for side in (height_px, width_px)
+        )
+        y, x = height_px // 2, width_px // 2
+        middle_m = depth_m[
+            max(0, y - half_y) : y + half_y, max(0, x - half_x) : x + half_x
+        ]
+        known_m = middle_m[middle_m > 0.0]
+        if known_m.size:
+            # the lower of the two in the middle: never between a wall and the sky
+            return float(np.sort(known_m, axis=None)[(known_m.size - 1) // 2])
+    return math.inf

@@ -1,0 +1,80 @@
+"""Files that are there whole or not at all, and what they hold."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+PART = ".part"
+_BLOCK_BYTES = 1 << 20
+
+
+def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
+    """Have a file written under another name beside it, then give it its own.
+
+    A process that is killed leaves a file ``.NAME.RANDOM.part.SUFFIX`` at most, which
+    `remove_parts` finds.
+
+    Returns
+    -------
+    dict
+        bytes and sha256 of the file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    random = secrets.token_hex(4)
+    part = path.with_name(f".{path.stem}.{random}{PART}{path.suffix}")
+    try:
+        write(part)
+        with part.open("rb") as file:
+            os.fsync(file.fileno())  # its content before its name, also in a power cut
+        told = content_of(part)
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    return told
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    """Return how many bytes a file has, and their SHA-256."""
+    digest, size_bytes = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            digest.update(block)
+            size_bytes += len(block)
+    return {"bytes": size_bytes, "sha256": digest.hexdigest()}
+
+
+def remove_parts(folder: Path) -> int:
+    """Remove what killed processes left; return how many files."""
+    parts = [path for path in folder.rglob(".*") if PART in path.suffixes]
+    for path in parts:
+        path.unlink(missing_ok=True)
+    return len(parts)
+
+
+def input_of(path: Path) -> dict[str, Any]:
+    """Return name, size, time and hash of a file that was read."""
+    status = path.stat()
+    return {
+        "name": path.name,
+        "mtime_ns": status.st_mtime_ns,
+        **content_of(path),
+    }
+
+
+def is_unchanged(path: Path, told: dict[str, Any]) -> bool:
+    """Return whether a file is what it was; read again only where its time differs."""
+    try:
+        status = path.stat()
+    except OSError:
+        return False
+    if status.st_size != told["bytes"]:
+        return False
+    if status.st_mtime_ns == told["mtime_ns"]:
+        return True
+    return content_of(path)["sha256"] == told["sha256"]
