@@ -16,6 +16,10 @@ from filter_service import Camera, EyeFilter, Filtered, FilterError, RgbdView
 BUILD_LIMIT_S = 600.0
 
 
+class EngineUnusable(RuntimeError):
+    """No frame can be filtered on this machine; says what to install."""
+
+
 class ExactFilter:
     """Filters frames through the eyes of a job; one eye and camera is kept at a time.
 
@@ -26,12 +30,19 @@ class ExactFilter:
     def __init__(self, job: Job) -> None:
         self._job = job
         self._key: tuple[str, Camera] | None = None
+        self._open: EyeFilter | None = None  # while it is, engine and builder stay
         self._filter: EyeFilter | None = None
         self._failure: FilterError | None = None
         self.build_s = 0.0
 
     def close(self) -> None:
         """Give up what is held."""
+        self._give_up_eye()
+        if self._open is not None:
+            self._open.close()
+        self._open = None
+
+    def _give_up_eye(self) -> None:
         if self._filter is not None:
             self._filter.close()
         self._filter = self._key = self._failure = None
@@ -62,7 +73,11 @@ class ExactFilter:
         return seen
 
     def _prepare(self, profile: str, camera: Camera) -> None:
-        self.close()
+        self._give_up_eye()
+        try:
+            self._open = self._open or EyeFilter(engine=self._job.engine)
+        except FilterError as error:
+            raise EngineUnusable(str(error)) from None
         self._key = profile, camera
         body: Mapping[str, Any] = self._job.profiles[profile]
         self._filter = EyeFilter(

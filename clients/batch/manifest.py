@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -23,6 +24,7 @@ from clients.batch.whole_files import is_unchanged, write_whole
 from clients.batch.work import Record
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 SYNC_S = 2.0
 """So much work may a power cut undo."""
 
@@ -188,7 +190,8 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
     """Return counts, failures and notes of the frames that are wanted."""
     n_done, failures = Counter[str](), []
-    notes, pixels = Counter[str](), Counter[str]()
+    notes: dict[str, dict[str, Any]] = {}  # those alike but for their numbers are one
+    pixels = Counter[str]()
     for record in manifest.records():
         if (record["profile"], record["frame"]) not in wanted:
             continue
@@ -196,12 +199,16 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
             failures.append({k: record[k] for k in ("profile", "frame", "error")})
             continue
         n_done[record["profile"]] += 1
-        notes.update(record["notes"])
+        for note in record["notes"]:
+            of_kind = notes.setdefault(
+                _NUMBER.sub("#", note), {"frames": 0, "example": note}
+            )
+            of_kind["frames"] += 1
         for name in ("missing_depth_count", "clamped_depth_count", "overflow_count"):
             pixels[name] += record[name]
     return {
         "frames_done": dict(n_done),
         "failures": failures,
         **pixels,
-        "notes": [{"note": note, "frames": n} for note, n in notes.most_common()],
+        "notes": list(notes.values()),
     }

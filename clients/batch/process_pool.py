@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
+from clients.batch.exact_filter import EngineUnusable
 from clients.batch.job import Job
 from clients.batch.work import Record, Unit, failed_records
 
@@ -43,7 +44,12 @@ class ProcessPool:
         self._deaths: Counter[tuple[str, str]] = Counter()
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as frames are done, in no order."""
+        """Yield the records of units as frames are done, in no order.
+
+        Raises
+        ------
+        EngineUnusable
+        """
         waiting = deque(units)
         try:
             while True:
@@ -106,6 +112,8 @@ class ProcessPool:
         except (EOFError, OSError):
             yield from self._after_death(worker, waiting)
             return
+        if kind == "unusable":
+            raise EngineUnusable(content)
         if kind == "record":
             worker.pending.remove(content["frame"])
             yield content

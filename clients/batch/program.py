@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from clients.batch.dry_run import dry_run, lines_of
+from clients.batch.exact_filter import EngineUnusable
 from clients.batch.manifest import Manifest
 from clients.batch.options import arguments_of, batch_of, workers_and_threads
 from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
 from clients.batch.run import Batch, Pool, only_one, prepare_folder, run_batch
-from filter_service import EyeFilter
 from filter_service.errors import FilterError
 from filter_service.progress import Progress
 
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     ------
     ValueError
         Bad input; names it.
-    FilterError
+    EngineUnusable
         The engine does not work here.
     """
     n_workers, n_threads = workers_and_threads(options)
@@ -39,8 +39,6 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         os.environ[THREADS_VARIABLE] = "1"
         price = options.price_per_core_hour
         return dry_run(batch, n_cores=n_workers * n_threads, price_per_core_hour=price)
-    with EyeFilter(engine=batch.job.engine):
-        pass  # it works on this machine
     prepare_folder(batch, overwrite=options.overwrite)
     pool = _pool(options, batch, n_workers, n_threads)
     with (
@@ -86,7 +84,9 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
     for kind in ("missing", "clamped"):
         if count := summary.get(f"{kind}_depth_count"):
             lines.append(f"note: {count} pixels with {kind} depth")
-    lines += [f"note: {n['frames']} frames: {n['note']}" for n in summary["notes"]]
+    lines += [
+        f"note: {n['frames']} frames, as: {n['example']}" for n in summary["notes"]
+    ]
     return lines
 
 
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"batch: {error}", file=sys.stderr)
         return 2
-    except (FilterError, OSError) as error:
+    except (EngineUnusable, FilterError, OSError) as error:
         print(f"batch: {error}", file=sys.stderr)
         return 1
     if options.json:

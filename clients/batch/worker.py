@@ -11,6 +11,7 @@ import signal
 import sys
 from multiprocessing.connection import Connection
 
+from clients.batch.exact_filter import EngineUnusable
 from clients.batch.work import UnitRunner
 
 
@@ -26,6 +27,8 @@ def main(descriptor: int) -> None:
             for record in runner.run(unit, lambda: not pipe.poll()):
                 pipe.send(("record", record))
             pipe.send(("done", unit.number))
+    except EngineUnusable as error:
+        pipe.send(("unusable", str(error)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
 

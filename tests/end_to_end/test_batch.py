@@ -1,0 +1,369 @@
+"""`ocufilter batch`: the same bytes whoever makes them, in any order, after kills."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients.batch import program
+from clients.batch.exact_filter import ExactFilter
+from clients.batch.job import Job, batch_settings
+from clients.batch.states import States
+from filter_service import Camera, RgbdView
+from filter_service.image_files import read_color
+from tests.source_tree import ROOT
+
+TIMEOUT_S = 120
+WIDTH_PX, HEIGHT_PX = 64, 48
+COUNT = 40
+PROFILES = ("-p", "myopia", "-p", "normal=emmetropia")
+COMMAND = (sys.executable, "-m", "filter_service", "batch")
+MODE = ("--settings", '{"mode": "on-axis", "eye_model": "wavefront"}')
+"""Quick to prepare: these tests are about files and processes."""
+
+
+def start(*arguments, **options):
+    return subprocess.Popen(
+        [*COMMAND, *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+def run(*arguments, code=0):
+    process = start(*arguments)
+    out, error = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == code, error
+    return out, error
+
+
+def pictures(folder):
+    """Return the bytes of every file of results."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith((".lock", "manifest"))
+    }
+
+
+def write_frame(folder, name, rng):
+    color = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    depth_mm = rng.integers(400, 3000, (HEIGHT_PX // 8, WIDTH_PX // 8))
+    depth_mm = np.kron(depth_mm, np.ones((8, 8))).astype(np.uint16)
+    depth_mm[:2, :3] = 0
+    Image.fromarray(color).save(folder / f"color/{name}.png")
+    Image.fromarray(depth_mm).save(folder / f"depth/{name}.png")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A folder of frames."""
+    folder = tmp_path_factory.mktemp("room")
+    for name in ("color", "depth"):
+        (folder / name).mkdir()
+    rng = np.random.default_rng(5)
+    for number in range(COUNT):
+        write_frame(folder, f"{number:03d}", rng)
+    return folder
+
+
+@pytest.fixture
+def long_room(room, tmp_path):
+    """The same frames ten times."""
+    folder = tmp_path / "room"
+    for path in room.glob("*/*.png"):
+        (folder / path.parent.name).mkdir(parents=True, exist_ok=True)
+        for k in range(10):
+            (folder / path.parent.name / f"{k}{path.name}").hardlink_to(path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def usual(room, tmp_path_factory):
+    """What one worker makes of it, undisturbed."""
+    out = tmp_path_factory.mktemp("usual") / "out"
+    told = run(room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
+    assert "80 of 80 pictures" in told[0]
+    return out
+
+
+def test_one_worker_makes_what_the_filter_makes(room, usual):
+    states = States(4.0, 0.0)
+    mode = json.loads(MODE[1])
+    job = Job(
+        {"myopia": {"kind": "preset", "name": "myopia"}},
+        batch_settings(mode, states),
+        states,
+    )
+    camera = Camera.from_fov(20.0, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+    color = read_color(room / "color/007.png")
+    depth_m = 0.001 * np.asarray(Image.open(room / "depth/007.png")).astype(np.float64)
+    view = RgbdView(color, depth_m.astype(np.float32), camera.tangents)
+    exact = ExactFilter(job)
+    seen = exact.see("myopia", view, pupil_mm=4.0, focus_dpt=0.0)
+    exact.close()
+    np.testing.assert_array_equal(read_color(usual / "myopia/007.png"), seen.color)
+    assert not np.array_equal(seen.color, color)
+
+
+def test_the_manifest_tells_of_every_frame(room, usual):
+    lines = (usual / "manifest.jsonl").read_text().splitlines()
+    job, *frames = map(json.loads, lines)
+    assert job["profiles"]["normal"] == {"kind": "preset", "name": "emmetropia"}
+    assert job["settings"]["pupil_range_mm"] == [4.0, 4.0]
+    assert len(frames) == 2 * COUNT
+    first = next(r for r in frames if (r["profile"], r["frame"]) == ("myopia", "000"))
+    assert first["missing_depth_count"] == 6
+    path = usual / first["file"]
+    assert first["bytes"] == path.stat().st_size
+    names = [(told["name"], told["bytes"]) for told in first["inputs"]]
+    files = [room / part / "000.png" for part in ("color", "depth")]
+    assert names == [(path.name, path.stat().st_size) for path in files]
+    summary = json.loads((usual / "manifest.json").read_text())
+    assert summary["frames_done"] == {"myopia": COUNT, "normal": COUNT}
+    assert summary["missing_depth_count"] == 6 * 2 * COUNT
+    assert "far point" in summary["notes"][0]["example"]
+
+
+def test_two_workers_of_two_threads_make_the_same_bytes(room, usual, tmp_path):
+    common = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
+    run(*common, "--workers", 2, "--threads", 2)
+    assert pictures(tmp_path / "out") == pictures(usual)
+
+
+def kill(arguments, out, chance):
+    """Kill a batch after one to three frames more; half of the time workers, too."""
+    target = line_count(out) + chance.randint(1, 3)
+    process = start(*arguments, "-o", out)
+    while process.poll() is None and line_count(out) < target:
+        time.sleep(0.002)
+    time.sleep(chance.uniform(0.0, 0.03))  # somewhere in the next frame
+    was_at_work = process.poll() is None
+    process.kill()
+    if chance.random() < 0.5:
+        for worker in workers_of(out):
+            with suppress(ProcessLookupError):
+                os.kill(worker, signal.SIGKILL)
+    process.communicate()
+    return was_at_work
+
+
+def workers_of(out):
+    """Return the workers of a batch: their environment names its folder."""
+    found = []
+    for folder in os.listdir("/proc"):
+        if not folder.isdigit():
+            continue
+        try:
+            with open(f"/proc/{folder}/cmdline", "rb") as file:
+                words = file.read().split(b"\0")
+            with open(f"/proc/{folder}/environ", "rb") as file:
+                ours = f"OCUFILTER_TEST_OUT={out}".encode() in file.read().split(b"\0")
+        except OSError:
+            continue
+        if ours and b"clients.batch.worker" in words:
+            found.append(int(folder))
+    return found
+
+
+def line_count(out):
+    path = out / "manifest.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def finish_after_kills(room, out, n_kills):
+    arguments = (room, *PROFILES, *MODE, "--fov-deg", 20, "--workers", 2)
+    chance, n_lines = random.Random(n_kills), []
+    for _ in range(n_kills):
+        assert kill(arguments, out, chance)
+        n_lines.append(line_count(out))
+    assert n_lines == sorted(n_lines)  # no line was lost
+    run(*arguments, "-o", out)
+    deadline_s = time.monotonic() + 20.0
+    while workers_of(out):  # those left behind end by themselves
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
+    run(*arguments, "-o", out)  # clears what those left
+
+
+def test_killed_at_random_moments_and_finished_nothing_is_lost(
+    room, usual, tmp_path, monkeypatch
+):
+    out = tmp_path / "out"
+    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
+    finish_after_kills(room, out, 2)
+    assert pictures(out) == pictures(usual)
+
+
+@pytest.mark.slow
+def test_killed_twenty_times_and_finished_nothing_is_lost(
+    long_room, usual, tmp_path, monkeypatch
+):
+    out = tmp_path / "out"
+    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
+    finish_after_kills(long_room, out, 20)
+    expected = {
+        name.replace("/", f"/{k}"): content
+        for name, content in pictures(usual).items()
+        for k in range(10)
+    }
+    assert pictures(out) == expected
+
+
+def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(usual, out)
+    arguments = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
+    told, _ = run(*arguments)
+    assert "0 of them in this run" in told
+    (out / "myopia/003.png").unlink()
+    (out / "normal/004.png").write_bytes(b"cut short")
+    with (out / "manifest.jsonl").open("ab") as file:
+        file.write(b'{"kind": "frame", "profile": "myo')  # a power cut
+    (out / "myopia/.005.abc.part.png").write_bytes(b"half")
+    told, _ = run(*arguments)
+    assert "80 of 80 pictures, 2 of them in this run" in told
+    assert pictures(out) == pictures(usual)
+
+
+def test_another_job_in_the_same_folder_is_refused(room, usual):
+    arguments = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", usual)
+    _, error = run(*arguments, "--pupil-mm", 5, code=2)
+    assert error.count("\n") == 1
+    assert "settings.pupil_range_mm is [5.0, 5.0], and was [4.0, 4.0]" in error
+    assert "--overwrite" in error
+    _, error = run(room, *PROFILES, *MODE, "--fov-deg", 20, "-o", ROOT, code=2)
+    assert "holds '.ci' and no manifest.jsonl" in error
+
+
+@pytest.mark.slow
+def test_overwrite_begins_anew(room, tmp_path):
+    common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
+    run(*common, "--limit", 2, "--format", "npy")
+    told, _ = run(*common, "--limit", 1, "--format", "exr", "--half", "--overwrite")
+    assert "1 of 1 pictures" in told
+    names = {path.name for path in (tmp_path / "out/myopia").iterdir()}
+    assert names == {"000.exr"}
+    assert read_color(tmp_path / "out/myopia/000.exr").max() < 1.2
+
+
+def test_bad_files_are_named_and_the_rest_goes_on(tmp_path, rng):
+    room = tmp_path / "room"
+    for name in ("color", "depth"):
+        (room / name).mkdir(parents=True)
+    for number in range(4):
+        write_frame(room, f"{number}", rng)
+    (room / "color/1.png").write_bytes(b"no picture")
+    (room / "depth/2.png").unlink()
+    Image.new("I;16", (5, 5)).save(room / "depth/3.png")
+    out = tmp_path / "out"
+    common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
+    told, error = run(*common, code=1)
+    assert "1 of 4 pictures" in told
+    assert "1.png': cannot be read" in error
+    assert "no depth of the name '2'" in error
+    assert "5x5 px; allowed: the size of" in error
+    assert "3 pictures failed" in error
+    summary = json.loads((out / "manifest.json").read_text())
+    assert [one["frame"] for one in summary["failures"]] == ["1", "2", "3"]
+    for number in (1, 2, 3):  # mended
+        write_frame(room, f"{number}", rng)
+    told, _ = run(*common)
+    assert "4 of 4 pictures, 3 of them in this run" in told
+
+
+def decoded(path):
+    import av
+
+    with av.open(str(path)) as container:
+        frames = [
+            frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)
+        ]
+        return frames, float(container.streams.video[0].average_rate)
+
+
+VIDEO = (*MODE, "--fov-deg", 20, "--fps", 24, "--format")
+
+
+def test_a_video_without_loss_holds_the_pictures(room, usual, tmp_path):
+    out = tmp_path / "out"
+    run(room, "-p", "myopia", *VIDEO, "ffv1", "-o", out, "--workers", 1)
+    frames, rate_hz = decoded(out / "myopia.mkv")
+    assert (len(frames), rate_hz) == (COUNT, 24.0)
+    for number, frame in enumerate(frames):
+        expected = read_color(usual / f"myopia/{number:03d}.png")
+        np.testing.assert_array_equal(frame, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ffv1", "h264"])
+def test_videos_are_the_same_bytes_by_two_workers_and_after_a_kill(
+    long_room, tmp_path, monkeypatch, kind
+):
+    arguments = (long_room, "-p", "myopia", *VIDEO, kind, "--workers")
+    run(*arguments, 1, "-o", tmp_path / "one")
+    out = tmp_path / "two"
+    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
+    for _ in range(2):
+        assert kill((*arguments, 2), out, random.Random(kind))
+    run(*arguments, 2, "-o", out)
+    assert pictures(out) == pictures(tmp_path / "one")
+    frames, rate_hz = decoded(next(out.glob("myopia.*")))
+    assert (len(frames), rate_hz) == (10 * COUNT, 24.0)
+
+
+def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
+    out = tmp_path / "out"
+    common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--dry-run")
+    told, _ = run(*common, "--json", "--workers", 2, "--price-per-core-hour", 0.5)
+    report = json.loads(told)
+    assert not out.exists()
+    assert (report["frames"], report["pictures_missing"]) == (COUNT, COUNT)
+    assert report["cores"] == 2
+    ms = report["ms_per_picture_and_core"]
+    assert report["core_hours_per_million"] == pytest.approx(ms / 3.6, rel=0.01)
+    assert report["price_per_million"] == pytest.approx(ms / 7.2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("nowhere", "-p", "myopia"), "'nowhere': no such file"),
+        (("{room}", "-p", "hawk"), "'hawk' is not known"),
+        (("{room}", "-p", "myopia", "-p", "myopia"), "the name 'myopia' is taken"),
+        (("{room}", "-p", "myopia", "--focus-dpt", "near"), "--focus-dpt 'near'"),
+        (("{room}", "-p", "myopia", "--workers", "0"), "--workers 0: allowed is 1"),
+        (
+            ("{room}", "-p", "myopia", "--settings", '{"prepare": "stream"}'),
+            "prepare is 'stream'; allowed in a batch: 'ranges'",
+        ),
+        (("{room}", "-p", "myopia", "--half"), "--half: allowed with --format npy"),
+    ],
+)
+def test_bad_input_is_refused_in_a_line(room, tmp_path, arguments, words, capsys):
+    filled = [text.replace("{room}", str(room)) for text in arguments]
+    code = program.main([*filled, "--fov-deg", "20", "-o", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert words in error
+    assert error.count("\n") == 1
+
+
+@pytest.fixture(autouse=True)
+def signals():
+    """The program handles one in its own way; here it runs in the tests' process."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
