@@ -12,7 +12,7 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-witness
+.PHONY: demo test test-training test-batch-ray test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-batch-ray setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -24,6 +24,9 @@ test: setup-test  ## all tests but the slow ones and those for a hardware GPU
 
 test-training: setup-training  ## the tests of the training, with torch, and a short run
 	$(PYTHON) -m pytest tests/training $(ARGS)
+
+test-batch-ray: setup-batch-ray  ## `ocufilter batch` on two workers of a Ray cluster
+	$(PYTHON) -m pytest tests/batch_ray $(ARGS)
 
 test-headset:  ## `ocufilter headset` against a real OpenXR runtime, in a root of its own
 	@sh tests/headset/setup_root.sh
@@ -78,6 +81,9 @@ setup-test:
 
 setup-training:
 	@sh setup.sh training
+
+setup-batch-ray:
+	@sh setup.sh batch-ray
 
 setup-witness:
 	@sh setup.sh witness

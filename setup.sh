@@ -4,6 +4,7 @@
 #   sh setup.sh         the Python environment in .venv and the system libraries
 #   sh setup.sh test    the same, a virtual screen for the window test, and Node
 #   sh setup.sh training  the first, and what training the networks needs (torch)
+#   sh setup.sh batch-ray  the first, and Ray, for `ocufilter batch` on many machines
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
@@ -169,6 +170,13 @@ install_training_packages() { # on top of the others; the service never needs th
     cp $STAMP $TRAINING_STAMP
 }
 
+install_ray() { # on top of the others
+    if $VENV/bin/python -c 'import ray' 2>/dev/null; then return; fi
+    say "installing Ray (half a minute)"
+    $VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt --no-build-isolation -e '.[batch-ray]'
+}
+
 has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer
     PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep -Eq 'libLLVM(-|\.so\.)(1[6-9]|[2-9][0-9])'
 }
@@ -197,4 +205,5 @@ if [ "${1:-}" = test ]; then
     install_test_packages
     install_javascript_client
 fi
+if [ "${1:-}" = batch-ray ]; then install_ray; fi
 if [ "${1:-}" = witness ]; then install_witness; fi

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +69,8 @@ class RayPool:
                 log_to_driver=False,
             )
         try:
-            yield from self._run(deque((unit, 0) for unit in units))
+            with redirect_stdout(sys.stderr):  # where Ray tells of workers that died
+                yield from self._run(deque((unit, 0) for unit in units))
         finally:
             if started:
                 ray.shutdown()
