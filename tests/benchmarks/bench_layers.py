@@ -26,6 +26,7 @@ from tests.benchmarks.harness import (
     report,
     write_report,
 )
+from tests.benchmarks.paper_page.published import table
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db
@@ -41,13 +42,13 @@ GRIDS = {
 REFERENCE_DB = 62.0
 REFERENCE_STEP_PX = 0.125
 ATLAS_TEXEL_BYTES = 16
+_TEXTURE, _CACHE = table(6), table(9)["dynamic"]
 PAPER = {  # layers and texture MB on axis (Table 6); cache GB, texture MB (Table 9)
-    "emmetropia": ((65, 1.79), (5.71, 234.06)),
-    "myopia": ((65, 0.81), (4.70, 192.67)),
-    "astigmatism": ((65, 0.70), (4.43, 181.58)),
-    "keratoconus": ((65, 1.55), (7.68, 314.38)),
-    "cataract": ((65, 0.81), (3.09, 85.01)),
-    "post_lasik": ((65, 1.32), (6.50, 266.08)),
+    eye: (
+        (layers, _TEXTURE["memory_mib"]["proposed"][eye]),
+        (_CACHE["cache_gib"][eye], _CACHE["texture_mib"][eye]),
+    )
+    for eye, layers in _TEXTURE["layers"]["proposed"].items()
 }
 THEIRS = {
     "on-axis": "theirs {} layers, {} MB",

@@ -7,6 +7,8 @@ reference that shares their accumulation rule.
 
 from dataclasses import dataclass
 
+from tests.benchmarks.paper_page.published import table
+
 HARDWARE = "NVIDIA TITAN Xp"
 
 CONDITIONS = (
@@ -18,70 +20,25 @@ CONDITIONS = (
     "post_lasik",
 )
 
+ON_AXIS_METHODS = ("Barsky", "predecessor", "paper on-axis")
+_MS, _DB, _OFF_AXIS = table(7), table(8), table(10)
+
 ON_AXIS = {  # method: scene: (ms, dB) per condition
-    "Barsky": {
-        "Primitives": (
-            (21930, 31.92),
-            (12330, 33.39),
-            (11980, 33.61),
-            (17100, 33.64),
-            (15530, 31.53),
-            (16460, 31.07),
-        ),
-        "San Miguel": (
-            (13410, 33.70),
-            (13510, 33.52),
-            (13290, 33.89),
-            (14620, 32.61),
-            (15220, 30.81),
-            (11860, 30.89),
-        ),
-    },
-    "predecessor": {
-        "Primitives": (
-            (24.68, 46.52),
-            (21.73, 46.80),
-            (26.51, 47.07),
-            (27.08, 45.74),
-            (24.50, 45.55),
-            (21.29, 45.76),
-        ),
-        "San Miguel": (
-            (16.13, 46.29),
-            (23.06, 50.75),
-            (30.62, 49.35),
-            (24.66, 48.91),
-            (17.09, 45.51),
-            (20.60, 48.10),
-        ),
-    },
-    "paper on-axis": {
-        "Primitives": (
-            (10.57, 46.43),
-            (9.53, 46.77),
-            (7.51, 47.09),
-            (12.93, 45.77),
-            (9.38, 45.53),
-            (8.67, 45.73),
-        ),
-        "San Miguel": (
-            (7.43, 46.14),
-            (8.66, 50.60),
-            (10.70, 49.33),
-            (9.87, 48.83),
-            (6.81, 45.45),
-            (8.73, 47.95),
-        ),
-    },
+    method: {
+        scene: tuple((_MS[method][scene][eye], own_db[eye]) for eye in CONDITIONS)
+        for scene, own_db in _DB[method].items()
+    }
+    for method in ON_AXIS_METHODS
 }
 
-OFF_AXIS_PRIMITIVES = (
-    (20.9, 45.6),
-    (14.7, 45.1),
-    (13.5, 45.4),
-    (19.6, 44.3),
-    (13.4, 44.8),
-    (24.4, 44.3),
+
+def _number(cell: str) -> float:
+    return float(cell.split()[0])
+
+
+OFF_AXIS_PRIMITIVES = tuple(
+    (_number(_OFF_AXIS["Primitives"]["quality"][eye]), _number(own_db))
+    for eye, own_db in _OFF_AXIS["Primitives"]["dynamic"].items()
 )
 """Table 10: time printed under the quality setup, error under the dynamic one; those of
 the previous methods are 1.0 to 1.9 h and 29.2 to 33.8 dB."""

@@ -35,7 +35,8 @@ CELL_PX = (240, 135)
 LABEL_PX = 20
 GAP_PX = 4
 JPEG_QUALITY = 78
-PAPER, INK, SOFT = "#ffffff", "#1b2126", "#5a646d"
+PAPER, INK = "#ffffff", "#1b2126"
+FRAME_RGB = (1.0, 0.35, 0.0)
 
 LOW_ORDER = ("emmetropia", "myopia", "astigmatism")
 MIXED = ("keratoconus", "cataract", "post_lasik")
@@ -49,7 +50,7 @@ ON_AXIS_METHODS = {
     "ours on-axis": "ocufilter",
 }
 FIELD_METHODS = {
-    "Celaya": "Rodríguez Celaya [26]",
+    "Celaya": "Celaya et al. [26]",
     "Gonzalez": "Gonzalez-Utrera [27]",
     "paper quality": "the paper, quality",
     "ours quality": "ocufilter, quality",
@@ -163,7 +164,7 @@ def _srgb(linear_rgb: NDArray) -> NDArray[np.uint8]:
 
 
 def _framed(color: NDArray, window: Window) -> NDArray:
-    """Draw a white line around the part that is shown large."""
+    """Draw a line around the part that is shown large."""
     framed = np.array(color)
     top, left = window.y, window.x
     bottom, right = top + window.height_px, left + window.width_px
@@ -173,7 +174,7 @@ def _framed(color: NDArray, window: Window) -> NDArray:
         (slice(top, bottom), slice(left - 1, left + 1)),
         (slice(top, bottom), slice(right - 1, right + 1)),
     ):
-        framed[rows, columns] = 1.0
+        framed[rows, columns] = FRAME_RGB
     return framed
 
 
