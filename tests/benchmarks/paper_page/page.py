@@ -1,0 +1,363 @@
+"""The page itself: sections as one HTML file that needs nothing else."""
+
+import base64
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from tests.benchmarks.harness import commit_id
+from tests.benchmarks.paper_page.estimating import sections as estimating_sections
+from tests.benchmarks.paper_page.figures import first_figure, picture_sections
+from tests.benchmarks.paper_page.measured import Measured
+from tests.benchmarks.paper_page.numbers import median_text, range_text, value_text
+from tests.benchmarks.paper_page.published import published
+from tests.benchmarks.paper_page.rendering import psf_section
+from tests.benchmarks.paper_page.rendering import sections as rendering_sections
+from tests.benchmarks.paper_page.rows import (
+    APART,
+    VERDICTS,
+    WORSE,
+    Block,
+    Line,
+    Section,
+    counts,
+    counts_there,
+)
+
+STYLE = Path(__file__).parent / "page.css"
+TITLE = "ocufilter beside the paper"
+EMPTY = "–"
+
+READING = (
+    "<b>Published</b>: as the paper prints it, on its hardware.",
+    "<b>ocufilter</b>: ours for the same task, in the conditions nearest to theirs.",
+    "<b>Rebuilt</b>: the same system built anew by this project, on our machine; "
+    "beside it <b>ocufilter there</b>, in the very same conditions, which is fairest.",
+    "<b>Better, worse</b>: of the two numbers as they stand.  Level: within 2 %, of "
+    "PSNRs within 0.5 dB.  Not comparable: one is missing, or a line says why.",
+    "Pupils, foci and eyes are the paper's six conditions, whose wavefronts are the "
+    "same to four digits; the eyes' periphery follows from the eye model, as there.",
+)
+
+
+def all_sections(measured: Measured) -> list[Section]:
+    """Return every table and figure, in the paper's order."""
+    found = [
+        first_figure(measured),
+        *estimating_sections(measured),
+        *rendering_sections(measured),
+        *picture_sections(measured),
+        psf_section(measured),
+    ]
+    order = {"Figure": 0, "Table": 1, "Section": 2}
+
+    def place(section: Section) -> tuple:
+        kind, _, number = section.number.partition(" ")
+        return order[kind] if number != "1" else -1, float(number)
+
+    return sorted(found, key=place)
+
+
+def page(measured: Measured) -> str:
+    """Return the whole page."""
+    sections = all_sections(measured)
+    body = [
+        _header(sections),
+        _contents(sections),
+        _worse(sections),
+        _reading(),
+        *(_section(section, measured) for section in sections),
+        _origins(sections, measured),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{TITLE}</title>"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><main>\n"
+        + "\n".join(body)
+        + "\n</main></body></html>\n"
+    )
+
+
+def _header(sections: Sequence[Section]) -> str:
+    source = published()["source"]
+    rows = (
+        ("the paper's own method, as published", counts(sections, own=True)),
+        ("earlier methods, as the paper reports them", counts(sections, own=False)),
+        (
+            "the paper's own method, rebuilt, same conditions",
+            counts_there(sections, own=True),
+        ),
+        (
+            "earlier methods, rebuilt, same conditions",
+            counts_there(sections, own=False),
+        ),
+    )
+    cells = "".join(
+        f"<tr><th scope=row>{name}</th>"
+        + "".join(f"<td>{found[v] or EMPTY}</td>" for v in VERDICTS)
+        + "</tr>"
+        for name, found in rows
+    )
+    heads = "".join(
+        f"<th scope=col><span class='chip {_class(v)}'>{v}</span></th>"
+        for v in VERDICTS
+    )
+    return (
+        f"<header><h1>{TITLE}</h1>"
+        f"<p class=source>{escape(source)}</p>"
+        "<p>Every table (3 to 11) and figure with results (1, 9 to 12) of the paper, "
+        "its figures beside ours, with what differs.</p>"
+        "<table class=summary><caption>Rows in which ocufilter is better or worse "
+        "than</caption><thead><tr><th></th>"
+        f"{heads}</tr></thead><tbody>{cells}</tbody></table>"
+        f"<p class=small>{summary_line(sections)}</p></header>"
+    )
+
+
+def summary_line(sections: Sequence[Section]) -> str:
+    """Say all in one line, of the paper's own method as published."""
+    found = counts(sections, own=True)
+    words = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
+    return f"Beside the paper's own published figures: {words}."
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    rows = []
+    for section in sections:
+        found = counts([section], own=True) + counts([section], own=False)
+        there = counts_there([section], own=True) + counts_there([section], own=False)
+        rows.append(
+            f"<tr><td><a href='#{section.anchor}'>{section.number}</a></td>"
+            f"<td>{escape(section.title)}</td>"
+            f"<td>{_tally(found)}</td><td>{_tally(there)}</td></tr>"
+        )
+    return (
+        "<nav><h2>Contents</h2><table class=contents><thead><tr><th></th><th></th>"
+        "<th>beside what is published</th><th>beside what was rebuilt</th></tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></nav>"
+    )
+
+
+def _tally(found: Counter) -> str:
+    chips = [
+        f"<span class='chip {_class(v)}' title='{v}'>{found[v]} {v}</span>"
+        for v in VERDICTS
+        if found[v]
+    ]
+    return " ".join(chips) or EMPTY
+
+
+def _class(verdict: str) -> str:
+    return verdict.replace(" ", "-")
+
+
+def _worse(sections: Sequence[Section]) -> str:
+    """Say plainly where the paper, or its method built anew, is better."""
+    lines = []
+    for section in sections:
+        for block in section.blocks:
+            if not (block.is_own and block.is_contest):
+                continue
+            beside = [n for n in block.lines if block.verdict(n) == WORSE]
+            there = [n for n in block.lines if block.verdict_there(n) == WORSE]
+            if beside:
+                theirs = [n.published for n in beside]
+                ours = [n.ours for n in beside]
+                lines.append(_worse_line(section, block, beside, theirs, ours, ""))
+            if there:
+                theirs = [n.rebuilt for n in there]
+                ours = [n.ours_there for n in there]
+                how = f" (rebuilt: {block.rebuilt_as})"
+                lines.append(_worse_line(section, block, there, theirs, ours, how))
+    return (
+        "<section><h2>Where the paper is better</h2><p>Its own method only, row by "
+        "row; the sections say what differs.</p><ul>"
+        + "".join(lines)
+        + "</ul></section>"
+    )
+
+
+def _worse_line(section, block: Block, lines, theirs, ours, how: str) -> str:
+    unit = block.measure.unit
+    scene = f", {escape(block.scene)}" if block.scene else ""
+    return (
+        f"<li><a href='#{section.anchor}'>{section.number}</a>{scene}: "
+        f"{block.measure.name}{escape(how)}, {len(lines)} of {len(block.lines)} rows: "
+        f"the paper {range_text(theirs, unit)}, ocufilter {range_text(ours, unit)}</li>"
+    )
+
+
+def _reading() -> str:
+    items = "".join(f"<li>{text}</li>" for text in READING)
+    return f"<section><h2>How to read it</h2><ul>{items}</ul></section>"
+
+
+def _section(section: Section, measured: Measured) -> str:
+    parts = [
+        f"<section id='{section.anchor}'><h2>{section.number}. "
+        f"{escape(section.title)}</h2>",
+        f"<p><b>The paper shows.</b> {escape(section.shows)}</p>",
+        f"<p><b>What comes of it.</b> {escape(section.finding)}</p>",
+    ]
+    if section.picture:
+        parts.append(_picture(section, measured))
+    if section.blocks:
+        parts += [_by_system(section), _all_lines(section)]
+    if section.missing:
+        parts.append(f"<p class=note><b>Missing.</b> {escape(section.missing)}</p>")
+    parts += [f"<p class=note>{escape(note)}</p>" for note in section.notes]
+    files = ", ".join(f"{name}.json" for name in section.origins)
+    parts.append(
+        f"<p class=note>Ours from {files} (<a href='#origins'>origins</a>)</p>"
+    )
+    return "\n".join([*parts, "</section>"])
+
+
+def _picture(section: Section, measured: Measured) -> str:
+    content = measured.path(section.picture).read_bytes()
+    data = base64.b64encode(content).decode("ascii")
+    alt = escape(f"{section.number}: {section.picture_says}", quote=True)
+    return (
+        f"<figure><img alt='{alt}' src='data:image/jpeg;base64,{data}'>"
+        f"<figcaption>{escape(section.picture_says)}</figcaption></figure>"
+    )
+
+
+def _heads(section: Section) -> tuple[bool, bool]:
+    """Whether any line has a published figure, and any a rebuilt one."""
+    lines = [line for block in section.blocks for line in block.lines]
+    return (
+        any(line.published is not None for line in lines),
+        any(line.rebuilt is not None for line in lines),
+    )
+
+
+def _head_row(first: Sequence[str], section: Section) -> str:
+    has_published, has_rebuilt = _heads(section)
+    names = list(first)
+    if has_published:
+        names += ["published", "ocufilter", ""]
+    if has_rebuilt:
+        names += ["rebuilt", "ocufilter there", ""]
+    return "<tr>" + "".join(f"<th scope=col>{name}</th>" for name in names) + "</tr>"
+
+
+def _by_system(section: Section) -> str:
+    """One row a block: medians, and how often ocufilter is better."""
+    has_published, has_rebuilt = _heads(section)
+    rows = []
+    for block in section.blocks:
+        unit = block.measure.unit
+        cells = [f"<th scope=row>{_name(block)}</th>"]
+        if has_published:
+            cells += [
+                f"<td>{median_text([n.published for n in block.lines], unit)}</td>",
+                f"<td>{median_text([n.ours for n in block.lines], unit)}</td>",
+                f"<td class=verdicts>{_block_tally(block)}</td>",
+            ]
+        if has_rebuilt:
+            there = Counter(
+                block.verdict_there(n) for n in block.lines if n.rebuilt is not None
+            )
+            tally = _tally(there) if block.is_contest else EMPTY
+            cells += [
+                f"<td>{median_text([n.rebuilt for n in block.lines], unit)}</td>",
+                f"<td>{median_text([n.ours_there for n in block.lines], unit)}</td>",
+                f"<td class=verdicts>{tally}</td>",
+            ]
+        rows.append(f"<tr{_own(block)}>{''.join(cells)}</tr>")
+    return (
+        "<table class=lines><caption>Medians over rows</caption><thead>"
+        f"{_head_row([''], section)}</thead><tbody>{''.join(rows)}</tbody></table>"
+    )
+
+
+def _block_tally(block: Block) -> str:
+    if not block.is_contest:
+        return EMPTY
+    return _tally(
+        Counter(block.verdict(n) for n in block.lines if n.published is not None)
+    )
+
+
+def _own(block: Block) -> str:
+    return " class=own" if block.is_own else ""
+
+
+def _name(block: Block) -> str:
+    parts = [f"<b>{escape(block.system)}</b>"]
+    if block.scene:
+        parts.append(escape(block.scene))
+    parts.append(f"{block.measure.name}, {block.measure.unit}")
+    return "<br>".join(parts)
+
+
+def _all_lines(section: Section) -> str:
+    has_published, has_rebuilt = _heads(section)
+    width = 1 + 3 * has_published + 3 * has_rebuilt
+    rows = []
+    for block in section.blocks:
+        title = _name(block).replace("<br>", " · ")
+        if block.rebuilt_as and block.has_rebuilt:
+            title += f" · rebuilt: {escape(block.rebuilt_as)}"
+        if block.incomparable:
+            title += f" · <i>not comparable: {escape(block.incomparable)}</i>"
+        rows.append(f"<tr class=block><th colspan={width}>{title}</th></tr>")
+        rows += [
+            _line(block, line, has_published=has_published, has_rebuilt=has_rebuilt)
+            for line in block.lines
+        ]
+    count = sum(len(block.lines) for block in section.blocks)
+    return (
+        f"<details><summary>All {count} rows</summary><table class=lines><thead>"
+        f"{_head_row(['row'], section)}</thead><tbody>{''.join(rows)}</tbody></table>"
+        "</details>"
+    )
+
+
+def _line(block: Block, line: Line, *, has_published: bool, has_rebuilt: bool) -> str:
+    unit = block.measure.unit
+    cells = [f"<th scope=row>{escape(line.case)}</th>"]
+    if has_published:
+        cells += [
+            f"<td>{value_text(line.published, unit)}</td>",
+            f"<td>{value_text(line.ours, unit)}</td>",
+            _verdict_cell(block.verdict(line), shown=block.is_contest),
+        ]
+    if has_rebuilt:
+        shown = block.is_contest and line.rebuilt is not None
+        cells += [
+            f"<td>{value_text(line.rebuilt, unit)}</td>",
+            f"<td>{value_text(line.ours_there, unit)}</td>",
+            _verdict_cell(block.verdict_there(line), shown=shown),
+        ]
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _verdict_cell(verdict: str, *, shown: bool) -> str:
+    if not shown:
+        return "<td></td>"
+    text = EMPTY if verdict == APART else verdict
+    return f"<td class=verdicts><span class='chip {_class(verdict)}'>{text}</span></td>"
+
+
+def _origins(sections: Sequence[Section], measured: Measured) -> str:
+    names = sorted({name for section in sections for name in section.origins})
+    rows = "".join(
+        f"<tr><th scope=row>{name}.json{' (fresh)' * measured.is_fresh(name)}</th>"
+        f"<td>{escape(measured.origin(name))}</td></tr>"
+        for name in names
+    )
+    hardware = published()["text"]["hardware"]
+    return (
+        "<section id=origins><h2>Where the figures are from</h2>"
+        f"<p>The paper: {escape(hardware['gpu'])} for rendering, "
+        f"{escape(hardware['cpu'])} for estimating, {hardware['size']}, "
+        f"{hardware['fov_deg']}° high.  Ours, each file with the commit that measured "
+        "it; a + says that files differed from it:</p>"
+        f"<table class=origins><tbody>{rows}</tbody></table>"
+        f"<p class=note>Page made at commit {commit_id()} by "
+        "<code>ocufilter paper</code>.</p></section>"
+    )
