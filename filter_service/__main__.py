@@ -14,7 +14,14 @@ from filter_service.commands.field import field
 from filter_service.commands.filter_image import filter_image
 from filter_service.commands.keys import keys
 from filter_service.commands.prepare import prepare
-from filter_service.commands.programs import batch, bench, demo, headset, report
+from filter_service.commands.programs import (
+    batch,
+    bench,
+    demo,
+    headset,
+    paper,
+    report,
+)
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
 from filter_service.commands.status import status
@@ -55,6 +62,7 @@ for program in (headset, batch, report):
             "help_option_names": [],  # the program's own help says more
         }
     )(program)
+app.command()(paper)
 app.command()(prepare)
 app.command()(doctor)
 

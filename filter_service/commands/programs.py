@@ -1,4 +1,4 @@
-"""`ocufilter demo` and `ocufilter bench`: programs of clients and tests, started.
+"""`ocufilter demo`, `bench` and others: programs of clients and tests, started.
 
 The service never imports its clients or tests; it can only start them.
 """
@@ -175,6 +175,34 @@ def bench(
     """
     arguments = [*(["--quick"] if quick else []), *context.args]
     _run_program(BENCH_MODULES[name], arguments, json_output=json_output)
+
+
+def paper(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="The page, one file.")
+    ] = Path("paper.html"),
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Run the benchmarks first; it says how long."),
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="With --fresh: few cases, small frames.")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Set the paper's tables and figures beside ours, as one HTML page.
+
+    From the committed results, in seconds: published figures, ours, what differs, and
+    where the paper is better.  Runs in a checkout.
+
+    ocufilter paper -o paper.html
+    """
+    if quick and not fresh:
+        raise ValueError("--quick: allowed with --fresh only")
+    arguments = ["--out", str(out.absolute())]
+    arguments += ["--fresh"] * fresh + ["--quick"] * quick
+    program = "tests.benchmarks.paper_page.program"
+    _run_program(program, arguments, json_output=json_output)
 
 
 def _checked_size(size: str) -> str:

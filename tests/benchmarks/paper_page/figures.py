@@ -43,12 +43,12 @@ def first_figure(measured: Measured) -> Section:
         ("networks", "field"),
         (
             Block(
-                *("The paper", SECONDS, tuple(estimation), ""),
+                *("The paper", SECONDS, tuple(estimation)),
                 is_own=True,
                 scene="estimating the eye and its aberrations",
             ),
             Block(
-                *("The paper", MILLISECONDS, tuple(rendering), ""),
+                *("The paper", MILLISECONDS, tuple(rendering)),
                 is_own=True,
                 scene="rendering a frame",
             ),
@@ -95,7 +95,7 @@ def _picture_block(found: list[dict], name: str, ours: str) -> Block:
     )
     system = SYSTEMS.get(name.removeprefix("paper "), SYSTEMS.get(name, name))
     return Block(
-        *(system, DECIBELS, lines, ""),
+        *(system, DECIBELS, lines),
         is_own=name.startswith("paper"),
         scene="part of the picture, linear light",
         rebuilt_as="part of the picture",

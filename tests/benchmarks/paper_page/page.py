@@ -29,6 +29,9 @@ STYLE = Path(__file__).parent / "page.css"
 TITLE = "ocufilter beside the paper"
 EMPTY = "–"
 
+FEW_LINES = 3
+"""Blocks of so few lines are shown as they are, without medians."""
+
 READING = (
     "<b>Published</b>: as the paper prints it, on its hardware.",
     "<b>ocufilter</b>: ours for the same task, in the conditions nearest to theirs.",
@@ -42,7 +45,7 @@ READING = (
 
 
 def all_sections(measured: Measured) -> list[Section]:
-    """Return every table and figure, in the paper's order."""
+    """Return every figure and table, by number."""
     found = [
         first_figure(measured),
         *estimating_sections(measured),
@@ -82,16 +85,17 @@ def page(measured: Measured) -> str:
 
 def _header(sections: Sequence[Section]) -> str:
     source = published()["source"]
+    tables = without_pictures(sections)
     rows = (
         ("the paper's own method, as published", counts(sections, own=True)),
         ("earlier methods, as the paper reports them", counts(sections, own=False)),
         (
             "the paper's own method, rebuilt, same conditions",
-            counts_there(sections, own=True),
+            counts_there(tables, own=True),
         ),
         (
             "earlier methods, rebuilt, same conditions",
-            counts_there(sections, own=False),
+            counts_there(tables, own=False),
         ),
     )
     cells = "".join(
@@ -114,6 +118,11 @@ def _header(sections: Sequence[Section]) -> str:
         f"{heads}</tr></thead><tbody>{cells}</tbody></table>"
         f"<p class=small>{summary_line(sections)}</p></header>"
     )
+
+
+def without_pictures(sections: Sequence[Section]) -> list[Section]:
+    """Leave out figures 9 to 12: parts of pictures that the tables judge whole."""
+    return [s for s in sections if s.number == "Figure 1" or not s.picture]
 
 
 def summary_line(sections: Sequence[Section]) -> str:
@@ -203,16 +212,29 @@ def _section(section: Section, measured: Measured) -> str:
     ]
     if section.picture:
         parts.append(_picture(section, measured))
-    if section.blocks:
-        parts += [_by_system(section), _all_lines(section)]
+    parts += _tables(section)
     if section.missing:
         parts.append(f"<p class=note><b>Missing.</b> {escape(section.missing)}</p>")
-    parts += [f"<p class=note>{escape(note)}</p>" for note in section.notes]
+    if section.notes:
+        notes = "".join(f"<li>{escape(note)}</li>" for note in section.notes)
+        parts.append(f"<div class=note><b>What differs.</b><ul>{notes}</ul></div>")
     files = ", ".join(f"{name}.json" for name in section.origins)
     parts.append(
         f"<p class=note>Ours from {files} (<a href='#origins'>origins</a>)</p>"
     )
     return "\n".join([*parts, "</section>"])
+
+
+def _tables(section: Section) -> list[str]:
+    """Medians and, folded away, all rows; or what there is, if that is little."""
+    sizes = [len(block.lines) for block in section.blocks]
+    if max(sizes) == 1:
+        return [_by_system(section, title="")]
+    rows = _all_lines(section)
+    if max(sizes) <= FEW_LINES:
+        return [rows]
+    fold = f"<details><summary>All {sum(sizes)} rows</summary>{rows}</details>"
+    return [_by_system(section, title="Medians over rows"), fold]
 
 
 def _picture(section: Section, measured: Measured) -> str:
@@ -225,28 +247,31 @@ def _picture(section: Section, measured: Measured) -> str:
     )
 
 
-def _heads(section: Section) -> tuple[bool, bool]:
-    """Whether any line has a published figure, and any a rebuilt one."""
+def _heads(section: Section) -> tuple[bool, bool, bool]:
+    """Whether lines have published figures, rebuilt ones, and ours beside those."""
     lines = [line for block in section.blocks for line in block.lines]
     return (
         any(line.published is not None for line in lines),
         any(line.rebuilt is not None for line in lines),
+        any(None not in (line.rebuilt, line.ours_there) for line in lines),
     )
 
 
 def _head_row(first: Sequence[str], section: Section) -> str:
-    has_published, has_rebuilt = _heads(section)
+    has_published, has_rebuilt, has_there = _heads(section)
     names = list(first)
     if has_published:
         names += ["published", "ocufilter", ""]
     if has_rebuilt:
-        names += ["rebuilt", "ocufilter there", ""]
+        names.append("rebuilt")
+    if has_there:
+        names += ["ocufilter there", ""]
     return "<tr>" + "".join(f"<th scope=col>{name}</th>" for name in names) + "</tr>"
 
 
-def _by_system(section: Section) -> str:
+def _by_system(section: Section, *, title: str) -> str:
     """One row a block: medians, and how often ocufilter is better."""
-    has_published, has_rebuilt = _heads(section)
+    has_published, has_rebuilt, has_there = _heads(section)
     rows = []
     for block in section.blocks:
         unit = block.measure.unit
@@ -258,18 +283,17 @@ def _by_system(section: Section) -> str:
                 f"<td class=verdicts>{_block_tally(block)}</td>",
             ]
         if has_rebuilt:
-            there = Counter(
-                block.verdict_there(n) for n in block.lines if n.rebuilt is not None
+            cells.append(
+                f"<td>{median_text([n.rebuilt for n in block.lines], unit)}</td>"
             )
-            tally = _tally(there) if block.is_contest else EMPTY
+        if has_there:
             cells += [
-                f"<td>{median_text([n.rebuilt for n in block.lines], unit)}</td>",
-                f"<td>{median_text([n.ours_there for n in block.lines], unit)}</td>",
-                f"<td class=verdicts>{tally}</td>",
+                f"<td>{median_text(_ours_there(block), unit)}</td>",
+                f"<td class=verdicts>{_block_tally_there(block)}</td>",
             ]
         rows.append(f"<tr{_own(block)}>{''.join(cells)}</tr>")
     return (
-        "<table class=lines><caption>Medians over rows</caption><thead>"
+        f"<table class=lines><caption>{title}</caption><thead>"
         f"{_head_row([''], section)}</thead><tbody>{''.join(rows)}</tbody></table>"
     )
 
@@ -282,6 +306,22 @@ def _block_tally(block: Block) -> str:
     )
 
 
+def _block_tally_there(block: Block) -> str:
+    if not (block.is_contest and block.rebuilt_is_same):
+        return EMPTY
+    return _tally(
+        Counter(
+            block.verdict_there(n)
+            for n in block.lines
+            if n.rebuilt is not None and n.ours_there is not None
+        )
+    )
+
+
+def _ours_there(block: Block) -> list[float | None]:
+    return [n.ours_there for n in block.lines if n.rebuilt is not None]
+
+
 def _own(block: Block) -> str:
     return " class=own" if block.is_own else ""
 
@@ -290,13 +330,14 @@ def _name(block: Block) -> str:
     parts = [f"<b>{escape(block.system)}</b>"]
     if block.scene:
         parts.append(escape(block.scene))
-    parts.append(f"{block.measure.name}, {block.measure.unit}")
+    parts.append(block.measure.name)  # values have their units
     return "<br>".join(parts)
 
 
 def _all_lines(section: Section) -> str:
-    has_published, has_rebuilt = _heads(section)
-    width = 1 + 3 * has_published + 3 * has_rebuilt
+    heads = _heads(section)
+    has_published, has_rebuilt, has_there = heads
+    width = 1 + 3 * has_published + has_rebuilt + 2 * has_there
     rows = []
     for block in section.blocks:
         title = _name(block).replace("<br>", " · ")
@@ -305,19 +346,15 @@ def _all_lines(section: Section) -> str:
         if block.incomparable:
             title += f" · <i>not comparable: {escape(block.incomparable)}</i>"
         rows.append(f"<tr class=block><th colspan={width}>{title}</th></tr>")
-        rows += [
-            _line(block, line, has_published=has_published, has_rebuilt=has_rebuilt)
-            for line in block.lines
-        ]
-    count = sum(len(block.lines) for block in section.blocks)
+        rows += [_line(block, line, heads) for line in block.lines]
     return (
-        f"<details><summary>All {count} rows</summary><table class=lines><thead>"
-        f"{_head_row(['row'], section)}</thead><tbody>{''.join(rows)}</tbody></table>"
-        "</details>"
+        f"<table class=lines><thead>{_head_row([''], section)}</thead>"
+        f"<tbody>{''.join(rows)}</tbody></table>"
     )
 
 
-def _line(block: Block, line: Line, *, has_published: bool, has_rebuilt: bool) -> str:
+def _line(block: Block, line: Line, heads: tuple[bool, bool, bool]) -> str:
+    has_published, has_rebuilt, has_there = heads
     unit = block.measure.unit
     cells = [f"<th scope=row>{escape(line.case)}</th>"]
     if has_published:
@@ -326,11 +363,17 @@ def _line(block: Block, line: Line, *, has_published: bool, has_rebuilt: bool) -
             f"<td>{value_text(line.ours, unit)}</td>",
             _verdict_cell(block.verdict(line), shown=block.is_contest),
         ]
+    shown = (
+        block.is_contest
+        and block.rebuilt_is_same
+        and line.rebuilt is not None
+        and line.ours_there is not None
+    )
     if has_rebuilt:
-        shown = block.is_contest and line.rebuilt is not None
+        cells.append(f"<td>{value_text(line.rebuilt, unit)}</td>")
+    if has_there:
         cells += [
-            f"<td>{value_text(line.rebuilt, unit)}</td>",
-            f"<td>{value_text(line.ours_there, unit)}</td>",
+            f"<td>{value_text(line.ours_there if shown else None, unit)}</td>",
             _verdict_cell(block.verdict_there(line), shown=shown),
         ]
     return f"<tr>{''.join(cells)}</tr>"

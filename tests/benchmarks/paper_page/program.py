@@ -19,7 +19,12 @@ from tests.benchmarks.paper_page.fresh import (
     run_all,
 )
 from tests.benchmarks.paper_page.measured import Measured, ResultMissing
-from tests.benchmarks.paper_page.page import all_sections, page, summary_line
+from tests.benchmarks.paper_page.page import (
+    all_sections,
+    page,
+    summary_line,
+    without_pictures,
+)
 from tests.benchmarks.paper_page.rows import VERDICTS, counts, counts_there
 
 FRESH = OUT / "paper"
@@ -67,6 +72,8 @@ def main() -> int:
 
 
 def _said(path: Path, sections) -> dict:
+    tables = without_pictures(sections)
+
     def numbers(found) -> dict[str, int]:
         return {verdict: found[verdict] for verdict in VERDICTS}
 
@@ -77,8 +84,8 @@ def _said(path: Path, sections) -> dict:
             "earlier": numbers(counts(sections, own=False)),
         },
         "rebuilt": {
-            "own": numbers(counts_there(sections, own=True)),
-            "earlier": numbers(counts_there(sections, own=False)),
+            "own": numbers(counts_there(tables, own=True)),
+            "earlier": numbers(counts_there(tables, own=False)),
         },
     }
 

@@ -71,24 +71,26 @@ class Block:
         Whose figures they are, as the paper names it.
     is_own : bool
         Whether that is the method that the paper proposes.
-    differs : str
-        What is not alike between the published figure and ours.
     incomparable : str
         Why the published figures and ours say nothing about each other; empty where
         they do.
     is_contest : bool
         Whether one of them can be better at all: statistics of data cannot.
+    rebuilt_as : str
+        How the system was built anew.
+    rebuilt_is_same : bool
+        Whether that is the system itself, and not another answer of ours to its task.
     """
 
     system: str
     measure: Measure
     lines: tuple[Line, ...]
-    differs: str
     is_own: bool = False
     scene: str = ""
     incomparable: str = ""
     is_contest: bool = True
     rebuilt_as: str = ""
+    rebuilt_is_same: bool = True
 
     @property
     def has_rebuilt(self) -> bool:
@@ -103,6 +105,8 @@ class Block:
 
     def verdict_there(self, line: Line) -> str:
         """Ours beside the rebuilt system, in the same conditions."""
+        if not (self.is_contest and self.rebuilt_is_same):
+            return APART
         return self.measure.compare(_number(line.ours_there), _number(line.rebuilt))
 
 
@@ -165,7 +169,7 @@ def counts_there(sections: Iterable[Section], *, own: bool) -> Counter:
         block.verdict_there(line)
         for section in sections
         for block in section.blocks
-        if block.is_contest and block.is_own == own
+        if block.is_contest and block.rebuilt_is_same and block.is_own == own
         for line in block.lines
-        if line.rebuilt is not None and line.ours_there is not None
+        if _number(line.rebuilt) is not None and line.ours_there is not None
     )
