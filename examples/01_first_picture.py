@@ -1,0 +1,20 @@
+"""First picture: what a person with -6 dioptres sees of a courtyard without glasses.
+
+    python examples/01_first_picture.py
+
+Five lines do it: a scene, an eye, a frame.  Distances are in metres, pupils in
+millimetres, focus in dioptres (1 / metres; 0 is far away).
+"""
+
+from common import load_courtyard, save_pictures, still
+
+from filter_service import EyeFilter
+
+color, depth_m, camera = load_courtyard()
+with EyeFilter("myopia", camera) as eye:
+    seen = still(eye, color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
+
+save_pictures(
+    "01_first_picture.png",
+    [("the scene", color), ("-6 dioptres, pupil 4 mm, looking far away", seen.color)],
+)

@@ -1,0 +1,80 @@
+"""A data set as many eyes see it: for training what has to cope with human vision.
+
+    python examples/07_augment_data_set.py
+
+Pictures of letters, 4 m away, each through people drawn at random: refraction, age and
+pupil.  The labels say which eye saw each picture, so that a model can learn from that,
+too.  Writes out/examples/letters/ with PNGs and labels.csv.
+"""
+
+import csv
+import string
+
+import numpy as np
+from common import OUT, font, save_pictures, still
+from PIL import Image, ImageDraw
+
+from filter_service import Camera, EyeFilter, FilterSettings
+
+SIDE_PX = 64
+FIELD_DEG = 0.6  # of the whole picture; its letter is 20/100
+DISTANCE_DPT = 0.25  # 4 m
+LETTER_COUNT, PEOPLE_COUNT = 4, 6
+SHOWN_COUNT = 24
+
+rng = np.random.default_rng(7)
+letters = rng.choice(list(string.ascii_uppercase), LETTER_COUNT, replace=False)
+
+
+def drawn(letter):
+    """Return a picture of a letter, (height, width, 3)."""
+    picture = Image.new("RGB", (SIDE_PX, SIDE_PX), "white")
+    place = (SIDE_PX / 2, SIDE_PX / 2)
+    ImageDraw.Draw(picture).text(
+        place, letter, fill="black", font=font(48), anchor="mm"
+    )
+    return np.array(picture)
+
+
+def person():
+    """Draw the eye of somebody: what an optician would write down."""
+    return {
+        "kind": "prescription",
+        "sphere_dpt": round(float(rng.normal(-0.8, 0.8)), 2),
+        "cylinder_dpt": round(-float(rng.gamma(1.2, 0.4)), 2),
+        "axis_deg": round(float(rng.uniform(1.0, 180.0))),
+        "age_years": round(float(rng.uniform(20.0, 70.0))),
+    }
+
+
+folder = OUT / "letters"
+folder.mkdir(parents=True, exist_ok=True)
+camera = Camera.from_fov(FIELD_DEG, width_px=SIDE_PX, height_px=SIDE_PX)
+depth_m = np.full((SIDE_PX, SIDE_PX), 1.0 / DISTANCE_DPT, np.float32)
+settings = FilterSettings(
+    mode="on-axis",  # a picture of half a degree has one PSF everywhere
+    object_planes_dpt=(DISTANCE_DPT,),  # and one distance
+)
+rows, pictures = [], []
+with EyeFilter("emmetropia", camera, settings) as eye:
+    for number in range(PEOPLE_COUNT):
+        profile = person()
+        pupil_mm = round(float(rng.uniform(2.5, 6.0)), 1)
+        eye.set_profile(profile)
+        eye.wait()
+        for letter in letters:
+            state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": DISTANCE_DPT}
+            seen = still(eye, drawn(letter), depth_m, **state)
+            file = f"{letter}_{number:02d}.png"
+            Image.fromarray(seen.color).save(folder / file)
+            rows.append({"file": file, "letter": letter, "pupil_mm": pupil_mm} | profile)
+            refraction = f"{profile['sphere_dpt']:+.1f} {profile['cylinder_dpt']:+.1f}"
+            pictures.append((refraction, seen.color))
+
+with (folder / "labels.csv").open("w", newline="", encoding="utf-8") as file:
+    writer = csv.DictWriter(file, rows[0].keys())
+    writer.writeheader()
+    writer.writerows(rows)
+print(f"{len(rows)} pictures of {PEOPLE_COUNT} people in {folder}")
+enlarged = [(text, picture.repeat(2, 0).repeat(2, 1)) for text, picture in pictures]
+save_pictures("07_augment_data_set.png", enlarged[:SHOWN_COUNT], columns=LETTER_COUNT)

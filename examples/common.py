@@ -1,0 +1,71 @@
+"""What the examples share: a scene to look at, and pictures in a row.
+
+The scene is a courtyard of 480 x 270 pixels: colour in a JPEG, distance in a 16-bit PNG
+of millimetres, in which 65535 stands for the sky.
+"""
+
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from filter_service import Camera
+
+DATA = Path(__file__).parent / "data"
+OUT = Path("out/examples")
+FIELD_OF_VIEW_DEG = 50.0  # from the scene's lower to its upper edge
+SKY_MM = 65535
+
+PREVIEW_S = 0.05  # between two looks through an eye that is being prepared
+
+CAPTION_PX = 26
+GAP_PX = 6
+
+
+def load_courtyard():
+    """Return colour (sRGB, 8 bits), distance in metres, and the camera."""
+    color = np.array(Image.open(DATA / "courtyard.jpg"))
+    millimetres = np.array(Image.open(DATA / "courtyard_depth.png"))
+    depth_m = np.where(millimetres == SKY_MM, np.inf, millimetres / 1000.0)
+    height_px, width_px = depth_m.shape
+    camera = Camera.from_fov(
+        FIELD_OF_VIEW_DEG, width_px=width_px, height_px=height_px
+    )
+    return color, depth_m.astype(np.float32), camera
+
+
+def still(eye, color, depth_m, **state):
+    """Return one picture, seen through all that the eye needs for it.
+
+    A filter is made for streams: while it prepares for a new eye, pupil or focus it
+    shows a preview, and says so (`is_complete`).  A single picture can wait.
+    """
+    seen = eye.filter(color, depth_m, **state)
+    while not seen.is_complete:
+        time.sleep(PREVIEW_S)
+        seen = eye.filter(color, depth_m, **state)
+    return seen
+
+
+def font(size_px):
+    """Return the font that comes with Pillow."""
+    return ImageFont.load_default(size=size_px)
+
+
+def save_pictures(name, pictures, *, columns=2):
+    """Write pairs of caption and picture as one file, and say where it is."""
+    height_px, width_px = pictures[0][1].shape[:2]
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    step_x, step_y = width_px + GAP_PX, height_px + CAPTION_PX
+    page = Image.new("RGB", (columns * step_x - GAP_PX, rows * step_y), "white")
+    draw = ImageDraw.Draw(page)
+    for k, (caption, picture) in enumerate(pictures):
+        x, y = k % columns * step_x, k // columns * step_y
+        page.paste(Image.fromarray(picture), (x, y))
+        place = (x + 2, y + height_px + CAPTION_PX // 2)
+        draw.text(place, caption, fill="#1b2126", font=font(15), anchor="lm")
+    OUT.mkdir(parents=True, exist_ok=True)
+    page.save(OUT / name)
+    print(OUT / name)
