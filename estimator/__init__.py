@@ -8,6 +8,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     dynamics/      what drives an eye: light, distance, gaze
     media/         light that is scattered or absorbed on the way
     psf/           point-spread functions of wavefronts
+    corrections/   what people wear to see better
     eye/           the 45-parameter model
     profiles/      what is known of one eye
     networks/      the trained networks

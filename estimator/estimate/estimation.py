@@ -35,7 +35,7 @@ from estimator.networks.card import (
 )
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, remove_central_tilt
-from estimator.profiles.measured_wavefront import accommodation_amplitude_dpt
+from estimator.profiles.measured_wavefront import profile_amplitude_dpt
 from estimator.profiles.parse import EyeProfile
 from estimator.profiles.typical_aberrations import (
     typical_note,
@@ -174,9 +174,7 @@ def accommodating_eye(
         parameters,
         retina=profile.retina,
         pupil_diameter_mm=profile.pupil_diameter_mm,
-        amplitude_dpt=accommodation_amplitude_dpt(
-            age_years=profile.age_years, add_dpt=profile.add_dpt
-        ),
+        amplitude_dpt=profile_amplitude_dpt(profile),
         correction=profile.correction,
         rest=MeasuredRest.of(
             parameters, profile, wavelengths_nm=REFERENCE_WAVELENGTH_NM

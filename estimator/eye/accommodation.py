@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
+from estimator.corrections.worn_lens import worn_refraction
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.focus_table import FocusTable, table_pupils_mm
 from estimator.eye.focusing import Focusing
@@ -132,12 +133,12 @@ class AccommodatingEye(Focusing):
         self._bare_dpt = float(refractions_dpt[0])
         self._rest = rest
         self._table: FocusTable | None = None
-        self._correction_dpt, at_cornea_dpt = 0.0, 0.0
+        at_cornea_dpt = 0.0
         if correction is not None:
             at_cornea_dpt, *_ = rx.power_vector(correction)
-            self._correction_dpt, *_ = rx.power_vector(
-                correction, depth_mm=self.entrance_pupil_mm
-            )
+        self._correction_dpt = worn_refraction(
+            correction, entrance_pupil_mm=self.entrance_pupil_mm
+        )
         self.bare_refraction_dpt = refraction_at_cornea_dpt(
             self._bare_dpt + float(self._rest_dpt(pupil_diameter_mm)),
             entrance_pupil_mm=self.entrance_pupil_mm,
@@ -205,7 +206,12 @@ class AccommodatingEye(Focusing):
         bare_dpt = self._focus_table.refraction_dpt(
             pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
         )
-        return bare_dpt - self._correction_dpt
+        return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
+
+    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
+        """M of the worn correction through a pupil."""
+        at_centre_dpt, per_mm2 = self._correction_dpt
+        return at_centre_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
 
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
@@ -217,7 +223,8 @@ class AccommodatingEye(Focusing):
         least_dpt = relaxed_dpt - self._age_amplitude_dpt
         return self._focus_table.accommodation_dpt(
             pupil_mm=pupil_diameter_mm,
-            refraction_dpt=max(refraction_dpt, least_dpt) + self._correction_dpt,
+            refraction_dpt=max(refraction_dpt, least_dpt)
+            + self._taken_off_dpt(pupil_diameter_mm),
         )
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from estimator.corrections.rings import Rings
 from estimator.optics.vergence import ObjectVergence
 
 OUT_OF_REACH_DPT = 1e-6
@@ -137,10 +138,13 @@ class FocusingEye(Focusing):
         Above it the pupil is capped.
     pupil_limit : str
         What that pupil is: "measured" or "traced".
+    rings : Rings or None
+        What makes several foci of it, where a worn lens does.
     """
 
     max_pupil_diameter_mm: float
     pupil_limit: str
+    rings: Rings | None = None
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
         """Pupil asked for, capped where the eye knows no more."""

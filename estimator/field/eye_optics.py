@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.corrections.rings import Rings
 from estimator.optics.vergence import ObjectVergence
 from estimator.wavefront.field_wavefronts import FieldWavefronts
 
@@ -29,6 +30,10 @@ class EyeOptics(Protocol):
     @property
     def vergence(self) -> ObjectVergence:
         """From object distances to vergences, through the worn correction."""
+
+    @property
+    def rings(self) -> Rings | None:
+        """What makes several foci of it, where a worn lens does."""
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
         """Pupil diameter asked for, mm, capped where the eye knows no more."""

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.focusing import FocusingEye
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
@@ -34,7 +35,6 @@ from estimator.field.trace_range import (
 from estimator.field.traced_fields import TracedFields, check_limits
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
-    correction_polynomial,
     distinct_rows,
     total_defocus_dpt,
     with_defocus,
@@ -63,7 +63,7 @@ class TracedEye(FocusingEye):
     rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
     and at other fields by the same factor.  What the eye leaves of its measurement is
     added to its wavefronts, see `measured_rest`.  The worn correction is taken off at
-    every field alike, see `field_wavefronts.correction_polynomial`.
+    every field alike, see `worn_lens.worn_polynomial`.
 
     Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
     the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
@@ -112,7 +112,8 @@ class TracedEye(FocusingEye):
         has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
         self._on_axis = self._field if has_axis else axis
         self.entrance_pupil_mm = eye.accommodating.entrance_pupil_mm
-        self._correction = correction_polynomial(
+        self.rings = rings_of(eye.profile.correction)
+        self._correction = worn_polynomial(
             eye.profile.correction, entrance_pupil_mm=self.entrance_pupil_mm
         )
         self._rest = eye.rest(axis.grid.wavelengths_nm)

@@ -1,6 +1,7 @@
 """What is known of one eye: a prescription, a measurement, an eye.
 
 parse                a profile's object, checked, as an `EyeProfile`
+worn                 what it says is worn
 options              what any profile may ask for besides
 files                .json, .abp and .csv profiles, and presets by name
 presets.json         the six presets

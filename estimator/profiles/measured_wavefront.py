@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.corrections.worn_lens import replaces_lens, rings_of, worn_polynomial
 from estimator.eye.focusing import FocusingEye
 from estimator.optics import prescription as rx
 from estimator.optics.chromatic import chromatic_refraction_dpt
@@ -55,6 +56,15 @@ def accommodation_amplitude_dpt(
     return amplitude_dpt
 
 
+def profile_amplitude_dpt(profile: EyeProfile) -> float:
+    """Largest accommodation of a profile's eye, dpt: none with an intraocular lens."""
+    if replaces_lens(profile.correction):
+        return 0.0
+    return accommodation_amplitude_dpt(
+        age_years=profile.age_years, add_dpt=profile.add_dpt
+    )
+
+
 @dataclass(frozen=True)
 class WavefrontState:
     """Wavefront of the eye at one pupil, object, focus and wavelength.
@@ -94,10 +104,11 @@ class MeasuredWavefront(FocusingEye):
             radius_mm,
         )
         if profile.correction is not None:
-            zernike_um = zernike_um - rx.zernike_from_power_vector(
-                *rx.power_vector(profile.correction, depth_mm=depth_mm),
-                zernike_radius_mm=radius_mm,
+            zernike_um = zernike_um - zernike_from_polynomial(
+                worn_polynomial(profile.correction, entrance_pupil_mm=depth_mm),
+                radius_mm,
             )
+        self.rings = rings_of(profile.correction)
         self.vergence = ObjectVergence.seen_through(
             profile.correction, entrance_pupil_mm=depth_mm
         )
@@ -108,9 +119,7 @@ class MeasuredWavefront(FocusingEye):
         self.zernike_radius_mm = radius_mm
         self.wavelength_nm = profile.wavelength_nm
         self.max_pupil_diameter_mm = profile.max_pupil_diameter_mm
-        self.amplitude_dpt = accommodation_amplitude_dpt(
-            age_years=profile.age_years, add_dpt=profile.add_dpt
-        )
+        self.amplitude_dpt = profile_amplitude_dpt(profile)
         self.refraction_dpt = refraction_at_cornea_dpt(
             self.refraction_at_dpt(pupil_diameter_mm=2.0 * radius_mm),
             entrance_pupil_mm=depth_mm,

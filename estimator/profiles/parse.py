@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye import checked_fields as fields
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import (
@@ -33,7 +34,7 @@ from estimator.optics.zernike import (
     flip_horizontal,
     index_from_nm,
 )
-from estimator.profiles import options
+from estimator.profiles import options, worn
 
 __all__ = [
     "EyeProfile",
@@ -52,14 +53,7 @@ COMMON_FIELDS = (
     "retina",
     *options.FIELDS,
 )
-PRESCRIPTION_FIELDS = (
-    "sphere_dpt",
-    "cylinder_dpt",
-    "axis_deg",
-    "vertex_mm",
-    "add_dpt",
-    "higher_order",
-)
+PRESCRIPTION_FIELDS = (*worn.SPECTACLE_FIELDS, "add_dpt", "higher_order")
 HIGHER_ORDERS = ("typical", "none")
 """What a traced eye has beside its prescription: aberrations of its age, or none."""
 
@@ -116,7 +110,8 @@ class EyeProfile:
     max_pupil_diameter_mm : float
         Largest pupil the data speak for (infinite for a prescription).
     correction : Prescription or None
-        Spectacles or lens worn during the simulation.
+        Spectacles worn during the simulation; a `WornLens` for what is worn on the eye
+        or in it.
     add_dpt : float
         Near addition; limits the amplitude of accommodation when above zero.
     measurements : tuple of Measurement
@@ -229,16 +224,11 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
     age_years = None
     if "age_years" in data:
         age_years = fields.number(data, "age_years", 3.0, 120.0)
-    correction = None
-    if data.get("correction") is not None:
-        body = fields.mapping(data["correction"], "correction")
-        fields.only_known(body, PRESCRIPTION_FIELDS[:4], path="correction.")
-        correction = _prescription(body, path="correction.")
     retina = parse_retina(data)
     return {
         "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
         "age_years": age_years,
-        "correction": correction,
+        "correction": worn.correction(data),
         "retina": retina,
         "periphery": options.periphery(data, has_own=retina is not None),
         "straylight": options.straylight(data, age_years),
@@ -247,23 +237,10 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:
-    if data.get("cylinder_dpt") and "axis_deg" not in data:
-        allowed = "a number from 0 to 180"
-        raise ProfileError(f"{path}axis_deg", "is missing beside a cylinder", allowed)
-    return rx.Prescription(
-        sphere_dpt=fields.number(data, "sphere_dpt", -30.0, 30.0, path=path),
-        cylinder_dpt=fields.number(
-            data, "cylinder_dpt", -15.0, 15.0, default=0.0, path=path
-        ),
-        axis_deg=fields.number(data, "axis_deg", 0.0, 180.0, default=0.0, path=path),
-        vertex_mm=fields.number(data, "vertex_mm", 0.0, 25.0, default=0.0, path=path),
-    )
-
-
 def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, COMMON_FIELDS + PRESCRIPTION_FIELDS)
-    prescription = _prescription(data)
+    prescription = worn.prescription(data)
+    common = _common(data)
     zernike_um = rx.zernike_from_power_vector(
         *rx.power_vector(prescription), zernike_radius_mm=PRESCRIPTION_RADIUS_MM
     )
@@ -277,11 +254,24 @@ def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
         ),
         max_pupil_diameter_mm=math.inf,
         add_dpt=fields.number(data, "add_dpt", 0.0, 4.0, default=0.0),
-        higher_order=fields.choice(
-            data, "higher_order", HIGHER_ORDERS, default="typical"
-        ),
-        **_common(data),
+        higher_order=_higher_order(data, common["correction"]),
+        **common,
     )
+
+
+def _higher_order(data: Mapping[str, Any], correction: rx.Prescription | None) -> str:
+    """Return one of `HIGHER_ORDERS`; those of a lens that is gone are gone with it."""
+    is_gone = replaces_lens(correction)
+    found = fields.choice(
+        data, "higher_order", HIGHER_ORDERS, default="none" if is_gone else "typical"
+    )
+    if is_gone and found != "none":
+        raise ProfileError(
+            "higher_order",
+            "is 'typical', which are the aberrations of eyes with their own lens",
+            "none, with an intraocular lens",
+        )
+    return found
 
 
 def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:

@@ -14,6 +14,7 @@ enz                the extended Nijboer-Zernike series
 enz_series         its coefficients
 tail               mean light far outside
 stiles_crawford    the eye's apodisation
+screens            rings in the pupil, of lenses with several foci
 reference          the slow float64 truth
 """
 

@@ -28,7 +28,8 @@ from estimator.psf.kernel_types import (
     disc_mask,
     empty_buffer,
 )
-from estimator.psf.pupil import pupil_frames
+from estimator.psf.pupil import pupil_ellipses, pupil_frames
+from estimator.psf.screens import PupilScreen, ScreenTables
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.psf.survey import (
     PIXEL_CORNER_PX,
@@ -202,6 +203,7 @@ def plan_psfs(
     pixel_from_mrad: ArrayLike | None = None,
     pupil_ellipse: ArrayLike | None = None,
     stiles_crawford: StilesCrawford | None = None,
+    pupil_screen: PupilScreen | None = None,
     radius_px: int | None = None,
     method: str = "auto",
     diffraction: bool = True,
@@ -218,18 +220,37 @@ def plan_psfs(
         raise ValueError(f"method {method!r} includes diffraction: use 'geometric'")
     circle_mm = checked_positive("pupil_diameter_mm", pupil_diameter_mm, count) / 2.0
     wavelength_nm = checked_positive("wavelength_nm", wavelength_nm, count)
+    if pupil_screen is not None and (
+        method not in ("auto", "fourier") or not diffraction
+    ):
+        raise ValueError(
+            f"method {method!r}, diffraction {diffraction}: rings in the pupil are "
+            "known to 'fourier' alone, with diffraction"
+        )
+    pixel_from_mrad = checked_scale(pixel_pitch_mrad, pixel_from_mrad, count)
+    ellipse = checked_ellipse(pupil_ellipse, circle_mm)
     survey = survey_pupils(
         pupil_frames(
             wavefront_polynomial(zernike_um),
             circle_radius_mm=circle_mm,
             wavelength_nm=wavelength_nm,
-            pixel_from_mrad=checked_scale(pixel_pitch_mrad, pixel_from_mrad, count),
-            pupil_ellipse=checked_ellipse(pupil_ellipse, circle_mm),
+            pixel_from_mrad=pixel_from_mrad,
+            pupil_ellipse=ellipse,
             apodisation=(
                 stiles_crawford.amplitude(wavelength_nm) if stiles_crawford else None
             ),
         )
     )
+    if pupil_screen is not None:
+        survey = survey.behind(
+            ScreenTables.of(
+                pupil_screen,
+                half_width_um_per_px=survey.frames.half_width_um_per_px,
+                pixel_from_mrad=pixel_from_mrad,
+                pupil_ellipse=pupil_ellipses(ellipse, circle_mm),
+                wavelength_nm=wavelength_nm,
+            )
+        )
     radii = _choose_radii(
         survey,
         radius_px=radius_px,
@@ -237,7 +258,9 @@ def plan_psfs(
         max_radius_px=max_radius_px,
         min_energy_ratio=min_energy_ratio,
     )
-    if method == "auto" and diffraction:
+    if pupil_screen is not None:
+        shares = np.zeros(count)
+    elif method == "auto" and diffraction:
         shares = geometric_shares(survey)
     else:
         shares = np.full(count, 1.0 if method in ("auto", "geometric") else 0.0)
@@ -253,6 +276,7 @@ def compute_psf_batch(
     pixel_from_mrad: ArrayLike | None = None,
     pupil_ellipse: ArrayLike | None = None,
     stiles_crawford: StilesCrawford | None = None,
+    pupil_screen: PupilScreen | None = None,
     radius_px: int | None = None,
     method: str = "auto",
     accuracy: str = "normal",
@@ -283,6 +307,8 @@ def compute_psf_batch(
         it is None.
     stiles_crawford : StilesCrawford, optional
         Directional sensitivity of the cones; none where it is None.
+    pupil_screen : PupilScreen, optional
+        Rings of a lens with several foci, before all pupils; by the wave method alone.
     radius_px : int, optional
         Kernel radius of all PSFs; chosen for each where it is None.
     method : "auto", "fourier", "geometric", "enz" or "enz_unchecked"
@@ -330,6 +356,7 @@ def compute_psf_batch(
         pixel_from_mrad=pixel_from_mrad,
         pupil_ellipse=pupil_ellipse,
         stiles_crawford=stiles_crawford,
+        pupil_screen=pupil_screen,
         radius_px=radius_px,
         method=method,
         diffraction=diffraction,

@@ -258,6 +258,9 @@ class _Work:
             edge_response(),
             field,
         )
+        if self.survey.screen is not None:
+            samples = self.plan.pupil_samples[part]
+            self.survey.screen.apply(members, samples, size, field)
         # In place; the rows below the pupil are zero and stay so.
         lit = field[:, : int(size[:, 1].max())]
         spectra = scipy.fft.fft(lit, axis=2, overwrite_x=True)

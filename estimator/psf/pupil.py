@@ -161,6 +161,17 @@ def _log_amplitudes(apodisation, jacobian, ellipse, half) -> NDArray[np.float64]
     return -per_mm2[:, None] * log_amplitude
 
 
+def pupil_ellipses(
+    pupil_ellipse: NDArray[np.float64] | None, circle_radius_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Ellipses (P, 5) of pupils, see `ELLIPSE_COLUMNS`; whole circles where None."""
+    if pupil_ellipse is not None:
+        return pupil_ellipse
+    found = np.zeros((circle_radius_mm.size, ELLIPSE_COLUMNS))
+    found[:, 2:4] = circle_radius_mm[:, None]
+    return found
+
+
 def pupil_frames(
     polynomial_um: NDArray[np.float64],
     *,
@@ -185,9 +196,7 @@ def pupil_frames(
         k in mm^-2 and centre in mm of the amplitude exp(-k |u - u0|²).
     """
     count = polynomial_um.shape[0]
-    if pupil_ellipse is None:
-        pupil_ellipse = np.zeros((count, ELLIPSE_COLUMNS))
-        pupil_ellipse[:, 2:4] = circle_radius_mm[:, None]
+    pupil_ellipse = pupil_ellipses(pupil_ellipse, circle_radius_mm)
     jacobian = np.ascontiguousarray(pixel_from_mrad, dtype=np.float64)
     box, disc = np.empty((count, N_TERMS)), np.empty((count, N_TERMS))
     half, shear = np.empty((count, 2)), np.empty(count)

@@ -5,7 +5,7 @@ pre-pass of the PSF engines (`fourier.py`, `geometric.py`).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from estimator.optics.zernike import EXPONENTS
 from estimator.psf.pupil import PupilFrames
+from estimator.psf.screens import ScreenTables
 
 N_EDGE = 48
 _RING_RADII = (0.2, 0.35, 0.5, 0.65, 0.8, 0.9)
@@ -45,6 +46,8 @@ class PupilSurvey:
     edge_light_um : (P,)
         Wavelength, times the edge's share of the passed light over its share of the
         area: what the edge's diffracted light is proportional to.
+    screen : ScreenTables, optional
+        Rings in the pupils; light then goes farther than the slopes at the edge say.
     """
 
     frames: PupilFrames
@@ -56,6 +59,17 @@ class PupilSurvey:
     narrow_ratio: NDArray[np.float64]
     passed_ratio: NDArray[np.float64]
     edge_light_um: NDArray[np.float64]
+    screen: ScreenTables | None = None
+
+    def behind(self, screen: ScreenTables) -> "PupilSurvey":
+        """Return the same pupils with rings before them."""
+        return replace(
+            self,
+            slope_low_px=self.slope_low_px - screen.reach_px,
+            slope_high_px=self.slope_high_px + screen.reach_px,
+            blur_radius_px=self.blur_radius_px + screen.reach_px.max(axis=1),
+            screen=screen,
+        )
 
     @property
     def extent_px(self) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ from filter_service.commands.wavefront import (
 if TYPE_CHECKING:
     import numpy as np
 
+    from estimator.corrections.rings import Rings
     from estimator.psf.kernel_types import Psf
     from estimator.psf.stiles_crawford import StilesCrawford
 
@@ -58,6 +59,7 @@ class _State:
     ellipse: dict | None
     eye_side: str | None
     notes: tuple[str, ...]
+    rings: "Rings | None" = None
 
 
 def psf(
@@ -157,9 +159,8 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
     from estimator.profiles.measured_wavefront import MeasuredWavefront
 
     profile = load_profile(source)
-    found = MeasuredWavefront.from_profile(profile).state(
-        focus_dpt=focus_dpt or 0.0, **view
-    )
+    worn = MeasuredWavefront.from_profile(profile)
+    found = worn.state(focus_dpt=focus_dpt or 0.0, **view)
     return _State(
         name=profile.name,
         zernike_um=found.zernike_um,
@@ -168,6 +169,7 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
         ellipse=None,
         eye_side=profile.eye_side,
         notes=tuple(found.notes),
+        rings=worn.rings,
     )
 
 
@@ -217,6 +219,7 @@ def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", 
         "pixel_pitch_mrad": MRAD_PER_RAD * math.radians(pixel_arcmin / ARCMIN_PER_DEG),
         "method": method,
         "max_radius_px": MAX_RADIUS_PX,
+        "pupil_screen": state.rings,
     }
     if state.ellipse is not None:
         names = ("centre_x_mm", "centre_y_mm", "semi_major_mm", "semi_minor_mm")

@@ -11,14 +11,13 @@ from estimator.psf.survey import (
     PIXEL_CORNER_PX,
     PupilSurvey,
     needed_radius_px,
-    survey_pupils,
 )
 from estimator.psf.switch import geometric_shares
 from estimator.threads import thread_count
 from filter_service.constants import RGB
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
-from filter_service.planning.slopes import PupilStates, state_frames
+from filter_service.planning.slopes import PupilStates, state_survey
 
 _LENGTHS = np.unique(
     [2**a * 3**b * 5**c for a in range(5, 24) for b in range(3) for c in range(2)]
@@ -38,7 +37,7 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
     """Fields of `PlanPrediction`: count, memory, time and cores."""
     count = (RGB if spec.settings.chromatic else 1) * len(plan.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
-    survey = survey_pupils(state_frames(eye, spec, states))
+    survey = state_survey(eye, spec, states)
     texels = float(np.mean(box_texels(spec, survey)))
     cores = thread_count()
     per_psf = len(spec.primary_wavelengths_nm)
@@ -120,6 +119,8 @@ def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.floa
     radius_px = kernel_radius_px(spec, survey, share=COMPUTED_BEYOND)
     count = survey.blur_radius_px.size
     share = geometric_shares(survey) if spec.settings.diffraction else np.ones(count)
+    if survey.screen is not None:
+        share = np.zeros(count)
     samples = np.zeros(count)
     chosen = share < 1.0
     if chosen.any():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,12 @@ from filter_service.planning.error_law import (
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import RaggedNodes
 from filter_service.planning.readable import ReadableDefocus, joined_ranges
-from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.slopes import (
+    PupilStates,
+    main_foci_dpt,
+    slopes_px,
+    state_frames,
+)
 
 _LADDER = 49
 
@@ -116,12 +122,18 @@ class _Rays:
     unit_px : (P,)
     half_way_error : float
         RMS error half-way between nodes.
+    foci_dpt : (n_foci,)
+        Defocus at which light is in focus: 0, and more with a lens that has several.
+    reach_px : (P,)
+        How much farther than rays such a lens sends light.
     """
 
     zero_px: NDArray[np.float64]
     per_dpt: NDArray[np.float64]
     unit_px: NDArray[np.float64]
     half_way_error: float
+    foci_dpt: NDArray[np.float64]
+    reach_px: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -140,7 +152,14 @@ class _Rays:
             slopes_px(state_frames(eye, spec, PupilStates(**columns))), 2
         )
         error = half_way_error("defocus", allowed_error)
-        return cls(zero_px, one_px - zero_px, unit_px, error)
+        return cls(
+            zero_px,
+            one_px - zero_px,
+            unit_px,
+            error,
+            main_foci_dpt(eye, spec),
+            _reach_px(eye, spec, groups),
+        )
 
     def nodes(
         self,
@@ -183,8 +202,8 @@ class _Rays:
         difference_px = np.sqrt(mean_square(per_dpt)) * steps_dpt
         middles = lows + steps_dpt * (np.arange(_LADDER - 1)[:, None] + 0.5)
         allowed_px = np.full(middles.shape, np.inf)
-        for shift in shifts:
-            x = (middles + shift)[..., None]
+        for shift, focus_dpt in product(shifts, self.foci_dpt.tolist()):
+            x = (middles + shift - focus_dpt)[..., None]
             covariance = at_zero + x * (at_one - at_zero - spread) + x * x * spread
             of_channel_px = allowed_difference_px(
                 covariance,
@@ -207,7 +226,7 @@ class _Rays:
         drawn so.
         """
         lows, highs = ranges_dpt.T
-        limit_px = _LARGEST_RATIO * spec.max_blur_radius_px
+        limit_px = _LARGEST_RATIO * spec.max_blur_radius_px - self.reach_px
         first_dpt, last_dpt, room = self._within(limit_px)
         fits = (room > 0.0).all(axis=1) & (
             np.maximum(first_dpt, lows) <= np.minimum(last_dpt, highs)
@@ -230,11 +249,11 @@ class _Rays:
             largest_px = np.sqrt((slopes**2).sum(axis=-1)).max(axis=-1)
             best, at = largest_px.argmin(axis=0), np.arange(shrunk.size)
             limited_dpt[shrunk] = at_dpt[best, at][:, None]
-            ratio[shrunk] = limit_px / largest_px[best, at]
+            ratio[shrunk] = limit_px[shrunk] / largest_px[best, at]
         return limited_dpt, ratio
 
     def _within(
-        self, limit_px: float
+        self, limit_px: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """First and last defocus (P,) with all rays within a limit, if any are.
 
@@ -243,13 +262,23 @@ class _Rays:
         """
         a = np.maximum((self.per_dpt**2).sum(axis=-1), 1e-12)
         half_b = (self.zero_px * self.per_dpt).sum(axis=-1)
-        room = half_b**2 - a * ((self.zero_px**2).sum(axis=-1) - limit_px**2)
+        beyond = (self.zero_px**2).sum(axis=-1) - limit_px[:, None] ** 2
+        room = half_b**2 - a * beyond
         reach = np.sqrt(np.maximum(room, 0.0))
         return (
             ((-half_b - reach) / a).max(axis=1),
             ((-half_b + reach) / a).min(axis=1),
             room,
         )
+
+
+def _reach_px(
+    eye: EyeOptics, spec: GridSpec, groups: PupilStates
+) -> NDArray[np.float64]:
+    if eye.rings is None:
+        return np.zeros(groups.h_deg.size)
+    reach_dpt = max(eye.rings.reach_dpt(nm) for nm in spec.channel_wavelengths_nm)
+    return reach_dpt * groups.pupil_diameter_mm / 2.0 / min(spec.pixel_pitch_mrad)
 
 
 def _spread(

@@ -9,6 +9,7 @@ Frame layers follow the paper, as far as they must: never more than a step of bl
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,9 @@ kernel shows a change of its radius in proportion only."""
 
 BASE_OBJECT_STEP_DPT = 0.25
 """The paper's object distances: 33 over 8 dpt."""
+
+FOCUS_LADDER = 65
+"""Places between two foci at which the step to the next node is looked at."""
 
 LAYER_BLUR_RATIO = {"on-axis": 0.05, "quality": 0.05, "dynamic": 0.1}
 """Step of blur from layer to layer, of the blur radius; at least `MIN_BLUR_STEP_PX`."""
@@ -271,6 +275,37 @@ def pupil_nodes_mm(pupil_range_mm: tuple[float, float]) -> NDArray[np.float64]:
         return np.array([high_mm])
     count = 1 + math.ceil(math.log(high_mm / low_mm) / math.log(PUPIL_RATIO))
     return np.geomspace(low_mm, high_mm, count)
+
+
+def nodes_through_foci_dpt(
+    low_dpt: float,
+    high_dpt: float,
+    *,
+    foci_dpt: NDArray[np.float64],
+    blur_px_per_dpt: float,
+    max_blur_step_px: float,
+) -> NDArray[np.float64]:
+    """Nodes as those of `defocus_nodes_dpt`, of a lens that is sharp at several.
+
+    Each focus inside the range is a node, and steps are those of the nearest.
+    """
+    inside = foci_dpt[(foci_dpt > low_dpt) & (foci_dpt < high_dpt)]
+    ends = np.unique(np.concatenate([[low_dpt], inside, [high_dpt]]))
+    nodes = [ends[:1]]
+    for first, last in pairwise(ends.tolist()):
+        at_dpt = np.linspace(first, last, FOCUS_LADDER)
+        away_dpt = np.abs(at_dpt[:, None] - foci_dpt).min(axis=1)
+        step_px = [
+            blur_step_px(blur, max_blur_step_px)
+            for blur in (away_dpt * blur_px_per_dpt).tolist()
+        ]
+        density = blur_px_per_dpt / np.array(step_px)
+        steps = np.diff(at_dpt) * (density[1:] + density[:-1]) / 2.0
+        needed = np.append(0.0, np.cumsum(steps))
+        count = max(math.ceil(needed[-1]), 1)
+        wanted = np.linspace(0.0, needed[-1], count + 1)[1:]
+        nodes.append(np.interp(wanted, needed, at_dpt))
+    return np.unique(np.concatenate(nodes))
 
 
 def defocus_nodes_dpt(

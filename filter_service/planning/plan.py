@@ -5,6 +5,7 @@ reach, at the two neighbouring nodes of pupil and accommodation; only that is pl
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from filter_service.planning.grid import (
     GREEN,
     GridSpec,
     defocus_nodes_dpt,
+    nodes_through_foci_dpt,
     pupil_nodes_mm,
 )
 from filter_service.planning.nodes import (
@@ -48,7 +50,7 @@ from filter_service.planning.sampled_use import (
     sample_use,
     unit_px,
 )
-from filter_service.planning.slopes import PupilStates
+from filter_service.planning.slopes import PupilStates, main_foci_dpt
 from filter_service.settings import TOLERANCES
 
 __all__ = [
@@ -199,7 +201,7 @@ def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> DefocusN
     exact_dpt = joined_ranges(found.beside_shift_dpt)
     is_exact = np.array([np.ptp(ranges_dpt) < EXACT_DPT for ranges_dpt in exact_dpt])
     nodes = [
-        own_dpt[:1, 0] if exact else _nodes_by_blur(spec, pupil_mm, ranges_dpt)
+        own_dpt[:1, 0] if exact else _nodes_by_blur(eye, spec, pupil_mm, ranges_dpt)
         for exact, own_dpt, ranges_dpt, pupil_mm in zip(
             is_exact,
             exact_dpt,
@@ -214,17 +216,19 @@ def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> DefocusN
 
 
 def _nodes_by_blur(
-    spec: GridSpec, pupil_mm: float, ranges_dpt: NDArray[np.float64]
+    eye: EyeOptics, spec: GridSpec, pupil_mm: float, ranges_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Nodes over ranges (n, 2) of total defocus."""
-    pieces = [
-        defocus_nodes_dpt(
-            *range_dpt,
-            blur_px_per_dpt=spec.blur_px_per_dpt(pupil_mm),
-            max_blur_step_px=spec.max_blur_step_px,
-        )
-        for range_dpt in ranges_dpt.tolist()
-    ]
+    steps = {
+        "blur_px_per_dpt": spec.blur_px_per_dpt(pupil_mm),
+        "max_blur_step_px": spec.max_blur_step_px,
+    }
+    if eye.rings is None:
+        nodes = partial(defocus_nodes_dpt, **steps)
+    else:
+        foci_dpt = main_foci_dpt(eye, spec)
+        nodes = partial(nodes_through_foci_dpt, foci_dpt=foci_dpt, **steps)
+    pieces = [nodes(*range_dpt) for range_dpt in ranges_dpt.tolist()]
     return np.unique(np.concatenate(pieces))
 
 

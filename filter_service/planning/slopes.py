@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.field.eye_optics import EyeOptics
 from estimator.optics.zernike import EXPONENTS, wavefront_polynomial
 from estimator.psf.pupil import PupilFrames, pupil_frames
+from estimator.psf.screens import ScreenTables
 from estimator.psf.stiles_crawford import StilesCrawford
+from estimator.psf.survey import PupilSurvey, survey_pupils
 from filter_service.planning.grid import GridSpec
 
 N_RINGS, N_AZIMUTHS = 5, 16
@@ -73,6 +75,30 @@ def state_frames(
         pupil_ellipse=found.pupil_ellipse,
         apodisation=weighed and weighed.amplitude(states.wavelength_nm),
     )
+
+
+def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSurvey:
+    """Slopes of states (P,) and how far their light goes, rings of a lens and all."""
+    survey = survey_pupils(state_frames(eye, spec, states))
+    if eye.rings is None:
+        return survey
+    return survey.behind(
+        ScreenTables.of(
+            eye.rings,
+            half_width_um_per_px=survey.frames.half_width_um_per_px,
+            pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
+            pupil_ellipse=eye.wavefronts(**vars(states)).pupil_ellipse,
+            wavelength_nm=states.wavelength_nm,
+        )
+    )
+
+
+def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
+    """Total defocus (n,) at which some channel is sharp."""
+    if eye.rings is None:
+        return np.zeros(1)
+    channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
+    return np.unique(np.concatenate([eye.rings.main_dpt(nm) for nm in channels_nm]))
 
 
 def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:

@@ -3,6 +3,7 @@
 eye_for_spec         the eye of a profile, for what a cache covers
 build_store          every PSF of a plan, in chunks
 wide_primaries       kernels of primaries of two wavelengths
+several_foci         how sharp kernels are that have several foci
 psf_engine           on the CPU or the GPU
 gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from filter_service.planning.plan import CachePlan, plan_cache
 from filter_service.planning.slopes import PupilStates, apodisation
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import CPU, PsfEngine
+from filter_service.psfs.several_foci import sharpest_blur_px
 from filter_service.psfs.store import PsfStore
 from filter_service.psfs.wide_primaries import mean_batch, states_of_primaries
 
@@ -146,12 +148,16 @@ def _computed(
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
         stiles_crawford=apodisation(eye, spec),
+        pupil_screen=eye.rings,
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.settings.diffraction,
         max_radius_px=spec.max_blur_radius_px,
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )
+    if eye.rings is not None:
+        blur_px = sharpest_blur_px(eye, spec, states)
+        batch = replace(batch, blur_radius_px=blur_px)
     return mean_batch(batch, per_psf)
 
 

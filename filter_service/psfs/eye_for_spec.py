@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+from estimator.corrections.worn_lens import WornLens
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
@@ -43,6 +44,8 @@ def eye_for_spec(
             progress(fraction, stage)
 
     settings = spec.settings
+    if isinstance(profile.correction, WornLens) and profile.correction.rings:
+        _check_diffracts(settings.diffraction)
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
@@ -59,6 +62,14 @@ def eye_for_spec(
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
     return eye, notes
+
+
+def _check_diffracts(diffraction: bool) -> None:
+    if not diffraction:
+        raise ValueError(
+            "settings.diffraction is false beside a lens with several foci: its rings "
+            "are known to diffraction alone; allowed is true"
+        )
 
 
 def _with_axis(ranges_deg: FieldRange) -> FieldRange:

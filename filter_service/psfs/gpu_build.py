@@ -26,11 +26,13 @@ from estimator.psf.compute import (
     PsfBatch,
     PsfPlan,
     PsfTooLarge,
+    compute_psf_batch,
     finished_batch,
     plan_psfs,
 )
 from estimator.psf.fourier import fourier_kernels
 from estimator.psf.kernel_types import KernelBuffer, empty_buffer
+from estimator.psf.screens import PupilScreen
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.threads import thread_count
 from filter_service.gl.gpu import Gpu
@@ -233,6 +235,7 @@ def gpu_psf_batch(
     pixel_from_mrad: ArrayLike | None = None,
     pupil_ellipse: ArrayLike | None = None,
     stiles_crawford: StilesCrawford | None = None,
+    pupil_screen: PupilScreen | None = None,
     radius_px: int | None = None,
     method: str = "auto",
     accuracy: str = "normal",
@@ -253,6 +256,8 @@ def gpu_psf_batch(
         The wave method takes FFTs of up to 1024 samples here; wavefronts that need
         longer ones (a spot of about 600 to 1000 lambda/D) go through the CPU's, up to
         its own limit.
+    pupil_screen : PupilScreen, optional
+        The processor computes what has one.
     workers : int, optional
         Threads of the survey; as many as the process may use where it is None.
     pace : Pace, optional
@@ -283,6 +288,14 @@ def gpu_psf_batch(
         "max_radius_px": max_radius_px,
         "min_energy_ratio": min_energy_ratio,
     }
+    if pupil_screen is not None:
+        return compute_psf_batch(
+            zernike_um,
+            pupil_screen=pupil_screen,
+            accuracy=accuracy,
+            workers=workers,
+            **options,
+        )
     passes = PsfPasses(gpu, pace or Pace())
     batches = []
     for block in _prepare(gpu, zernike_um, options, accuracy, workers):

@@ -185,14 +185,14 @@ def frame_layers(
         if pupil_weight * used_weight > 0.0
     )
     notes += _limit_notes(store, corners)
-    reads = _state_reads(plan, pupil_mm, corners)
+    reads = _state_reads(store, pupil_mm, corners)
     far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
     far_near_dpt = (
         float(eye.vergence.vergence_dpt(far_dpt)),
         float(eye.vergence.vergence_dpt(near_dpt)),
     )
     low_dpt, high_dpt = change.range_dpt
-    in_focus_dpt = -layer_zero_dpt[plan.axis_node]
+    in_focus_dpt = _in_focus_dpt(store, layer_zero_dpt[plan.axis_node])
     blur_px_per_dpt = store.spec.blur_px_per_dpt(pupil_mm)
     layer_dpt = layer_distances_dpt(
         *(store.tables, reads, layer_zero_dpt),
@@ -267,10 +267,29 @@ def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
     return [(lower, 1.0 - share), (upper, share)]
 
 
-def _state_reads(plan: CachePlan, pupil_mm: float, corners: tuple) -> StateReads:
+def _in_focus_dpt(
+    store: PsfStore, at_infinity_dpt: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Vergences at which some channel is sharp; at several foci, where an eye has."""
+    if store.eye.rings is None:
+        return -at_infinity_dpt
+    channels_nm = store.spec.channel_wavelengths_nm.tolist()
+    return np.concatenate(
+        [
+            store.eye.rings.main_dpt(nm) - zero_dpt
+            for nm, zero_dpt in zip(channels_nm, at_infinity_dpt, strict=True)
+        ]
+    )
+
+
+def _state_reads(store: PsfStore, pupil_mm: float, corners: tuple) -> StateReads:
+    plan = store.plan
     n_used = plan.accommodations_dpt.size
+    scales = np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners])
+    if store.eye.rings is not None:  # foci stay where they are in any pupil
+        scales = np.ones(len(corners))
     return StateReads(
         groups=np.array([pupil * n_used + used for pupil, used, _ in corners]),
-        scales=np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners]),
+        scales=scales,
         weights=np.array([weight for _, _, weight in corners]),
     )

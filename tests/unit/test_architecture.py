@@ -52,17 +52,18 @@ EYE_ROOMS = {
     "optics": (),
     "wavefront": ("optics",),
     "psf": ("optics",),
+    "corrections": ("wavefront", "optics"),
     "media": (),
     "acuity": ("optics",),
     "dynamics": (),
-    "eye": ("wavefront", "optics"),
-    "profiles": ("eye", "media", "wavefront", "optics"),
+    "eye": ("corrections", "wavefront", "optics"),
+    "profiles": ("eye", "corrections", "media", "wavefront", "optics"),
     "periphery": ("profiles", "optics"),
     "networks": ("eye", "optics"),
     "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
     "field": (
         *("estimate", "networks", "periphery", "profiles"),
-        *("eye", "wavefront", "optics"),
+        *("eye", "corrections", "wavefront", "optics"),
     ),
 }
 """From light to an eye over its field: each room knows only those before it."""

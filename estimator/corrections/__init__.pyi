@@ -1,0 +1,3 @@
+from .rings import DiffractiveRings as DiffractiveRings
+from .rings import RefractiveZones as RefractiveZones
+from .worn_lens import WornLens as WornLens

@@ -1,0 +1,137 @@
+"""Lenses with several foci at once, as what their rings do to light in the pupil.
+
+Foci are not added up as if each had an eye of its own: through 2 to 3 mm their light
+interferes, which is what extends the depth of focus of weak additions.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.corrections.kinoform import Kinoform
+from estimator.optics.units import NM_PER_UM
+
+LOWEST_ORDER, HIGHEST_ORDER = -3, 3
+"""Orders that are followed, below the lowest and above the highest with much light.
+What is left, some per cent still farther out of focus, is given to the two ends."""
+
+MAIN_SHARE = 0.1
+"""Share of the light from which on a focus is looked at for itself."""
+
+
+@dataclass(frozen=True)
+class DiffractiveRings:
+    """Diffractive lens in the plane of the entrance pupil.
+
+    Attributes
+    ----------
+    spacing_dpt : float
+        Power of the first order at ``design_nm``; that of order k is k times as large,
+        and all are in proportion to the wavelength.
+    kinoform : Kinoform
+    orders : (lowest, highest)
+        Those that the design is for.
+    far_order : int
+        The one that is in focus for far; its power at ``design_nm`` is in the eye's.
+    design_nm : float
+    diameter_mm : float
+        Of the rings; beyond them all light is for far.
+    centre_mm : (x, y)
+    """
+
+    spacing_dpt: float
+    kinoform: Kinoform
+    orders: tuple[int, int] = (0, 1)
+    far_order: int = 0
+    design_nm: float = 550.0
+    diameter_mm: float = 20.0
+    centre_mm: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def followed_orders(self) -> NDArray[np.int64]:
+        """Orders (K,) beside which nothing is left over."""
+        lowest, highest = self.orders
+        return np.arange(lowest + LOWEST_ORDER, highest + HIGHEST_ORDER + 1)
+
+    def amplitudes(self, wavelength_nm: float) -> NDArray[np.complex128]:
+        """Amplitudes (K,) of the orders that are followed; squares sum to 1."""
+        found = self.kinoform.amplitudes(
+            self.followed_orders, height_ratio=self.design_nm / wavelength_nm
+        )
+        left = max(1.0 - float((np.abs(found) ** 2).sum()), 0.0) / 2.0
+        for end in (0, -1):
+            size = abs(found[end])
+            turn = found[end] / size if size > 0.0 else 1.0
+            found[end] = np.hypot(size, np.sqrt(left)) * turn
+        return found
+
+    def added_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
+        """Power (K,) of each order beyond that for which the eye is in focus."""
+        colour = wavelength_nm / self.design_nm
+        return self.spacing_dpt * (self.followed_orders * colour - self.far_order)
+
+    def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
+        """Power (n,) of those that have much of the light."""
+        is_main = np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
+        return self.added_dpt(wavelength_nm)[is_main]
+
+    def reach_dpt(self, wavelength_nm: float) -> float:
+        """Largest power, of either sign, that light is sent out of focus by."""
+        return float(np.abs(self.added_dpt(wavelength_nm)).max())
+
+    def transmission(
+        self, square_mm2: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.complex128]:
+        """Complex amplitude behind the lens at squared distances from its centre."""
+        square = np.asarray(square_mm2, dtype=np.float64)
+        inside = np.minimum(square, (self.diameter_mm / 2.0) ** 2)
+        turns_um = NM_PER_UM / wavelength_nm
+        field = np.zeros(square.shape, complex)
+        for added_dpt, amplitude in zip(
+            self.added_dpt(wavelength_nm), self.amplitudes(wavelength_nm), strict=True
+        ):
+            field += amplitude * np.exp(1j * np.pi * turns_um * added_dpt * inside)
+        return np.where(square > inside, np.exp(1j * np.angle(field)), field)
+
+
+@dataclass(frozen=True)
+class RefractiveZones:
+    """Rings of different power, in the plane of the entrance pupil.
+
+    Attributes
+    ----------
+    outer_mm : tuple of float
+        Outer radius of each ring, ascending; the last goes on.
+    powers_dpt : tuple of float
+        Power of each beyond that for far.
+    centre_mm : (x, y)
+    """
+
+    outer_mm: tuple[float, ...]
+    powers_dpt: tuple[float, ...]
+    centre_mm: tuple[float, float] = (0.0, 0.0)
+
+    def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
+        """Power (n,) of all rings."""
+        return np.unique(self.powers_dpt)
+
+    def reach_dpt(self, wavelength_nm: float) -> float:
+        """Largest power, of either sign, that light is sent out of focus by."""
+        return float(np.abs(self.powers_dpt).max())
+
+    def transmission(
+        self, square_mm2: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.complex128]:
+        """Complex amplitude behind the lens; its surface has no steps."""
+        square = np.asarray(square_mm2, dtype=np.float64)
+        ends = np.square(self.outer_mm)
+        path_um, before = np.zeros(square.shape), 0.0
+        for end, power_dpt in zip(ends, self.powers_dpt, strict=True):
+            path_um += power_dpt / 2.0 * np.clip(square - before, 0.0, end - before)
+            before = end
+        path_um += self.powers_dpt[-1] / 2.0 * np.maximum(square - before, 0.0)
+        return np.exp(2j * np.pi * NM_PER_UM / wavelength_nm * path_um)
+
+
+Rings = DiffractiveRings | RefractiveZones

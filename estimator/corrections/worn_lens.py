@@ -1,0 +1,124 @@
+"""A lens on or in the eye: a prescription, its own aberration, and where it sits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.corrections.rings import Rings
+from estimator.optics import prescription as rx
+from estimator.optics.zernike import EXPONENTS, N_TERMS, index_from_nm
+from estimator.wavefront.field_wavefronts import (
+    DEGREE,
+    correction_polynomial,
+    polynomial_in_mm,
+    total_defocus_dpt,
+    zernike_from_polynomial,
+)
+
+ABERRATION_PUPIL_MM = 6.0
+"""Pupil for which a lens's spherical aberration is stated."""
+
+POWER_PUPIL_MM = 4.0
+"""Pupil through which its power is the stated one, as an eye's refraction is."""
+
+C40 = index_from_nm(4, 0)
+
+
+@dataclass(frozen=True)
+class WornLens(rx.Prescription):
+    """A contact lens or an intraocular lens, as it acts in the entrance pupil.
+
+    Attributes
+    ----------
+    sphere_dpt, cylinder_dpt, axis_deg, vertex_mm : float
+        See `Prescription`; a lens in the pupil's own plane has minus its depth.
+    kind : {"contact_lens", "iol"}
+    spherical_aberration_um : float
+        C(4,0) on 6 mm that it adds; its power through 4 mm stays.
+    centre_mm : (x, y)
+        In the entrance pupil, x to the person's right, y up.
+    rings : Rings or None
+        Where it has several foci.
+    replaces_lens : bool
+        Whether the eye's own lens is gone, and accommodation with it.
+    """
+
+    kind: str = "contact_lens"
+    spherical_aberration_um: float = 0.0
+    centre_mm: tuple[float, float] = (0.0, 0.0)
+    rings: Rings | None = None
+    replaces_lens: bool = False
+
+
+def rings_of(correction: rx.Prescription | None) -> Rings | None:
+    """Return what makes several foci of a worn correction; None where it has one."""
+    return correction.rings if isinstance(correction, WornLens) else None
+
+
+def replaces_lens(correction: rx.Prescription | None) -> bool:
+    """Return whether a correction takes the place of the eye's own lens."""
+    return isinstance(correction, WornLens) and correction.replaces_lens
+
+
+def worn_polynomial(
+    correction: rx.Prescription | None, *, entrance_pupil_mm: float
+) -> NDArray[np.float64]:
+    """Monomials (28,), um/mm^degree, that a correction takes off in the pupil's plane.
+
+    Its power as `correction_polynomial` has it, less its own aberration.
+    """
+    taken_um = correction_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
+    if isinstance(correction, WornLens) and correction.spherical_aberration_um:
+        taken_um = taken_um - own_polynomial(correction)
+    return taken_um
+
+
+def worn_refraction(
+    correction: rx.Prescription | None, *, entrance_pupil_mm: float
+) -> tuple[float, float]:
+    """M, dpt, that it takes off through a pinhole, and more for each mm² of radius²."""
+    if correction is None:
+        return 0.0, 0.0
+    taken_um = worn_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
+    radii_mm = np.array([1.0, 2.0])
+    on_circles = zernike_from_polynomial(np.tile(taken_um, (2, 1)), radii_mm)
+    narrow_dpt, wide_dpt = total_defocus_dpt(on_circles, radii_mm).tolist()
+    per_mm2 = (wide_dpt - narrow_dpt) / (radii_mm[1] ** 2 - radii_mm[0] ** 2)
+    return narrow_dpt - per_mm2 * radii_mm[0] ** 2, per_mm2
+
+
+def own_polynomial(lens: WornLens) -> NDArray[np.float64]:
+    """Monomials (28,) of a lens's own aberration, about the pupil's centre.
+
+    Off its centre a lens has coma too, and astigmatism; the tilt is that of the chief
+    ray, which has none.
+    """
+    zernike_um = np.zeros(N_TERMS)
+    zernike_um[C40] = lens.spherical_aberration_um
+    own_um = polynomial_in_mm(zernike_um, ABERRATION_PUPIL_MM / 2.0)
+    through = zernike_from_polynomial(own_um, POWER_PUPIL_MM / 2.0)
+    power_um = np.zeros(N_TERMS)
+    power_um[rx.C20] = through[rx.C20]
+    own_um = own_um - polynomial_in_mm(power_um, POWER_PUPIL_MM / 2.0)
+    own_um = shifted_polynomial(own_um, lens.centre_mm)
+    return np.where(DEGREE < 2, 0.0, own_um)
+
+
+def shifted_polynomial(
+    polynomial_um: NDArray[np.float64], centre_mm: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Monomials (28,) of p(u - centre)."""
+    if not any(centre_mm):
+        return polynomial_um
+    place = {tuple(e): k for k, e in enumerate(EXPONENTS.astype(int).tolist())}
+    found = np.zeros(N_TERMS)
+    for (a, b), value in zip(place, polynomial_um.tolist(), strict=True):
+        if value == 0.0:
+            continue
+        along_x = np.polynomial.polynomial.polypow((-centre_mm[0], 1.0), a)
+        along_y = np.polynomial.polynomial.polypow((-centre_mm[1], 1.0), b)
+        for i, from_x in enumerate(along_x.tolist()):
+            for j, from_y in enumerate(along_y.tolist()):
+                found[place[i, j]] += value * from_x * from_y
+    return found

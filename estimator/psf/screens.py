@@ -1,0 +1,122 @@
+"""Rings in the pupil that no polynomial describes: a factor by the distance from them.
+
+Only the wave method knows them.  They are tabulated over the squared distance from
+their centre, where the rings of a lens are about equally wide.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+TABLE_COUNT = 1 << 15
+"""Entries of a table: rings of 40 waves over the pupil have 800 each."""
+
+
+class PupilScreen(Protocol):
+    """What rings do to the light, the same at every pupil and field."""
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """Of the rings, from the pupil's centre."""
+
+    def reach_dpt(self, wavelength_nm: float) -> float:
+        """Largest power by which light is sent out of focus, of either sign."""
+
+    def transmission(
+        self, square_mm2: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.complex128]:
+        """Complex amplitude at squared distances from the centre."""
+
+
+@dataclass(frozen=True)
+class ScreenTables:
+    """A screen before P pupils.
+
+    Attributes
+    ----------
+    from_box_mm : (P, 2, 3)
+        Place against the screen's centre: a matrix of the box's x and y, and an offset.
+    tables : (n_wavelengths, TABLE_COUNT) complex64
+    which : (P,) int64
+        Table of each pupil.
+    steps_per_mm2 : float
+    reach_px : (P, 2)
+        How much farther light goes than without it, x and y.
+    """
+
+    from_box_mm: NDArray[np.float64]
+    tables: NDArray[np.complex64]
+    which: NDArray[np.int64]
+    steps_per_mm2: float
+    reach_px: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        screen: PupilScreen,
+        *,
+        half_width_um_per_px: NDArray[np.float64],
+        pixel_from_mrad: NDArray[np.float64],
+        pupil_ellipse: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+    ) -> "ScreenTables":
+        """Tabulate a screen for pupils, see `pupil.pupil_frames`."""
+        matrix = np.swapaxes(pixel_from_mrad, 1, 2) * half_width_um_per_px[:, None, :]
+        offset = pupil_ellipse[:, :2] - np.array(screen.centre_mm)
+        largest_mm = pupil_ellipse[:, 2] + np.hypot(*offset.T)
+        # The smoothed edge of the pupil reaches beyond it.
+        most_mm2 = (1.5 * float(largest_mm.max())) ** 2
+        square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * most_mm2
+        colours_nm, which = np.unique(wavelength_nm, return_inverse=True)
+        reach_dpt = np.array([screen.reach_dpt(nm) for nm in colours_nm.tolist()])
+        reach_mrad = reach_dpt[which] * largest_mm
+        return cls(
+            from_box_mm=np.concatenate([matrix, offset[:, :, None]], axis=2),
+            tables=np.stack(
+                [screen.transmission(square_mm2, nm) for nm in colours_nm.tolist()]
+            ).astype(np.complex64),
+            which=which,
+            steps_per_mm2=TABLE_COUNT / most_mm2,
+            reach_px=reach_mrad[:, None] * np.linalg.norm(pixel_from_mrad, axis=2),
+        )
+
+    def apply(
+        self,
+        members: NDArray[np.int64],
+        samples: NDArray[np.float64],
+        size: NDArray[np.int64],
+        field: NDArray[np.complex64],
+    ) -> None:
+        """Multiply fields (B, My, N) of some pupils; grids as in `fill_pupils`."""
+        _apply(
+            self.from_box_mm[members],
+            self.tables,
+            self.which[members],
+            self.steps_per_mm2,
+            samples,
+            size,
+            field,
+        )
+
+
+@njit(cache=True, nogil=True)
+def _apply(from_box, tables, which, steps_per_mm2, samples, size, field):
+    last = tables.shape[1] - 1
+    for b in range(field.shape[0]):
+        m, table = from_box[b], tables[which[b]]
+        columns, rows = size[b]
+        for j in range(rows):
+            y = (j - (rows - 1) / 2.0) * 2.0 / samples[b, 1]
+            row = field[b, j]
+            for i in range(columns):
+                if row[i] == 0.0:
+                    continue
+                x = (i - (columns - 1) / 2.0) * 2.0 / samples[b, 0]
+                u = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+                v = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+                step = math.floor((u * u + v * v) * steps_per_mm2)
+                row[i] *= table[min(step, last)]
