@@ -12,6 +12,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.corrections.progressive import (
+    ProgressiveLens,
+    progressive_polynomial,
+)
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.focusing import FocusingEye
@@ -63,7 +67,7 @@ class TracedEye(FocusingEye):
     rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
     and at other fields by the same factor.  What the eye leaves of its measurement is
     added to its wavefronts, see `measured_rest`.  The worn correction is taken off at
-    every field alike, see `worn_lens.worn_polynomial`.
+    every field alike, but for a progressive lens, see `worn_lens.worn_polynomial`.
 
     Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
     the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
@@ -113,8 +117,9 @@ class TracedEye(FocusingEye):
         self._on_axis = self._field if has_axis else axis
         self.entrance_pupil_mm = eye.accommodating.entrance_pupil_mm
         self.rings = rings_of(eye.profile.correction)
+        self._worn = eye.profile.correction
         self._correction = worn_polynomial(
-            eye.profile.correction, entrance_pupil_mm=self.entrance_pupil_mm
+            self._worn, entrance_pupil_mm=self.entrance_pupil_mm
         )
         self._rest = eye.rest(axis.grid.wavelengths_nm)
 
@@ -370,13 +375,21 @@ class TracedEye(FocusingEye):
         return TracedFields(
             self._field,
             self._on_axis,
-            self._correction,
+            self._correction_at(h_deg, v_deg),
             self._rest,
             periphery=self.periphery,
             h_deg=h_deg,
             v_deg=v_deg,
             wavelength_nm=wavelength_nm,
             pupil_diameter_mm=pupil_diameter_mm,
+        )
+
+    def _correction_at(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
+        """Return what the worn correction takes off: (28,), or (n, 28) at fields."""
+        if not isinstance(self._worn, ProgressiveLens):
+            return self._correction
+        return progressive_polynomial(
+            self._worn, h_deg, v_deg, entrance_pupil_mm=self.entrance_pupil_mm
         )
 
     def _check_fields(self, h_deg, v_deg) -> None:

@@ -46,7 +46,7 @@ class TracedFields:
     ----------
     field, on_axis : FieldInterpolation
         That of the states, and one that holds the axis.
-    correction_um : (28,), um/mm^degree
+    correction_um : (28,) or (n, 28), um/mm^degree
         What a worn correction takes off.
     rest : MeasuredRest
         What is added.

@@ -10,6 +10,7 @@ from estimator.corrections.intraocular import (
     power_at_pupil_dpt,
 )
 from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones, Rings
 from estimator.corrections.worn_lens import WornLens
 from estimator.eye import checked_fields as fields
@@ -17,8 +18,9 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 
-KINDS = ("spectacles", "contact_lens", "iol")
+KINDS = ("spectacles", "progressive", "contact_lens", "iol")
 SPECTACLE_FIELDS = ("sphere_dpt", "cylinder_dpt", "axis_deg", "vertex_mm")
+PROGRESSIVE_FIELDS = ("add_dpt", "corridor_mm", "gaze_deg")
 SEATED_FIELDS = (
     *SPECTACLE_FIELDS[:3],
     "rotation_deg",
@@ -56,11 +58,26 @@ def correction(data: Mapping[str, Any]) -> rx.Prescription | None:
     if kind == "spectacles":
         fields.only_known(body, ("kind", *SPECTACLE_FIELDS), path=PATH)
         return prescription(body, path=PATH)
+    if kind == "progressive":
+        return _progressive(body)
     if kind == "contact_lens":
         fields.only_known(body, ("kind", *SEATED_FIELDS), path=PATH)
         return WornLens(**_seated(body, kind, needs_sphere=True))
     is_prescription = data.get("kind") == "prescription"
     return _intraocular(body, has_cornea=not is_prescription)
+
+
+def _progressive(body: Mapping[str, Any]) -> ProgressiveLens:
+    fields.only_known(body, ("kind", *SPECTACLE_FIELDS, *PROGRESSIVE_FIELDS), path=PATH)
+    h_deg, v_deg = _numbers(body, "gaze_deg", -60.0, 60.0, (2, 2), [0.0, 0.0])
+    return ProgressiveLens.of(
+        prescription(body, path=PATH),
+        add_dpt=fields.number(body, "add_dpt", 0.25, 4.0, path=PATH),
+        corridor_mm=fields.number(
+            body, "corridor_mm", 8.0, 24.0, default=14.0, path=PATH
+        ),
+        gaze_deg=(h_deg, v_deg),
+    )
 
 
 def prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.worn_lens import WornLens
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
@@ -14,6 +15,12 @@ from filter_service.errors import BuildCancelled
 from filter_service.planning.grid import GridSpec, pupil_nodes_mm
 
 NO_LATERAL_COLOR = "a measured wavefront holds no lateral colour: it needs a traced eye"
+
+
+ONE_GAZE = (
+    "the progressive lens is that of the middle of settings.gaze_range_deg: "
+    "another gaze sees the world through the same part of it"
+)
 
 
 def eye_for_spec(
@@ -48,6 +55,9 @@ def eye_for_spec(
         _check_diffracts(settings.diffraction)
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
+    if isinstance(profile.correction, ProgressiveLens):
+        worn = profile.correction.looking(settings.gaze_deg)
+        profile = replace(profile, correction=worn)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
     eye, notes = prepare_eye(
         profile,
@@ -61,6 +71,8 @@ def eye_for_spec(
     )
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
+    if isinstance(profile.correction, ProgressiveLens) and any(settings.gaze_range_deg):
+        notes = (*notes, ONE_GAZE)
     return eye, notes
 
 

@@ -1,0 +1,146 @@
+"""A progressive lens: spectacles whose power changes with the direction of gaze.
+
+No maker publishes a surface.  This one is W = U(y) + g(x) F(y) with U'' = F: along the
+corridor x = 0 it has the power F(y) in every meridian, from far to the addition, and
+beside it the astigmatism 2 |F'(y)| x with an oblique axis that no smooth surface can be
+without (Minkwitz, Optica Acta 10, 1963).  Farther out g' levels off, as designs do, so
+that the astigmatism stays about as large as the addition.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics import prescription as rx
+from estimator.optics.units import MM_PER_M
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+from estimator.wavefront.field_wavefronts import polynomial_in_mm
+
+ROTATION_CENTRE_MM = 13.5
+"""About which the eye turns, behind the cornea."""
+
+HALF_WIDTH_MM = 5.0
+"""Beside the corridor, over which g' levels off."""
+
+
+@dataclass(frozen=True)
+class ProgressiveLens(rx.Prescription):
+    """A progressive lens; as a `Prescription` it is what the fovea sees through.
+
+    Attributes
+    ----------
+    distance : Prescription
+        That for far.
+    add_dpt : float
+    corridor_mm : float
+        From the fitting cross, before the pupil of an eye that looks straight ahead,
+        down to the whole addition.
+    gaze_deg : (h, v)
+        Where the eye looks, from straight ahead of the head.
+    """
+
+    distance: rx.Prescription = field(default_factory=lambda: rx.Prescription(0.0))
+    add_dpt: float = 0.0
+    corridor_mm: float = 14.0
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(
+        cls,
+        distance: rx.Prescription,
+        *,
+        add_dpt: float,
+        corridor_mm: float,
+        gaze_deg: tuple[float, float] = (0.0, 0.0),
+    ) -> "ProgressiveLens":
+        """Return the lens as it is seen through in a direction of gaze."""
+        lens = cls(
+            **vars(distance),
+            distance=distance,
+            add_dpt=add_dpt,
+            corridor_mm=corridor_mm,
+            gaze_deg=gaze_deg,
+        )
+        power = lens.power_matrices_dpt(*lens.lens_point_mm(0.0, 0.0))
+        m_dpt = float(power[0, 0] + power[1, 1]) / 2.0
+        j0_dpt = float(power[0, 0] - power[1, 1]) / 2.0
+        seen = rx.prescription_from_power_vector(m_dpt, j0_dpt, float(power[0, 1]))
+        seen = replace(seen, vertex_mm=distance.vertex_mm)
+        return replace(lens, **vars(seen))
+
+    def looking(self, gaze_deg: tuple[float, float]) -> "ProgressiveLens":
+        """Return the lens for an eye that looks so much farther aside and up."""
+        h_deg, v_deg = (
+            own + more for own, more in zip(self.gaze_deg, gaze_deg, strict=True)
+        )
+        return ProgressiveLens.of(
+            self.distance,
+            add_dpt=self.add_dpt,
+            corridor_mm=self.corridor_mm,
+            gaze_deg=(h_deg, v_deg),
+        )
+
+    def lens_point_mm(
+        self, h_deg: ArrayLike, v_deg: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where light from field directions crosses the lens, x and y (...).
+
+        From the fitting cross: by gaze about the centre of rotation, and from there by
+        field about the entrance pupil.
+        """
+        by_gaze_mm = self.vertex_mm + ROTATION_CENTRE_MM
+        by_field_mm = self.vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM
+        x, y = (
+            by_gaze_mm * np.tan(np.radians(gaze)) + by_field_mm * np.tan(direction)
+            for gaze, direction in zip(
+                self.gaze_deg, (np.radians(h_deg), np.radians(v_deg)), strict=True
+            )
+        )
+        return x, y
+
+    def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
+        """Power (..., 2, 2) at points of the lens, x to the person's right, y up."""
+        x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
+        down = np.clip(-y / self.corridor_mm, 0.0, 1.0)
+        # A step whose first two derivatives are zero at both ends.
+        power = self.add_dpt * down**3 * (10.0 - 15.0 * down + 6.0 * down**2)
+        slope = -30.0 * down**2 * (1.0 - down) ** 2
+        bend = 60.0 * down * (1.0 - down) * (1.0 - 2.0 * down)
+        slope = self.add_dpt * slope / self.corridor_mm
+        bend = self.add_dpt * bend / self.corridor_mm**2
+        aside = x / HALF_WIDTH_MM
+        g = HALF_WIDTH_MM**2 * (np.logaddexp(aside, -aside) - np.log(2.0))
+        across = HALF_WIDTH_MM * np.tanh(aside) * slope
+        found = np.empty((*x.shape, 2, 2))
+        found[..., 0, 0] = power / np.cosh(aside) ** 2
+        found[..., 1, 1] = power + g * bend
+        found[..., 0, 1] = found[..., 1, 0] = across
+        m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
+        return found + np.array([[m + j0, j45], [j45, m - j0]])
+
+
+def progressive_polynomial(
+    lens: ProgressiveLens,
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    *,
+    entrance_pupil_mm: float,
+) -> NDArray[np.float64]:
+    """Monomials (..., 28) that a lens takes off at field directions (...).
+
+    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1.
+    """
+    power = lens.power_matrices_dpt(*lens.lens_point_mm(h_deg, v_deg))
+    before_m = (lens.vertex_mm + entrance_pupil_mm) / MM_PER_M
+    at_pupil = power @ np.linalg.inv(np.eye(2) - before_m * power)
+    m = (at_pupil[..., 0, 0] + at_pupil[..., 1, 1]) / 2.0
+    j0 = (at_pupil[..., 0, 0] - at_pupil[..., 1, 1]) / 2.0
+    unit = np.stack(
+        [
+            rx.zernike_from_power_vector(*row, zernike_radius_mm=1.0)
+            for row in np.eye(3).tolist()
+        ]
+    )
+    parts = np.stack([m, j0, at_pupil[..., 0, 1]], axis=-1)
+    return parts @ polynomial_in_mm(unit, 1.0)
