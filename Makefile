@@ -9,7 +9,7 @@ USUAL := -m "not clock and not slow and not gpu"
 ALONE := -m "clock and not slow and not gpu"
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
-BENCHES := estimate focus people media acuity dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip
+BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip
 
 .DEFAULT_GOAL := help
 .PHONY: demo test test-training test-batch-ray test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-batch-ray setup-witness

@@ -1,16 +1,18 @@
 """A progressive lens: spectacles whose power changes with the direction of gaze.
 
-No maker publishes a surface.  This one is W = U(y) + g(x) F(y) with U'' = F: along the
-corridor x = 0 it has the power F(y) in every meridian, from far to the addition, and
-beside it the astigmatism 2 |F'(y)| x with an oblique axis that no smooth surface can be
-without (Minkwitz, Optica Acta 10, 1963).  Farther out g' levels off, as designs do, so
-that the astigmatism stays about as large as the addition.
+No maker publishes a surface.  This one is U(y) with U'' = F, along the corridor x = 0,
+smoothed upwards and downwards by a normal distribution as wide as |x|.  On the corridor
+it has the power F(y) in every meridian, from far to the addition; beside it the
+astigmatism 2 |F'(y)| x with an oblique axis that no smooth surface can be without
+(Minkwitz, Optica Acta 10, 1963), which levels off at 0.8 of the addition.  F is the
+normal distribution itself, a quarter of the corridor wide.
 """
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
@@ -19,9 +21,6 @@ from estimator.wavefront.field_wavefronts import polynomial_in_mm
 
 ROTATION_CENTRE_MM = 13.5
 """About which the eye turns, behind the cornea."""
-
-HALF_WIDTH_MM = 5.0
-"""Beside the corridor, over which g' levels off."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class ProgressiveLens(rx.Prescription):
     add_dpt : float
     corridor_mm : float
         From the fitting cross, before the pupil of an eye that looks straight ahead,
-        down to the whole addition.
+        where 2 % of the addition are, down to where 98 % are.
     gaze_deg : (h, v)
         Where the eye looks, from straight ahead of the head.
     """
@@ -102,20 +101,15 @@ class ProgressiveLens(rx.Prescription):
     def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
         """Power (..., 2, 2) at points of the lens, x to the person's right, y up."""
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
-        down = np.clip(-y / self.corridor_mm, 0.0, 1.0)
-        # A step whose first two derivatives are zero at both ends.
-        power = self.add_dpt * down**3 * (10.0 - 15.0 * down + 6.0 * down**2)
-        slope = -30.0 * down**2 * (1.0 - down) ** 2
-        bend = 60.0 * down * (1.0 - down) * (1.0 - 2.0 * down)
-        slope = self.add_dpt * slope / self.corridor_mm
-        bend = self.add_dpt * bend / self.corridor_mm**2
-        aside = x / HALF_WIDTH_MM
-        g = HALF_WIDTH_MM**2 * (np.logaddexp(aside, -aside) - np.log(2.0))
-        across = HALF_WIDTH_MM * np.tanh(aside) * slope
+        wide_mm = np.hypot(self.corridor_mm / 4.0, x)
+        z = (-y - self.corridor_mm / 2.0) / wide_mm
+        power_dpt = self.add_dpt * ndtr(z)
+        bell_dpt = self.add_dpt * np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)
+        aside = x / wide_mm
         found = np.empty((*x.shape, 2, 2))
-        found[..., 0, 0] = power / np.cosh(aside) ** 2
-        found[..., 1, 1] = power + g * bend
-        found[..., 0, 1] = found[..., 1, 0] = across
+        found[..., 0, 0] = power_dpt - bell_dpt * z * aside**2
+        found[..., 1, 1] = power_dpt
+        found[..., 0, 1] = found[..., 1, 0] = -bell_dpt * aside
         m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
         return found + np.array([[m + j0, j45], [j45, m - j0]])
 

@@ -232,7 +232,7 @@ def _trifocal(body: Mapping[str, Any]) -> Profile:
         raise ProfileError(
             PATH + "light_ratio", "is missing", "three shares, where adds are not 1:2"
         )
-    coarse, fine = _numbers(body, "steps_waves", 0.0, 0.95, (2, 2), [0.27, 0.44])
+    coarse, fine = _numbers(body, "steps_waves", 0.0, 0.95, (2, 2))
     return spacing_dpt, Kinoform.two_combs(coarse, fine), (0, 2), 0
 
 

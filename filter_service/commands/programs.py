@@ -27,6 +27,7 @@ class Bench(StrEnum):
     PEOPLE = "people"
     MEDIA = "media"
     ACUITY = "acuity"
+    CORRECTIONS = "corrections"
     DYNAMICS = "dynamics"
     DISPLAYS = "displays"
     NETWORKS = "networks"
@@ -59,6 +60,7 @@ BENCH_MODULES = {
     Bench.PEOPLE: "tests.benchmarks.bench_people",
     Bench.MEDIA: "tests.benchmarks.bench_media",
     Bench.ACUITY: "tests.benchmarks.bench_acuity",
+    Bench.CORRECTIONS: "tests.benchmarks.bench_corrections",
     Bench.DYNAMICS: "tests.benchmarks.bench_dynamics",
     Bench.DISPLAYS: "tests.benchmarks.bench_displays",
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
