@@ -1,0 +1,253 @@
+"""Lenses that people wear: closed forms, their true profiles, and published ones."""
+
+import numpy as np
+import pytest
+
+from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.progressive import ProgressiveLens, progressive_polynomial
+from estimator.corrections.rings import DiffractiveRings
+from estimator.corrections.worn_lens import (
+    WornLens,
+    own_polynomial,
+    shifted_polynomial,
+    worn_refraction,
+)
+from estimator.field.prepare import prepare_eye
+from estimator.optics import prescription as rx
+from estimator.optics.zernike import EXPONENTS, index_from_nm
+from estimator.profiles.parse import parse_profile
+from estimator.psf.compute import compute_psf_batch
+from estimator.wavefront.field_wavefronts import (
+    correction_polynomial,
+    total_defocus_dpt,
+    zernike_from_polynomial,
+)
+from tests.lens_truth import MM_PER_DEG, PUBLISHED, Truth, modulation, worn_eye
+
+AT_CPD = np.arange(2.0, 40.0, 2.0)
+OBJECTS_DPT = np.array([0.0, 0.6, 1.2, 2.2])
+DESIGNS = {
+    "bifocal": {"design": "bifocal", "add_dpt": 3.0},
+    "edof": {"design": "edof", "add_dpt": 1.75},
+    "rings to 3 mm": {"design": "bifocal", "add_dpt": 3.0, "rings_diameter_mm": 3.0},
+    "zones": {
+        "design": "zones",
+        "zone_adds_dpt": [0.0, 2.5, 0.0],
+        "zone_diameters_mm": [2.0, 3.0, 4.0],
+    },
+}
+
+
+@pytest.mark.parametrize("height_ratio", [1.0, 550 / 453, 550 / 618])
+@pytest.mark.parametrize("step_waves", [0.5, 1.5, 0.3])
+def test_a_sawtooth_shares_light_as_sinc_squared(step_waves, height_ratio):
+    orders = np.arange(-3, 5)
+    found = Kinoform.sawtooth(step_waves).amplitudes(orders, height_ratio=height_ratio)
+    expected = np.sinc(step_waves * height_ratio - orders) ** 2
+    assert np.abs(found) ** 2 == pytest.approx(expected, abs=1e-5)
+
+
+def test_two_combs_are_one_where_the_other_has_no_height():
+    orders = np.arange(-4, 8)
+    fine = np.abs(Kinoform.two_combs(0.0, 0.5).amplitudes(orders)) ** 2
+    assert fine[orders % 2 == 1] == pytest.approx(0.0, abs=1e-9)
+    single = (
+        np.abs(Kinoform.sawtooth(0.5).amplitudes(orders[orders % 2 == 0] // 2)) ** 2
+    )
+    assert fine[orders % 2 == 0] == pytest.approx(single, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "light",
+    [{0: 0.44, 2: 0.22, 3: 0.22}, {0: 0.41, 1: 0.41}, {0: 0.42, 1: 0.16, 2: 0.26}],
+)
+def test_a_profile_is_found_for_shares_of_light(light):
+    found = Kinoform.with_light(light).amplitudes(np.array(list(light)))
+    assert np.abs(found) ** 2 == pytest.approx(list(light.values()), abs=0.035)
+
+
+@pytest.mark.parametrize("wavelength_nm", [453.0, 550.0, 618.0])
+def test_no_light_is_lost_among_the_orders(wavelength_nm):
+    rings = DiffractiveRings(2.2, Kinoform.sawtooth(0.5))
+    assert (np.abs(rings.amplitudes(wavelength_nm)) ** 2).sum() == pytest.approx(1.0)
+    added = rings.added_dpt(wavelength_nm)
+    assert np.diff(added) == pytest.approx(2.2 * wavelength_nm / 550.0)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize(
+    ("pupil_mm", "limit"), [(2.0, 0.05), (3.0, 0.02), (4.5, 0.012)]
+)
+def test_kernels_are_those_of_the_true_profile(name, pupil_mm, limit):
+    eye, wavelength_nm = worn_eye(**DESIGNS[name]), 500.0
+    found = modulation(
+        eye, OBJECTS_DPT, pupil_mm=pupil_mm, wavelength_nm=wavelength_nm, at_cpd=AT_CPD
+    )
+    truth = Truth(pupil_mm, wavelength_nm)
+    behind = truth.profile(eye.rings)
+    zero_dpt = eye.chromatic_shift_dpt(wavelength_nm) + eye.refraction_at_dpt(
+        pupil_diameter_mm=pupil_mm
+    )
+    true = [
+        truth.modulation(behind * truth.defocused(zero_dpt + d), AT_CPD)
+        for d in OBJECTS_DPT.tolist()
+    ]
+    assert np.abs(found - true).max() < limit
+
+
+def test_the_light_of_foci_interferes_through_small_pupils():
+    """Why kernels are not sums of those of each focus."""
+    rings = worn_eye(**DESIGNS["edof"]).rings
+    errors = []
+    for pupil_mm in (2.0, 4.5):
+        truth = Truth(pupil_mm, 550.0)
+        true = truth.modulation(truth.profile(rings) * truth.defocused(0.5), AT_CPD)
+        errors.append(np.abs(truth.of_sum(rings, 0.5, AT_CPD) - true).max())
+    assert errors[0] > 0.2
+    assert errors[1] < 0.06
+
+
+def test_published_modulation_is_met():
+    table = PUBLISHED["transfer"]
+    at_cpd = [table["line_pairs_per_mm"] * MM_PER_DEG]
+    objects_dpt = np.arange(0.0, 3.2, 0.1)
+    ranges = {"far": (0.0, 0.3), "intermediate": (0.8, 1.8), "near": (2.0, 3.2)}
+    for name, lens in table["lenses"].items():
+        curve = modulation(
+            worn_eye(**lens["body"]),
+            objects_dpt,
+            pupil_mm=table["aperture_mm"],
+            wavelength_nm=table["wavelength_nm"],
+            at_cpd=at_cpd,
+        )
+        for focus in set(ranges) & set(lens):
+            low, high = ranges[focus]
+            inside = (objects_dpt >= low) & (objects_dpt <= high)
+            found = np.abs(curve[inside, 0]).max()
+            expected = pytest.approx(lens[focus], abs=table["tolerance"])
+            assert found == expected, (name, focus)
+
+
+def test_a_lens_off_its_centre_has_coma_and_keeps_its_power():
+    lens = WornLens(0.0, spherical_aberration_um=0.3, centre_mm=(0.3, -0.4))
+    zernike_um = zernike_from_polynomial(own_polynomial(lens), 3.0)
+    per_mm = -0.3 / 3.0 * 2.0 * np.sqrt(10.0)
+    assert zernike_um[index_from_nm(4, 0)] == pytest.approx(0.3)
+    assert zernike_um[index_from_nm(3, 1)] == pytest.approx(0.3 * per_mm)
+    assert zernike_um[index_from_nm(3, -1)] == pytest.approx(-0.4 * per_mm)
+    centred = own_polynomial(WornLens(0.0, spherical_aberration_um=0.3))
+    through = zernike_from_polynomial(centred, 2.0)
+    assert total_defocus_dpt(through, 2.0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_polynomial_is_shifted(rng):
+    polynomial, centre = rng.normal(size=28), (0.4, -0.7)
+    x, y = rng.normal(size=(2, 9))
+
+    def value(coefficients, x, y):
+        return (x[:, None] ** EXPONENTS[:, 0] * y[:, None] ** EXPONENTS[:, 1]) @ (
+            coefficients
+        )
+
+    moved = shifted_polynomial(polynomial, centre)
+    expected = value(polynomial, x - centre[0], y - centre[1])
+    assert value(moved, x, y) == pytest.approx(expected)
+
+
+def test_refraction_of_a_lens_through_any_pupil():
+    lens = WornLens(-3.0, spherical_aberration_um=-0.2, centre_mm=(0.3, 0.0))
+    at_centre_dpt, per_mm2 = worn_refraction(lens, entrance_pupil_mm=3.0)
+    through = at_centre_dpt + per_mm2 * 2.0**2
+    paraxial_dpt = -3.0 / 1.009
+    aside_dpt = total_defocus_dpt(
+        zernike_from_polynomial(own_polynomial(lens), 2.0), 2.0
+    )
+    assert through == pytest.approx(paraxial_dpt - aside_dpt)
+
+
+def test_astigmatism_beside_the_corridor_is_minkwitz_s():
+    lens = ProgressiveLens.of(rx.Prescription(0.0), add_dpt=2.0, corridor_mm=14.0)
+    y_mm, step_mm = np.array([-3.0, -7.0, -12.0]), 1e-4
+    powers = lens.power_matrices_dpt(0.0, y_mm)
+    assert powers[:, 0, 0] == pytest.approx(powers[:, 1, 1])  # an umbilical line
+    above = lens.power_matrices_dpt(0.0, y_mm + step_mm)[:, 0, 0]
+    slope = (above - powers[:, 0, 0]) / step_mm
+    beside = np.linalg.eigvalsh(lens.power_matrices_dpt(0.01, y_mm))
+    astigmatism = beside[:, 1] - beside[:, 0]
+    assert astigmatism == pytest.approx(2.0 * 0.01 * np.abs(slope), rel=1e-3)
+
+
+def test_the_powers_of_a_progressive_lens_are_those_of_one_surface():
+    """W_xx, W_xy and W_yy of any surface have the same derivatives across."""
+    lens = ProgressiveLens.of(rx.Prescription(0.0), add_dpt=2.0, corridor_mm=14.0)
+    x, y, h = np.array([1.0, 6.0, -4.0]), np.array([-2.0, -9.0, -14.0]), 1e-4
+
+    def change(dx, dy):
+        more = lens.power_matrices_dpt(x + dx, y + dy)
+        return (more - lens.power_matrices_dpt(x - dx, y - dy)) / (2.0 * h)
+
+    along_x, along_y = change(h, 0.0), change(0.0, h)
+    assert along_y[:, 0, 0] == pytest.approx(along_x[:, 0, 1], abs=1e-6)
+    assert along_y[:, 0, 1] == pytest.approx(along_x[:, 1, 1], abs=1e-6)
+
+
+def test_a_progressive_lens_takes_off_what_spectacles_of_its_power_do():
+    lens = ProgressiveLens.of(
+        rx.Prescription(-4.0, -1.0, 30.0, 12.0), add_dpt=2.0, corridor_mm=14.0
+    ).looking((8.0, -20.0))
+    found = progressive_polynomial(lens, 0.0, 0.0, entrance_pupil_mm=3.0)
+    expected = correction_polynomial(lens, entrance_pupil_mm=3.0)
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_traced_eye_sees_through_each_part_of_a_progressive_lens():
+    worn = {"kind": "progressive", "sphere_dpt": 0, "vertex_mm": 12, "add_dpt": 2.0}
+    bare = {
+        "kind": "prescription",
+        "sphere_dpt": 0.0,
+        "age_years": 70,
+        "higher_order": "none",
+    }
+    fields = {
+        "h_deg": np.array([0.0, 0.0, 12.0]),
+        "v_deg": np.array([0.0, -20.0, -20.0]),
+    }
+    state = {
+        "pupil_diameter_mm": 3.0,
+        "accommodation_dpt": 0.0,
+        "wavelength_nm": 536.0,
+    }
+    range_deg = ((-20.0, 20.0), (-20.0, 20.0))
+    defocus = []
+    for more in ({}, {"correction": worn}):
+        eye, _ = prepare_eye(
+            parse_profile(bare | more),
+            pupil_diameters_mm=[3.0, 4.0],
+            field_range_deg=range_deg,
+        )
+        defocus.append(eye.total_defocus_dpt(**fields, **state))
+        again = eye.defocus_at(**fields, wavelength_nm=536.0)(
+            pupil_diameter_mm=3.0, accommodation_dpt=0.0
+        )
+        assert again == pytest.approx(defocus[-1], abs=1e-6)
+    lens = parse_profile(bare | {"correction": worn}).correction
+    powers = lens.power_matrices_dpt(
+        *lens.lens_point_mm(fields["h_deg"], fields["v_deg"])
+    )
+    expected = np.trace(powers, axis1=1, axis2=2) / 2.0
+    assert defocus[0] - defocus[1] == pytest.approx(expected, abs=0.06)
+    assert defocus[0][1] - defocus[1][1] > 0.3
+
+
+def test_rings_are_for_the_wave_method_alone():
+    rings = DiffractiveRings(2.2, Kinoform.sawtooth(0.5))
+    for options in ({"method": "geometric"}, {"diffraction": False}):
+        with pytest.raises(ValueError, match="rings in the pupil"):
+            compute_psf_batch(
+                np.zeros((1, 28)),
+                pupil_diameter_mm=3.0,
+                wavelength_nm=550.0,
+                pixel_pitch_mrad=1.0,
+                pupil_screen=rings,
+                **options,
+            )
