@@ -108,7 +108,7 @@ class Truth:
         edge = (rings.diameter_mm / 2.0) ** 2
         design_um = rings.design_nm / NM_PER_UM
         periods = np.minimum(square, edge) * rings.spacing_dpt / 2.0 / design_um
-        held = np.array(rings.kinoform.waves)
+        held = np.array(rings.kinoform.path_ratio)
         place = (periods % 1.0 * held.size).astype(int)
         waves = held[place] - rings.far_order * periods
         return np.exp(2j * np.pi * waves * rings.design_nm / self.wavelength_nm)

@@ -24,12 +24,12 @@ class Kinoform:
 
     Attributes
     ----------
-    waves : tuple of float
-        By how much light is ahead there, in waves of the design wavelength, at
-        `N_SAMPLES` places evenly over a period in r².
+    path_ratio : tuple of float
+        By how far light is ahead, over the design wavelength, at `N_SAMPLES` places
+        evenly over a period in r².
     """
 
-    waves: tuple[float, ...]
+    path_ratio: tuple[float, ...]
 
     @classmethod
     def sawtooth(cls, step_waves: float) -> "Kinoform":
@@ -69,16 +69,16 @@ class Kinoform:
         return cls(tuple((waves - waves.min()).tolist()))
 
     def amplitudes(
-        self, orders: NDArray[np.int64], *, height_ratio: float = 1.0
+        self, orders: NDArray[np.int64], *, color_ratio: float = 1.0
     ) -> NDArray[np.complex128]:
         """Amplitudes (K,) of orders (K,); their squares are shares of the light.
 
         Parameters
         ----------
-        height_ratio : float
+        color_ratio : float
             Design wavelength over that of the light.
         """
-        field = np.exp(2j * np.pi * height_ratio * np.array(self.waves))
+        field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
         middle = np.exp(-1j * np.pi * orders / N_SAMPLES)  # samples lie half-way
         return (np.fft.fft(field) / N_SAMPLES)[orders % N_SAMPLES] * middle
 

@@ -57,7 +57,7 @@ class DiffractiveRings:
     def amplitudes(self, wavelength_nm: float) -> NDArray[np.complex128]:
         """Amplitudes (K,) of the orders that are followed; squares sum to 1."""
         found = self.kinoform.amplitudes(
-            self.followed_orders, height_ratio=self.design_nm / wavelength_nm
+            self.followed_orders, color_ratio=self.design_nm / wavelength_nm
         )
         left = max(1.0 - float((np.abs(found) ** 2).sum()), 0.0) / 2.0
         for end in (0, -1):

@@ -16,6 +16,10 @@ TABLE_COUNT = 1 << 15
 """Entries of a table: rings of 40 waves over the pupil have 800 each."""
 
 
+BEYOND_EDGE = 1.5
+"""How far tables go over the pupil's radius: its smoothed edge reaches beyond it."""
+
+
 class PupilScreen(Protocol):
     """What rings do to the light, the same at every pupil and field."""
 
@@ -43,7 +47,8 @@ class ScreenTables:
     tables : (n_wavelengths, TABLE_COUNT) complex64
     which : (P,) int64
         Table of each pupil.
-    steps_per_mm2 : float
+    radius_mm : float
+        Of the last entry.
     reach_px : (P, 2)
         How much farther light goes than without it, x and y.
     """
@@ -51,7 +56,7 @@ class ScreenTables:
     from_box_mm: NDArray[np.float64]
     tables: NDArray[np.complex64]
     which: NDArray[np.int64]
-    steps_per_mm2: float
+    radius_mm: float
     reach_px: NDArray[np.float64]
 
     @classmethod
@@ -68,9 +73,8 @@ class ScreenTables:
         matrix = np.swapaxes(pixel_from_mrad, 1, 2) * half_width_um_per_px[:, None, :]
         offset = pupil_ellipse[:, :2] - np.array(screen.centre_mm)
         largest_mm = pupil_ellipse[:, 2] + np.hypot(*offset.T)
-        # The smoothed edge of the pupil reaches beyond it.
-        most_mm2 = (1.5 * float(largest_mm.max())) ** 2
-        square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * most_mm2
+        radius_mm = BEYOND_EDGE * float(largest_mm.max())
+        square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
         colours_nm, which = np.unique(wavelength_nm, return_inverse=True)
         reach_dpt = np.array([screen.reach_dpt(nm) for nm in colours_nm.tolist()])
         reach_mrad = reach_dpt[which] * largest_mm
@@ -80,7 +84,7 @@ class ScreenTables:
                 [screen.transmission(square_mm2, nm) for nm in colours_nm.tolist()]
             ).astype(np.complex64),
             which=which,
-            steps_per_mm2=TABLE_COUNT / most_mm2,
+            radius_mm=radius_mm,
             reach_px=reach_mrad[:, None] * np.linalg.norm(pixel_from_mrad, axis=2),
         )
 
@@ -96,7 +100,7 @@ class ScreenTables:
             self.from_box_mm[members],
             self.tables,
             self.which[members],
-            self.steps_per_mm2,
+            TABLE_COUNT / self.radius_mm**2,
             samples,
             size,
             field,

@@ -38,12 +38,12 @@ DESIGNS = {
 }
 
 
-@pytest.mark.parametrize("height_ratio", [1.0, 550 / 453, 550 / 618])
+@pytest.mark.parametrize("color_ratio", [1.0, 550 / 453, 550 / 618])
 @pytest.mark.parametrize("step_waves", [0.5, 1.5, 0.3])
-def test_a_sawtooth_shares_light_as_sinc_squared(step_waves, height_ratio):
+def test_a_sawtooth_shares_light_as_sinc_squared(step_waves, color_ratio):
     orders = np.arange(-3, 5)
-    found = Kinoform.sawtooth(step_waves).amplitudes(orders, height_ratio=height_ratio)
-    expected = np.sinc(step_waves * height_ratio - orders) ** 2
+    found = Kinoform.sawtooth(step_waves).amplitudes(orders, color_ratio=color_ratio)
+    expected = np.sinc(step_waves * color_ratio - orders) ** 2
     assert np.abs(found) ** 2 == pytest.approx(expected, abs=1e-5)
 
 
