@@ -75,13 +75,18 @@ def draw_rms_by_order(
         label = labels[k] if labels else None
         bars = axes.bar(at, values, width * 0.92, color=color, label=label)
         axes.bar_label(
-            bars, [f"{v:.2f}" for v in values], fontsize=SMALL_PT, color=INK, padding=1
+            bars,
+            [f"{v:.2f}" for v in values],
+            fontsize=SMALL_PT,
+            color=INK,
+            padding=1,
+            rotation=0 if len(studies) == 1 else 90,
         )
-        seconds.append(f"{by_order[2]:.2f} µm")
+        seconds.append(f"{by_order[2]:.2f}")
     axes.set_xticks(places, names)
     axes.margins(y=0.5 if labels else 0.18)  # above the bars there are words
     axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
-    note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)}"
+    note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)} µm"
     dress(axes, title="RMS by radial order", x=f"radial order\n{note}", y="RMS, µm")
     axes.xaxis.label.set_fontsize(SMALL_PT)
     if labels:

@@ -37,6 +37,8 @@ from clients.report.facts import EyeFacts
 from clients.report.sources import Citations
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
+MAP_MM, PSF_MM = 46.0, 54.0
+"""Heights at which the first page holds all that belongs on it."""
 
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
@@ -67,13 +69,13 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
     tables = _refraction_table(before, after), _vision_table(before, after)
     bars = on_axes(
         lambda axes: draw_rms_by_order(axes, studies, labels=labels),
-        50.0,
+        MAP_MM,
         "Root mean square by radial order, before and after",
     )
     return Section(
         "Before and after",
         (
-            Row(tables, (1.0, 1.6)),
+            Row(tables, (1.0, 1.9)),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair) for pair in pairs)),
             _charts(before, after, DAY_MM),
@@ -86,7 +88,7 @@ def _psfs(study: EyeStudy, label: str) -> Plot:
         draw_psfs(panel, study)
         panel.suptitle(label, fontsize=TITLE_PT)
 
-    return Plot(draw, 64.0, f"Point-spread functions: {label}")
+    return Plot(draw, PSF_MM, f"Point-spread functions: {label}")
 
 
 def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
@@ -101,7 +103,7 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
             from_order=FIRST_HIGHER,
             title=f"{label}, orders 3 to 6",
         ),
-        50.0,
+        MAP_MM,
         f"Map of the higher orders: {label}",
     )
 
