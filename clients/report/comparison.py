@@ -37,7 +37,7 @@ from clients.report.facts import EyeFacts
 from clients.report.sources import Citations
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
-MAP_MM, PSF_MM = 46.0, 54.0
+MAP_MM, PSF_MM = 46.0, 58.0
 """Heights at which the first page holds all that belongs on it."""
 
 

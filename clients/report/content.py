@@ -31,7 +31,7 @@ from clients.report.blocks import (
 )
 from clients.report.charts import DISTANCES_M
 from clients.report.facts import EyeFacts
-from clients.report.numbers import written
+from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 
@@ -181,7 +181,9 @@ def _refraction_note(facts: EyeFacts) -> str:
         f"{numbers['measured']['refraction_pupil_mm']:.3g} mm pupil, relaxed, without "
         f"correction. The eye found is {fit['eye_length_mm']:.2f} mm long, "
         f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
-        f"{fit['rms_error_um']:.1g} µm RMS."
+        f"{fit['rms_error_um']:.1g} µm RMS. As spectacles at "
+        f"{SPECTACLE_VERTEX_MM:g} mm: "
+        f"{written(spectacles_for(numbers['eye']['refraction']))}."
     )
     light_nm = facts.study.found.wavelength_nm
     if light_nm != WAVELENGTH_NM:

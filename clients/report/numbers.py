@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,9 @@ from estimator import (
 
 PRESCRIBED_PUPIL_MM = 4.0
 """Pupil through which a refraction is told, where one as wide was measured."""
+
+SPECTACLE_VERTEX_MM = 12.0
+"""Usual distance from the cornea."""
 
 TOLD_CPD = (10.0, 20.0, 30.0)
 FIELD_TOLD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
@@ -67,6 +71,21 @@ def written(lens: Prescription) -> str:
     if abs(lens.cylinder_dpt) >= 0.005:
         text += f" {_signed(lens.cylinder_dpt)} cyl x {lens.axis_deg:.0f}°"
     return text
+
+
+def spectacles_for(refraction: Mapping[str, float]) -> Prescription:
+    """Return spectacles at `SPECTACLE_VERTEX_MM` for a refraction at the cornea."""
+    sphere_dpt = refraction["sphere_dpt"]
+    powers_dpt = [
+        power_dpt / (1.0 + SPECTACLE_VERTEX_MM / 1000.0 * power_dpt)
+        for power_dpt in (sphere_dpt, sphere_dpt + refraction["cylinder_dpt"])
+    ]
+    return Prescription(
+        sphere_dpt=powers_dpt[0],
+        cylinder_dpt=powers_dpt[1] - powers_dpt[0],
+        axis_deg=refraction["axis_deg"],
+        vertex_mm=SPECTACLE_VERTEX_MM,
+    )
 
 
 def _signed(value: float) -> str:

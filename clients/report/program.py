@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from clients.figures.study import profile_of
 from clients.report.make import SUFFIXES, eyes_of, report_numbers, write_report
@@ -26,9 +27,16 @@ from filter_service.errors import FilterError
 from filter_service.progress import Progress
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with a command line in one line, as other errors."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}; --help says more")
+
+
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="ocufilter report",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -107,9 +115,8 @@ def _called(source: str) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; return its exit code."""
-    options = arguments_of(argv)
     try:
-        sys.stdout.write(run(options) + "\n")
+        sys.stdout.write(run(arguments_of(argv)) + "\n")
     except KeyboardInterrupt:
         return 130
     except (FilterError, ValueError) as error:

@@ -88,7 +88,7 @@ def _periphery(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     people = f"people with such an axis {cite('periphery')}"
     known = [note for note in study.field.notes if "known to" in note]
     spread = known[0].partition("; ")[2] if known else ""
-    tail = f"; {spread}" if spread else ""
+    tail = f"; {spread.replace('+-', '±')}" if spread else ""
     if count:
         text = f"{count} directions of the profile; between them {people}{tail}"
         return ("Visual field", MEASURED, text)
@@ -134,7 +134,8 @@ def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
 def _nerves(cite: Citations) -> tuple[str, ...]:
     text = (
         "a template observer with a young adult's retina and nerves reads what the "
-        f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in it"
+        f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in it; "
+        f"visual Strehl ratio {cite('strehl')}, charts {cite('chart')}"
     )
     return ("Acuity", "predicted", text)
 

@@ -15,7 +15,7 @@ from clients.report.charts import picture_side_px
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.make import document_of
-from clients.report.numbers import Refraction, measured_numbers
+from clients.report.numbers import Refraction, measured_numbers, spectacles_for
 from clients.report.pdf_text import column_widths_mm, lines_of, width_mm
 from clients.report.program import main
 from clients.report.provenance import provenance_table
@@ -53,6 +53,13 @@ def test_the_refraction_is_what_was_entered_at_the_cornea(myope):
         assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
     assert myope.numbers["eye"]["rms_error_um"] < 0.02
     assert myope.numbers["eye"]["amplitude_dpt"] == 0.0  # at 60
+
+
+def test_spectacles_for_the_eye_are_those_that_were_prescribed(myope):
+    lens = spectacles_for(myope.numbers["eye"]["refraction"])
+    assert lens.sphere_dpt == pytest.approx(-4.0, abs=0.01)
+    assert lens.cylinder_dpt == pytest.approx(-1.0, abs=0.01)
+    assert lens.vertex_mm == 12.0
 
 
 def test_far_point_and_near_point_of_a_presbyope_meet(myope):
@@ -111,7 +118,7 @@ def test_what_is_assumed_is_told_from_what_was_measured():
     assert entered["Refraction"][0] == "entered"
     assert entered["Higher orders"][0] == "assumed"
     assert "60 years" in entered["Higher orders"][1]
-    assert "+-" in entered["Visual field"][1]
+    assert "±" in entered["Visual field"][1]
     none = _rows(MYOPE | {"higher_order": "none"})
     assert none["Higher orders"][1].startswith("none")
 
@@ -243,6 +250,8 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
             ["nobody", "-o", "eye.html"],
             "report: profile field 'profile': 'nobody' is not known",
         ),
+        ([], "report: the following arguments are required: profile"),
+        (["myopia", "-o", "a.pdf", "--fast"], "unrecognized arguments: --fast"),
         (["myopia"], "report: --out is missing: allowed is a .html or .pdf file"),
         (["myopia", "-o", "eye.docx"], "allowed is a .html or .pdf file"),
         (["myopia", "-o", "nowhere/eye.pdf"], "there is no folder nowhere"),
