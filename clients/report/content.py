@@ -36,6 +36,11 @@ from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 
 DAY_MM, DUSK_MM = PUPILS_MM
+
+MAP_MM, PSF_MM = 47.0, 57.0
+"""Heights at which the first page holds all that belongs on it."""
+
+FIELD_MM, CURVE_MM, TERMS_MM = 84.0, 68.0, 42.0
 SIDES = {"OD": "right eye (OD)", "OS": "left eye (OS)"}
 NOT_A_DEVICE = (
     "A simulation for research and explanation, not a medical device: no diagnosis or "
@@ -83,12 +88,12 @@ def summary(facts: EyeFacts) -> Section:
                 (
                     Plot(
                         lambda panel: draw_wavefront_maps(panel, study),
-                        50.0,
+                        MAP_MM,
                         "Maps of the wavefront over the pupil, all and higher orders",
                     ),
                     on_axes(
                         lambda axes: draw_rms_by_order(axes, [study]),
-                        50.0,
+                        MAP_MM,
                         "Root mean square of the wavefront by radial order",
                     ),
                 ),
@@ -98,13 +103,13 @@ def summary(facts: EyeFacts) -> Section:
                 (
                     Plot(
                         lambda panel: draw_psfs(panel, study),
-                        60.0,
+                        PSF_MM,
                         "Point-spread functions through 3 and 5 mm, as it is and best "
                         "corrected",
                     ),
                     on_axes(
                         lambda axes: draw_mtf(axes, study),
-                        60.0,
+                        PSF_MM,
                         "Modulation transfer functions through 3 and 5 mm",
                     ),
                 ),
@@ -298,7 +303,7 @@ def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Sectio
                 (
                     on_axes(
                         lambda axes: draw_terms(axes, study),
-                        42.0,
+                        TERMS_MM,
                         "Coefficients of orders 3 to 6, as they came and of the eye",
                     ),
                 )
@@ -314,7 +319,7 @@ def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Sectio
                 (
                     Plot(
                         lambda panel: draw_field_maps(panel, study),
-                        84.0,
+                        FIELD_MM,
                         "Maps of M, J0, J45 and blur over 60 by 40 degrees",
                     ),
                     field_table_block(facts),
@@ -325,12 +330,12 @@ def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Sectio
                 (
                     on_axes(
                         lambda axes: draw_through_focus_acuity(axes, study),
-                        68.0,
+                        CURVE_MM,
                         "Acuity by distance, looking far and accommodating",
                     ),
                     on_axes(
                         lambda axes: draw_cross_section(axes, study),
-                        68.0,
+                        CURVE_MM,
                         "Vertical section of the eye found, with rays from far away",
                     ),
                 )

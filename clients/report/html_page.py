@@ -52,7 +52,8 @@ footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
   main { padding: 5mm; } }
 @media print { body { background: #fff; } main { padding: 0; max-width: none; }
   section.page { break-before: page; } section.page h2 { margin-top: 0; }
-  .row, table, figure { break-inside: avoid; } }
+  .row, table, figure { break-inside: avoid; } .row { margin-bottom: 2mm; }
+  table { font-size: 7.5pt; } .note, .plain, figcaption { font-size: 7pt; } }
 """
 
 

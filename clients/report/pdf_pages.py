@@ -33,6 +33,7 @@ from clients.report.pdf_text import column_widths_mm, line_mm, lines_of
 
 TITLE_PT, HEADING_PT, BLOCK_PT, CELL_PT, NOTE_PT = 15.0, 11.0, 8.5, 7.5, 6.8
 CELL_GAP_MM, CELL_ROOM_MM, ROW_GAP_MM = 3.0, 1.3, 3.0
+HEAD_MM = 16.0
 BOTTOM_MM = PAGE_HEIGHT_MM - MARGIN_MM - 5.0
 
 
@@ -94,10 +95,10 @@ class _Pages:
             page, MARGIN_MM, self._y_mm + 10.0, document.subtitle, BLOCK_PT, color=SOFT
         )
         self._rule(page, MARGIN_MM, CONTENT_WIDTH_MM, self._y_mm + 12.5, BLUE, 1.5)
-        self._y_mm += 16.0
+        self._y_mm += HEAD_MM
 
     def _section(self, section: Section, *, is_first: bool) -> None:
-        first_mm = _row_height_mm(section.rows[0])
+        first_mm = row_height_mm(section.rows[0])
         if section.starts_page or self._y_mm + 8.0 + first_mm > BOTTOM_MM:
             self._new_page()
         if not is_first:
@@ -110,7 +111,7 @@ class _Pages:
             self._y_mm += 3.5
         for row in section.rows:
             for part in _fitting(row):
-                height_mm = _row_height_mm(part)
+                height_mm = row_height_mm(part)
                 if self._y_mm + height_mm > BOTTOM_MM:
                     self._new_page()
                 self._row(part, height_mm)
@@ -245,7 +246,8 @@ def _cells_mm(cells: list[list[str]]) -> float:
     return max(len(lines) for lines in cells) * line_mm(CELL_PT) + CELL_ROOM_MM
 
 
-def _row_height_mm(row: Row) -> float:
+def row_height_mm(row: Row) -> float:
+    """Return how high a row is: as its highest block."""
     return max(
         _height_mm(block, width_mm)
         for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)

@@ -10,13 +10,28 @@ import pytest
 
 from clients.figures import EyeStudy
 from clients.report import report_numbers
-from clients.report.blocks import Document, Picture, Row, Section, Table, Words
+from clients.report.blocks import (
+    MARGIN_MM,
+    Document,
+    Picture,
+    Row,
+    Section,
+    Table,
+    Words,
+)
 from clients.report.charts import picture_side_px
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.make import document_of
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
-from clients.report.pdf_text import column_widths_mm, lines_of, width_mm
+from clients.report.pdf_pages import (
+    BOTTOM_MM,
+    HEAD_MM,
+    NOTE_PT,
+    ROW_GAP_MM,
+    row_height_mm,
+)
+from clients.report.pdf_text import column_widths_mm, line_mm, lines_of, width_mm
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
@@ -241,6 +256,16 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
     assert row.blocks[2].caption == (
         f"6 m, 3 mm: logMAR {log_mar:+.2f} ({10**-log_mar:.2f})"
     )
+
+
+def test_the_summary_fits_on_the_first_page(corrected):
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    charts = {(p, d): grey for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+    shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
+    rows = document_of([shown]).sections[0].rows
+    used_mm = HEAD_MM + sum(row_height_mm(row) + ROW_GAP_MM for row in rows)
+    two_notes_mm = 2 * line_mm(NOTE_PT)  # of another colour, of a wider pupil
+    assert used_mm + two_notes_mm < BOTTOM_MM - MARGIN_MM
 
 
 @pytest.mark.parametrize(
