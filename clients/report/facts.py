@@ -65,7 +65,7 @@ def facts_of(
     label : str
         Instead of the profile's name.
     has_charts : bool
-        Whether letter charts are filtered, which takes most of the time.
+        Whether letter charts are filtered, which takes a quarter of the time.
     progress : callable, optional
         Called with a fraction and a stage.
 

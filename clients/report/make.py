@@ -39,7 +39,7 @@ def report_html(
     label, after_label : str
         What the eyes are called, instead of their profiles' names.
     has_charts : bool
-        Whether letter charts are filtered, which takes half of the time.
+        Whether letter charts are filtered, which takes a quarter of the time.
     progress : callable, optional
         Called with a fraction and a stage.
 
