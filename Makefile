@@ -26,7 +26,7 @@ test-training: setup-training  ## the tests of the training, with torch, and a s
 	$(PYTHON) -m pytest tests/training $(ARGS)
 
 test-batch-ray: setup-batch-ray  ## `ocufilter batch` on two workers of a Ray cluster
-	$(PYTHON) -m pytest tests/batch_ray $(ARGS)
+	.batch_ray/bin/python -m pytest tests/batch_ray $(ARGS)
 
 test-headset:  ## `ocufilter headset` against a real OpenXR runtime, in a root of its own
 	@sh tests/headset/setup_root.sh
@@ -67,7 +67,7 @@ check: setup  ## lint, formatting, types, and every shader through glslang
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv .witness .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .witness .batch_ray .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list

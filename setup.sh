@@ -4,7 +4,7 @@
 #   sh setup.sh         the Python environment in .venv and the system libraries
 #   sh setup.sh test    the same, a virtual screen for the window test, and Node
 #   sh setup.sh training  the first, and what training the networks needs (torch)
-#   sh setup.sh batch-ray  the first, and Ray, for `ocufilter batch` on many machines
+#   sh setup.sh batch-ray the first, and Ray in an environment of its own
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
@@ -23,6 +23,7 @@ COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
 WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
 WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
 WITNESS_VENV=.witness
+RAY_VENV=.batch_ray
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
@@ -170,11 +171,16 @@ install_training_packages() { # on top of the others; the service never needs th
     cp $STAMP $TRAINING_STAMP
 }
 
-install_ray() { # on top of the others
-    if $VENV/bin/python -c 'import ray' 2>/dev/null; then return; fi
-    say "installing Ray (half a minute)"
-    $VENV/bin/python -m pip -qq --disable-pip-version-check \
-        install -c constraints.txt --no-build-isolation -e '.[batch-ray]'
+install_ray() { # in an environment of its own that sees the first
+    if [ -x $RAY_VENV/bin/python ] &&
+        $RAY_VENV/bin/python -c 'import ray, clients' 2>/dev/null; then return; fi
+    say "installing Ray into $RAY_VENV (half a minute)"
+    $VENV/bin/python -m venv --clear $RAY_VENV
+    where='import sysconfig; print(sysconfig.get_path("purelib"))'
+    echo "import site; site.addsitedir('$($VENV/bin/python -c "$where")')" \
+        >"$($RAY_VENV/bin/python -c "$where")/ocufilter.pth"
+    $RAY_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt ray
 }
 
 has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer

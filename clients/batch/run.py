@@ -197,17 +197,24 @@ def run_batch(
     on_done(n_done, len(wanted))
     for profile in {unit.profile for unit in units}:
         video_of(batch, profile).unlink(missing_ok=True)  # it is to be another
+    cpu_s = 0.0
     for record in pool.run(units):
         manifest.append(record)
+        cpu_s += record.get("cpu_ms", 0.0) / 1e3
         n_done += 1
         on_done(n_done, len(wanted))
+    remove_parts(batch.out)  # of workers that were killed on the way
     if batch.job.is_video:
         _join_videos(batch, manifest)
     took_s = time.monotonic() - started_s
     summary = {
         "frames": len(wanted),
         **summary_of(manifest, wanted),
-        "this_run": {"frames": n_missing, "seconds": round(took_s, 3)},
+        "this_run": {
+            "frames": n_missing,
+            "seconds": round(took_s, 3),
+            "core_seconds": round(cpu_s, 3),
+        },
     }
     write_summary(batch.out, {**batch.described(), **summary})
     return summary

@@ -1,14 +1,9 @@
 """`ocufilter batch`: the same bytes whoever makes them, in any order, after kills."""
 
 import json
-import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -20,26 +15,15 @@ from clients.batch.job import Job, batch_settings
 from clients.batch.states import States
 from filter_service import Camera, RgbdView
 from filter_service.image_files import read_color
+from tests.batch_kills import kill, line_count, pictures, start, wait_for_orphans
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 120
 WIDTH_PX, HEIGHT_PX = 64, 48
 COUNT = 40
 PROFILES = ("-p", "myopia", "-p", "normal=emmetropia")
-COMMAND = (sys.executable, "-m", "filter_service", "batch")
 MODE = ("--settings", '{"mode": "on-axis", "eye_model": "wavefront"}')
 """Quick to prepare: these tests are about files and processes."""
-
-
-def start(*arguments, **options):
-    return subprocess.Popen(
-        [*COMMAND, *map(str, arguments)],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
-    )
 
 
 def run(*arguments, code=0):
@@ -47,15 +31,6 @@ def run(*arguments, code=0):
     out, error = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == code, error
     return out, error
-
-
-def pictures(folder):
-    """Return the bytes of every file of results."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and not path.name.startswith((".lock", "manifest"))
-    }
 
 
 def write_frame(folder, name, rng):
@@ -143,46 +118,6 @@ def test_two_workers_of_two_threads_make_the_same_bytes(room, usual, tmp_path):
     assert pictures(tmp_path / "out") == pictures(usual)
 
 
-def kill(arguments, out, chance):
-    """Kill a batch after one to three frames more; half of the time workers, too."""
-    target = line_count(out) + chance.randint(1, 3)
-    process = start(*arguments, "-o", out)
-    while process.poll() is None and line_count(out) < target:
-        time.sleep(0.002)
-    time.sleep(chance.uniform(0.0, 0.03))  # somewhere in the next frame
-    was_at_work = process.poll() is None
-    process.kill()
-    if chance.random() < 0.5:
-        for worker in workers_of(out):
-            with suppress(ProcessLookupError):
-                os.kill(worker, signal.SIGKILL)
-    process.communicate()
-    return was_at_work
-
-
-def workers_of(out):
-    """Return the workers of a batch: their environment names its folder."""
-    found = []
-    for folder in os.listdir("/proc"):
-        if not folder.isdigit():
-            continue
-        try:
-            with open(f"/proc/{folder}/cmdline", "rb") as file:
-                words = file.read().split(b"\0")
-            with open(f"/proc/{folder}/environ", "rb") as file:
-                ours = f"OCUFILTER_TEST_OUT={out}".encode() in file.read().split(b"\0")
-        except OSError:
-            continue
-        if ours and b"clients.batch.worker" in words:
-            found.append(int(folder))
-    return found
-
-
-def line_count(out):
-    path = out / "manifest.jsonl"
-    return path.read_bytes().count(b"\n") if path.exists() else 0
-
-
 def finish_after_kills(room, out, n_kills):
     arguments = (room, *PROFILES, *MODE, "--fov-deg", 20, "--workers", 2)
     chance, n_lines = random.Random(n_kills), []
@@ -191,28 +126,20 @@ def finish_after_kills(room, out, n_kills):
         n_lines.append(line_count(out))
     assert n_lines == sorted(n_lines)  # no line was lost
     run(*arguments, "-o", out)
-    deadline_s = time.monotonic() + 20.0
-    while workers_of(out):  # those left behind end by themselves
-        assert time.monotonic() < deadline_s
-        time.sleep(0.1)
+    wait_for_orphans(out)
     run(*arguments, "-o", out)  # clears what those left
+    assert not [path for path in out.rglob(".*") if ".part" in path.suffixes]
 
 
-def test_killed_at_random_moments_and_finished_nothing_is_lost(
-    room, usual, tmp_path, monkeypatch
-):
+def test_killed_at_random_moments_and_finished_nothing_is_lost(room, usual, tmp_path):
     out = tmp_path / "out"
-    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
     finish_after_kills(room, out, 2)
     assert pictures(out) == pictures(usual)
 
 
 @pytest.mark.slow
-def test_killed_twenty_times_and_finished_nothing_is_lost(
-    long_room, usual, tmp_path, monkeypatch
-):
+def test_killed_twenty_times_and_finished_nothing_is_lost(long_room, usual, tmp_path):
     out = tmp_path / "out"
-    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
     finish_after_kills(long_room, out, 20)
     expected = {
         name.replace("/", f"/{k}"): content
@@ -310,12 +237,11 @@ def test_a_video_without_loss_holds_the_pictures(room, usual, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ffv1", "h264"])
 def test_videos_are_the_same_bytes_by_two_workers_and_after_a_kill(
-    long_room, tmp_path, monkeypatch, kind
+    long_room, tmp_path, kind
 ):
     arguments = (long_room, "-p", "myopia", *VIDEO, kind, "--workers")
     run(*arguments, 1, "-o", tmp_path / "one")
     out = tmp_path / "two"
-    monkeypatch.setenv("OCUFILTER_TEST_OUT", str(out))
     for _ in range(2):
         assert kill((*arguments, 2), out, random.Random(kind))
     run(*arguments, 2, "-o", out)
