@@ -43,8 +43,6 @@ class Unit:
     frames : tuple of SourceFrame
     segment : Path, optional
         Where they become a piece of a video, relative to the output folder.
-    first : int
-        Number of the first frame in that video.
     """
 
     number: int
@@ -143,6 +141,7 @@ class UnitRunner:
         def write(path: Path) -> None:
             kind, rate_hz = VIDEO_KINDS[self._job.format], self._job.rate_hz
             write_segment(path, images(), kind=kind, rate_hz=rate_hz)
+            path.touch()  # where there was no frame to write
 
         try:
             told = write_whole(self._out / unit.segment, write)
@@ -152,6 +151,8 @@ class UnitRunner:
             for frame in unit.frames:
                 yield _failed(unit.profile, frame, error)
             return
+        if not any(record["ok"] for record in records):
+            (self._out / unit.segment).unlink()
         for record in records:
             if record["ok"]:
                 record = {**record, "file": unit.segment.as_posix(), **told}

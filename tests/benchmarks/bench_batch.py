@@ -1,18 +1,20 @@
 """What a data set costs: frames per second and core, beside the pictures' error.
 
     python -m tests.benchmarks.bench_batch [--quick] [--json]
-        [--sizes WxH ...] [--eyes NAME ...] [--frames N] [--errors] [--no-kills]
+        [--sizes WxH ...] [--eyes NAME ...] [--frames N] [--no-kills]
 
 `ocufilter batch` on the demo's walk through *Courtyard*: 8-bit PNG of colour and 16-bit
-PNG of depth in mm from files, pupil and focus from a list, another in every frame, PNG to
-files; over the whole visual field.  One worker, two, and one with two threads.  A row's
-time is wall time of the batch for each frame, without its first frames and so without the
-preparation of the eye; "cpu" is processor time in the worker, which other work on the
-machine changes less; "read", "filter" and "write" are wall times of the parts.
+PNG of depth in mm from files, pupil and focus from a list, another in every frame, PNG
+to files; over the whole visual field.  One worker, two, and one with two threads.  A
+row's time is wall time of the batch for each frame, without its first frames and so
+without the preparation of the eye; "cpu" is processor time in the worker, which other
+work on the machine changes less; "read", "filter" and "write" are wall times of the
+parts.
 
-The error is that of one picture, in linear light and as its file was read, against the
-dense reference of `bench live` (depth in mm is part of the error); see there for
-``--errors``.  A million frames: in core-hours, by wall time and by processor time.
+The error is that of one picture, in linear light and read from its files (depth in mm is
+part of it), against the dense reference of `bench live`, in three windows of 64 x 64 px:
+middle, left edge, corner.  A million frames: in core-hours, by wall time and by
+processor time.
 
 Then a batch is killed 20 times by SIGKILL at random moments, workers with it or left
 behind, and finished: what is lost, half written or another.
@@ -56,8 +58,9 @@ from tests.benchmarks.harness import (
     report,
     write_report,
 )
-from tests.benchmarks.live_walk import Judge, Walk, judged_windows
+from tests.benchmarks.live_walk import Judge, Walk
 from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.view_sources import Window
 
 MILLION = 1e6
 MS_PER_HOUR = 3.6e6
@@ -68,6 +71,7 @@ WARM_FRAMES = 8
 
 WAYS = {"1 worker": (1, 1), "2 workers": (2, 1), "1 worker, 2 threads": (1, 2)}
 FOV_DEG = 50.0
+WINDOW_PX = 64
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class Rate:
     frames_per_s_and_core: float
     core_hours_per_million: float
     cpu_hours_per_million: float
-    psnr_db: float | None
+    psnr_db: float
     load_before: float
     is_busy: bool
 
@@ -134,14 +138,28 @@ class _Exact:
         self._filter.close()
 
 
-def error_db(
-    walk: Walk, frames: list[SourceFrame], eye: str, *, compute: bool
-) -> float:
+def windows_of(size_px: tuple[int, int]) -> list[Window | None]:
+    """Return the parts of a frame that are judged."""
+    (width_px, height_px), side_px = size_px, WINDOW_PX
+    if height_px <= side_px:
+        return [None]
+    middle_y = (height_px - side_px) // 2
+    corners = [
+        ((width_px - side_px) // 2, middle_y),
+        (0, middle_y),
+        (width_px - side_px, height_px - side_px),
+    ]
+    return [Window(x, y, side_px, side_px) for x, y in corners]
+
+
+def error_db(walk: Walk, frames: list[SourceFrame], eye: str) -> float:
     """Return the error of the judged frame."""
     job = replace(job_of(walk, frames, eye), format="npy")
     exact = _Exact(job, eye, frames[walk.judged])
     try:
-        return Judge.of(walk, eye, compute=compute).error_db(exact, None, 1.0)
+        windows = windows_of(walk.size_px)
+        judge = Judge.of(walk, eye, compute=True, windows=windows)
+        return judge.error_db(exact, None, 1.0)
     finally:
         exact.close()
 
@@ -186,7 +204,7 @@ def measured(
         cpu_hours_per_million=round(
             float(np.median(cpu_ms)) * MILLION / MS_PER_HOUR, 2
         ),
-        psnr_db=None if np.isnan(psnr_db) else round(psnr_db, 2),
+        psnr_db=round(psnr_db, 2),
         load_before=round(load, 2),
         is_busy=load > 0.5,
     )
@@ -203,10 +221,7 @@ def measured(
 
 
 def _row(rate: Rate, part: str, times_ms, wall_ms: float) -> Row:
-    windows = judged_windows(tuple(map(int, rate.size.split("x"))))
     reference = "dense, over the field, bins of 0.2 deg and 0.005 dpt"
-    if windows != [None]:
-        reference += f", {len(windows)} windows"
     return Row(
         bench="batch",
         method=part,
@@ -261,7 +276,6 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--eyes", nargs="+", choices=CONDITIONS)
     parser.add_argument("--sizes", nargs="+", type=size_px_argument, metavar="WxH")
     parser.add_argument("--frames", type=int, metavar="N", help="96, of 720p 48")
-    parser.add_argument("--errors", action="store_true", help="compute references")
     parser.add_argument("--no-kills", action="store_true")
     options = parser.parse_args(argv)
     eyes = options.eyes or ["myopia", "keratoconus"]
@@ -277,8 +291,7 @@ def main(argv: list[str] | None = None) -> None:
         with tempfile.TemporaryDirectory() as folder:
             frames = write_walk(walk, Path(folder) / "room", count)
             for eye in eyes:
-                compute = options.errors or options.quick
-                psnr_db = error_db(walk, frames, eye, compute=compute)
+                psnr_db = error_db(walk, frames, eye)
                 job = job_of(walk, frames, eye)
                 for way in WAYS:
                     rate, more = measured(job, frames, way, psnr_db)
@@ -295,7 +308,7 @@ def main(argv: list[str] | None = None) -> None:
     if options.json:
         print(json.dumps(content))
         return
-    print_rows([row for row in rows if row.error is not None])
+    print_rows(rows)
     print(json.dumps(content.get("kills")))
     if not options.quick:
         print(write_report("batch", content).relative_to(RESULTS.parents[2]))

@@ -94,16 +94,26 @@ class Judge:
 
     Attributes
     ----------
+    windows : list of Window or None
+        Parts of the frame; None is the whole.
     truths : list of (height, width, 3) or None
-        Of `judged_windows`; None where references are not there.
+        Of the windows; None where references are not there.
     """
 
     walk: Walk
+    windows: list[Window | None]
     truths: list[NDArray[np.float64]] | None
 
     @classmethod
-    def of(cls, walk: Walk, eye: str, *, compute: bool) -> "Judge":
-        """Read references, or compute those that lack."""
+    def of(
+        cls,
+        walk: Walk,
+        eye: str,
+        *,
+        compute: bool,
+        windows: list[Window | None] | None = None,
+    ) -> "Judge":
+        """Read references, or compute those that lack; of the usual windows if None."""
         view, state = walk.views[walk.judged], walk.states[walk.judged]
         spec = grid_spec(
             **walk.camera,
@@ -113,13 +123,12 @@ class Judge:
             object_range_dpt=path_settings(SCENE)["object_range_dpt"],
         )
         exact = EyeState(traced_eye(eye, spec), spec, *state.values())
-        windows = judged_windows(walk.size_px)
+        windows = windows or judged_windows(walk.size_px)
         known = [has_reference(view, exact, bins=True, window=w) for w in windows]
         if not compute and not all(known):
-            return cls(walk, None)
-        return cls(
-            walk, [dense_reference(view, exact, bins=True, window=w) for w in windows]
-        )
+            return cls(walk, windows, None)
+        truths = [dense_reference(view, exact, bins=True, window=w) for w in windows]
+        return cls(walk, windows, truths)
 
     def error_db(self, renderer, handle, tolerance: float) -> float:
         """PSNR in linear light; not a number without references."""
@@ -131,10 +140,7 @@ class Judge:
             **self.walk.states[self.walk.judged],
             render_tolerance=tolerance,
         ).color
-        parts = [
-            seen if window is None else window.of(seen)
-            for window in judged_windows(self.walk.size_px)
-        ]
+        parts = [seen if window is None else window.of(seen) for window in self.windows]
         return psnr_db(_pixels(parts), _pixels(self.truths))
 
 
