@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from clients.arguments import read_object
-from clients.batch.job import FORMATS, LINEAR_FORMATS, Job, batch_settings
+from clients.batch.job import (
+    FORMATS,
+    LINEAR_FORMATS,
+    VIDEO_FORMATS,
+    Job,
+    batch_settings,
+)
 from clients.batch.layouts import LAYOUTS, Told, list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import SourceFrame
@@ -230,6 +236,8 @@ def _check(options: argparse.Namespace) -> None:
         if value is not None and not low <= value <= high:
             option = name.replace("_", "-")
             raise ValueError(f"--{option} {value:g}: allowed is {low:g} to {high:g}")
+    if options.format in VIDEO_FORMATS:
+        import clients.batch.video_writing  # noqa: F401  (that it is installed)
     if options.half and options.format not in LINEAR_FORMATS:
         raise ValueError("--half: allowed with --format npy or exr")
     if options.out.exists() and not options.out.is_dir():

@@ -94,6 +94,7 @@ class ProcessPool:
             [sys.executable, "-P", "-m", "clients.batch.worker", str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for us, and we end them
             env={
                 **os.environ,
                 THREADS_VARIABLE: str(self._n_threads),

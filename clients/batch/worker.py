@@ -7,7 +7,6 @@ It ends when the pipe does, between two frames at the latest.
 
 from __future__ import annotations
 
-import signal
 import sys
 from multiprocessing.connection import Connection
 
@@ -17,7 +16,6 @@ from clients.batch.work import UnitRunner
 
 def main(descriptor: int) -> None:
     """Serve a pipe until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: for the driver
     pipe = Connection(descriptor)
     try:
         runner = UnitRunner(*pipe.recv())

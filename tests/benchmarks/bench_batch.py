@@ -11,9 +11,9 @@ without the preparation of the eye; "cpu" is processor time in the worker, which
 work on the machine changes less; "read", "filter" and "write" are wall times of the
 parts.
 
-The error is that of one picture, in linear light and read from its files (depth in mm is
-part of it), against the dense reference of `bench live`, in three windows of 64 x 64 px:
-middle, left edge, corner.  A million frames: in core-hours, by wall time and by
+The error is that of one picture, in linear light and read from its files (depth in mm
+is part of it), against the dense reference of `bench live`, in three windows of 64 x 64
+px: middle, left edge, corner.  A million frames: in core-hours, by wall time and by
 processor time.
 
 Then a batch is killed 20 times by SIGKILL at random moments, workers with it or left

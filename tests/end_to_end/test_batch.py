@@ -1,9 +1,11 @@
 """`ocufilter batch`: the same bytes whoever makes them, in any order, after kills."""
 
 import json
+import os
 import random
 import shutil
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -15,7 +17,15 @@ from clients.batch.job import Job, batch_settings
 from clients.batch.states import States
 from filter_service import Camera, RgbdView
 from filter_service.image_files import read_color
-from tests.batch_kills import kill, line_count, pictures, start, wait_for_orphans
+from tests.batch_kills import (
+    MARK,
+    kill,
+    line_count,
+    pictures,
+    start,
+    wait_for_orphans,
+    workers_of,
+)
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 120
@@ -138,15 +148,47 @@ def test_killed_at_random_moments_and_finished_nothing_is_lost(room, usual, tmp_
 
 
 @pytest.mark.slow
+def test_a_worker_that_is_killed_is_replaced(long_room, tmp_path, usual):
+    out = tmp_path / "out"
+    arguments = (long_room, *PROFILES, *MODE, "--fov-deg", 20, "--workers", 2)
+    process = start(*arguments, "-o", out, **{MARK: str(out)})
+    for n_lines in (5, 50):
+        while line_count(out) < n_lines:
+            assert process.poll() is None
+            time.sleep(0.01)
+        os.kill(workers_of(out)[0], signal.SIGKILL)
+    _, error = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0, error
+    assert pictures(out) == ten_times(pictures(usual))
+
+
+@pytest.mark.slow
+def test_a_batch_that_is_interrupted_says_how_to_go_on(long_room, tmp_path):
+    out = tmp_path / "out"
+    process = start(long_room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out)
+    while line_count(out) < 9:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert error.endswith("batch: stopped; the same command goes on with it\n")
+    assert "Traceback" not in error
+
+
+def ten_times(expected):
+    """Return what `long_room` gives, from what `room` gives."""
+    return {
+        name.replace("/", f"/{k}"): content
+        for name, content in expected.items()
+        for k in range(10)
+    }
+
+
+@pytest.mark.slow
 def test_killed_twenty_times_and_finished_nothing_is_lost(long_room, usual, tmp_path):
     out = tmp_path / "out"
     finish_after_kills(long_room, out, 20)
-    expected = {
-        name.replace("/", f"/{k}"): content
-        for name, content in pictures(usual).items()
-        for k in range(10)
-    }
-    assert pictures(out) == expected
+    assert pictures(out) == ten_times(pictures(usual))
 
 
 def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
