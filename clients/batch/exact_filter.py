@@ -1,8 +1,9 @@
 """Pictures that depend on their frame, eye and settings, and on nothing before them.
 
 `EyeFilter` is made for streams: a first preview, PSFs that grow with what is asked, and
-states that are kept from frame to frame.  Here each eye and camera is prepared whole
-before its first frame, and what frames leave is forgotten.
+states that are kept from frame to frame, as the width of the field's cells, which grows
+where kernels are many.  Here each eye and camera is prepared whole before its first
+frame, and what frames leave is forgotten.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from typing import Any
 
 from clients.batch.job import Job
 from filter_service import Camera, EyeFilter, Filtered, FilterError, RgbdView
+from filter_service.errors import WorkerCrashed
 
+ATTEMPTS = 2
 BUILD_LIMIT_S = 600.0
 
 
@@ -73,18 +76,22 @@ class ExactFilter:
         return seen
 
     def _prepare(self, profile: str, camera: Camera) -> None:
-        self._give_up_eye()
         try:
             self._open = self._open or EyeFilter(engine=self._job.engine)
         except FilterError as error:
             raise EngineUnusable(str(error)) from None
-        self._key = profile, camera
-        body: Mapping[str, Any] = self._job.profiles[profile]
-        self._filter = EyeFilter(
-            body, camera, self._job.settings, engine=self._job.engine
-        )
-        try:
-            ready = self._filter.wait(BUILD_LIMIT_S)
-            self.build_s += ready.build_ms / 1e3
-        except FilterError as error:
-            self._failure = error
+        for _ in range(ATTEMPTS):
+            self._give_up_eye()
+            self._key = profile, camera
+            body: Mapping[str, Any] = self._job.profiles[profile]
+            settings, engine = self._job.settings, self._job.engine
+            self._filter = EyeFilter(body, camera, settings, engine=engine)
+            try:
+                ready = self._filter.wait(BUILD_LIMIT_S)
+                self.build_s += ready.build_ms / 1e3
+                return
+            except WorkerCrashed as error:  # memory was short, maybe
+                self._failure = error
+            except FilterError as error:
+                self._failure = error
+                return

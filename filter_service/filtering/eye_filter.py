@@ -217,8 +217,8 @@ class EyeFilter:
     def forget(self) -> None:
         """Have the next frame filtered as if it were the first.
 
-        Frames leave what saves time in those that follow, which differ by it where
-        kernels are so large that cells of the field had to be made wider.  With this
+        Frames leave what saves time in those that follow.  These differ by it where
+        kernels were so many that cells of the field had to be made wider.  With this
         and ``prepare="ranges"`` a picture does not depend on the frames before it.
         """
         self.workshop.engine.forget()

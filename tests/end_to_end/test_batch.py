@@ -143,7 +143,7 @@ def finish_after_kills(room, out, n_kills):
 
 def test_killed_at_random_moments_and_finished_nothing_is_lost(room, usual, tmp_path):
     out = tmp_path / "out"
-    finish_after_kills(room, out, 2)
+    finish_after_kills(room, out, 1)
     assert pictures(out) == pictures(usual)
 
 

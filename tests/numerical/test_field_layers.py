@@ -134,6 +134,24 @@ def test_larger_cells_serve_where_kernels_take_too_much_memory(
     assert np.isfinite(bench.render(color, depth_m).color).all()
 
 
+def test_what_a_frame_left_is_forgotten_on_demand(engine, rng, monkeypatch):
+    """A frame of many distances leaves wider cells to one that needs none."""
+    width, height = 96, 72
+    bench = FieldBench(engine, "myopia", tangents(width, height, 40.0), (width, height))
+    color = texture(rng, height, width, cell_px=3)
+    plain_m = np.full((height, width), 2.0, np.float32)
+    deep_m = rng.uniform(0.3, 3.0, (height, width)).astype(np.float32)
+    counts = [bench.render(color, d).kernel_texel_count for d in (plain_m, deep_m)]
+    assert counts[0] < 0.5 * counts[1]
+    engine.limit_kernels(monkeypatch, sum(counts) // 2, width * height)
+    bench.renderer = engine.new_renderer()
+    first = bench.render(color, plain_m).color.copy()
+    bench.render(color, deep_m)
+    assert not np.array_equal(bench.render(color, plain_m).color, first)
+    bench.renderer.forget()
+    np.testing.assert_array_equal(bench.render(color, plain_m).color, first)
+
+
 def test_plans_end_where_kernels_may_not_grow():
     """At the edge of its model's field the cataract's defocus goes on to -40 dpt."""
     spec = spec_for(
