@@ -345,6 +345,40 @@ def test_a_video_wants_as_many_depths_as_it_has_frames(tmp_path):
         list_frames(tmp_path / "c.mkv", "auto", FOV)
 
 
+def test_segments_become_one_video_in_which_a_gap_is_time(tmp_path, rng):
+    import av
+
+    from clients.batch.video_writing import VIDEO_KINDS, join_segments, write_segment
+
+    images = rng.integers(0, 256, (5, 30, 40, 3), dtype=np.uint8)
+    kind = {"kind": VIDEO_KINDS["ffv1"], "rate_hz": 30000 / 1001}
+    write_segment(tmp_path / "a.mkv", enumerate(images[:2]), **kind)
+    write_segment(tmp_path / "b.mkv", [(0, images[2]), (2, images[4])], **kind)
+    segments = [(0, tmp_path / "a.mkv"), (2, tmp_path / "b.mkv")]
+    for name in ("whole", "again"):
+        join_segments(tmp_path / f"{name}.mkv", segments, **kind)
+    whole, again = (tmp_path / f"{name}.mkv" for name in ("whole", "again"))
+    assert whole.read_bytes() == again.read_bytes()
+    with av.open(str(whole)) as container:
+        frames = list(container.decode(video=0))
+    times_s = [frame.time for frame in frames]
+    np.testing.assert_allclose(times_s, np.array([0, 1, 2, 4]) * 1.001 / 30, atol=1e-3)
+    for frame, number in zip(frames, (0, 1, 2, 4), strict=True):
+        np.testing.assert_array_equal(frame.to_ndarray(format="rgb24"), images[number])
+
+
+def test_h264_wants_even_sides(tmp_path):
+    from clients.batch.video_writing import VIDEO_KINDS, write_segment
+
+    with pytest.raises(ValueError, match="41x30 px; allowed with h264: even sides"):
+        write_segment(
+            tmp_path / "a.mkv",
+            [(0, np.zeros((30, 41, 3), np.uint8))],
+            kind=VIDEO_KINDS["h264"],
+            rate_hz=30.0,
+        )
+
+
 # --- states ------------------------------------------------------------------
 
 
