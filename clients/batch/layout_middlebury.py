@@ -77,6 +77,13 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
     except ValueError:
         raise ValueError(f"'{path}': doffs or baseline is no number") from None
     return (
-        Pinhole(matrix[0], matrix[4], matrix[2], matrix[5]),
+        Pinhole(matrix[0], matrix[4], matrix[2], matrix[5], _size_px(fields)),
         Disparity(matrix[0], M_PER_MM * baseline_mm, offset_px),
     )
+
+
+def _size_px(fields: dict[str, str]) -> tuple[int, int] | None:
+    sides = fields.get("width", ""), fields.get("height", "")
+    if not all(side.isdecimal() for side in sides):
+        return None
+    return int(sides[0]), int(sides[1])

@@ -31,7 +31,11 @@ from clients.batch.source import Pinhole, Scaled, SourceFrame
 from filter_service.image_files import read_depth
 
 COLOR_CAMERA = Pinhole(
-    518.85790117450188, 519.46961112127485, 325.58244941119034, 253.73616633400465
+    518.85790117450188,
+    519.46961112127485,
+    325.58244941119034,
+    253.73616633400465,
+    (640, 480),
 )
 DEPTH_CAMERA = Pinhole(
     582.62448167737955, 582.69103270988637, 313.04475870804731, 238.43889626620386
@@ -53,7 +57,7 @@ SHIFT_M = np.array(
 COUNT_SCALE_M, COUNT_AT_INFINITY = 351.3, 1092.5
 MAX_DEPTH_M = 10.0
 _RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?:ppm|pgm)$")
-_EXTRACTED = re.compile(r"^(\d+_colors|rgb_\d+)\.(?:png|jpg)$")
+_EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 from clients.batch.source import Pinhole, Scaled, SourceFrame
 
 DEPTH_SCALE_M = 1.0 / 5000.0
-CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5)
+CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
 MAX_APART_S = 0.02
 ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
 

@@ -39,15 +39,31 @@ class FieldOfView:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A calibrated camera; pixel (0, 0) has its centre at (0, 0)."""
+    """A calibrated camera; pixel (0, 0) has its centre at (0, 0).
+
+    Where the size of its images is known, others are refused.
+    """
 
     focal_x_px: float
     focal_y_px: float
     center_x_px: float
     center_y_px: float
+    size_px: tuple[int, int] | None = None
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return those to the edges, half a pixel beyond the last centres."""
+        """Return those to the edges, half a pixel beyond the last centres.
+
+        Raises
+        ------
+        ValueError
+            The camera is that of images of another size.
+        """
+        if self.size_px not in (None, (width_px, height_px)):
+            raise ValueError(
+                f"{width_px}x{height_px} px, and the camera of this layout is for "
+                f"{self.size_px[0]}x{self.size_px[1]}; allowed: that size, or "
+                "--intrinsics or --fov-deg"
+            )
         return (
             -(self.center_x_px + 0.5) / self.focal_x_px,
             (width_px - 0.5 - self.center_x_px) / self.focal_x_px,

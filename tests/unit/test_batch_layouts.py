@@ -155,6 +155,21 @@ def test_nyu_pairs_are_millimetres_with_the_color_camera_of_the_toolbox(tmp_path
     np.testing.assert_allclose(right - left, 640 / 518.857901, rtol=1e-8)
 
 
+def test_a_camera_of_other_images_is_refused(tmp_path):
+    write_color(tmp_path / "00001_colors.png")
+    write_integers(tmp_path / "00001_depth.png", [[1, 2, 3, 4]] * 2)
+    _, (frame,) = list_frames(tmp_path, "auto", Told())
+    with pytest.raises(ValueError, match=r"4x2 px, and the camera .* is for 640x480"):
+        frame.optics.tangents(4, 2)
+
+
+def test_pairs_that_are_only_like_nyu_are_not_taken_for_it(tmp_path):
+    write_color(tmp_path / "rgb_0001.png")
+    write_integers(tmp_path / "depth_0001.png", [[1, 2, 3, 4]] * 2)
+    layout, (frame,) = list_frames(tmp_path, "auto", FOV)
+    assert (layout, frame.name) == ("pairs", "0001")
+
+
 def test_nyu_pairs_have_other_names_too(tmp_path):
     write_color(tmp_path / "rgb_00045.jpg")
     write_integers(tmp_path / "sync_depth_00045.png", [[1500, 0, 9999, 1]] * 2)
