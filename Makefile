@@ -12,7 +12,7 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training test-batch-ray test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-batch-ray setup-witness
+.PHONY: demo test test-training test-examples test-batch-ray test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -27,6 +27,9 @@ test-training: setup-training  ## the tests of the training, with torch, and a s
 
 test-batch-ray: setup-batch-ray  ## `ocufilter batch` on two workers of a Ray cluster
 	.batch_ray/bin/python -m pytest tests/batch_ray $(ARGS)
+
+test-examples: setup-examples  ## the notebook, in an environment as a user has it
+	.examples/bin/python -m pytest -c /dev/null --rootdir . -p no:cacheprovider tests/examples $(ARGS)
 
 test-headset:  ## `ocufilter headset` against a real OpenXR runtime, in a root of its own
 	@sh tests/headset/setup_root.sh
@@ -67,7 +70,7 @@ check: setup  ## lint, formatting, types, and every shader through glslang
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv .witness .batch_ray .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .witness .batch_ray .examples .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list
@@ -84,6 +87,9 @@ setup-training:
 
 setup-batch-ray:
 	@sh setup.sh batch-ray
+
+setup-examples:
+	@sh setup.sh examples
 
 setup-witness:
 	@sh setup.sh witness

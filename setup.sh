@@ -5,6 +5,7 @@
 #   sh setup.sh test    the same, a virtual screen for the window test, and Node
 #   sh setup.sh training  the first, and what training the networks needs (torch)
 #   sh setup.sh batch-ray the first, and Ray in an environment of its own
+#   sh setup.sh examples  an environment of its own that has the package and Jupyter
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
@@ -24,8 +25,10 @@ WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
 WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
 WITNESS_VENV=.witness
 RAY_VENV=.batch_ray
+EXAMPLES_VENV=.examples
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
+EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
 
 say() { printf 'setup: %s\n' "$*" >&2; }
@@ -203,8 +206,24 @@ install_witness() { # Mitsuba: a path tracer that the frames are compared with
         install $WITNESS_PACKAGES
 }
 
+install_examples() { # the package as users install it, apart from the checkout
+    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt; git rev-parse HEAD)
+    wanted=$(echo "$wanted" | cksum)
+    if [ "$(cat $EXAMPLES_STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
+    say "installing the package and Jupyter into $EXAMPLES_VENV (a minute)"
+    $(find_python) -m venv --clear $EXAMPLES_VENV
+    pip="$EXAMPLES_VENV/bin/python -m pip -qq --disable-pip-version-check"
+    $pip install -c constraints.txt setuptools pytest
+    $pip install -c constraints.txt --no-build-isolation '.[clients,examples]'
+    echo "$wanted" >$EXAMPLES_STAMP
+}
+
 install_system_libraries
 install_c_compiler
+if [ "${1:-}" = examples ]; then
+    install_examples
+    exit
+fi
 install_packages
 if [ "${1:-}" = training ]; then install_training_packages; fi
 if [ "${1:-}" = test ]; then

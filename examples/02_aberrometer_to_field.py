@@ -2,9 +2,10 @@
 
     python examples/02_aberrometer_to_field.py
 
-The file holds Zernike coefficients of the axis.  An eye model is fitted to them; it
-says what the eye does elsewhere, which no usual aberrometer measures.  The picture has
-the blur of a point of light in fifteen directions, and the refraction along the horizon.
+The file holds Zernike coefficients of the axis.  An eye model is fitted to them; away
+from the axis, where usual aberrometers measure nothing, it is as people with such an
+axis are.  The picture has the blur of a point of light in fifteen directions, and the
+refraction along the horizon.
 """
 
 import numpy as np

@@ -60,7 +60,9 @@ filters = {side: EyeFilter(PROFILES[side], camera) for side in sides}
 for eye_filter in filters.values():
     eye_filter.wait()
 is_complete = False
-while not is_complete:  # it shows previews first; "preparing" where there is not even one
+while (
+    not is_complete
+):  # it shows previews first; "preparing" where there is not even one
     time.sleep(PREVIEW_S)
     planned = plan_views(
         filters.get, views, states, pupil_diameter_mm=4.5, focus_dpt=0.5

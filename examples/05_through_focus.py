@@ -23,7 +23,11 @@ EYES = {
 
 card = Image.new("RGB", (SIDE_PX, SIDE_PX), "white")
 draw = ImageDraw.Draw(card)
-for text, size_px, y in (("E N T", 44, 14), ("O P T I C", 24, 70), ("S A H L Z", 15, 112)):
+for text, size_px, y in (
+    ("E N T", 44, 14),
+    ("O P T I C", 24, 70),
+    ("S A H L Z", 15, 112),
+):
     draw.text((SIDE_PX / 2, y), text, fill="black", font=font(size_px), anchor="ma")
 color = np.array(card)
 depth_m = np.full((SIDE_PX, SIDE_PX), 1.0 / CARD_DPT, np.float32)

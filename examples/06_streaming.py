@@ -14,17 +14,24 @@ from clients import FilterClient, FilteredFrame, ServiceProcess
 from filter_service import RgbdView
 
 FRAME_COUNT = 24
-SHOWN = (0, 8, 16, 23)
+SHOWN = (0, 6, 12, 18)
+PERSON = {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 25}
+SETTINGS = {  # all is prepared before the first frame; usually it is done on the way
+    "prepare": "ranges",
+    "pupil_range_mm": (3.0, 5.0),
+    "focus_range_dpt": (0.0, 3.0),
+    "object_range_dpt": (0.0, 3.0),
+}
 
 color, depth_m, camera = load_courtyard()
 view = RgbdView(color, depth_m, camera.tangents)
 phase = np.linspace(0.0, 2.0 * np.pi, FRAME_COUNT, endpoint=False)
 pupils_mm = 4.0 + np.sin(phase)  # a pupil that opens and closes
-foci_dpt = 1.0 - np.cos(phase)  # a gaze that comes near and goes away again
+foci_dpt = 1.5 * (1.0 - np.cos(phase))  # a gaze that comes near and goes away again
 
 frames, times_ms = [], []
 with ServiceProcess() as service, FilterClient(service.endpoint) as client:
-    client.set_profile("post_lasik", views=[view])  # returns when the eye is ready
+    client.set_profile(PERSON, settings=SETTINGS, views=[view])  # waits for the eye
     for pupil_mm, focus_dpt in zip(pupils_mm, foci_dpt, strict=True):
         client.submit([view], pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
         # ... here a renderer would draw its next frame ...
@@ -34,7 +41,9 @@ with ServiceProcess() as service, FilterClient(service.endpoint) as client:
                     frames.append(np.array(event.color))  # its memory is used again
                     times_ms.append(event.header.total_ms)
 
-print(f"{FRAME_COUNT} frames, {np.median(times_ms):.0f} ms each in the service (median)")
+print(
+    f"{FRAME_COUNT} frames, {np.median(times_ms):.0f} ms each in the service (median)"
+)
 save_pictures(
     "06_streaming.png",
     [

@@ -17,10 +17,9 @@ from PIL import Image, ImageDraw
 from filter_service import Camera, EyeFilter, FilterSettings
 
 SIDE_PX = 64
-FIELD_DEG = 0.6  # of the whole picture; its letter is 20/100
+FIELD_DEG = 1.1  # of the whole picture; its letter is 20/200 on a chart
 DISTANCE_DPT = 0.25  # 4 m
 LETTER_COUNT, PEOPLE_COUNT = 4, 6
-SHOWN_COUNT = 24
 
 rng = np.random.default_rng(7)
 letters = rng.choice(list(string.ascii_uppercase), LETTER_COUNT, replace=False)
@@ -40,7 +39,7 @@ def person():
     """Draw the eye of somebody: what an optician would write down."""
     return {
         "kind": "prescription",
-        "sphere_dpt": round(float(rng.normal(-0.8, 0.8)), 2),
+        "sphere_dpt": round(float(rng.normal(-0.6, 0.7)), 2),
         "cylinder_dpt": round(-float(rng.gamma(1.2, 0.4)), 2),
         "axis_deg": round(float(rng.uniform(1.0, 180.0))),
         "age_years": round(float(rng.uniform(20.0, 70.0))),
@@ -59,7 +58,7 @@ rows, pictures = [], []
 with EyeFilter("emmetropia", camera, settings) as eye:
     for number in range(PEOPLE_COUNT):
         profile = person()
-        pupil_mm = round(float(rng.uniform(2.5, 6.0)), 1)
+        pupil_mm = round(float(rng.uniform(2.5, 5.0)), 1)
         eye.set_profile(profile)
         eye.wait()
         for letter in letters:
@@ -67,7 +66,9 @@ with EyeFilter("emmetropia", camera, settings) as eye:
             seen = still(eye, drawn(letter), depth_m, **state)
             file = f"{letter}_{number:02d}.png"
             Image.fromarray(seen.color).save(folder / file)
-            rows.append({"file": file, "letter": letter, "pupil_mm": pupil_mm} | profile)
+            rows.append(
+                {"file": file, "letter": letter, "pupil_mm": pupil_mm} | profile
+            )
             refraction = f"{profile['sphere_dpt']:+.1f} {profile['cylinder_dpt']:+.1f}"
             pictures.append((refraction, seen.color))
 
@@ -77,4 +78,4 @@ with (folder / "labels.csv").open("w", newline="", encoding="utf-8") as file:
     writer.writerows(rows)
 print(f"{len(rows)} pictures of {PEOPLE_COUNT} people in {folder}")
 enlarged = [(text, picture.repeat(2, 0).repeat(2, 1)) for text, picture in pictures]
-save_pictures("07_augment_data_set.png", enlarged[:SHOWN_COUNT], columns=LETTER_COUNT)
+save_pictures("07_augment_data_set.png", enlarged, columns=2 * LETTER_COUNT)

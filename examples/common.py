@@ -29,9 +29,7 @@ def load_courtyard():
     millimetres = np.array(Image.open(DATA / "courtyard_depth.png"))
     depth_m = np.where(millimetres == SKY_MM, np.inf, millimetres / 1000.0)
     height_px, width_px = depth_m.shape
-    camera = Camera.from_fov(
-        FIELD_OF_VIEW_DEG, width_px=width_px, height_px=height_px
-    )
+    camera = Camera.from_fov(FIELD_OF_VIEW_DEG, width_px=width_px, height_px=height_px)
     return color, depth_m.astype(np.float32), camera
 
 

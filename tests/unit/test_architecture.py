@@ -47,6 +47,9 @@ MAY_IMPORT = {
 }
 """Ours that each package may import, as dotted prefixes."""
 
+EXAMPLES_IMPORT = {"numpy", "PIL", "matplotlib", "common"}
+"""Besides the standard library and the three faces."""
+
 EYE_ROOMS = {
     # room of the estimator: the other rooms that it may import
     "optics": (),
@@ -191,6 +194,24 @@ def test_packages_import_only_in_the_allowed_direction(package):
         for entry in package_imports(package)
         if entry.top in (*PACKAGES, "tests")
         and not _may(entry.module, MAY_IMPORT[package])
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_examples_use_what_the_faces_show_and_nothing_else():
+    faces = {
+        f"{package}.{name}"
+        for package in ("estimator", "filter_service", "clients")
+        for name in importlib.import_module(package).__all__
+    }
+    scripts = sorted((ROOT / "examples").glob("*.py"))
+    assert len(scripts) > 1
+    wrong = [
+        f"{entry.file}:{entry.line} imports {entry.module}"
+        for path in scripts
+        for entry in imports_of(path)
+        if entry.module not in faces
+        and entry.top not in {*EXAMPLES_IMPORT, *sys.stdlib_module_names}
     ]
     assert not wrong, "\n".join(wrong)
 

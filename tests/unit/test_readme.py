@@ -86,7 +86,7 @@ def test_every_public_make_target_is_phony_and_explained():
     assert _make_targets() == phony
     explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
     wanted = {"demo", "test", "test-training", "test-headset", "validate", "witness"}
-    wanted |= {"check", "gpu-kit", "gl-witness", "test-batch-ray"}
+    wanted |= {"check", "gpu-kit", "gl-witness", "test-batch-ray", "test-examples"}
     assert wanted | {"clean", "help"} == explained
 
 
