@@ -11,7 +11,12 @@ import pytest
 
 from tests.benchmarks.paper_page.measured import Measured, ResultMissing
 from tests.benchmarks.paper_page.numbers import value_text
-from tests.benchmarks.paper_page.page import all_sections, page, summary_line
+from tests.benchmarks.paper_page.page import (
+    FRESH_NOTE,
+    all_sections,
+    page,
+    summary_line,
+)
 from tests.benchmarks.paper_page.published import FIGURES, TABLES, table
 from tests.benchmarks.paper_page.rows import (
     APART,
@@ -255,6 +260,7 @@ def test_fresh_results_take_the_place_of_committed_ones(tmp_path):
     fresh = Measured(fresh=tmp_path)
     assert fresh.is_fresh("layers") and not fresh.is_fresh("field")
     assert "fresh00" in page(fresh) and "layers.json (fresh)" in page(fresh)
+    assert FRESH_NOTE in page(fresh) and FRESH_NOTE not in page(committed)
     with pytest.raises(ResultMissing, match=r"nothing\.json"):
         committed.results("nothing")
 

@@ -1,9 +1,8 @@
 """The benchmarks that the page needs, run one after the other.
 
 Their results go to a folder of their own; whole runs of those that keep results renew
-the committed files as well, as `ocufilter bench` does.  What needs another machine, and
-the training, is not among them: gpu.json, table3.json and table11.json stay as they are,
-and live.json, which takes an hour.
+the committed files as well, as `ocufilter bench` does.  What needs another machine, an
+hour (live.json), or the training, stays as it is: see `announcement`.
 """
 
 import subprocess

@@ -29,6 +29,11 @@ STYLE = Path(__file__).parent / "page.css"
 TITLE = "ocufilter beside the paper"
 EMPTY = "–"
 
+FRESH_NOTE = (
+    "Some figures are of a run just made (see the last section); the words beside the "
+    "tables were written for the committed results."
+)
+
 FEW_LINES = 3
 """Blocks of so few lines are shown as they are, without medians."""
 
@@ -69,7 +74,7 @@ def page(measured: Measured) -> str:
     """Return the whole page."""
     sections = all_sections(measured)
     body = [
-        _header(sections),
+        _header(sections, measured),
         _contents(sections),
         _worse(sections),
         _reading(),
@@ -86,7 +91,7 @@ def page(measured: Measured) -> str:
     )
 
 
-def _header(sections: Sequence[Section]) -> str:
+def _header(sections: Sequence[Section], measured: Measured) -> str:
     source = published()["source"]
     tables = without_pictures(sections)
     rows = (
@@ -119,8 +124,14 @@ def _header(sections: Sequence[Section]) -> str:
         "<table class=summary><caption>Rows in which ocufilter is better or worse "
         "than</caption><thead><tr><th></th>"
         f"{heads}</tr></thead><tbody>{cells}</tbody></table>"
-        f"<p class=small>{summary_line(sections)}</p></header>"
+        f"<p class=small>{summary_line(sections)}</p>{_fresh_note(measured)}</header>"
     )
+
+
+def _fresh_note(measured: Measured) -> str:
+    if measured.fresh is None:
+        return ""
+    return f"<p><b>{FRESH_NOTE}</b>  Where an eye or a size was not run, a row is empty.</p>"
 
 
 def without_pictures(sections: Sequence[Section]) -> list[Section]:
