@@ -73,6 +73,7 @@ def test_of_three_cards_the_one_looked_at_is_sharp(run):
     assert detail(far_card) > 2.0 * detail(near)
 
 
+@pytest.mark.slow
 def test_of_two_eyes_the_short_sighted_one_blurs_what_is_far(run):
     page = run("04_stereo")
     left, right = (cell(page, 1, column, (2, 2))[:130] for column in (0, 1))
