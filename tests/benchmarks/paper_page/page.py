@@ -131,7 +131,8 @@ def _header(sections: Sequence[Section], measured: Measured) -> str:
 def _fresh_note(measured: Measured) -> str:
     if measured.fresh is None:
         return ""
-    return f"<p><b>{FRESH_NOTE}</b>  Where an eye or a size was not run, a row is empty.</p>"
+    empty = "Where an eye or a size was not run, a row is empty."
+    return f"<p><b>{FRESH_NOTE}</b>  {empty}</p>"
 
 
 def without_pictures(sections: Sequence[Section]) -> list[Section]:
