@@ -207,8 +207,10 @@ install_witness() { # Mitsuba: a path tracer that the frames are compared with
 }
 
 install_examples() { # the package as users install it, apart from the checkout
-    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt; git rev-parse HEAD)
-    wanted=$(echo "$wanted" | cksum)
+    wanted=$(pwd; cksum setup.sh pyproject.toml constraints.txt
+        find estimator filter_service clients shaders -type f ! -name '*.so' \
+            ! -path '*/__pycache__/*' ! -path '*/node_modules/*' -exec cksum {} +)
+    wanted=$(echo "$wanted" | sort | cksum)
     if [ "$(cat $EXAMPLES_STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     say "installing the package and Jupyter into $EXAMPLES_VENV (a minute)"
     $(find_python) -m venv --clear $EXAMPLES_VENV

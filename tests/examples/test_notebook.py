@@ -13,7 +13,8 @@ nbclient = pytest.importorskip("nbclient", reason="for `make test-examples`")
 nbformat = pytest.importorskip("nbformat", reason="for `make test-examples`")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-LIMIT_S = 120
+LIMIT_S = 600
+"""Of a cell: the first ones of a new environment wait for loops to be compiled."""
 
 
 @pytest.fixture
