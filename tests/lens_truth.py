@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.rings import DiffractiveRings, Rings
 from estimator.optics.units import NM_PER_UM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -28,6 +29,13 @@ MM_PER_DEG = 0.2908
 def worn_eye(**correction) -> MeasuredWavefront:
     """Return an eye without other aberrations that wears an intraocular lens."""
     body = {"kind": "iol", "cornea_spherical_aberration_um": 0.0, **correction}
+    profile = {"kind": "prescription", "sphere_dpt": 0.0, "correction": body}
+    return MeasuredWavefront.from_profile(parse_profile(profile))
+
+
+def lenslet_eye(**correction) -> MeasuredWavefront:
+    """Return an eye without aberrations behind spectacles with lenslets."""
+    body = {"kind": "lenslets", "sphere_dpt": 0.0, "vertex_mm": 12.0, **correction}
     profile = {"kind": "prescription", "sphere_dpt": 0.0, "correction": body}
     return MeasuredWavefront.from_profile(parse_profile(profile))
 
@@ -59,7 +67,7 @@ def modulation(
         pupil_diameter_mm=pupil_mm,
         wavelength_nm=wavelength_nm,
         pixel_pitch_mrad=pixel_mrad,
-        pupil_screen=eye.rings,
+        pupil_screen=eye.rings and eye.rings.seen_from(0.0, 0.0),
         max_radius_px=LARGEST_PX,
     )
     cycles_per_px = np.asarray(at_cpd) * DEG_PER_MRAD * pixel_mrad
@@ -123,3 +131,45 @@ class Truth:
             field = self.defocused(total_dpt - added)
             found += abs(amplitude) ** 2 * self.modulation(field, at_cpd)
         return found
+
+
+def lenslets_truth(
+    lens: Lenslets, *, pupil_mm: float, wavelength_nm: float, at_cpd, depth_mm: float
+) -> NDArray[np.float64]:
+    """Modulation (n,), mean of x and y, of light that goes on from lens to pupil.
+
+    An angular spectrum carries it over; a perfect eye looks into the distance.
+    """
+    count, side_mm = 1024, 2.5 * pupil_mm
+    along = ((np.arange(count) + 0.5) / count - 0.5) * side_mm
+    x, y = np.meshgrid(along, along)
+    cx, cy = lens.centre_mm
+    nearest = np.full(x.shape, np.inf)
+    pitch, inner, outer = lens.lattice_mm
+    for row in range(-40, 41):
+        v = row * pitch * np.sqrt(3.0) / 2.0
+        for column in range(-40, 41):
+            u = (column + row % 2 / 2.0) * pitch
+            near = abs(u + cx) < pupil_mm and abs(v + cy) < pupil_mm
+            if near or np.hypot(u + cx, v + cy) < 2.0 * pupil_mm:
+                if inner <= np.hypot(u, v) <= outer:
+                    square = (x - cx - u) ** 2 + (y - cy - v) ** 2
+                    nearest = np.minimum(nearest, square)
+    field = lens.transmission(nearest, wavelength_nm)
+    per_mm = np.fft.fftfreq(count, side_mm / count)
+    square = per_mm[:, None] ** 2 + per_mm**2
+    wavelength_mm = wavelength_nm / 1e6
+    carried = np.exp(-1j * np.pi * wavelength_mm * depth_mm * square)
+    # Light that goes on has its phase fall off with the angle in this convention, where
+    # a positive wavefront is ahead.
+    field = np.fft.ifft2(np.fft.fft2(field) * np.conj(carried))
+    inside = np.hypot(x, y) <= pupil_mm / 2.0
+    passed = np.where(inside, field, 0.0)
+    steps = np.asarray(at_cpd) * DEG_PER_MRAD * wavelength_nm / NM_PER_UM
+    steps = steps / side_mm * count
+    found = []
+    for turned in (passed, passed.T):
+        spectrum = np.fft.fft(turned, 2 * count, axis=1)
+        line = np.fft.ifft((np.abs(spectrum) ** 2).sum(axis=0)).real
+        found.append(np.interp(steps, np.arange(count), line[:count]) / line[0])
+    return np.mean(found, axis=0)

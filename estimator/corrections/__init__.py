@@ -3,6 +3,8 @@
 worn_lens         a lens on or in the eye: power, its own aberration, where it sits
 rings             several foci at once: diffractive rings, refractive zones
 kinoform          light in the orders of a diffractive profile, by scalar theory
+lens_plane        where on a spectacle lens one looks through
+lenslets          spectacles with lenslets around a clear middle
 progressive       spectacles whose power changes with the direction of gaze
 intraocular       from the plane of an intraocular lens to that of the pupil
 """

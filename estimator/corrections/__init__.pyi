@@ -1,3 +1,4 @@
+from .lenslets import Lenslets as Lenslets
 from .progressive import ProgressiveLens as ProgressiveLens
 from .rings import DiffractiveRings as DiffractiveRings
 from .rings import RefractiveZones as RefractiveZones

@@ -14,13 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
-from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.wavefront.field_wavefronts import polynomial_in_mm
-
-ROTATION_CENTRE_MM = 13.5
-"""About which the eye turns, behind the cornea."""
 
 
 @dataclass(frozen=True)
@@ -85,18 +82,11 @@ class ProgressiveLens(rx.Prescription):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where light from field directions crosses the lens, x and y (...).
 
-        From the fitting cross: by gaze about the centre of rotation, and from there by
-        field about the entrance pupil.
+        From the fitting cross, see `lens_plane`.
         """
-        by_gaze_mm = self.vertex_mm + ROTATION_CENTRE_MM
-        by_field_mm = self.vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM
-        x, y = (
-            by_gaze_mm * np.tan(np.radians(gaze)) + by_field_mm * np.tan(direction)
-            for gaze, direction in zip(
-                self.gaze_deg, (np.radians(h_deg), np.radians(v_deg)), strict=True
-            )
+        return lens_point_mm(
+            h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
-        return x, y
 
     def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
         """Power (..., 2, 2) at points of the lens, x to the person's right, y up."""

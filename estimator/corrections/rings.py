@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.lenslets import Lenslets
 from estimator.optics.units import NM_PER_UM
 
 LOWEST_ORDER, HIGHEST_ORDER = -3, 3
@@ -71,14 +72,24 @@ class DiffractiveRings:
         colour = wavelength_nm / self.design_nm
         return self.spacing_dpt * (self.followed_orders * colour - self.far_order)
 
+    @property
+    def lattice_mm(self) -> None:
+        """Rings have one centre."""
+
+    def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "DiffractiveRings":
+        """Return the lens from field directions: it is in the pupil, the same."""
+        return self
+
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Power (n,) of those that have much of the light."""
         is_main = np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
         return self.added_dpt(wavelength_nm)[is_main]
 
-    def reach_dpt(self, wavelength_nm: float) -> float:
-        """Largest power, of either sign, that light is sent out of focus by."""
-        return float(np.abs(self.added_dpt(wavelength_nm)).max())
+    def reach_mrad(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """How far light goes aside, at distances from the centre."""
+        return np.abs(self.added_dpt(wavelength_nm)).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -112,13 +123,23 @@ class RefractiveZones:
     powers_dpt: tuple[float, ...]
     centre_mm: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def lattice_mm(self) -> None:
+        """Rings have one centre."""
+
+    def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "RefractiveZones":
+        """Return the lens from field directions: it is in the pupil, the same."""
+        return self
+
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Power (n,) of all rings."""
         return np.unique(self.powers_dpt)
 
-    def reach_dpt(self, wavelength_nm: float) -> float:
-        """Largest power, of either sign, that light is sent out of focus by."""
-        return float(np.abs(self.powers_dpt).max())
+    def reach_mrad(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """How far light goes aside, at distances from the centre."""
+        return np.abs(self.powers_dpt).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -134,4 +155,4 @@ class RefractiveZones:
         return np.exp(2j * np.pi * NM_PER_UM / wavelength_nm * path_um)
 
 
-Rings = DiffractiveRings | RefractiveZones
+Rings = DiffractiveRings | RefractiveZones | Lenslets

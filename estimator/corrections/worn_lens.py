@@ -1,10 +1,12 @@
 """A lens on or in the eye: a prescription, its own aberration, and where it sits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.corrections.lenslets import Lenslets
+from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import Rings
 from estimator.optics import prescription as rx
 from estimator.optics.zernike import EXPONENTS, N_TERMS, index_from_nm
@@ -27,13 +29,13 @@ C40 = index_from_nm(4, 0)
 
 @dataclass(frozen=True)
 class WornLens(rx.Prescription):
-    """A contact lens or an intraocular lens, as it acts in the entrance pupil.
+    """A lens that is more than its powers, as it acts in the entrance pupil.
 
     Attributes
     ----------
     sphere_dpt, cylinder_dpt, axis_deg, vertex_mm : float
         See `Prescription`; a lens in the pupil's own plane has minus its depth.
-    kind : {"contact_lens", "iol"}
+    kind : {"contact_lens", "iol", "lenslets"}
     spherical_aberration_um : float
         C(4,0) on 6 mm that it adds; its power through 4 mm stays.
     centre_mm : (x, y)
@@ -49,6 +51,19 @@ class WornLens(rx.Prescription):
     centre_mm: tuple[float, float] = (0.0, 0.0)
     rings: Rings | None = None
     replaces_lens: bool = False
+
+    def looking(self, gaze_deg: tuple[float, float]) -> "WornLens":
+        """Return the lens for an eye that looks so much farther aside and up."""
+        if not isinstance(self.rings, Lenslets):
+            return self
+        return replace(self, rings=self.rings.looking(gaze_deg))
+
+
+def turns_with_gaze(correction: rx.Prescription | None) -> bool:
+    """Return whether another gaze looks through another part of it."""
+    return isinstance(correction, ProgressiveLens) or isinstance(
+        rings_of(correction), Lenslets
+    )
 
 
 def rings_of(correction: rx.Prescription | None) -> Rings | None:

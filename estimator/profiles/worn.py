@@ -1,5 +1,6 @@
 """What a profile says is worn: spectacles, a contact lens, an intraocular lens."""
 
+import math
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
@@ -10,6 +11,7 @@ from estimator.corrections.intraocular import (
     power_at_pupil_dpt,
 )
 from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones, Rings
 from estimator.corrections.worn_lens import WornLens
@@ -18,9 +20,17 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 
-KINDS = ("spectacles", "progressive", "contact_lens", "iol")
+KINDS = ("spectacles", "progressive", "lenslets", "contact_lens", "iol")
 SPECTACLE_FIELDS = ("sphere_dpt", "cylinder_dpt", "axis_deg", "vertex_mm")
 PROGRESSIVE_FIELDS = ("add_dpt", "corridor_mm", "gaze_deg")
+LENSLET_FIELDS = (
+    "lenslet_add_dpt",
+    "lenslet_diameter_mm",
+    "lenslet_count",
+    "clear_diameter_mm",
+    "lenslets_diameter_mm",
+    "gaze_deg",
+)
 SEATED_FIELDS = (
     *SPECTACLE_FIELDS[:3],
     "rotation_deg",
@@ -60,6 +70,8 @@ def correction(data: Mapping[str, Any]) -> rx.Prescription | None:
         return prescription(body, path=PATH)
     if kind == "progressive":
         return _progressive(body)
+    if kind == "lenslets":
+        return _lenslets(body)
     if kind == "contact_lens":
         fields.only_known(body, ("kind", *SEATED_FIELDS), path=PATH)
         return WornLens(**_seated(body, kind, needs_sphere=True))
@@ -78,6 +90,40 @@ def _progressive(body: Mapping[str, Any]) -> ProgressiveLens:
         ),
         gaze_deg=(h_deg, v_deg),
     )
+
+
+def _lenslets(body: Mapping[str, Any]) -> WornLens:
+    """Return spectacles with lenslets, by default as DIMS lenses have them."""
+    fields.only_known(body, ("kind", *SPECTACLE_FIELDS, *LENSLET_FIELDS), path=PATH)
+    worn = prescription(body, path=PATH)
+
+    def number(name: str, low: float, high: float, default: float) -> float:
+        return fields.number(body, name, low, high, default=default, path=PATH)
+
+    diameter_mm = number("lenslet_diameter_mm", 0.5, 3.0, 1.03)
+    clear_mm = number("clear_diameter_mm", 0.0, 30.0, 9.4)
+    whole_mm = number("lenslets_diameter_mm", 10.0, 70.0, 33.0)
+    count = number("lenslet_count", 7.0, 5000.0, 396.0)
+    inner_mm, outer_mm = (clear_mm + diameter_mm) / 2.0, (whole_mm - diameter_mm) / 2.0
+    area_mm2 = math.pi * (outer_mm**2 - inner_mm**2) / count
+    pitch_mm = math.sqrt(max(area_mm2, 0.0) * 2.0 / math.sqrt(3.0))
+    if pitch_mm < diameter_mm:
+        raise ProfileError(
+            PATH + "lenslet_count",
+            f"{count:g} lenslets of {diameter_mm:g} mm have no room",
+            "fewer or smaller ones, or more room for them",
+        )
+    h_deg, v_deg = _numbers(body, "gaze_deg", -60.0, 60.0, (2, 2), [0.0, 0.0])
+    lenslets = Lenslets(
+        power_dpt=number("lenslet_add_dpt", 0.5, 8.0, 3.5),
+        diameter_mm=diameter_mm,
+        pitch_mm=pitch_mm,
+        inner_mm=inner_mm,
+        outer_mm=outer_mm,
+        vertex_mm=worn.vertex_mm,
+        gaze_deg=(h_deg, v_deg),
+    )
+    return WornLens(**vars(worn), kind="lenslets", rings=lenslets)
 
 
 def prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:

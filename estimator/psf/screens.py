@@ -20,20 +20,30 @@ BEYOND_EDGE = 1.5
 """How far tables go over the pupil's radius: its smoothed edge reaches beyond it."""
 
 
+ONE_CENTRE = (0.0, 0.0, 0.0)
+"""Stands for no honeycomb."""
+
+
 class PupilScreen(Protocol):
-    """What rings do to the light, the same at every pupil and field."""
+    """What rings do to the light, about one centre or many."""
 
     @property
-    def centre_mm(self) -> tuple[float, float]:
-        """Of the rings, from the pupil's centre."""
+    def centre_mm(self) -> ArrayLike:
+        """Of the rings, from the pupil's centre: (2,), or (P, 2) for each pupil."""
 
-    def reach_dpt(self, wavelength_nm: float) -> float:
-        """Largest power by which light is sent out of focus, of either sign."""
+    @property
+    def lattice_mm(self) -> tuple[float, float, float] | None:
+        """Pitch of a honeycomb of rings, and the radii between which it lies."""
+
+    def reach_mrad(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """How far light goes aside at distances from the centre."""
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Complex amplitude at squared distances from the centre."""
+        """Complex amplitude at squared distances from the centre of rings."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,8 @@ class ScreenTables:
         Table of each pupil.
     radius_mm : float
         Of the last entry.
+    lattice_mm : (pitch, inner, outer)
+        Of a honeycomb of such rings; zeros where there is one centre.
     reach_px : (P, 2)
         How much farther light goes than without it, x and y.
     """
@@ -57,6 +69,7 @@ class ScreenTables:
     tables: NDArray[np.complex64]
     which: NDArray[np.int64]
     radius_mm: float
+    lattice_mm: tuple[float, float, float]
     reach_px: NDArray[np.float64]
 
     @classmethod
@@ -73,11 +86,14 @@ class ScreenTables:
         matrix = np.swapaxes(pixel_from_mrad, 1, 2) * half_width_um_per_px[:, None, :]
         offset = pupil_ellipse[:, :2] - np.array(screen.centre_mm)
         largest_mm = pupil_ellipse[:, 2] + np.hypot(*offset.T)
+        lattice_mm = screen.lattice_mm or ONE_CENTRE
         radius_mm = BEYOND_EDGE * float(largest_mm.max())
+        if screen.lattice_mm is not None:
+            radius_mm = lattice_mm[0]
         square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
         colours_nm, which = np.unique(wavelength_nm, return_inverse=True)
-        reach_dpt = np.array([screen.reach_dpt(nm) for nm in colours_nm.tolist()])
-        reach_mrad = reach_dpt[which] * largest_mm
+        reaches = [screen.reach_mrad(largest_mm, nm) for nm in colours_nm.tolist()]
+        reach_mrad = np.stack(reaches)[which, np.arange(which.size)]
         return cls(
             from_box_mm=np.concatenate([matrix, offset[:, :, None]], axis=2),
             tables=np.stack(
@@ -85,6 +101,7 @@ class ScreenTables:
             ).astype(np.complex64),
             which=which,
             radius_mm=radius_mm,
+            lattice_mm=lattice_mm,
             reach_px=reach_mrad[:, None] * np.linalg.norm(pixel_from_mrad, axis=2),
         )
 
@@ -101,6 +118,7 @@ class ScreenTables:
             self.tables,
             self.which[members],
             TABLE_COUNT / self.radius_mm**2,
+            self.lattice_mm,
             samples,
             size,
             field,
@@ -108,7 +126,25 @@ class ScreenTables:
 
 
 @njit(cache=True, nogil=True)
-def _apply(from_box, tables, which, steps_per_mm2, samples, size, field):
+def _square_mm2(u, v, lattice):
+    """Squared distance from the nearest centre; beyond all rings where none is near."""
+    pitch, inner, outer = lattice
+    if pitch == 0.0:
+        return u * u + v * v
+    row = math.sqrt(3.0) * pitch  # every second one
+    x, y = pitch * round(u / pitch), row * round(v / row)
+    p = pitch * (round(u / pitch - 0.5) + 0.5)
+    q = row * (round(v / row - 0.5) + 0.5)
+    square, other = (u - x) ** 2 + (v - y) ** 2, (u - p) ** 2 + (v - q) ** 2
+    if other < square:
+        x, y, square = p, q, other
+    if not inner * inner <= x * x + y * y <= outer * outer:
+        return math.inf
+    return square
+
+
+@njit(cache=True, nogil=True)
+def _apply(from_box, tables, which, steps_per_mm2, lattice, samples, size, field):
     last = tables.shape[1] - 1
     for b in range(field.shape[0]):
         m, table = from_box[b], tables[which[b]]
@@ -122,5 +158,5 @@ def _apply(from_box, tables, which, steps_per_mm2, samples, size, field):
                 x = (i - (columns - 1) / 2.0) * 2.0 / samples[b, 0]
                 u = m[0, 0] * x + m[0, 1] * y + m[0, 2]
                 v = m[1, 0] * x + m[1, 1] * y + m[1, 2]
-                step = math.floor((u * u + v * v) * steps_per_mm2)
-                row[i] *= table[min(step, last)]
+                step = _square_mm2(u, v, lattice) * steps_per_mm2
+                row[i] *= table[last if step >= last else math.floor(step)]

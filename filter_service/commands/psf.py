@@ -219,7 +219,7 @@ def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", 
         "pixel_pitch_mrad": MRAD_PER_RAD * math.radians(pixel_arcmin / ARCMIN_PER_DEG),
         "method": method,
         "max_radius_px": MAX_RADIUS_PX,
-        "pupil_screen": state.rings,
+        "pupil_screen": state.rings and state.rings.seen_from(0.0, 0.0),
     }
     if state.ellipse is not None:
         names = ("centre_x_mm", "centre_y_mm", "semi_major_mm", "semi_minor_mm")

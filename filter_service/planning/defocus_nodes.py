@@ -277,8 +277,11 @@ def _reach_px(
 ) -> NDArray[np.float64]:
     if eye.rings is None:
         return np.zeros(groups.h_deg.size)
-    reach_dpt = max(eye.rings.reach_dpt(nm) for nm in spec.channel_wavelengths_nm)
-    return reach_dpt * groups.pupil_diameter_mm / 2.0 / min(spec.pixel_pitch_mrad)
+    reaches = [
+        eye.rings.reach_mrad(groups.pupil_diameter_mm / 2.0, nm)
+        for nm in spec.channel_wavelengths_nm.tolist()
+    ]
+    return np.max(reaches, axis=0) / min(spec.pixel_pitch_mrad)
 
 
 def _spread(

@@ -148,7 +148,7 @@ def _computed(
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
         stiles_crawford=apodisation(eye, spec),
-        pupil_screen=eye.rings,
+        pupil_screen=eye.rings and eye.rings.seen_from(states.h_deg, states.v_deg),
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.settings.diffraction,

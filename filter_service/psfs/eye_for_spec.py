@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.worn_lens import WornLens
+from estimator.corrections.worn_lens import WornLens, turns_with_gaze
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
@@ -18,7 +17,7 @@ NO_LATERAL_COLOR = "a measured wavefront holds no lateral colour: it needs a tra
 
 
 ONE_GAZE = (
-    "the progressive lens is that of the middle of settings.gaze_range_deg: "
+    "the lens is seen through as in the middle of settings.gaze_range_deg: "
     "another gaze sees the world through the same part of it"
 )
 
@@ -55,7 +54,7 @@ def eye_for_spec(
         _check_diffracts(settings.diffraction)
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
-    if isinstance(profile.correction, ProgressiveLens):
+    if turns_with_gaze(profile.correction):
         worn = profile.correction.looking(settings.gaze_deg)
         profile = replace(profile, correction=worn)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
@@ -71,7 +70,7 @@ def eye_for_spec(
     )
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
-    if isinstance(profile.correction, ProgressiveLens) and any(settings.gaze_range_deg):
+    if turns_with_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes
 

@@ -29,7 +29,15 @@ from estimator.psf.compute import compute_psf_batch
 from estimator.wavefront.field_wavefronts import zernike_from_polynomial
 from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish, time_calls
 from tests.benchmarks.lens_picture import draw_lenses
-from tests.lens_truth import MM_PER_DEG, PUBLISHED, Truth, modulation, worn_eye
+from tests.lens_truth import (
+    MM_PER_DEG,
+    PUBLISHED,
+    Truth,
+    lenslet_eye,
+    lenslets_truth,
+    modulation,
+    worn_eye,
+)
 
 THROUGH_FOCUS_DPT = np.arange(0.0, 3.61, 0.05)
 OBJECTS_DPT = np.arange(0.0, 3.1, 0.5)
@@ -52,6 +60,7 @@ LINES = {
     "rings to 3 mm": {"design": "bifocal", "add_dpt": 3.0, "rings_diameter_mm": 3.0},
 }
 PEAK_LEAST = 0.08
+BEFORE_PUPIL_MM = 15.05
 KERNELS = 96
 
 
@@ -199,6 +208,31 @@ def diffraction_rows(pupils_mm) -> list[Row]:
                             *("true profile, FFT", OBJECTS_DPT.size),
                         )
                     )
+    return rows
+
+
+def lenslet_rows(pupils_mm) -> list[Row]:
+    """Return the largest error of modulation behind lenslets, looking down."""
+    rows = []
+    for v_deg in (0.0, -25.0):
+        eye = lenslet_eye(gaze_deg=[0.0, v_deg])
+        for pupil_mm in pupils_mm:
+            seen = {"pupil_mm": pupil_mm, "wavelength_nm": 555.0, "at_cpd": AT_CPD}
+            found, times_ms = _timed(partial(modulation, eye, [0.0], **seen))
+            true = lenslets_truth(
+                eye.rings.seen_from(0.0, 0.0), **seen, depth_mm=BEFORE_PUPIL_MM
+            )
+            rows.append(
+                _row(
+                    *(
+                        "diffraction",
+                        "lenslets",
+                        f"{pupil_mm:g} mm, {-v_deg:g} deg down",
+                    ),
+                    *(times_ms, "modulation", np.abs(found[0] - true).max()),
+                    "honeycomb, carried over 15 mm",
+                )
+            )
     return rows
 
 
@@ -394,7 +428,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     rows = closed_form_rows() + toric_rows()
-    rows += diffraction_rows((3.0,) if options.quick else PUPILS_MM)
+    pupils_mm = (3.0,) if options.quick else PUPILS_MM
+    rows += diffraction_rows(pupils_mm) + lenslet_rows(pupils_mm)
     published, curves = transfer_rows()
     rows += published + distance_rows()
     if not options.quick:

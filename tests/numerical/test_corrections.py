@@ -22,7 +22,15 @@ from estimator.wavefront.field_wavefronts import (
     total_defocus_dpt,
     zernike_from_polynomial,
 )
-from tests.lens_truth import MM_PER_DEG, PUBLISHED, Truth, modulation, worn_eye
+from tests.lens_truth import (
+    MM_PER_DEG,
+    PUBLISHED,
+    Truth,
+    lenslet_eye,
+    lenslets_truth,
+    modulation,
+    worn_eye,
+)
 
 AT_CPD = np.arange(2.0, 40.0, 2.0)
 OBJECTS_DPT = np.array([0.0, 0.6, 1.2, 2.2])
@@ -237,6 +245,42 @@ def test_a_traced_eye_sees_through_each_part_of_a_progressive_lens():
     expected = np.trace(powers, axis1=1, axis2=2) / 2.0
     assert defocus[0] - defocus[1] == pytest.approx(expected, abs=0.06)
     assert defocus[0][1] - defocus[1][1] > 0.3
+
+
+@pytest.mark.parametrize(("v_deg", "pupil_mm"), [(0.0, 4.0), (-25.0, 3.0)])
+def test_lenslets_are_what_carries_light_from_lens_to_pupil(v_deg, pupil_mm):
+    """Straight down the clear middle is seen, lower down the honeycomb."""
+    eye = lenslet_eye(gaze_deg=[0.0, v_deg])
+    seen = {"pupil_mm": pupil_mm, "wavelength_nm": 555.0, "at_cpd": AT_CPD}
+    found = modulation(eye, [0.0], **seen)[0]
+    lens = eye.rings.seen_from(0.0, 0.0)
+    assert np.abs(found - lenslets_truth(lens, **seen, depth_mm=15.05)).max() < 0.012
+    perfect = np.abs(found - Truth(pupil_mm, 555.0).modulation(1.0, AT_CPD)).max()
+    assert (perfect < 0.005) == (v_deg == 0.0)
+
+
+def test_lenslets_are_those_of_each_direction():
+    """One call for several fields is one call for each."""
+    lens = lenslet_eye(gaze_deg=[0.0, 0.0]).rings
+    h_deg, v_deg = np.array([0.0, 25.0, 25.0]), np.array([0.0, 0.0, -12.0])
+    options = {
+        "pupil_diameter_mm": 4.0,
+        "wavelength_nm": 536.0,
+        "pixel_pitch_mrad": 0.5,
+        "radius_px": 12,
+    }
+    together = compute_psf_batch(
+        np.zeros((3, 28)), pupil_screen=lens.seen_from(h_deg, v_deg), **options
+    )
+    for k in range(3):
+        alone = compute_psf_batch(
+            np.zeros((1, 28)),
+            pupil_screen=lens.seen_from(h_deg[k], v_deg[k]),
+            **options,
+        )
+        assert alone[0].kernel == pytest.approx(together[k].kernel, abs=1e-5)
+    assert together[1].kernel.max() < 0.6 * together[0].kernel.max()
+    assert together[1].kernel.max() != together[2].kernel.max()
 
 
 def test_rings_are_for_the_wave_method_alone():

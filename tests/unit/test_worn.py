@@ -83,6 +83,18 @@ def test_a_progressive_lens_is_what_the_gaze_goes_through():
     assert ahead.looking((0.0, -35.0)) == down
 
 
+def test_lenslets_have_the_room_that_their_number_leaves():
+    lens = wearing({"kind": "lenslets", "sphere_dpt": -3, "vertex_mm": 12}).correction
+    assert power_vector(lens)[0] == pytest.approx(-3.0 / 1.036)
+    cell_mm2 = lens.rings.pitch_mm**2 * np.sqrt(3.0) / 2.0
+    zone_mm2 = np.pi * (lens.rings.outer_mm**2 - lens.rings.inner_mm**2)
+    assert zone_mm2 / cell_mm2 == pytest.approx(396)
+    turned = lens.looking((0.0, -25.0)).rings.seen_from([0.0, 10.0], [0.0, 0.0])
+    x, y = np.transpose(turned.centre_mm)
+    assert y == pytest.approx(25.5 * np.tan(np.radians(25.0)))
+    assert x == pytest.approx([0.0, -15.05 * np.tan(np.radians(10.0))])
+
+
 @pytest.mark.parametrize(
     ("correction", "field"),
     [
@@ -131,6 +143,10 @@ def test_a_progressive_lens_is_what_the_gaze_goes_through():
             "correction.zone_diameters_mm",
         ),
         ({"kind": "progressive", "sphere_dpt": 0}, "correction.add_dpt"),
+        (
+            {"kind": "lenslets", "sphere_dpt": 0, "lenslet_count": 2000},
+            "correction.lenslet_count",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(correction, field):

@@ -1,0 +1,32 @@
+"""Where on a spectacle lens one looks through, by gaze and by field."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+
+ROTATION_CENTRE_MM = 13.5
+"""About which the eye turns, behind the cornea."""
+
+
+def lens_point_mm(
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    *,
+    vertex_mm: float,
+    gaze_deg: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where light from field directions crosses a lens, x and y (...).
+
+    From the point before the pupil of an eye that looks straight ahead: by gaze about
+    the centre of rotation, and from there by field about the entrance pupil.
+    """
+    by_gaze_mm = vertex_mm + ROTATION_CENTRE_MM
+    by_field_mm = vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM
+    x, y = (
+        by_gaze_mm * np.tan(np.radians(gaze)) + by_field_mm * np.tan(direction)
+        for gaze, direction in zip(
+            gaze_deg, (np.radians(h_deg), np.radians(v_deg)), strict=True
+        )
+    )
+    return x, y
