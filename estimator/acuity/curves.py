@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.acuity.predict import predict_acuity
 from estimator.acuity.retina import retina_log_mar
+from estimator.acuity.transfer import Screen
 from estimator.optics.prescription import C20
 from estimator.optics.units import SPHERE_PER_C20
 
@@ -42,6 +43,7 @@ def acuity_through_focus(
     object_dpt: ArrayLike,
     wavelength_nm: float = 555.0,
     pupil_ellipse: NDArray[np.float64] | None = None,
+    pupil_screen: Screen | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return acuity, logMAR, and visual Strehl ratio (n,) at distances (n,).
@@ -53,6 +55,9 @@ def acuity_through_focus(
     object_dpt : (n,)
         Distances from the entrance pupil; negative ones lie behind the eye, as a plus
         lens puts them.
+    pupil_ellipse : (5,), optional
+    pupil_screen : Screen, optional
+        See `optical_transfer`.
 
     Raises
     ------
@@ -71,6 +76,7 @@ def acuity_through_focus(
             zernike_radius_mm=zernike_radius_mm,
             wavelength_nm=wavelength_nm,
             pupil_ellipse=pupil_ellipse,
+            pupil_screen=pupil_screen,
         )
         found[:, k] = acuity.log_mar, acuity.visual_strehl_ratio
         if progress is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from estimator.acuity.sensitivity import mean_eye_transfer, neural_sensitivity
-from estimator.acuity.transfer import Transfer, optical_transfer
+from estimator.acuity.transfer import Screen, Transfer, optical_transfer
 
 TILTS = slice(1, 3)
 
@@ -66,6 +66,7 @@ def predict_acuity(
     zernike_radius_mm: float,
     wavelength_nm: float = 555.0,
     pupil_ellipse: NDArray[np.float64] | None = None,
+    pupil_screen: Screen | None = None,
 ) -> Acuity:
     """Return the acuity of a wavefront, as far as the optics decide it.
 
@@ -74,6 +75,7 @@ def predict_acuity(
     zernike_um : (28,)
         Object distance included: of an eye out of focus its C(2,0).
     pupil_ellipse : (5,), optional
+    pupil_screen : Screen, optional
         See `optical_transfer`.
 
     Raises
@@ -89,7 +91,7 @@ def predict_acuity(
     # Where the picture lies on the retina does not matter.
     zernike_um = np.array(zernike_um, dtype=np.float64)
     zernike_um[TILTS] = 0.0
-    seen = optical_transfer(zernike_um, **pupil)
+    seen = optical_transfer(zernike_um, **pupil, pupil_screen=pupil_screen)
     perfect = optical_transfer(np.zeros_like(zernike_um), **pupil)
     return Acuity(
         log_mar=log_mar_of(seen),

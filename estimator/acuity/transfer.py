@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,28 @@ STEP_WAVES = 0.25
 
 NM_PER_MM = 1e6
 UM_PER_MM = 1e3
+
+
+class Screen(Protocol):
+    """Rings in the pupil, see `psf.screens.PupilScreen`."""
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """From the middle of the circle."""
+
+    @property
+    def lattice_mm(self) -> tuple[float, float, float] | None:
+        """None of rings about one centre."""
+
+    def reach_mrad(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """How far light goes aside at distances from the centre."""
+
+    def transmission(
+        self, square_mm2: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.complex128]:
+        """Complex amplitude at squared distances from the centre."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +110,7 @@ def optical_transfer(
     zernike_radius_mm: float,
     wavelength_nm: float,
     pupil_ellipse: NDArray[np.float64] | None = None,
+    pupil_screen: Screen | None = None,
 ) -> Transfer:
     """Return the transfer function of a wavefront, for light of one wavelength.
 
@@ -96,18 +120,22 @@ def optical_transfer(
     pupil_ellipse : (5,), optional
         Centre x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
         the whole circle if not given.
+    pupil_screen : Screen, optional
+        Rings of a lens with several foci, as an eye's ``rings`` are.
 
     Raises
     ------
     ValueError
         A wavefront that is not finite, or so steep that `MOST_SAMPLES` do not resolve
-        it.
+        it; a honeycomb of lenslets.
     """
+    if pupil_screen is not None and pupil_screen.lattice_mm is not None:
+        raise ValueError("pupil_screen: rings about one centre, not lenslets")
     if not np.all(np.isfinite(zernike_um)):
         raise ValueError("zernike_um: all 28 coefficients must be finite")
     per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm
     count = max(
-        _samples(zernike_um, wavelength_nm),
+        _samples(zernike_um, wavelength_nm, pupil_screen, zernike_radius_mm),
         fft.next_fast_len(
             math.ceil(2.0 * zernike_radius_mm * per_mm_cpd / FREQUENCY_STEP_CPD)
         ),
@@ -119,6 +147,10 @@ def optical_transfer(
     inside = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
     phase = 2.0 * np.pi * wavefront_um * UM_PER_MM / wavelength_nm
     pupil = inside * np.exp(1j * phase)
+    if pupil_screen is not None:
+        cx, cy = pupil_screen.centre_mm
+        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
+        pupil = pupil * pupil_screen.transmission(square_mm2, wavelength_nm)
     padded = 2 * count
     intensity = np.abs(fft.fft2(pupil, (padded, padded))) ** 2
     transfer = fft.fftshift(fft.ifft2(intensity))[1:, 1:]  # odd, 0 in the middle
@@ -137,11 +169,18 @@ def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
     return powers @ by_powers @ powers.T
 
 
-def _samples(zernike_um: NDArray, wavelength_nm: float) -> int:
+def _samples(
+    zernike_um: NDArray,
+    wavelength_nm: float,
+    screen: Screen | None,
+    radius_mm: float,
+) -> int:
     """Return samples across the circle that follow the steepest part of its rim."""
     angles = 2.0 * np.pi * np.arange(72) / 72
     slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
     steepest_um = float(np.linalg.norm(slopes @ zernike_um, axis=-1).max())
+    if screen is not None:
+        steepest_um += radius_mm * float(screen.reach_mrad(radius_mm, wavelength_nm))
     waves_across = 2.0 * steepest_um * UM_PER_MM / wavelength_nm
     wanted = max(LEAST_SAMPLES, math.ceil(waves_across / STEP_WAVES))
     if wanted > MOST_SAMPLES:

@@ -67,6 +67,7 @@ def field(
 
     import numpy as np
 
+    from estimator.corrections.worn_lens import rings_of
     from estimator.field.field_table import field_table
     from estimator.profiles.files import load_profile
     from filter_service.image_files import check_output
@@ -90,6 +91,8 @@ def field(
     notes = list(found.notes)
     if eye.correction is not None:
         notes.append("seen through the worn correction")
+    if rings_of(eye.correction) is not None:
+        notes.append("rings or lenslets of it are in no coefficient: it is for far")
     if json_output:
         print_json({"directions": _directions(found), "notes": notes})
     else:

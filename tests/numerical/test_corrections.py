@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from estimator.acuity import acuity_through_focus, optical_transfer
 from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.progressive import ProgressiveLens, progressive_polynomial
 from estimator.corrections.rings import DiffractiveRings
@@ -281,6 +282,40 @@ def test_lenslets_are_those_of_each_direction():
         assert alone[0].kernel == pytest.approx(together[k].kernel, abs=1e-5)
     assert together[1].kernel.max() < 0.6 * together[0].kernel.max()
     assert together[1].kernel.max() != together[2].kernel.max()
+
+
+def test_acuity_through_focus_has_the_foci_of_a_lens():
+    """A monofocal lens blurs near what a bifocal one shows."""
+    bifocal = worn_eye(**DESIGNS["bifocal"]).rings
+    near_dpt = bifocal.spacing_dpt
+    transfer = optical_transfer(
+        np.zeros(28), zernike_radius_mm=1.5, wavelength_nm=550.0, pupil_screen=bifocal
+    )
+    truth = Truth(3.0, 550.0)
+    expected = truth.modulation(truth.profile(bifocal), AT_CPD)
+    assert transfer.in_phase(AT_CPD) == pytest.approx(expected, abs=0.02)
+    objects_dpt = [0.0, near_dpt / 2.0, near_dpt]
+    one, two = (
+        acuity_through_focus(
+            np.zeros(28),
+            zernike_radius_mm=1.5,
+            object_dpt=objects_dpt,
+            wavelength_nm=550.0,
+            pupil_screen=rings,
+        )[0]
+        for rings in (None, bifocal)
+    )
+    assert one[2] > one[0] + 0.4
+    assert two[2] == pytest.approx(two[0], abs=0.02)
+    assert one[0] < two[0] < one[0] + 0.2
+    assert two[1] > two[0] + 0.1
+    with pytest.raises(ValueError, match="not lenslets"):
+        optical_transfer(
+            np.zeros(28),
+            zernike_radius_mm=1.5,
+            wavelength_nm=550.0,
+            pupil_screen=lenslet_eye().rings,
+        )
 
 
 def test_rings_are_for_the_wave_method_alone():

@@ -6,6 +6,8 @@ import re
 import numpy as np
 import pytest
 
+from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.rings import DiffractiveRings
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import PsfTooLarge, compute_psf_batch
 from estimator.psf.fourier import edge_response
@@ -460,3 +462,16 @@ def test_a_store_is_the_same_from_either_engine(stiles_crawford):
         np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(cpu, gpu, strict=True)
     ]
     assert max(errors) <= 0.02
+
+
+def test_pupils_with_rings_are_left_to_the_processor(gpu):
+    rings = DiffractiveRings(2.2, Kinoform.sawtooth(0.5))
+    options = {
+        "pupil_diameter_mm": 3.0,
+        "wavelength_nm": 550.0,
+        "pixel_pitch_mrad": 1.0,
+        "pupil_screen": rings,
+    }
+    found = gpu_psf_batch(gpu, np.zeros((2, 28)), **options)
+    expected = compute_psf_batch(np.zeros((2, 28)), **options)
+    assert np.array_equal(found.flat_kernels, expected.flat_kernels)
