@@ -227,7 +227,7 @@ def lenslet_rows(pupils_mm) -> list[Row]:
                     *(
                         "diffraction",
                         "lenslets",
-                        f"{pupil_mm:g} mm, {-v_deg:g} deg down",
+                        f"{pupil_mm:g} mm, {abs(v_deg):g} deg down",
                     ),
                     *(times_ms, "modulation", np.abs(found[0] - true).max()),
                     "honeycomb, carried over 15 mm",
