@@ -80,41 +80,32 @@ KIND_WORDS = {
 def summary(facts: EyeFacts) -> Section:
     """Return what one reads first."""
     study = facts.study
+    maps = Plot(
+        lambda panel: draw_wavefront_maps(panel, study),
+        MAP_MM,
+        "Maps of the wavefront over the pupil, all and higher orders",
+    )
+    orders = on_axes(
+        lambda axes: draw_rms_by_order(axes, [study]),
+        MAP_MM,
+        "Root mean square of the wavefront by radial order",
+    )
+    points = Plot(
+        lambda panel: draw_psfs(panel, study),
+        PSF_MM,
+        "Point-spread functions through 3 and 5 mm, as it is and best corrected",
+    )
+    contrast = on_axes(
+        lambda axes: draw_mtf(axes, study),
+        PSF_MM,
+        "Modulation transfer functions through 3 and 5 mm",
+    )
     return Section(
         "Summary",
         (
-            Row((refraction_table(facts), vision_table(facts)), (1.0, 1.0)),
-            Row(
-                (
-                    Plot(
-                        lambda panel: draw_wavefront_maps(panel, study),
-                        MAP_MM,
-                        "Maps of the wavefront over the pupil, all and higher orders",
-                    ),
-                    on_axes(
-                        lambda axes: draw_rms_by_order(axes, [study]),
-                        MAP_MM,
-                        "Root mean square of the wavefront by radial order",
-                    ),
-                ),
-                (2.0, 1.0),
-            ),
-            Row(
-                (
-                    Plot(
-                        lambda panel: draw_psfs(panel, study),
-                        PSF_MM,
-                        "Point-spread functions through 3 and 5 mm, as it is and best "
-                        "corrected",
-                    ),
-                    on_axes(
-                        lambda axes: draw_mtf(axes, study),
-                        PSF_MM,
-                        "Modulation transfer functions through 3 and 5 mm",
-                    ),
-                ),
-                (1.0, 1.4),
-            ),
+            Row((refraction_table(facts), vision_table(facts))),
+            Row((maps, orders), (2.0, 1.0)),
+            Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
             Row((Words((_legend(study),)),)),
         ),
@@ -293,59 +284,55 @@ def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
 
 def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Section, ...]:
     """Return what lies behind the summary."""
-    study = facts.study
     of_whom = f" ({name})" if name else ""
-    known = Section(
-        f"What is known{of_whom}",
-        (
-            Row((provenance_table(study, cite),)),
-            Row(
-                (
-                    on_axes(
-                        lambda axes: draw_terms(axes, study),
-                        TERMS_MM,
-                        "Coefficients of orders 3 to 6, as they came and of the eye",
-                    ),
-                )
-            ),
-            Row((coefficient_table(facts),)),
-        ),
-        starts_page=True,
+    return _field_section(facts, of_whom), _known_section(facts, cite, of_whom)
+
+
+def _field_section(facts: EyeFacts, of_whom: str) -> Section:
+    study = facts.study
+    maps = Plot(
+        lambda panel: draw_field_maps(panel, study),
+        FIELD_MM,
+        "Maps of M, J0, J45 and blur over 60 by 40 degrees",
     )
-    field = Section(
+    acuity = on_axes(
+        lambda axes: draw_through_focus_acuity(axes, study),
+        CURVE_MM,
+        "Acuity by distance, looking far and accommodating",
+    )
+    section = on_axes(
+        lambda axes: draw_cross_section(axes, study),
+        CURVE_MM,
+        "Vertical section of the eye found, with rays from far away",
+    )
+    return Section(
         f"Over the visual field, and by distance{of_whom}",
         (
-            Row(
-                (
-                    Plot(
-                        lambda panel: draw_field_maps(panel, study),
-                        FIELD_MM,
-                        "Maps of M, J0, J45 and blur over 60 by 40 degrees",
-                    ),
-                    field_table_block(facts),
-                ),
-                (2.4, 1.0),
-            ),
-            Row(
-                (
-                    on_axes(
-                        lambda axes: draw_through_focus_acuity(axes, study),
-                        CURVE_MM,
-                        "Acuity by distance, looking far and accommodating",
-                    ),
-                    on_axes(
-                        lambda axes: draw_cross_section(axes, study),
-                        CURVE_MM,
-                        "Vertical section of the eye found, with rays from far away",
-                    ),
-                )
-            ),
+            Row((maps, field_table_block(facts)), (2.4, 1.0)),
+            Row((acuity, section)),
             chart_row(facts, DUSK_MM),
             Row((Words(study.field.notes, "How it was computed", is_list=True),)),
         ),
         starts_page=True,
     )
-    return field, known
+
+
+def _known_section(facts: EyeFacts, cite: Citations, of_whom: str) -> Section:
+    study = facts.study
+    terms = on_axes(
+        lambda axes: draw_terms(axes, study),
+        TERMS_MM,
+        "Coefficients of orders 3 to 6, as they came and of the eye",
+    )
+    return Section(
+        f"What is known{of_whom}",
+        (
+            Row((provenance_table(study, cite),)),
+            Row((terms,)),
+            Row((coefficient_table(facts),)),
+        ),
+        starts_page=True,
+    )
 
 
 def coefficient_table(facts: EyeFacts) -> Table:
