@@ -8,6 +8,7 @@ charts      the letter chart near and far
 provenance  what was measured, what is assumed
 sources     papers
 blocks      what a report is made of
+tables      of a report
 content     the report of one eye
 comparison  of two
 html_page   written as one HTML file

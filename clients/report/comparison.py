@@ -21,20 +21,22 @@ from clients.report.content import (
     DAY_MM,
     DUSK_MM,
     NOT_A_DEVICE,
-    REFRACTION_ROWS,
-    VISION_ROWS,
-    acuity_words,
     chart_row,
     details,
     on_axes,
-    pupil_word,
-    refraction_words,
-    signed,
     sources,
     subtitle,
 )
 from clients.report.facts import EyeFacts
 from clients.report.sources import Citations
+from clients.report.tables import (
+    REFRACTION_ROWS,
+    VISION_ROWS,
+    acuity_words,
+    pupil_word,
+    refraction_words,
+    signed,
+)
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
 MAP_MM, PSF_MM = 46.0, 58.0

@@ -1,0 +1,183 @@
+"""The tables of a report: refraction, vision, field, coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from clients.figures.study import WAVELENGTH_NM
+from clients.report.blocks import Table
+from clients.report.facts import EyeFacts
+from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
+
+REFRACTION_ROWS = {
+    "sphere, dpt": "sphere_dpt",
+    "cylinder, dpt": "cylinder_dpt",
+    "axis, deg": "axis_deg",
+    "M, dpt": "M_dpt",
+    "J0, dpt": "J0_dpt",
+    "J45, dpt": "J45_dpt",
+}
+
+
+def refraction_words(refraction: dict, name: str) -> str:
+    """Return one number of a refraction as it is written."""
+    if name != "axis_deg":
+        return signed(refraction[name])
+    has_axis = abs(refraction["cylinder_dpt"]) >= 0.005
+    return f"{refraction[name]:.0f}" if has_axis else "–"
+
+
+def refraction_table(facts: EyeFacts) -> Table:
+    """Return the refraction that came in, and that of the eye found."""
+    numbers = facts.numbers
+    is_entered = facts.study.profile.kind in ("prescription", "eye")
+    pairs = numbers["measured"]["refraction"], numbers["eye"]["refraction"]
+    return Table(
+        "Refraction",
+        tuple(
+            (word, *(refraction_words(pair, name) for pair in pairs))
+            for word, name in REFRACTION_ROWS.items()
+        ),
+        head=(
+            "at the cornea, 555 nm",
+            "entered" if is_entered else "measured",
+            "eye found",
+        ),
+        note=_refraction_note(facts),
+    )
+
+
+def _refraction_note(facts: EyeFacts) -> str:
+    numbers, fit = facts.numbers, facts.numbers["eye"]
+    note = (
+        f"{numbers['measured']['refraction_pupil_mm']:.3g} mm pupil, relaxed, without "
+        f"correction. The eye found is {fit['eye_length_mm']:.2f} mm long, "
+        f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
+        f"{fit['rms_error_um']:.1g} µm RMS. As spectacles at "
+        f"{SPECTACLE_VERTEX_MM:g} mm: "
+        f"{written(spectacles_for(numbers['eye']['refraction']))}."
+    )
+    light_nm = facts.study.found.wavelength_nm
+    if light_nm != WAVELENGTH_NM:
+        note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's colour."
+    lens = facts.study.profile.correction
+    if lens is not None:
+        note += (
+            f" Worn: {written(lens)} at {lens.vertex_mm:g} mm; M through it "
+            f"{signed(fit['refraction_through_correction_dpt'])} dpt."
+        )
+    return note
+
+
+def signed(value: float) -> str:
+    """Return a number with its sign, to a hundredth."""
+    if abs(value) < 0.005:
+        return "0.00"
+    return f"{value:+.2f}".replace("-", "−")
+
+
+def vision_table(facts: EyeFacts) -> Table:
+    """Return what is seen through both pupils, as it is and best corrected."""
+    pupils = facts.numbers["pupils"]
+    note = "Acuity in logMAR, and as a decimal."
+    if any(p["is_beyond_measured"] for p in pupils):
+        note += " * wider than the pupil measured: see “What is known”."
+    return Table(
+        "Vision on the axis",
+        tuple((word, *map(words, pupils)) for word, words in VISION_ROWS.items()),
+        head=("far object, 555 nm", *(pupil_word(p) for p in pupils)),
+        note=note,
+    )
+
+
+def distance_words(distance_dpt: float) -> str:
+    """Return a far or near point in dpt, and as people say it."""
+    if abs(distance_dpt) < 0.02:
+        return "infinity"
+    if distance_dpt < 0.0:
+        return f"{signed(distance_dpt)} (behind)"
+    distance_m = 1.0 / distance_dpt
+    where = f"{100 * distance_m:.0f} cm" if distance_m < 1.0 else f"{distance_m:.1f} m"
+    return f"{distance_dpt:.2f} ({where})"
+
+
+VISION_ROWS: dict[str, Callable[[dict], str]] = {
+    "higher orders, RMS, µm": lambda p: f"{p['higher_order_rms_um']:.2f}",
+    "acuity as it is": lambda p: acuity_words(p["as_it_is"]["log_mar"]),
+    "acuity best corrected": lambda p: acuity_words(p["best_corrected"]["log_mar"]),
+    "visual Strehl as it is": lambda p: _ratio(p["as_it_is"]["visual_strehl_ratio"]),
+    "visual Strehl corrected": lambda p: _ratio(
+        p["best_corrected"]["visual_strehl_ratio"]
+    ),
+    "MTF 10 / 30 cpd, corrected": lambda p: _modulations(
+        p["best_corrected"]["modulation"]
+    ),
+    "far point, dpt": lambda p: distance_words(p["far_point_dpt"]),
+    "near point, dpt": lambda p: distance_words(p["near_point_dpt"]),
+}
+
+
+def pupil_word(pupil: dict) -> str:
+    """Return a pupil, with a star where it is wider than what was measured."""
+    star = "*" if pupil["is_beyond_measured"] else ""
+    return f"{pupil['pupil_diameter_mm']:.3g} mm{star}"
+
+
+def _ratio(value: float | None) -> str:
+    return "–" if value is None else f"{max(value, 0.0):.3f}"
+
+
+def _modulations(values: dict | None) -> str:
+    if values is None:
+        return "–"
+    return f"{values['10_cpd']:.2f} / {values['30_cpd']:.2f}"
+
+
+def acuity_words(log_mar: float | None) -> str:
+    """Return an acuity in logMAR and as a decimal fraction."""
+    if log_mar is None:
+        return "worse than 2"
+    text = f"{log_mar:+.2f}".replace("-", "−")
+    return f"{text} ({10.0**-log_mar:.2f})"
+
+
+def coefficient_table(facts: EyeFacts) -> Table:
+    """Return all coefficients in three columns."""
+    measured = facts.numbers["measured"]
+    cells = [
+        (
+            f"({name.replace(',', ', ')})".replace("-", "−"),
+            f"{value:+.4f}".replace("-", "−"),
+        )
+        for name, value in measured["zernike_um"].items()
+    ]
+    third = -(-len(cells) // 3)
+    rows = tuple(
+        tuple(text for cell in cells[k::third] for text in cell) for k in range(third)
+    )
+    radius_mm, light_nm = measured["zernike_radius_mm"], measured["wavelength_nm"]
+    return Table(
+        "Coefficients, µm (OSA; x to the person's right, y up)",
+        rows,
+        head=("n, m", "µm") * 3,
+        note=f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
+        f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS.",
+    )
+
+
+def field_table_block(facts: EyeFacts) -> Table:
+    """Return the refraction along the horizontal meridian."""
+    rows = tuple(
+        (
+            f"{entry['h_deg']:+.0f}".replace("-", "−") if entry["h_deg"] else "0",
+            signed(entry["M_dpt"]),
+            signed(entry["J0_dpt"]),
+        )
+        for entry in facts.numbers["field"]
+    )
+    return Table(
+        "Along the horizontal",
+        rows,
+        head=("h, deg", "M, dpt", "J0, dpt"),
+        note="Relaxed, 4 mm pupil, at the cornea; h to the person's right.",
+    )
