@@ -20,7 +20,10 @@ def draw_lenses(
     objects_dpt: NDArray[np.float64],
     curves: dict[str, NDArray[np.float64]],
 ) -> None:
-    """Draw curves with published points, and two maps of a progressive lens."""
+    """Draw curves with published points, and two maps of a progressive lens.
+
+    The source names foci without distances: its points stand where our foci are.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 4.2), layout="constrained")

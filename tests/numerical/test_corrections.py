@@ -23,6 +23,10 @@ from estimator.wavefront.field_wavefronts import (
     total_defocus_dpt,
     zernike_from_polynomial,
 )
+from filter_service import Camera, FilterSettings
+from filter_service.planning.grid import GridSpec
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store_codec import pack, unpack
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
@@ -330,3 +334,29 @@ def test_rings_are_for_the_wave_method_alone():
                 pupil_screen=rings,
                 **options,
             )
+
+
+def test_the_gaze_of_the_settings_looks_through_its_part_of_a_lens():
+    """Down by 30 deg a far-corrected eye of 70 years is sharp at the addition."""
+    body = {"kind": "progressive", "sphere_dpt": 0.0, "vertex_mm": 12, "add_dpt": 2.0}
+    profile = parse_profile(
+        {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70, "correction": body}
+    )
+    camera = Camera.from_fov(20.0, width_px=64, height_px=48)
+    far_dpt = []
+    for gaze_deg in ((0.0, 0.0), (0.0, -35.0)):
+        settings = FilterSettings(
+            mode="on-axis", eye_model="wavefront", gaze_deg=gaze_deg
+        )
+        eye, notes = eye_for_spec(profile, GridSpec(camera, settings))
+        far_dpt.append(eye.sharpest_dpt(0.0, pupil_diameter_mm=4.0))
+        assert not notes
+    assert far_dpt[0] == pytest.approx(0.05, abs=0.02)
+    assert far_dpt[1] == pytest.approx(2.0, abs=0.08)
+
+
+def test_an_eye_with_rings_is_stored_and_read():
+    eye = worn_eye(**DESIGNS["bifocal"])
+    again = unpack(*pack(eye))
+    assert again.rings == eye.rings
+    assert np.array_equal(again.zernike_um, eye.zernike_um)
