@@ -1,0 +1,200 @@
+"""What a person enters about one eye, and the profile that it makes.
+
+Nothing of the page is here: texts go in, a profile's body or refusals come out.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from clients.web.numbers import NumberField
+from estimator import parse_profile, preset_names, profile_body
+
+EyeSide = Literal["OD", "OS"]
+Source = Literal["prescription", "preset", "file"]
+
+SIDES: dict[EyeSide, str] = {"OD": "Right eye", "OS": "Left eye"}
+PROFILE_SUFFIXES = (".json", ".csv", ".abp")
+MAX_PROFILE_BYTES = 2_000_000
+
+SPHERE = NumberField(
+    "sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True
+)
+CYLINDER = NumberField(
+    "cylinder_dpt", "Cylinder", "dpt", -15.0, 15.0, 0.25, is_signed=True
+)
+AXIS = NumberField("axis_deg", "Axis", "°", 0.0, 180.0, 1.0, digits=0)
+VERTEX = NumberField("vertex_mm", "Vertex", "mm", 0.0, 25.0, 1.0, digits=0)
+PRESCRIPTION = (SPHERE, CYLINDER, AXIS, VERTEX)
+NOTHING = {"sphere_dpt": "0.00", "cylinder_dpt": "0.00", "axis_deg": "0"}
+
+PRESET_TITLES = {
+    "emmetropia": "Emmetropia (normal)",
+    "myopia": "Myopia",
+    "astigmatism": "Astigmatism",
+    "keratoconus": "Keratoconus",
+    "cataract": "Cataract",
+    "post_lasik": "After LASIK",
+}
+
+
+def preset_titles() -> dict[str, str]:
+    """Return each preset's name and how a person reads it."""
+    return {
+        name: PRESET_TITLES.get(name, name.replace("_", " ").capitalize())
+        for name in preset_names()
+    }
+
+
+def _plain() -> dict[str, str]:
+    return {**NOTHING, "vertex_mm": "12"}
+
+
+@dataclass
+class EyeForm:
+    """The entries for one eye.
+
+    Attributes
+    ----------
+    side : "OD" or "OS"
+    source : which of the three kinds of entries counts
+    texts : the prescription, by a field's name, as typed
+    has_higher_order : whether it has the aberrations that are typical of its age
+    preset : name
+    file_body : profile of the file that was read, or None
+    file_name : of that
+    wears_correction : whether `worn` is on the nose
+    worn : the worn correction, as typed
+    """
+
+    side: EyeSide
+    source: Source = "prescription"
+    texts: dict[str, str] = field(default_factory=_plain)
+    has_higher_order: bool = True
+    preset: str = "myopia"
+    file_body: dict[str, Any] | None = None
+    file_name: str = ""
+    wears_correction: bool = False
+    worn: dict[str, str] = field(default_factory=_plain)
+
+    def body(self, *, age_years: float) -> dict[str, Any]:
+        """Return the profile.
+
+        Raises
+        ------
+        ValueError
+            An entry that is wrong: what it is and what is allowed.
+        """
+        body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
+        if self.wears_correction:
+            body["correction"] = read_prescription(self.worn, "Worn correction: ")
+        parse_profile(body)
+        return body
+
+    def _source_body(self) -> dict[str, Any]:
+        if self.source == "preset":
+            return {"kind": "preset", "name": self.preset}
+        if self.source == "file":
+            if self.file_body is None:
+                raise ValueError(
+                    f"No file yet; allowed: {', '.join(PROFILE_SUFFIXES)}"
+                )
+            return dict(self.file_body)
+        return {
+            "kind": "prescription",
+            "higher_order": "typical" if self.has_higher_order else "none",
+            **read_prescription(self.texts),
+        }
+
+    def correct_fully(self) -> None:
+        """Wear what the prescription says."""
+        self.worn = dict(self.texts)
+        self.wears_correction = True
+
+    def take_file(self, name: str, content: bytes) -> float | None:
+        """Read a profile file; return the age that it states, in years.
+
+        Raises
+        ------
+        ValueError
+            Not a profile; the form stays as it was.
+        """
+        body = read_profile_file(name, content)
+        self.take_body(body, Path(name).name)
+        return body.get("age_years")
+
+    def take_body(self, body: Mapping[str, Any], name: str) -> None:
+        """Take a profile over into the entries."""
+        body = dict(body)
+        correction = body.pop("correction", None)
+        if correction is not None:
+            self.wears_correction = True
+            self.worn = _as_texts(correction)
+        if body.get("kind") == "preset":
+            self.source, self.preset = "preset", body["name"]
+        elif _is_plain_prescription(body):
+            self.source, self.texts = "prescription", _as_texts(body)
+            self.has_higher_order = body.get("higher_order", "typical") == "typical"
+        else:
+            self.source, self.file_body, self.file_name = "file", body, name
+
+
+def read_prescription(texts: Mapping[str, str], where: str = "") -> dict[str, float]:
+    """Return the numbers of a prescription.
+
+    Raises
+    ------
+    ValueError
+        Names the entry, what it is and what is allowed.
+    """
+    values = {}
+    for entry in PRESCRIPTION:
+        try:
+            values[entry.name] = entry.read(texts[entry.name])
+        except ValueError as error:
+            raise ValueError(f"{where}{entry.label}: {error}") from None
+    return values
+
+
+def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
+    """Return the profile in a file that was sent.
+
+    Raises
+    ------
+    ValueError
+        Another kind of file, too large, or not a profile: says what is allowed.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in PROFILE_SUFFIXES:
+        allowed = ", ".join(PROFILE_SUFFIXES)
+        raise ValueError(f"“{Path(name).name:.60}” is no profile; allowed: {allowed}")
+    if len(content) > MAX_PROFILE_BYTES:
+        raise ValueError(
+            f"{len(content) / 1e6:.1f} MB is too much for a profile; allowed: "
+            f"{MAX_PROFILE_BYTES / 1e6:g} MB"
+        )
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        path = Path(folder) / f"profile{suffix}"
+        path.write_bytes(content)
+        try:
+            body = profile_body(path)
+            parse_profile(body)
+        except ValueError as error:
+            text = str(error).replace(str(path), Path(name).name)
+            raise ValueError(text) from None
+    return dict(body)
+
+
+def _is_plain_prescription(body: Mapping[str, Any]) -> bool:
+    known = {e.name for e in PRESCRIPTION} | {
+        *("kind", "higher_order", "eye_side", "age_years", "name")
+    }
+    return body.get("kind") == "prescription" and set(body) <= known
+
+
+def _as_texts(body: Mapping[str, Any]) -> dict[str, str]:
+    return {entry.name: entry.show(body.get(entry.name, 0.0)) for entry in PRESCRIPTION}

@@ -1,0 +1,95 @@
+"""Numbers that people type, read with their limits; refusals say what is allowed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
+
+
+@dataclass(frozen=True)
+class NumberField:
+    """One number of a form.
+
+    Attributes
+    ----------
+    name : str
+        As in a profile, with its unit.
+    label, unit : str
+        As a person reads them.
+    low, high : float
+        What is allowed.
+    step : float
+        Of arrow keys and sliders.
+    digits : int
+        Decimals that are shown.
+    is_signed : bool
+        Whether a plus is shown, as on a prescription.
+    """
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    step: float
+    digits: int = 2
+    is_signed: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """Return the range in words."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".replace("-", "\N{MINUS SIGN}")
+
+    def read(self, text: str) -> float:
+        """Return the number in a text; a comma may be the decimal point.
+
+        Raises
+        ------
+        ValueError
+            No number, or out of range: the text and what is allowed.
+        """
+        shown = text.strip()
+        if not shown:
+            raise ValueError(f"{self.label} is empty; allowed: {self.allowed}")
+        try:
+            value = float(shown.translate(MINUS_SIGNS))
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"“{shown:.20}” is not a number; allowed: {self.allowed}")
+        if not self.low <= value <= self.high:
+            raise ValueError(f"{shown:.20} is out of range; allowed: {self.allowed}")
+        return value
+
+    def problem(self, text: str) -> str | None:
+        """Return what is wrong with a text, or None."""
+        try:
+            self.read(text)
+        except ValueError as error:
+            return str(error)
+        return None
+
+    def show(self, value: float) -> str:
+        """Return a value as it stands in the form."""
+        sign = "+" if self.is_signed and value > 0 else ""
+        return f"{sign}{value:.{self.digits}f}"
+
+    def stepped(self, text: str, steps: int) -> str:
+        """Return the text some steps further, within what is allowed."""
+        try:
+            value = self.read(text)
+        except ValueError:
+            return text
+        grid = round(value / self.step) + steps
+        return self.show(min(max(grid * self.step, self.low), self.high))
+
+
+def distance_text(vergence_dpt: float) -> str:
+    """Return a distance in dpt and as people say it."""
+    if vergence_dpt < 0.005:
+        return "0 dpt · far away"
+    metres = 1.0 / vergence_dpt
+    told = f"{100 * metres:.0f} cm" if metres < 1.0 else f"{metres:.1f} m"
+    return f"{vergence_dpt:.2f} dpt · {told}"

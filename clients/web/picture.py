@@ -1,0 +1,243 @@
+"""What is looked at: a picture with depth, in full and small."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from filter_service import Camera, RgbdView
+from filter_service.image_files import read_depth
+
+MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
+"""Of the picture in full; what comes larger is made smaller."""
+
+SMALL_WIDTH_PX = 480
+"""A preview is no wider."""
+
+LEAST_SIDE_PX = 16
+MAX_PHOTO_BYTES = 60_000_000
+FAR_DPT = 0.0
+DEPTH_HELP = ".npy or .exr in metres, 16-bit .png in millimetres, float .tif"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture to look at.
+
+    Attributes
+    ----------
+    title : as a person reads it
+    view : in full
+    small : the same with fewer pixels
+    distance_dpt : where all of it stands; None where it has depths of its own
+    focus_dpt, pupil_diameter_mm : a state to begin with, or None
+    """
+
+    title: str
+    view: RgbdView
+    small: RgbdView
+    distance_dpt: float | None = None
+    focus_dpt: float | None = None
+    pupil_diameter_mm: float | None = None
+
+    @property
+    def aspect_ratio(self) -> float:
+        """Return width over height."""
+        return self.view.width_px / self.view.height_px
+
+    def at(self, distance_dpt: float) -> Picture:
+        """Return a flat picture at another distance; one with depths as it is."""
+        if self.distance_dpt is None or distance_dpt == self.distance_dpt:
+            return self
+        return replace(
+            self,
+            view=_flat(self.view, distance_dpt),
+            small=_flat(self.small, distance_dpt),
+            distance_dpt=distance_dpt,
+        )
+
+    def place(self, x: float, y: float) -> Place:
+        """Return what is at a place, from 0, 0 at the top left to 1, 1."""
+        view = self.view
+        column = min(int(x * view.width_px), view.width_px - 1)
+        row = min(int(y * view.height_px), view.height_px - 1)
+        left, right, up, down = view.tangents
+        depth_m = float(view.depth_m[row, column])
+        tangents = (left + x * (right - left), up + y * (down - up))
+        if view.depth_kind == "planar":
+            depth_m *= math.sqrt(1.0 + tangents[0] ** 2 + tangents[1] ** 2)
+        is_known = depth_m > 0.0 and not math.isinf(depth_m)
+        return Place(tangents, 1.0 / depth_m if is_known else FAR_DPT)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place in a picture: its direction, and how far what is there is."""
+
+    tangents: tuple[float, float]
+    distance_dpt: float
+
+    def direction_deg(self, gaze_deg: tuple[float, float]) -> tuple[float, float]:
+        """Return azimuth and elevation for an eye that looks at a gaze, deg.
+
+        Gaze turns the eye up by v, then aside by h; turned back, the place is where the
+        eye has it in its own field.
+        """
+        h, v = (math.radians(angle) for angle in gaze_deg)
+        x, y, z = self.tangents[0], self.tangents[1], -1.0
+        x, z = x * math.cos(h) + z * math.sin(h), z * math.cos(h) - x * math.sin(h)
+        y, z = y * math.cos(v) + z * math.sin(v), z * math.cos(v) - y * math.sin(v)
+        length = math.sqrt(x * x + y * y + z * z)
+        return math.degrees(math.atan2(x, -z)), math.degrees(math.asin(y / length))
+
+
+def picture_of(title: str, view: RgbdView, **more) -> Picture:
+    """Return a picture with its small one."""
+    n = math.ceil(view.width_px / SMALL_WIDTH_PX)
+    return Picture(title, view, coarser(view, n), **more)
+
+
+def coarser(view: RgbdView, n: int) -> RgbdView:
+    """Return a view with n x n pixels made one: mean light, nearest depth.
+
+    Columns and rows at the right and lower edge that do not fill a pixel are left out.
+    """
+    height_px, width_px = view.height_px // n, view.width_px // n
+    blocks = (height_px, n, width_px, n)
+    cut = (slice(height_px * n), slice(width_px * n))
+    light = linear_from_srgb8(view.color[cut])
+    mean = light.reshape(*blocks, 3).mean(axis=(1, 3))
+    depth_m = view.depth_m[cut].reshape(blocks)
+    valid_m = np.where(depth_m > 0.0, depth_m, np.inf)
+    left, right, up, down = view.tangents
+    return RgbdView(
+        srgb8_from_linear(mean),
+        valid_m.min(axis=(1, 3)).astype(np.float32),
+        (
+            left,
+            left + (right - left) * width_px * n / view.width_px,
+            up,
+            up + (down - up) * height_px * n / view.height_px,
+        ),
+        view.depth_kind,
+    )
+
+
+def linear_from_srgb8(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return linear light, 0 to 1."""
+    v = np.arange(256) / 255.0
+    table = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    return table.astype(np.float32)[color]
+
+
+def srgb8_from_linear(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return 8-bit sRGB."""
+    v = np.clip(light, 0.0, 1.0)
+    srgb = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * srgb).astype(np.uint8)
+
+
+def _flat(view: RgbdView, distance_dpt: float) -> RgbdView:
+    distance_m = np.inf if distance_dpt <= 0.0 else 1.0 / distance_dpt
+    return replace(
+        view, depth_m=np.full(view.color.shape[:2], distance_m, np.float32)
+    )
+
+
+def photo_picture(
+    name: str,
+    content: bytes,
+    *,
+    width_deg: float,
+    distance_dpt: float,
+    depth: tuple[str, bytes] | None = None,
+) -> Picture:
+    """Return a photo as a picture: flat at a distance, or with the depth of a file.
+
+    Parameters
+    ----------
+    width_deg : float
+        How wide it is seen, deg.
+    distance_dpt : float
+        Where it stands if there is no depth.
+    depth : (name, content), optional
+        Of the file.
+
+    Raises
+    ------
+    ValueError
+        A file that is no picture, or a depth of another shape: says what is allowed.
+    """
+    color = _photo_color(name, content)
+    height_px, width_px = color.shape[:2]
+    depth_m = None
+    if depth is not None:
+        depth_m = _photo_depth(*depth, shape=(height_px, width_px))
+    n = max(math.ceil(width_px / MAX_WIDTH_PX), math.ceil(height_px / MAX_HEIGHT_PX))
+    right = math.tan(math.radians(width_deg) / 2.0)
+    up = right * height_px / width_px
+    if depth_m is None:
+        depth_m = np.ones((height_px, width_px), np.float32)
+    view = coarser(RgbdView(color, depth_m, (-right, right, up, -up)), n)
+    title = Path(name).name[:60]
+    if depth is not None:
+        return picture_of(title, view)
+    flat = picture_of(title, view, distance_dpt=math.nan)
+    return flat.at(distance_dpt)
+
+
+def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
+    allowed = "allowed: a JPEG, PNG, WebP or TIFF picture of 8 bits"
+    _check_size(name, content)
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            upright = ImageOps.exif_transpose(image)
+            color = np.asarray(upright.convert("RGB"))
+    except (OSError, ValueError, Image.DecompressionBombError):
+        raise ValueError(f"“{name:.60}” is no picture; {allowed}") from None
+    if min(color.shape[:2]) < LEAST_SIDE_PX:
+        size = f"{color.shape[1]} × {color.shape[0]} px"
+        raise ValueError(f"“{name:.60}” is {size}; allowed: {LEAST_SIDE_PX} or more")
+    return color
+
+
+def _photo_depth(
+    name: str, content: bytes, *, shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    _check_size(name, content)
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        path = Path(folder) / f"depth{Path(name).suffix.lower()}"
+        path.write_bytes(content)
+        try:
+            depth_m = read_depth(path)
+        except ValueError as error:
+            text = str(error).replace(str(path), Path(name).name)
+            raise ValueError(text) from None
+    if depth_m.shape != shape:
+        found, wanted = (f"{w} × {h} px" for h, w in (depth_m.shape, shape))
+        raise ValueError(
+            f"“{name:.60}” is {found}; allowed: the size of the photo, {wanted}"
+        )
+    return depth_m
+
+
+def _check_size(name: str, content: bytes) -> None:
+    if len(content) > MAX_PHOTO_BYTES:
+        raise ValueError(
+            f"“{name:.60}” has {len(content) / 1e6:.0f} MB; allowed: "
+            f"{MAX_PHOTO_BYTES / 1e6:.0f} MB"
+        )
+
+
+def camera_of(width_deg: float, *, width_px: int, height_px: int) -> Camera:
+    """Return a symmetric camera that sees so many degrees across."""
+    right = math.tan(math.radians(width_deg) / 2.0)
+    up = right * height_px / width_px
+    return Camera(width_px, height_px, (-right, right, up, -up))

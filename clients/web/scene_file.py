@@ -1,0 +1,148 @@
+"""A scene rendered in a process apart, as the page's own must have no pyrender in it.
+
+    python -m clients.web.scene_file courtyard out.npz 960x540
+
+pyrender's OpenGL and a GPU's that filters do not share a process well, and building a
+scene takes seconds in which the page should answer.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from clients.arguments import read_size_px
+from clients.extra import what_to_install
+from clients.web.picture import Picture, picture_of
+from filter_service import RgbdView
+
+TIMEOUT_S = 300.0
+SIZE_PX = (960, 540)
+GLTF_SUFFIXES = (".glb", ".gltf")
+TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
+_CHECKOUT = Path(__file__).resolve().parents[2]
+# There `-m` finds our packages whatever the folder; installed ones are found anyway.
+_FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
+
+
+class SceneNotRendered(Exception):
+    """A scene could not be rendered; the text says why."""
+
+
+@cache
+def scene_picture(name: str) -> Picture:
+    """Return one of the project's scenes as a picture; takes seconds the first time.
+
+    Raises
+    ------
+    SceneNotRendered
+    """
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        return _rendered(name, TITLES[name], Path(folder))
+
+
+def gltf_picture(name: str, content: bytes) -> Picture:
+    """Return a glTF file as a picture.
+
+    Raises
+    ------
+    ValueError
+        Not a file of that kind.
+    SceneNotRendered
+        Damaged, or not to be rendered here.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in GLTF_SUFFIXES:
+        raise ValueError(
+            f"“{name:.60}” is no scene; allowed: {', '.join(GLTF_SUFFIXES)}, with its "
+            "pictures and meshes inside"
+        )
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        path = Path(folder) / f"scene{suffix}"
+        path.write_bytes(content)
+        try:
+            return _rendered(str(path), Path(name).name[:60], Path(folder))
+        except SceneNotRendered as error:
+            raise SceneNotRendered(
+                str(error).replace(str(path), Path(name).name)
+            ) from None
+
+
+def _rendered(source: str, title: str, folder: Path) -> Picture:
+    file = folder / "rendered.npz"
+    size = "{}x{}".format(*SIZE_PX)
+    command = [sys.executable, "-m", "clients.web.scene_file", source, str(file), size]
+    try:
+        done = subprocess.run(
+            command,
+            cwd=_FOLDER,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise SceneNotRendered(f"{title}: not done in {TIMEOUT_S:.0f} s") from None
+    if not file.is_file():
+        lines = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+        raise SceneNotRendered(lines[-1])
+    with np.load(file) as arrays:
+        state = arrays["state"]
+        view = RgbdView(
+            arrays["color"],
+            arrays["depth_m"],
+            tuple(arrays["tangents"].tolist()),
+            hidden_color=arrays["hidden_color"],
+            hidden_depth_m=arrays["hidden_depth_m"],
+        )
+    if not len(state):
+        return picture_of(title, view)
+    pupil_mm, focus_dpt = state.tolist()
+    return picture_of(title, view, focus_dpt=focus_dpt, pupil_diameter_mm=pupil_mm)
+
+
+def main(source: str, file: str, size: str) -> int:
+    """Render a scene and write it to a file; that is the child's part."""
+    try:
+        from clients.scene_renderer import SceneRenderer
+        from clients.scenes.catalogue import build_scene
+    except ModuleNotFoundError as error:
+        sys.stderr.write(what_to_install(error) + "\n")
+        return 1
+    from clients.headset.gltf_scene import load_gltf
+    from clients.headset.viewpoint import viewpoint
+    from clients.scenes.paths import PATHS, path_moments
+
+    try:
+        is_ours = source in PATHS
+        scene = build_scene(source) if is_ours else load_gltf(source)
+    except ValueError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    state = ()
+    if is_ours:
+        (moment,) = path_moments(PATHS[source], 1)
+        state = (moment.pupil_diameter_mm, moment.focus_dpt)
+    with SceneRenderer(scene, read_size_px(size)) as renderer:
+        seen, hidden = renderer.render_layers(viewpoint(scene))
+        unfinished = Path(file).with_suffix(".part.npz")
+        np.savez(
+            unfinished,
+            color=seen[0],
+            depth_m=seen[1],
+            hidden_color=hidden[0],
+            hidden_depth_m=hidden[1],
+            tangents=renderer.tangents,
+            state=state,
+        )
+    unfinished.rename(file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
