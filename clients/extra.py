@@ -12,3 +12,5 @@ def what_to_install(error: ModuleNotFoundError) -> str:
 
 
 HEADSET_INSTALL = f"{sys.executable} -m pip install pyopenxr"
+
+WEB_INSTALL = f"{sys.executable} -m pip install 'ocufilter[web,clients]'"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+DEGREE = "°"
 MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
 
 
@@ -40,7 +41,8 @@ class NumberField:
     @property
     def allowed(self) -> str:
         """Return the range in words."""
-        return f"{self.low:g} to {self.high:g} {self.unit}".replace("-", "\N{MINUS SIGN}")
+        limits = f"{self.low:g} to {self.with_unit(f'{self.high:g}')}"
+        return limits.replace("-", "\N{MINUS SIGN}")
 
     def read(self, text: str) -> float:
         """Return the number in a text; a comma may be the decimal point.
@@ -75,6 +77,10 @@ class NumberField:
         """Return a value as it stands in the form."""
         sign = "+" if self.is_signed and value > 0 else ""
         return f"{sign}{value:.{self.digits}f}"
+
+    def with_unit(self, text: str) -> str:
+        """Return a number's text with its unit behind it."""
+        return f"{text}{'' if self.unit == DEGREE else ' '}{self.unit}"
 
     def stepped(self, text: str, steps: int) -> str:
         """Return the text some steps further, within what is allowed."""

@@ -1,0 +1,205 @@
+"""The entries of one eye on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from nicegui import events, ui
+
+from clients.web.eye_form import (
+    PRESCRIPTION,
+    PROFILE_SUFFIXES,
+    SPHERE,
+    EyeForm,
+    preset_titles,
+)
+from clients.web.numbers import NumberField
+from clients.web.slider_row import THROTTLE_S
+
+SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
+SLIDER_REACH_DPT = 10.0
+"""Of the slider beneath the sphere; what is typed may go further."""
+
+
+class EyePanel:
+    """Entries for one eye; all of them keep the form up to date.
+
+    Parameters
+    ----------
+    on_change : called when what is entered has changed and is right
+    on_age : called with the age that a file states, years
+    """
+
+    def __init__(
+        self,
+        form: EyeForm,
+        on_change: Callable[[], None],
+        on_age: Callable[[float], None],
+    ) -> None:
+        self.form = form
+        self._on_change, self._on_age = on_change, on_age
+        with ui.element("div").classes("oc-eye") as self.box:
+            self.box.props["data-eye-panel"] = form.side
+            self._build()
+
+    @ui.refreshable_method
+    def _build(self) -> None:
+        form = self.form
+        ui.toggle(SOURCES, value=form.source, on_change=self._choose_source).props(
+            "no-caps unelevated spread dense"
+        ).classes("oc-toggle")
+        if form.source == "prescription":
+            self._prescription()
+        elif form.source == "preset":
+            ui.select(
+                preset_titles(), value=form.preset, on_change=self._choose_preset
+            ).props("outlined dense options-dense").classes("oc-wide").mark("preset")
+        else:
+            self._file()
+        ui.separator()
+        self._correction()
+
+    def _prescription(self) -> None:
+        form = self.form
+        with ui.element("div").classes("oc-fields"):
+            sphere = self._entry(SPHERE, form.texts)
+            self._sphere_slider(sphere)
+            for number in PRESCRIPTION[1:]:
+                self._entry(number, form.texts)
+        ui.switch(
+            "Higher-order aberrations of this age",
+            value=form.has_higher_order,
+            on_change=self._switch_higher_order,
+        ).props("dense").classes("oc-switch")
+
+    def _sphere_slider(self, entry: ui.input) -> None:
+        """Show a slider that moves an entry, and moves with it."""
+        slider = (
+            ui.slider(
+                min=-SLIDER_REACH_DPT,
+                max=SLIDER_REACH_DPT,
+                step=SPHERE.step,
+                value=_within(entry.value),
+            )
+            .props('dense aria-label="Sphere"')
+            .classes("oc-sphere")
+        )
+        slider.props["data-name"] = SPHERE.name
+        slider.on(
+            "update:model-value",
+            lambda event: entry.set_value(SPHERE.show(float(event.args))),
+            throttle=THROTTLE_S,
+        )
+        entry.on_value_change(lambda event: slider.set_value(_within(event.value)))
+
+    def _entry(self, number: NumberField, texts: dict[str, str]) -> ui.input:
+        """Return an entry for one number, which says what is wrong with it."""
+
+        def take(event: events.ValueChangeEventArguments) -> None:
+            texts[number.name] = event.value or ""
+            if number.problem(texts[number.name]) is None:
+                self._on_change()
+
+        entry = ui.input(
+            number.label,
+            value=texts[number.name],
+            validation=lambda text: number.problem(text or ""),
+            on_change=take,
+        )
+        entry.props(
+            f'outlined dense suffix="{number.unit}" inputmode="text" autocomplete="off"'
+        ).classes("oc-entry")
+        entry.props["data-name"] = number.name
+        for key, steps in (("up", 1), ("down", -1)):
+            entry.on(
+                f"keydown.{key}.prevent",
+                lambda _, steps=steps: entry.set_value(
+                    number.stepped(entry.value or "", steps)
+                ),
+            )
+        return entry
+
+    def _file(self) -> None:
+        ui.upload(
+            auto_upload=True, max_files=1, on_upload=self._take_file, label="Profile"
+        ).props(f'accept="{",".join(PROFILE_SUFFIXES)}" flat bordered').classes(
+            "oc-upload oc-wide"
+        ).mark("profile-file")
+        text = f"In use: {self.form.file_name}" if self.form.file_name else (
+            f"A profile: {', '.join(PROFILE_SUFFIXES)}"
+        )
+        ui.label(text).classes("oc-hint")
+
+    def _correction(self) -> None:
+        form = self.form
+        with ui.element("div").classes("oc-line"):
+            ui.switch(
+                "Wears a correction",
+                value=form.wears_correction,
+                on_change=self._switch_correction,
+            ).props("dense").classes("oc-switch")
+            if form.source == "prescription":
+                ui.button("Correct fully", on_click=self._correct_fully).props(
+                    "flat dense no-caps size=sm"
+                ).tooltip("Wear spectacles of the prescription above")
+        if form.wears_correction:
+            with ui.element("div").classes("oc-fields oc-worn"):
+                for number in PRESCRIPTION:
+                    self._entry(number, form.worn).props["data-worn"] = ""
+
+    def copy(self, other: EyeForm) -> None:
+        """Take over the entries of the other eye."""
+        form = self.form
+        form.source, form.preset = other.source, other.preset
+        form.texts, form.worn = dict(other.texts), dict(other.worn)
+        form.has_higher_order = other.has_higher_order
+        form.file_body, form.file_name = other.file_body, other.file_name
+        form.wears_correction = other.wears_correction
+        self._changed()
+
+    # What is chosen
+
+    def _choose_source(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.source = event.value
+        self._changed()
+
+    def _choose_preset(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.preset = event.value
+        self._on_change()
+
+    def _switch_higher_order(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.has_higher_order = event.value
+        self._on_change()
+
+    def _switch_correction(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.wears_correction = event.value
+        self._changed()
+
+    def _correct_fully(self) -> None:
+        self.form.correct_fully()
+        self._changed()
+
+    async def _take_file(self, event: events.UploadEventArguments) -> None:
+        content = await event.file.read()
+        try:
+            age_years = self.form.take_file(event.file.name, content)
+        except ValueError as error:
+            ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
+            return
+        if age_years is not None:
+            self._on_age(age_years)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Build it anew: other entries count now."""
+        self._build.refresh()
+        self._on_change()
+
+
+def _within(text: str | None) -> float:
+    """Return where the slider stands for a text."""
+    try:
+        value = SPHERE.read(text or "")
+    except ValueError:
+        return 0.0
+    return min(max(value, -SLIDER_REACH_DPT), SLIDER_REACH_DPT)

@@ -1,0 +1,159 @@
+"""One eye as the page shows it: a quick small picture, then the full one.
+
+The small one goes through the eye's wavefront on its axis, by formula, and is there
+within some hundredths of a second; the full one through the eye traced over its field.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from clients.web.eye_form import EyeSide
+from clients.web.picture import coarser
+from clients.web.picture_files import jpeg_of, png_of
+from clients.web.wishes import Kind, Seen, Wish
+from filter_service import EyeFilter, FilterError, FilterSettings, Filtered, RgbdView
+
+MS_PER_S = 1e3
+FOCUS_RANGE_DPT = (0.0, 8.0)
+FULL = FilterSettings(focus_range_dpt=FOCUS_RANGE_DPT)
+QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")
+LEAST_WIDTH_PX = 200
+"""Pictures whose blur is too wide for the filter are shown with fewer pixels, until
+that."""
+
+
+@dataclass
+class _Through:
+    """A filter with the profile that it was last given."""
+
+    filter: EyeFilter
+    given: Any = None
+    generation: int = 0
+
+    def give(self, body: Mapping[str, Any], settings: FilterSettings, view) -> None:
+        """Change the eye, if it is another."""
+        given = (body, settings, view.camera)
+        if given != self.given:
+            self.given = given
+            accepted = self.filter.set_profile(
+                body, settings=settings, cameras=[view.camera]
+            )
+            self.generation = accepted.generation
+
+    def see(self, view: RgbdView, wish: Wish, *, gaze_deg) -> Filtered | None:
+        """Return the picture through the newest eye as it is wanted, else None."""
+        state = {
+            "pupil_diameter_mm": wish.pupil_diameter_mm,
+            "focus_dpt": wish.focus_dpt,
+        }
+        if not self._is_whole():  # it is told the state, and nothing is rendered
+            self.filter.plan([view], **state)
+            self.filter.advance()
+            return None
+        seen = self.filter.try_filter(
+            [view], **state, gaze_deg=gaze_deg, prepared_only=True
+        )
+        self.filter.advance()  # by now it knows what this frame asks for
+        is_it = seen is not None and seen.is_complete
+        return seen if is_it and seen.generation == self.generation else None
+
+    def _is_whole(self) -> bool:
+        ready = self.filter.ready
+        return (
+            ready is not None
+            and ready.is_complete
+            and ready.eye.generation == self.generation
+        )
+
+
+class EyeView:
+    """The pictures of one eye of one page; for one thread.
+
+    Parameters
+    ----------
+    side : "OD" or "OS"
+    """
+
+    def __init__(self, side: EyeSide) -> None:
+        self.side = side
+        self._quick: _Through | None = None
+        self._full: _Through | None = None
+        self._merged = 1
+        self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
+
+    def preview(self, wish: Wish) -> Seen | None:
+        """Return the small picture; None while its eye is being prepared."""
+        self._stop_other(wish)
+        if self._quick is None:
+            self._quick = _Through(EyeFilter())
+        return self._look(self._quick, "preview", wish, QUICK, wish.picture.small)
+
+    def full(self, wish: Wish) -> Seen | None:
+        """Return the full picture; None while its eye is being prepared."""
+        if self._full is None:
+            self._full = _Through(EyeFilter())
+        settings = FULL.changed(gaze_deg=wish.gaze_deg)
+        view = wish.picture.view
+        if self._merged > 1:
+            view = coarser(view, self._merged)
+        return self._look(self._full, "full", wish, settings, view)
+
+    def _stop_other(self, wish: Wish) -> None:
+        """Give up the full eye where it is another, so that the worker is free."""
+        full = self._full
+        if full is None or full.given is None:
+            return
+        body, settings, _ = full.given
+        if (body, settings.gaze_deg) != (wish.bodies[self.side], wish.gaze_deg):
+            full.filter.close()
+            self._full, self._merged = None, 1
+
+    def _look(
+        self, through: _Through, kind: Kind, wish: Wish, settings, view: RgbdView
+    ) -> Seen | None:
+        began_s = time.monotonic()
+        try:
+            through.give(wish.bodies[self.side], settings, view)
+            seen = through.see(view, wish, gaze_deg=settings.gaze_deg)
+        except FilterError as error:
+            through.given = None
+            if kind == "full" and view.width_px >= 2 * LEAST_WIDTH_PX:
+                self._merged *= 2
+                return None
+            self.seen[kind] = wish.number
+            return Seen("failed", self.side, wish.number, b"", {"error": str(error)})
+        if seen is None:
+            return None
+        self.seen[kind] = wish.number
+        encode = png_of if kind == "full" else jpeg_of
+        return Seen(
+            kind,
+            self.side,
+            wish.number,
+            encode(seen.color),
+            _facts(seen, wish, MS_PER_S * (time.monotonic() - began_s)),
+        )
+
+    def close(self) -> None:
+        """Let go of everything."""
+        for through in (self._quick, self._full):
+            if through is not None:
+                through.filter.close()
+        self._quick = self._full = None
+
+
+def _facts(seen: Filtered, wish: Wish, took_ms: float) -> dict[str, Any]:
+    return {
+        "width_px": seen.color.shape[1],
+        "height_px": seen.color.shape[0],
+        "pupil_diameter_mm": round(seen.pupil_diameter_mm, 3),
+        "focus_dpt": round(seen.focus_dpt, 3),
+        "wanted_focus_dpt": wish.focus_dpt,
+        "frame_ms": round(sum(seen.stage_times_ms.values()), 2),
+        "took_ms": round(took_ms, 2),
+        "notes": list(seen.notes),
+    }

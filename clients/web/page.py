@@ -1,0 +1,265 @@
+"""The page: what it shows, and what becomes of every entry."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nicegui import Client, app, events, ui
+
+from clients.web.eye_form import SIDES, EyeSide
+from clients.web.eye_panel import EyePanel
+from clients.web.figure_panel import FigurePanel
+from clients.web.numbers import distance_text
+from clients.web.page_state import AGE, DISTANCE, FOCUS, LOOKS, PUPIL, PageState
+from clients.web.picture import Picture
+from clients.web.picture_files import png_of
+from clients.web.pictures_out import PicturesOut
+from clients.web.scene_panel import ScenePanel
+from clients.web.seeing import Seeing
+from clients.web.seen_view import SeenView
+from clients.web.slider_row import SliderRow
+from clients.web.studying import Studying
+from clients.web.wishes import Seen
+
+STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
+SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
+FIGURES_REST_S = 0.35
+"""After the last change: figures are drawn anew."""
+
+FIRST_ASPECT = 960 / 540
+PICTURES_PATH = "/pictures/"
+
+
+class Desk:
+    """What all pages of a process share."""
+
+    def __init__(self) -> None:
+        self.seeing = Seeing()
+        self.studying = Studying()
+        self.out: dict[str, PicturesOut] = {}
+
+    def close(self) -> None:
+        """End the thread and the process."""
+        self.seeing.close()
+        self.studying.close()
+
+
+class Page:
+    """One page in one browser.
+
+    Parameters
+    ----------
+    profile : what both eyes are at first, and its name
+    """
+
+    def __init__(self, desk: Desk, profile: tuple[Mapping[str, Any], str] | None) -> None:
+        self.desk = desk
+        self.name = secrets.token_urlsafe(16)
+        self.state = PageState()
+        if profile is not None:
+            self._take_profile(*profile)
+        self.out = desk.out[self.name] = PicturesOut()
+        self._loop = asyncio.get_running_loop()
+        self._renewal: asyncio.Task | None = None
+        desk.seeing.open(self.name, self._from_thread)
+        self._build()
+
+    def _take_profile(self, body: Mapping[str, Any], name: str) -> None:
+        for form in self.state.eyes.values():
+            form.take_body(body, name)
+        self.state.values[AGE.name] = body.get(AGE.name, self.state.values[AGE.name])
+
+    # Layout
+
+    def _build(self) -> None:
+        ui.add_css(STYLE)
+        ui.colors(primary="#1f5fa8", negative="#b3262e", positive="#2c8a57")
+        ui.context.client.content.classes("oc-content")
+        with ui.element("header").classes("oc-header"):
+            ui.label("ocufilter").classes("oc-brand")
+            ui.label("See through another person’s eyes").classes("oc-motto")
+            ui.element("span").classes("oc-grow")
+            self._download_buttons()
+        with ui.element("main").classes("oc-page"):
+            with ui.element("div").classes("oc-middle"):
+                self._picture_card()
+                self._sliders_card()
+            with ui.element("div").classes("oc-left"):
+                self._eyes_card()
+            with ui.element("div").classes("oc-right"):
+                self.figures = FigurePanel(self.name, self.state, self.desk.studying)
+        ui.timer(0.0, self.scene.first, once=True)
+
+    def _download_buttons(self) -> None:
+        for label, tip, act in (
+            ("Picture", "What the eye sees, PNG", self._download_picture),
+            ("Profile", "The eye's profile, JSON", self._download_profile),
+        ):
+            ui.button(label, icon="download", on_click=act).props(
+                "outline dense no-caps size=sm"
+            ).classes("oc-download").tooltip(tip)
+
+    def _picture_card(self) -> None:
+        with ui.element("section").classes("oc-card oc-picture"):
+            self.scene = ScenePanel(self.state, self._take_picture)
+            self.view = SeenView(
+                PICTURES_PATH + self.name, list(self.state.sides), FIRST_ASPECT
+            )
+            self.view.on("point", self._point)
+            self.view.on("look", self._look)
+            self._note = ui.label("").classes("oc-note")
+
+    def _sliders_card(self) -> None:
+        values = self.state.values
+        with ui.element("section").classes("oc-card oc-sliders"):
+            self.rows = {
+                number.name: SliderRow(
+                    number,
+                    values[number.name],
+                    lambda value, name=number.name: self._slide(name, value),
+                    words=distance_text if number in (FOCUS, DISTANCE) else None,
+                )
+                for number in LOOKS
+            }
+
+    def _eyes_card(self) -> None:
+        with ui.element("section").classes("oc-card"):
+            with ui.element("div").classes("oc-line"):
+                ui.label("The eye").classes("oc-title")
+                self._copy = ui.button(
+                    "copy to the other", on_click=self._copy_eye
+                ).props("flat dense no-caps size=sm")
+            ui.toggle(SHOWN, value=self.state.shown, on_change=self._show).props(
+                "no-caps unelevated spread dense"
+            ).classes("oc-toggle oc-shown")
+            self.panels: dict[EyeSide, EyePanel] = {}
+            for side, title in SIDES.items():
+                with ui.element("div").classes("oc-eye-box") as box:
+                    ui.label(title).classes("oc-eye-title").bind_visibility_from(
+                        self.state, "shown", value="both"
+                    )
+                    self.panels[side] = EyePanel(
+                        self.state.eyes[side], self.wish, self._take_age
+                    )
+                box.bind_visibility_from(
+                    self.state, "shown", lambda shown, side=side: shown in (side, "both")
+                )
+            self._problem = ui.label("").classes("oc-problem")
+
+    # What happens
+
+    def wish(self) -> None:
+        """Ask for what the entries say; explain an entry that is wrong."""
+        wish = self.state.wish()
+        self._problem.text = "\n".join(self.state.problems())
+        if wish is None:
+            return
+        self.desk.seeing.wish(self.name, wish)
+        if self._renewal is not None:
+            self._renewal.cancel()
+        self._renewal = asyncio.create_task(self._renew_figures())
+
+    async def _renew_figures(self) -> None:
+        await asyncio.sleep(FIGURES_REST_S)
+        self._renewal = None  # from here on it is not cancelled: newer ones wait
+        await self.figures.renew()
+
+    def _slide(self, name: str, value: float) -> None:
+        self.state.values[name] = value
+        self.wish()
+
+    def _take_age(self, age_years: float) -> None:
+        self.state.values[AGE.name] = age_years
+        self.rows[AGE.name].show(age_years)
+
+    def _take_picture(self, picture: Picture) -> None:
+        self.state.take_picture(picture)
+        for name in (PUPIL.name, FOCUS.name, DISTANCE.name):
+            self.rows[name].show(self.state.values[name])
+        self.rows[DISTANCE.name].enable(
+            picture.distance_dpt is not None, "as in the picture"
+        )
+        self.view.show_aspect(picture.aspect_ratio)
+        number = self.state.number + 1
+        self.out.put(Seen("scene", None, number, png_of(picture.view.color)))
+        self.wish()
+
+    def _show(self, event: events.ValueChangeEventArguments) -> None:
+        self.state.shown = event.value
+        self.view.show_eyes(list(self.state.sides))
+        self._copy.set_visibility(self.state.shown != "both")
+        self.wish()
+
+    def _copy_eye(self) -> None:
+        side = self.state.sides[0]
+        other = next(s for s in SIDES if s != side)
+        self.panels[other].copy(self.state.eyes[side])
+        ui.notify(f"{SIDES[other]}: as the {SIDES[side].lower()}", timeout=2000)
+
+    async def _point(self, event: events.GenericEventArguments) -> None:
+        place = event.args
+        await self.figures.point(place["eye"], place["x"], place["y"])
+
+    def _look(self, event: events.GenericEventArguments) -> None:
+        self.state.look_at(event.args["x"], event.args["y"])
+        self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
+        self.wish()
+
+    # What the thread shows
+
+    def _from_thread(self, seen: Seen) -> None:
+        self._loop.call_soon_threadsafe(self._take_seen, seen)
+
+    def _take_seen(self, seen: Seen) -> None:
+        self.out.put(seen)
+        if seen.kind in ("full", "failed"):
+            notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
+            self._note.text = "  ".join(_sentence(note) for note in notes if note)
+
+    # Downloads
+
+    async def _download_picture(self) -> None:
+        sides = [s for s in self.state.sides if self._full(s) is not None]
+        if not sides:
+            ui.notify("The full picture is not ready yet", type="warning")
+        for side in sides:
+            ui.download(self._full(side).data, f"ocufilter_{side}.png")
+
+    def _full(self, side: EyeSide) -> Seen | None:
+        seen = self.out.last(side)
+        return seen if seen is not None and seen.kind == "full" else None
+
+    def _download_profile(self) -> None:
+        for side in self.state.sides:
+            try:
+                text = json.dumps(self.state.body(side), indent=1)
+            except ValueError as error:
+                ui.notify(str(error), type="negative")
+                return
+            ui.download(text.encode(), f"ocufilter_{side}.json")
+
+    def close(self) -> None:
+        """Let go of what the page had."""
+        self.desk.seeing.forget(self.name)
+        self.desk.studying.forget(self.name)
+        self.desk.out.pop(self.name, None)
+
+
+def _sentence(note: str) -> str:
+    return note[:1].upper() + note[1:].rstrip(".") + "."
+
+
+def add_page(desk: Desk, profile: tuple[Mapping[str, Any], str] | None) -> None:
+    """Serve the page at `/`."""
+
+    @ui.page("/", title="ocufilter")
+    async def _page(client: Client) -> None:
+        page = Page(desk, profile)
+        client.on_delete(page.close)
+
+    app.on_shutdown(desk.close)

@@ -1,0 +1,127 @@
+"""What a page holds: both eyes' entries, how they look, and what at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from clients.web.eye_form import SIDES, EyeForm, EyeSide
+from clients.web.numbers import NumberField
+from clients.web.picture import Picture, Place
+from clients.web.wishes import Wish
+
+Shown = Literal["OD", "OS", "both"]
+
+PUPIL = NumberField("pupil_diameter_mm", "Pupil", "mm", 2.0, 7.0, 0.1, digits=1)
+FOCUS = NumberField("focus_dpt", "Focus", "dpt", 0.0, 8.0, 0.05)
+DISTANCE = NumberField("distance_dpt", "Distance", "dpt", 0.0, 6.0, 0.05)
+GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
+GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -15.0, 15.0, 1.0, digits=0)
+AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, digits=0)
+LOOKS = (PUPIL, FOCUS, DISTANCE, AGE, GAZE_H, GAZE_V)
+"""In the order of the page."""
+
+
+@dataclass
+class PageState:
+    """The entries of one page.
+
+    Attributes
+    ----------
+    picture : what is looked at; None while none is ready
+    right : the last profile of each eye in which nothing was wrong
+    shown : which eye, or both
+    """
+
+    eyes: dict[EyeSide, EyeForm] = field(
+        default_factory=lambda: {side: EyeForm(side) for side in SIDES}
+    )
+    values: dict[str, float] = field(
+        default_factory=lambda: {
+            PUPIL.name: 4.0,
+            FOCUS.name: 0.0,
+            DISTANCE.name: 0.25,
+            GAZE_H.name: 0.0,
+            GAZE_V.name: 0.0,
+            AGE.name: 30.0,
+        }
+    )
+    picture: Picture | None = None
+    shown: Shown = "OD"
+    number: int = 0
+    right: dict[EyeSide, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def sides(self) -> tuple[EyeSide, ...]:
+        """Return the eyes that are shown."""
+        return tuple(SIDES) if self.shown == "both" else (self.shown,)
+
+    def body(self, side: EyeSide) -> dict[str, Any]:
+        """Return an eye's profile.
+
+        Raises
+        ------
+        ValueError
+            An entry that is wrong: what it is and what is allowed.
+        """
+        return self.eyes[side].body(age_years=self.values[AGE.name])
+
+    def problems(self) -> list[str]:
+        """Return what is wrong with the entries of the eyes that are shown."""
+        found = []
+        for side in self.sides:
+            try:
+                self.body(side)
+            except ValueError as error:
+                found.append(f"{SIDES[side]}: {error}")
+        return found
+
+    @property
+    def gaze_deg(self) -> tuple[float, float]:
+        """Return where the eye looks in the picture."""
+        return self.values[GAZE_H.name], self.values[GAZE_V.name]
+
+    def take_picture(self, picture: Picture) -> None:
+        """Look at another picture, in the state that it suggests."""
+        self.picture = picture
+        if picture.focus_dpt is not None:
+            self.values[FOCUS.name] = min(picture.focus_dpt, FOCUS.high)
+        if picture.pupil_diameter_mm is not None:
+            self.values[PUPIL.name] = picture.pupil_diameter_mm
+        if picture.distance_dpt is not None:
+            self.values[DISTANCE.name] = picture.distance_dpt
+
+    def wish(self) -> Wish | None:
+        """Return what is to be seen now; None while there is no picture, or no eye.
+
+        An eye with a wrong entry stays as it was: see `problems`.
+        """
+        for side in self.sides:
+            try:
+                self.right[side] = self.body(side)
+            except ValueError:
+                continue
+        bodies = {side: self.right[side] for side in self.sides if side in self.right}
+        if self.picture is None or not bodies:
+            return None
+        self.picture = self.picture.at(self.values[DISTANCE.name])
+        self.number += 1
+        return Wish(
+            number=self.number,
+            picture=self.picture,
+            bodies=bodies,
+            pupil_diameter_mm=self.values[PUPIL.name],
+            focus_dpt=self.values[FOCUS.name],
+            gaze_deg=self.gaze_deg,
+        )
+
+    def place(self, x: float, y: float) -> Place | None:
+        """Return what is at a place of the picture."""
+        return None if self.picture is None else self.picture.place(x, y)
+
+    def look_at(self, x: float, y: float) -> None:
+        """Focus on what is at a place of the picture."""
+        place = self.place(x, y)
+        if place is not None:
+            self.values[FOCUS.name] = min(place.distance_dpt, FOCUS.high)

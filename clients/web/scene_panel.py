@@ -1,0 +1,132 @@
+"""What is looked at, chosen on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nicegui import events, run, ui
+
+from clients.web.chart import chart_picture
+from clients.web.page_state import DISTANCE, PageState
+from clients.web.picture import DEPTH_HELP, Picture, photo_picture
+from clients.web.scene_file import (
+    GLTF_SUFFIXES,
+    TITLES,
+    SceneNotRendered,
+    gltf_picture,
+    scene_picture,
+)
+
+KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
+PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
+FIRST = "courtyard"
+
+
+class ScenePanel:
+    """Chooses what is looked at; pictures are made beside the event loop.
+
+    Parameters
+    ----------
+    on_picture : called with each new picture
+    """
+
+    def __init__(self, state: PageState, on_picture: Callable[[Picture], None]) -> None:
+        self._state, self._on_picture = state, on_picture
+        self._kind = FIRST
+        self._photo: tuple[str, bytes] | None = None
+        self._depth: tuple[str, bytes] | None = None
+        self._width_deg = 35
+        with ui.element("div").classes("oc-scene"):
+            ui.toggle(KINDS, value=FIRST, on_change=self._choose).props(
+                "no-caps unelevated dense"
+            ).classes("oc-toggle oc-kinds")
+            self._busy = ui.spinner(size="1.4em").classes("oc-busy")
+        self._uploads()
+
+    @ui.refreshable_method
+    def _uploads(self) -> None:
+        """Show what a photo or a 3D file needs."""
+        if self._kind not in ("photo", "gltf"):
+            return
+        with ui.element("div").classes("oc-uploads"):
+            if self._kind == "gltf":
+                self._upload("glTF 2 scene", ",".join(GLTF_SUFFIXES), self._take_gltf)
+                return
+            self._upload("Photo", "image/*", self._take_photo)
+            self._upload("Its depth, if known", ".npy,.png,.tif,.tiff,.exr", self._take_depth)
+            with ui.element("div").classes("oc-photo-width"):
+                ui.select(
+                    PHOTO_WIDTHS_DEG, value=self._width_deg, on_change=self._set_width
+                ).props("outlined dense options-dense").tooltip(
+                    "How wide the photo is seen"
+                )
+                ui.label(
+                    f"Depth: {DEPTH_HELP}.  Without depth the photo stands flat at a "
+                    "distance."
+                ).classes("oc-hint")
+
+    def _upload(self, label: str, accept: str, take) -> None:
+        ui.upload(auto_upload=True, max_files=1, label=label, on_upload=take).props(
+            f'accept="{accept}" flat bordered'
+        ).classes("oc-upload").mark(label)
+
+    async def first(self) -> None:
+        """Show the first scene."""
+        await self._make(scene_picture, FIRST)
+
+    async def _choose(self, event: events.ValueChangeEventArguments) -> None:
+        self._kind = event.value
+        self._uploads.refresh()
+        if self._kind in TITLES:
+            await self._make(scene_picture, self._kind)
+        elif self._kind == "chart":
+            await self._make(chart_picture, self._state.values[DISTANCE.name])
+        elif self._kind == "photo":
+            await self._show_photo()
+
+    async def _take_gltf(self, event: events.UploadEventArguments) -> None:
+        await self._make(gltf_picture, event.file.name, await event.file.read())
+
+    async def _take_photo(self, event: events.UploadEventArguments) -> None:
+        self._photo = (event.file.name, await event.file.read())
+        self._depth = None  # that of another photo
+        await self._show_photo()
+
+    async def _take_depth(self, event: events.UploadEventArguments) -> None:
+        self._depth = (event.file.name, await event.file.read())
+        if self._photo is None:
+            ui.notify("Now the photo that this is the depth of", type="info")
+            return
+        await self._show_photo()
+
+    async def _set_width(self, event: events.ValueChangeEventArguments) -> None:
+        self._width_deg = event.value
+        await self._show_photo()
+
+    async def _show_photo(self) -> None:
+        if self._photo is None:
+            return
+        if not await self._make(
+            photo_picture,
+            *self._photo,
+            width_deg=self._width_deg,
+            distance_dpt=self._state.values[DISTANCE.name],
+            depth=self._depth,
+        ):
+            self._depth = None
+
+    async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
+        """Show the picture that a function makes, or say why there is none."""
+        kind = self._kind
+        self._busy.set_visibility(True)
+        try:
+            picture = await run.io_bound(make, *args, **options)
+        except (ValueError, SceneNotRendered) as error:
+            ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
+            return False
+        finally:
+            self._busy.set_visibility(False)
+        if picture is not None and kind == self._kind:  # else another was chosen
+            self._on_picture(picture)
+        return True

@@ -1,0 +1,142 @@
+"""The thread that filters: of what a page wishes, the newest wins.
+
+The page's event loop never filters; it leaves a wish here and goes on.  A wish that
+nobody has begun is replaced by a newer one.  The small picture comes at once; the full
+one once the hand has rested, and it is given up as soon as the hand moves on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from clients.web.eye_form import EyeSide
+from clients.web.eye_view import EyeView
+from clients.web.wishes import Seen, Wish
+
+REST_S = 0.12
+"""Without a newer wish: the hand rests."""
+
+POLL_S = 0.002
+"""Between two looks at an eye that is being prepared."""
+
+STALE_S = 0.5
+"""A small picture that takes longer is not waited for where the wish is another."""
+
+
+@dataclass
+class _Page:
+    """One page: its newest wish, the one in hand, and its eyes."""
+
+    show: Callable[[Seen], None]
+    newest: Wish | None = None
+    arrived_s: float = 0.0
+    in_hand: Wish | None = None
+    begun_s: float = 0.0
+    eyes: dict[EyeSide, EyeView] = field(default_factory=dict)
+
+    def step(self) -> float | None:
+        """Do a piece of work; return after how long to come again, in s, or None."""
+        now_s = time.monotonic()
+        wish = self._next_wish(now_s)
+        if wish is None:
+            return None
+        for side in wish.bodies:
+            self.eyes.setdefault(side, EyeView(side))
+        wanted = [self.eyes[side] for side in wish.bodies]
+        waits = False
+        for eye in wanted:
+            if eye.seen["preview"] < wish.number:
+                waits |= not self._showed(eye.preview(wish))
+        if waits:
+            return POLL_S
+        if wish is not self.newest:
+            return 0.0
+        if all(eye.seen["full"] >= wish.number for eye in wanted):
+            return None
+        rest_s = self.arrived_s + REST_S - now_s
+        if rest_s > 0.0:
+            return rest_s
+        for eye in wanted:
+            if eye.seen["full"] < wish.number:
+                waits |= not self._showed(eye.full(wish))
+            if wish is not self.newest:
+                return 0.0
+        return POLL_S if waits else None
+
+    def _next_wish(self, now_s: float) -> Wish | None:
+        """Return the wish in hand until its small pictures are seen, then the newest."""
+        is_new = self.in_hand is not self.newest
+        if is_new and (self._is_previewed() or now_s > self.begun_s + STALE_S):
+            self.in_hand, self.begun_s = self.newest, now_s
+        return self.in_hand
+
+    def _is_previewed(self) -> bool:
+        wish = self.in_hand
+        return wish is None or all(
+            side in self.eyes and self.eyes[side].seen["preview"] >= wish.number
+            for side in wish.bodies
+        )
+
+    def _showed(self, seen: Seen | None) -> bool:
+        if seen is not None:
+            self.show(seen)
+        return seen is not None
+
+    def close(self) -> None:
+        for eye in self.eyes.values():
+            eye.close()
+
+
+class Seeing:
+    """Filters for all pages of a process, in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._pages: dict[str, _Page] = {}
+        self._ended: list[_Page] = []
+        self._wake = threading.Event()
+        self._is_over = False
+        self._thread = threading.Thread(target=self._run, name="seeing", daemon=True)
+        self._thread.start()
+
+    def open(self, page: str, show: Callable[[Seen], None]) -> None:
+        """Take a page in; what it is shown is handed to ``show``, in this thread."""
+        self._pages[page] = _Page(show)
+
+    def wish(self, page: str, wish: Wish) -> None:
+        """Want to see something; an older wish is dropped."""
+        known = self._pages.get(page)
+        if known is not None:
+            known.newest, known.arrived_s = wish, time.monotonic()
+            self._wake.set()
+
+    def forget(self, page: str) -> None:
+        """Let go of a page."""
+        known = self._pages.pop(page, None)
+        if known is not None:
+            self._ended.append(known)
+            self._wake.set()
+
+    def close(self) -> None:
+        """End the thread and all eyes."""
+        self._is_over = True
+        self._wake.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._is_over:
+            self._wake.clear()
+            while self._ended:
+                self._ended.pop().close()
+            waits_s = list(self._step_all())
+            self._wake.wait(min(waits_s, default=None))
+        for page in [*self._pages.values(), *self._ended]:
+            page.close()
+
+    def _step_all(self) -> Iterator[float]:
+        for page in list(self._pages.values()):
+            wait_s = page.step()
+            if wait_s is not None:
+                yield wait_s

@@ -1,0 +1,162 @@
+// The pictures: the scene on the left of a split that is dragged, the eye's on the right.
+//
+// They come over a websocket of their own, as bytes: a JSON header and a picture's file.
+// Drawn is what came last; `window.ocufilter.drawn` says what was drawn, and when.
+const LABELS = { OD: "Right eye", OS: "Left eye" };
+const KEY_STEP = 2; // percent
+const POINT_MS = 90; // between two reports of where the pointer is
+const RECONNECT_MS = 1000;
+
+export default {
+  template: `
+    <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
+      <div v-for="eye in eyes" :key="eye" class="oc-view" :data-eye="eye"
+           :style="{ aspectRatio: aspect }"
+           @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
+           @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
+        <canvas :ref="'before' + eye" class="oc-before"></canvas>
+        <canvas :ref="'after' + eye" class="oc-after" :style="clip"></canvas>
+        <span class="oc-tag oc-tag-left" :style="{ opacity: split > 12 ? 1 : 0 }">Scene</span>
+        <span class="oc-tag oc-tag-right" :style="{ opacity: split < 88 ? 1 : 0 }">
+          {{ label(eye) }}</span>
+        <span class="oc-state" :class="'oc-' + state(eye).kind">{{ state(eye).text }}</span>
+        <span v-if="point && point.eye === eye" class="oc-cross"
+              :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
+        <div class="oc-split" :style="{ left: split + '%' }" role="slider" tabindex="0"
+             aria-label="Split between the scene and what the eye sees"
+             aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
+             @keydown="onKey"><i></i></div>
+      </div>
+    </div>`,
+  props: { address: String, eyes: Array, aspect: Number },
+  data() {
+    return { split: 50, dragging: false, point: null, states: {}, down: null };
+  },
+  computed: {
+    clip() {
+      return { clipPath: `inset(0 0 0 ${this.split}%)` };
+    },
+  },
+  created() {
+    this.latest = {}; // the newest message of each place, for canvases that come later
+    this.queue = Promise.resolve();
+    window.ocufilter = { drawn: [], split: () => this.split };
+  },
+  mounted() {
+    this.connect();
+  },
+  beforeUnmount() {
+    this.ended = true;
+    this.socket?.close();
+  },
+  watch: {
+    eyes() {
+      this.$nextTick(() => Object.values(this.latest).forEach((m) => this.draw(m)));
+    },
+  },
+  methods: {
+    label(eye) {
+      return LABELS[eye];
+    },
+    state(eye) {
+      return this.states[eye] ?? { kind: "wait", text: "preparing …" };
+    },
+    connect() {
+      const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+      this.socket = new WebSocket(`${scheme}//${location.host}${this.address}`);
+      this.socket.binaryType = "arraybuffer";
+      this.socket.onmessage = (event) => this.take(event.data);
+      this.socket.onclose = () => {
+        if (!this.ended) setTimeout(() => this.connect(), RECONNECT_MS);
+      };
+    },
+    take(buffer) {
+      const length = new DataView(buffer).getUint32(0, true);
+      const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+      const message = { header, data: buffer.slice(4 + length) };
+      if (header.eye && header.number < this.latest.scene?.header.number) return;
+      this.latest[header.eye ?? "scene"] = message;
+      this.queue = this.queue.then(() => this.draw(message));
+    },
+    async draw(message) {
+      const { header, data } = message;
+      const place = header.eye ?? "scene";
+      if (this.latest[place] !== message) return; // a newer one has come meanwhile
+      if (header.kind === "failed") {
+        this.states[place] = { kind: "failed", text: header.error };
+        return;
+      }
+      const bitmap = await createImageBitmap(new Blob([data]));
+      const eyes = header.eye ? [header.eye] : this.eyes;
+      for (const eye of eyes) {
+        const canvas = this.$refs[(header.eye ? "after" : "before") + eye]?.[0];
+        if (!canvas) continue;
+        canvas.width = bitmap.width;
+        canvas.height = bitmap.height;
+        canvas.getContext("2d").drawImage(bitmap, 0, 0);
+      }
+      bitmap.close();
+      if (!header.eye) return this.clear();
+      const text = header.kind === "full" ? `full picture · ${header.width_px} × ${header.height_px}` : "preview";
+      this.states[place] = { kind: header.kind, text };
+      const drawn = window.ocufilter.drawn;
+      drawn.push({ ...header, at_ms: performance.now() });
+      if (drawn.length > 500) drawn.shift();
+    },
+    clear() {
+      // what the eye saw of another scene is no longer shown
+      for (const eye of this.eyes) {
+        const message = this.latest[eye];
+        if (message && message.header.number >= this.latest.scene.header.number) continue;
+        const canvas = this.$refs["after" + eye]?.[0];
+        if (canvas) canvas.width = canvas.width;
+        delete this.latest[eye];
+        delete this.states[eye];
+      }
+    },
+    where(event) {
+      const box = event.currentTarget.getBoundingClientRect();
+      const part = (value) => Math.min(Math.max(value, 0), 1);
+      return {
+        x: part((event.clientX - box.left) / box.width),
+        y: part((event.clientY - box.top) / box.height),
+      };
+    },
+    onDown(event, eye) {
+      const { x } = this.where(event);
+      const box = event.currentTarget.getBoundingClientRect();
+      this.down = { x: event.clientX, y: event.clientY };
+      if (Math.abs(x - this.split / 100) * box.width < 22) {
+        this.dragging = true;
+        event.currentTarget.setPointerCapture(event.pointerId);
+        event.preventDefault();
+      }
+    },
+    onMove(event, eye) {
+      const { x, y } = this.where(event);
+      if (this.dragging) this.split = 100 * x;
+      else this.report(eye, x, y);
+    },
+    onUp(event, eye) {
+      const moved = this.down && Math.hypot(event.clientX - this.down.x, event.clientY - this.down.y);
+      const { x, y } = this.where(event);
+      if (!this.dragging && this.down && moved < 5) this.$emit("look", { eye, x, y });
+      this.dragging = false;
+      this.down = null;
+    },
+    onKey(event) {
+      const step = { ArrowLeft: -KEY_STEP, ArrowRight: KEY_STEP }[event.key];
+      if (!step) return;
+      this.split = Math.min(Math.max(this.split + step, 0), 100);
+      event.preventDefault();
+    },
+    report(eye, x, y) {
+      this.point = { eye, x, y };
+      if (this.reporting) return;
+      this.reporting = setTimeout(() => {
+        this.reporting = null;
+        this.$emit("point", this.point);
+      }, POINT_MS);
+    },
+  },
+};
