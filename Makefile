@@ -9,10 +9,10 @@ USUAL := -m "not clock and not slow and not gpu"
 ALONE := -m "clock and not slow and not gpu"
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
-BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip
+BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf build layers render live follow field occlusion sequence cost peers switch headset host abuse overload devices restart batch roundtrip web
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-training test-examples test-batch-ray test-headset validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-witness
+.PHONY: demo test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-web setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -35,7 +35,10 @@ test-headset:  ## `ocufilter headset` against a real OpenXR runtime, in a root o
 	@sh tests/headset/setup_root.sh
 	sh tests/headset/run_in_root.sh python -m pytest tests/headset $(ARGS)
 
-validate: setup-test  ## the slow tests, and every benchmark table as JSON
+test-web: setup-web  ## `ocufilter web` in a real browser (Chromium, headless)
+	$(PYTHON) -m pytest tests/web $(ARGS)
+
+validate: setup-test setup-web  ## the slow tests, and every benchmark table as JSON
 	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)
 	mkdir -p $(RESULTS) out
 	for bench in $(BENCHES); do \
@@ -90,6 +93,9 @@ setup-batch-ray:
 
 setup-examples:
 	@sh setup.sh examples
+
+setup-web:
+	@sh setup.sh web
 
 setup-witness:
 	@sh setup.sh witness

@@ -20,6 +20,7 @@ Importing this loads nothing but names.
     socket_floor     and its bytes alone
     scenes/          two scenes, a letter chart
     report/          `ocufilter report`
+    web/             a page in a browser
     figures/         figures of an eye, for reports and pages
 """
 

@@ -21,6 +21,7 @@ from filter_service.commands.programs import (
     headset,
     paper,
     report,
+    web,
 )
 from filter_service.commands.psf import psf
 from filter_service.commands.serve import serve
@@ -54,7 +55,7 @@ app.command()(psf)
 app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )(bench)
-for program in (headset, batch, report):
+for program in (headset, web, batch, report):
     app.command(
         context_settings={
             "allow_extra_args": True,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from clients.scenes.letter_chart import letter_chart
 from clients.web.picture import Picture, camera_of, picture_of
 
@@ -10,12 +12,10 @@ ROWS = tuple(round(0.8 - 0.1 * k, 1) for k in range(10))
 
 WIDTH_DEG = 9.6
 SIZE_PX = (960, 540)
-FAR_M = 1e6
-"""Beyond what any eye tells from infinity."""
 
 
 def chart_picture(distance_dpt: float) -> Picture:
     """Return a chart that is as large by angle at every distance."""
     camera = camera_of(WIDTH_DEG, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
-    chart = letter_chart(camera, distance_m=FAR_M, log_mar=ROWS)
+    chart = letter_chart(camera, distance_m=math.inf, log_mar=ROWS)
     return picture_of("Letter chart", chart.view, distance_dpt=0.0).at(distance_dpt)

@@ -56,9 +56,7 @@ def _wavefront_figure(
     study: EyeStudy, pupil_diameter_mm: float, focus_dpt: float
 ) -> Figure:
     """Return the wavefront in this pupil, of the distance that the eye looks at."""
-    seen = study.wavefront(
-        pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt
-    )
+    seen = study.wavefront(pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt)
     figure = Figure(
         figsize=(95.0 / MM_PER_INCH, 75.0 / MM_PER_INCH), layout="constrained"
     )

@@ -21,9 +21,7 @@ SIDES: dict[EyeSide, str] = {"OD": "Right eye", "OS": "Left eye"}
 PROFILE_SUFFIXES = (".json", ".csv", ".abp")
 MAX_PROFILE_BYTES = 2_000_000
 
-SPHERE = NumberField(
-    "sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True
-)
+SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
 CYLINDER = NumberField(
     "cylinder_dpt", "Cylinder", "dpt", -15.0, 15.0, 0.25, is_signed=True
 )
@@ -100,9 +98,7 @@ class EyeForm:
             return {"kind": "preset", "name": self.preset}
         if self.source == "file":
             if self.file_body is None:
-                raise ValueError(
-                    f"No file yet; allowed: {', '.join(PROFILE_SUFFIXES)}"
-                )
+                raise ValueError(f"No file yet; allowed: {', '.join(PROFILE_SUFFIXES)}")
             return dict(self.file_body)
         return {
             "kind": "prescription",

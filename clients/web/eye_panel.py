@@ -125,8 +125,10 @@ class EyePanel:
         ).props(f'accept="{",".join(PROFILE_SUFFIXES)}" flat bordered').classes(
             "oc-upload oc-wide"
         ).mark("profile-file")
-        text = f"In use: {self.form.file_name}" if self.form.file_name else (
-            f"A profile: {', '.join(PROFILE_SUFFIXES)}"
+        text = (
+            f"In use: {self.form.file_name}"
+            if self.form.file_name
+            else (f"A profile: {', '.join(PROFILE_SUFFIXES)}")
         )
         ui.label(text).classes("oc-hint")
 

@@ -15,7 +15,7 @@ from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
 from clients.web.wishes import Kind, Seen, Wish
-from filter_service import EyeFilter, FilterError, FilterSettings, Filtered, RgbdView
+from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, RgbdView
 
 MS_PER_S = 1e3
 FOCUS_RANGE_DPT = (0.0, 8.0)

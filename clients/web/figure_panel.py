@@ -45,9 +45,9 @@ class FigurePanel:
             )
         with ui.element("section").classes("oc-card"):
             self._title = ui.label("").classes("oc-title")
-            ui.toggle(
-                FIGURE_TITLES, value=self._figure, on_change=self._choose
-            ).props("no-caps unelevated spread dense").classes("oc-toggle")
+            ui.toggle(FIGURE_TITLES, value=self._figure, on_change=self._choose).props(
+                "no-caps unelevated spread dense"
+            ).classes("oc-toggle")
             self._image = ui.html("", sanitize=False).classes("oc-figure")
 
     async def point(self, side: EyeSide, x: float, y: float) -> None:

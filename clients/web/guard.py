@@ -87,7 +87,7 @@ class Guard:
 def is_from_here(scope: Scope) -> bool:
     """Return whether a request comes from our own page, or from no page at all.
 
-    A page of another port of the same machine brings our cookie along; its origin tells.
+    A page of another port of this machine brings our cookie along; its origin tells.
     """
     origin = _header(scope, b"origin")
     return not origin or urlsplit(origin).netloc == _header(scope, b"host")
@@ -99,7 +99,10 @@ def _header(scope: Scope, name: bytes) -> str:
 
 
 async def _answer(
-    send: Send, status: int, body: bytes, headers: list[tuple[bytes, bytes]] | None = None
+    send: Send,
+    status: int,
+    body: bytes,
+    headers: list[tuple[bytes, bytes]] | None = None,
 ) -> None:
     common = [
         (b"content-type", b"text/html; charset=utf-8"),

@@ -35,6 +35,9 @@ FIRST_ASPECT = 960 / 540
 PICTURES_PATH = "/pictures/"
 
 
+NamedProfile = tuple[Mapping[str, Any], str]
+
+
 class Desk:
     """What all pages of a process share."""
 
@@ -57,7 +60,7 @@ class Page:
     profile : what both eyes are at first, and its name
     """
 
-    def __init__(self, desk: Desk, profile: tuple[Mapping[str, Any], str] | None) -> None:
+    def __init__(self, desk: Desk, profile: NamedProfile | None) -> None:
         self.desk = desk
         self.name = secrets.token_urlsafe(16)
         self.state = PageState()
@@ -147,7 +150,9 @@ class Page:
                         self.state.eyes[side], self.wish, self._take_age
                     )
                 box.bind_visibility_from(
-                    self.state, "shown", lambda shown, side=side: shown in (side, "both")
+                    self.state,
+                    "shown",
+                    lambda shown, side=side: shown in (side, "both"),
                 )
             self._problem = ui.label("").classes("oc-problem")
 
@@ -254,7 +259,7 @@ def _sentence(note: str) -> str:
     return note[:1].upper() + note[1:].rstrip(".") + "."
 
 
-def add_page(desk: Desk, profile: tuple[Mapping[str, Any], str] | None) -> None:
+def add_page(desk: Desk, profile: NamedProfile | None) -> None:
     """Serve the page at `/`."""
 
     @ui.page("/", title="ocufilter")

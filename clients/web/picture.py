@@ -146,9 +146,7 @@ def srgb8_from_linear(light: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def _flat(view: RgbdView, distance_dpt: float) -> RgbdView:
     distance_m = np.inf if distance_dpt <= 0.0 else 1.0 / distance_dpt
-    return replace(
-        view, depth_m=np.full(view.color.shape[:2], distance_m, np.float32)
-    )
+    return replace(view, depth_m=np.full(view.color.shape[:2], distance_m, np.float32))
 
 
 def photo_picture(

@@ -12,8 +12,8 @@ from clients.web.wishes import Seen
 class PicturesOut:
     """What one page has yet to be sent; for the event loop's thread.
 
-    A picture that was not sent yet is dropped for a newer one of the same place, so that
-    a slow connection is late by one picture and not by many.
+    A picture that was not sent yet is dropped for a newer one of the same place: a slow
+    connection is late by one picture and not by many.
     """
 
     def __init__(self) -> None:

@@ -149,7 +149,9 @@ def half_light_px(kernel: NDArray[np.float64]) -> float:
 def _picture(light: NDArray[np.float64], side_arcmin: float) -> NDArray[np.uint8]:
     """Return light (n, n, 3), 0 to 1, enlarged, with a scale."""
     shown = np.round(255.0 * np.clip(light, 0.0, 1.0) ** GAMMA).astype(np.uint8)
-    image = Image.fromarray(shown).resize((SHOWN_PX, SHOWN_PX), Image.Resampling.BICUBIC)
+    image = Image.fromarray(shown).resize(
+        (SHOWN_PX, SHOWN_PX), Image.Resampling.BICUBIC
+    )
     length = max(a for a in NICE_ARCMIN if a <= 0.4 * side_arcmin)
     draw = ImageDraw.Draw(image)
     length_px, edge, low = length / side_arcmin * SHOWN_PX, 24, SHOWN_PX - 28

@@ -24,6 +24,7 @@ from clients.extra import WEB_INSTALL
 DEFAULT_PORT = 8765
 TOKEN_BYTES = 24
 
+
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line."""
     parser = argparse.ArgumentParser(
@@ -97,7 +98,9 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 def address_of(host: str, port: int, token: str) -> str:
     """Return the address to open."""
-    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(
+        host, host
+    )
     if ":" in shown:
         shown = f"[{shown}]"
     return f"http://{shown}:{port}/?token={token}"

@@ -54,7 +54,9 @@ class ScenePanel:
                 self._upload("glTF 2 scene", ",".join(GLTF_SUFFIXES), self._take_gltf)
                 return
             self._upload("Photo", "image/*", self._take_photo)
-            self._upload("Its depth, if known", ".npy,.png,.tif,.tiff,.exr", self._take_depth)
+            self._upload(
+                "Its depth, if known", ".npy,.png,.tif,.tiff,.exr", self._take_depth
+            )
             with ui.element("div").classes("oc-photo-width"):
                 ui.select(
                     PHOTO_WIDTHS_DEG, value=self._width_deg, on_change=self._set_width

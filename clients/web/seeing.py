@@ -67,7 +67,7 @@ class _Page:
         return POLL_S if waits else None
 
     def _next_wish(self, now_s: float) -> Wish | None:
-        """Return the wish in hand until its small pictures are seen, then the newest."""
+        """Return that in hand until its small pictures are seen, then the newest."""
         is_new = self.in_hand is not self.newest
         if is_new and (self._is_previewed() or now_s > self.begun_s + STALE_S):
             self.in_hand, self.begun_s = self.newest, now_s

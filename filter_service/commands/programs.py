@@ -1,6 +1,6 @@
 """`ocufilter demo`, `bench` and others: programs of clients and tests, started.
 
-The service never imports its clients or tests; it can only start them.
+They are started: the service never imports its clients or tests.
 """
 
 import importlib.util
@@ -52,6 +52,7 @@ class Bench(StrEnum):
     RESTART = "restart"
     BATCH = "batch"
     ROUNDTRIP = "roundtrip"
+    WEB = "web"
 
 
 BENCH_MODULES = {
@@ -85,6 +86,7 @@ BENCH_MODULES = {
     Bench.RESTART: "tests.benchmarks.bench_restart",
     Bench.BATCH: "tests.benchmarks.bench_batch",
     Bench.ROUNDTRIP: "clients.latency",
+    Bench.WEB: "tests.benchmarks.bench_web",
 }
 
 
@@ -143,6 +145,16 @@ def batch(context: typer.Context) -> None:
     ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
     """
     _become("clients.batch.program", context.args)
+
+
+def web(context: typer.Context) -> None:
+    """Show a page in a browser: an eye's entries, sliders, before and after.
+
+    Its options: `ocufilter web --help`.
+
+    ocufilter web --profile myopia
+    """
+    _become("clients.web.program", context.args)
 
 
 def _become(program: str, arguments: list[str]) -> None:

@@ -113,6 +113,10 @@ HOME = {
         "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else
     ),
+    "nicegui": ("clients/web/*",),
+    "fastapi": ("clients/web/*",),
+    "uvicorn": ("clients/web/server.py",),
+    "playwright": ("tests/web/*",),  # drives a browser
     "prometheus_client": ("filter_service/service/metrics.py",),
     "lz4": ("filter_service/wire/compression.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),

@@ -86,7 +86,14 @@ def test_every_public_make_target_is_phony_and_explained():
     assert _make_targets() == phony
     explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
     wanted = {"demo", "test", "test-training", "test-headset", "validate", "witness"}
-    wanted |= {"check", "gpu-kit", "gl-witness", "test-batch-ray", "test-examples"}
+    wanted |= {
+        "check",
+        "gpu-kit",
+        "gl-witness",
+        "test-batch-ray",
+        "test-examples",
+        "test-web",
+    }
     assert wanted | {"clean", "help"} == explained
 
 

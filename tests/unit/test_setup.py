@@ -28,7 +28,7 @@ def _required() -> list[str]:
     project = tomllib.loads(text)["project"]
     extras = project["optional-dependencies"]
     listed = [*project["dependencies"], *extras["clients"], *extras["dev"]]
-    listed += extras["peers"]
+    listed += [*extras["peers"], *extras["web"], *extras["web-test"]]
     return [re.match(r"[\w.-]+", requirement)[0] for requirement in listed]
 
 
@@ -58,6 +58,7 @@ def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
     setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
     first = re.search(r'^COMPILER_PACKAGES="(.*)"$', setup, re.MULTILINE)[1].split()
     brought_along = {"llvmlite", "glcontext", "typing_extensions"}  # by the others
+    brought_along.add("yaml")  # optional to numba; the extra `web` brings it
     ran = subprocess.run(
         [sys.executable, "-c", IMPORTED_TO_COMPILE],
         cwd=ROOT,

@@ -1,0 +1,109 @@
+"""The thread behind the page: small picture, then full; the newest wish wins."""
+
+import io
+import json
+import queue
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients.web.seeing import Seeing
+from clients.web.wishes import Wish
+from filter_service import EyeFilter, FilterSettings
+from tests.unit.web_parts import a_picture
+
+WAIT_S = 60.0
+
+
+class Screen:
+    """What a page was shown, in order."""
+
+    def __init__(self):
+        self.seen = queue.Queue()
+
+    def until(self, kind, number, eye="OD"):
+        """Return what was shown up to there."""
+        shown = []
+        while True:
+            shown.append(self.seen.get(timeout=WAIT_S))
+            last = shown[-1]
+            if (last.kind, last.number, last.eye) == (kind, number, eye):
+                return shown
+
+
+@pytest.fixture(scope="module")
+def seeing():
+    seeing = Seeing()
+    yield seeing
+    seeing.close()
+
+
+@pytest.fixture
+def screen(seeing):
+    screen = Screen()
+    seeing.open("page", screen.seen.put)
+    yield screen
+    seeing.forget("page")
+
+
+def wish(number, sphere_dpt=-3.0, eyes=("OD",), pupil_mm=4.0, picture=None):
+    bodies = {
+        eye: {"kind": "prescription", "sphere_dpt": sphere_dpt, "eye_side": eye}
+        for eye in eyes
+    }
+    picture = picture or a_picture()
+    return Wish(number, picture, bodies, pupil_mm, 0.0, (0.0, 0.0))
+
+
+def pixels(seen):
+    return np.asarray(Image.open(io.BytesIO(seen.data)).convert("RGB"))
+
+
+def test_small_then_full_and_the_full_one_is_the_filters_own(seeing, screen):
+    seeing.wish("page", wish(1))
+    preview, full = screen.until("full", 1)
+    assert preview.kind == "preview"
+    view = wish(1).picture.view
+    settings = FilterSettings(focus_range_dpt=(0.0, 8.0))
+    with EyeFilter(wish(1).bodies["OD"], view.camera, settings) as other:
+        other.wait()
+        expected = other.filter([view], pupil_diameter_mm=4.0, focus_dpt=0.0)
+    difference = np.abs(pixels(full).astype(int) - expected.color)
+    assert difference.max() <= 1
+    assert np.abs(pixels(full).astype(int) - view.color).max() > 60
+
+
+def test_of_wishes_that_wait_the_newest_is_seen(seeing, screen):
+    for number in range(1, 41):
+        seeing.wish("page", wish(number, sphere_dpt=-number / 8.0))
+    shown = screen.until("full", 40)
+    assert [seen.number for seen in shown if seen.kind == "full"] == [40]
+    assert len(shown) < 40  # most were never begun
+
+
+def test_both_eyes_are_seen_each_through_its_own(seeing, screen):
+    both = wish(1, eyes=("OD", "OS"))
+    both.bodies["OS"]["sphere_dpt"] = 0.0
+    seeing.wish("page", both)
+    shown = screen.until("full", 1, "OS")
+    full = {seen.eye: pixels(seen) for seen in shown if seen.kind == "full"}
+    assert full["OD"].std() < 0.8 * full["OS"].std()
+
+
+def test_a_header_and_a_file_travel_together(seeing, screen):
+    seeing.wish("page", wish(1))
+    data = screen.until("preview", 1)[-1].packed()
+    (length,) = struct.unpack_from("<I", data)
+    header = json.loads(data[4 : 4 + length])
+    assert (header["kind"], header["eye"], header["number"]) == ("preview", "OD", 1)
+    assert Image.open(io.BytesIO(data[4 + length :])).size == (60, 40)
+
+
+def test_what_cannot_be_seen_is_told_and_the_next_is_seen(seeing, screen):
+    seeing.wish("page", wish(1, pupil_mm=40.0))
+    (failed, *_) = screen.until("failed", 1)
+    assert "pupil_diameter_mm: it is 40.0" in failed.facts["error"]
+    seeing.wish("page", wish(2))
+    screen.until("full", 2)

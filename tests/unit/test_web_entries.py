@@ -1,0 +1,136 @@
+"""What is typed on the page becomes a profile, or an explanation."""
+
+import json
+
+import pytest
+
+from clients.web.eye_form import AXIS, SPHERE, EyeForm, preset_titles
+from clients.web.numbers import distance_text
+from clients.web.page_state import AGE, FOCUS, PageState
+from estimator import parse_profile, preset_names
+from tests.unit.web_parts import a_picture
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("-2,5", -2.5), (" +1.25 ", 1.25), ("−6", -6.0), ("0", 0.0)]
+)
+def test_numbers_are_read_as_people_write_them(text, value):
+    assert SPHERE.read(text) == value
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "said"),
+    [
+        (SPHERE, "abc", "“abc” is not a number; allowed: −30 to 30 dpt"),
+        (SPHERE, "-31", "-31 is out of range; allowed: −30 to 30 dpt"),
+        (SPHERE, "nan", "“nan” is not a number; allowed: −30 to 30 dpt"),
+        (SPHERE, "", "Sphere is empty; allowed: −30 to 30 dpt"),
+        (AXIS, "181", "181 is out of range; allowed: 0 to 180°"),
+    ],
+)
+def test_a_wrong_entry_is_told_with_what_is_allowed(field, text, said):
+    assert field.problem(text) == said
+
+
+def test_arrow_keys_step_within_what_is_allowed():
+    assert SPHERE.stepped("-2.5", 1) == "-2.25"
+    assert SPHERE.stepped("0", 1) == "+0.25"
+    assert SPHERE.stepped("30", 1) == "+30.00"
+    assert SPHERE.stepped("abc", 1) == "abc"
+
+
+def test_a_distance_is_told_as_people_say_it():
+    assert distance_text(0.0) == "0 dpt · far away"
+    assert distance_text(4.0) == "4.00 dpt · 25 cm"
+    assert distance_text(0.25) == "0.25 dpt · 4.0 m"
+
+
+def test_the_entries_become_a_profile_with_what_is_worn():
+    form = EyeForm("OS", has_higher_order=False)
+    form.texts.update(sphere_dpt="-6", cylinder_dpt="-3", axis_deg="102")
+    form.correct_fully()
+    body = form.body(age_years=40.0)
+    worn = {
+        "sphere_dpt": -6.0,
+        "cylinder_dpt": -3.0,
+        "axis_deg": 102.0,
+        "vertex_mm": 12.0,
+    }
+    assert body == {
+        "kind": "prescription",
+        "higher_order": "none",
+        "age_years": 40.0,
+        "eye_side": "OS",
+        **worn,
+        "correction": worn,
+    }
+
+
+def test_a_wrong_worn_entry_is_told_as_such():
+    form = EyeForm("OD", wears_correction=True)
+    form.worn["axis_deg"] = "200"
+    with pytest.raises(ValueError, match=r"Worn correction: Axis: 200 is out of range"):
+        form.body(age_years=30.0)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_may_be_chosen(name):
+    assert name in preset_titles()
+    form = EyeForm("OS", source="preset", preset=name)
+    assert parse_profile(form.body(age_years=30.0)).eye_side == "OS"
+
+
+def test_a_file_is_taken_as_what_it_is():
+    form = EyeForm("OD")
+    body = {"kind": "prescription", "sphere_dpt": -3, "age_years": 52}
+    assert form.take_file("p.json", json.dumps(body).encode()) == 52
+    assert (form.source, form.texts["sphere_dpt"]) == ("prescription", "-3.00")
+    wave = {
+        "kind": "zernike",
+        "pupil_diameter_mm": 5,
+        "wavelength_nm": 555,
+        "zernike_um": {"2,0": 1.0},
+    }
+    form.take_file("w.json", json.dumps(wave).encode())
+    assert (form.source, form.file_name) == ("file", "w.json")
+    assert form.body(age_years=30.0)["zernike_um"] == {"2,0": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("p.exe", b"", r"“p.exe” is no profile; allowed: .json, .csv, .abp"),
+        ("p.json", b"{", r"not JSON.*allowed: one JSON object"),
+        ("p.json", b'{"kind": "cat"}', r"'kind'.*'cat' is unknown.*prescription"),
+        ("p.csv", b"\xff\xfe\x00", r"is not a text file"),
+    ],
+)
+def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
+    form = EyeForm("OD")
+    with pytest.raises(ValueError, match=said) as refused:
+        form.take_file(name, content)
+    assert form == EyeForm("OD")
+    assert "/ocufilter-" not in str(refused.value)
+
+
+def test_a_wrong_entry_leaves_the_eye_as_it_was_and_the_sliders_alive():
+    state = PageState(picture=a_picture())
+    first = state.wish()
+    state.eyes["OD"].texts["sphere_dpt"] = "abc"
+    state.values[FOCUS.name] = 1.0
+    second = state.wish()
+    assert second.bodies == first.bodies
+    assert (second.focus_dpt, second.number) == (1.0, first.number + 1)
+    (problem,) = state.problems()
+    assert problem.startswith("Right eye: Sphere: “abc” is not a number")
+
+
+def test_both_eyes_are_asked_for_with_the_age_of_the_person():
+    state = PageState(picture=a_picture(), shown="both")
+    state.values[AGE.name] = 61.0
+    bodies = state.wish().bodies
+    assert {side: body["eye_side"] for side, body in bodies.items()} == {
+        "OD": "OD",
+        "OS": "OS",
+    }
+    assert {body["age_years"] for body in bodies.values()} == {61.0}

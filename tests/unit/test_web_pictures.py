@@ -1,0 +1,129 @@
+"""Pictures to look at: photos, depth, the chart, and places in them."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients.web.chart import chart_picture
+from clients.web.picture import coarser, photo_picture, picture_of
+from clients.web.scene_file import gltf_picture
+from filter_service import RgbdView
+from tests.unit.web_parts import a_picture
+
+FLAT = {"width_deg": 40.0, "distance_dpt": 0.5}
+
+
+def _png(color):
+    file = io.BytesIO()
+    Image.fromarray(color).save(file, "png")
+    return file.getvalue()
+
+
+def _npy(values):
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+@pytest.fixture
+def color():
+    return np.random.default_rng(3).integers(0, 256, (40, 64, 3), np.uint8)
+
+
+def test_a_flat_photo_stands_where_it_is_put(color):
+    picture = photo_picture("p.png", _png(color), **FLAT)
+    np.testing.assert_array_equal(picture.view.color, color)
+    assert np.all(picture.view.depth_m == 2.0)
+    assert math.degrees(2 * math.atan(picture.view.tangents[1])) == pytest.approx(40.0)
+    assert np.all(picture.at(0.0).view.depth_m == np.inf)
+    assert np.all(picture.at(4.0).small.depth_m == 0.25)
+
+
+def test_a_photo_with_depth_keeps_it(color):
+    depth_m = np.linspace(0.3, 9.0, 40 * 64).reshape(40, 64).astype(np.float32)
+    picture = photo_picture(
+        "p.png", _png(color), depth=("d.npy", _npy(depth_m)), **FLAT
+    )
+    np.testing.assert_array_equal(picture.view.depth_m, depth_m)
+    assert picture.at(3.0) is picture  # has distances of its own
+
+
+@pytest.mark.parametrize(
+    ("photo", "depth", "said"),
+    [
+        (("p.png", b"no picture"), None, "“p.png” is no picture; allowed: a JPEG"),
+        (None, ("d.npy", b"junk"), "d.npy"),
+        (None, ("d.txt", b"1"), r"allowed.*\.npy"),
+        (
+            None,
+            ("d.npy", "small"),
+            "“d.npy” is 8 × 8 px; allowed: the size of the photo",
+        ),
+    ],
+)
+def test_files_that_are_no_pictures_are_refused_with_what_is_allowed(
+    color, photo, depth, said
+):
+    if depth is not None and depth[1] == "small":
+        depth = (depth[0], _npy(np.ones((8, 8), np.float32)))
+    name, content = photo or ("p.png", _png(color))
+    with pytest.raises(ValueError, match=said) as refused:
+        photo_picture(name, content, depth=depth, **FLAT)
+    assert "/ocufilter-" not in str(refused.value)
+
+
+def test_a_large_photo_is_made_smaller():
+    picture = photo_picture(
+        "p.png", _png(np.full((2000, 3001, 3), 90, np.uint8)), **FLAT
+    )
+    assert picture.view.color.shape == (500, 750, 3)
+    assert picture.small.color.shape == (250, 375, 3)
+    assert np.all(picture.view.color == 90)
+
+
+def test_fewer_pixels_keep_light_nearest_depth_and_directions():
+    color = np.zeros((4, 6, 3), np.uint8)
+    color[:2, :2] = [[[0], [255]], [[255], [0]]]
+    depth_m = np.arange(24, dtype=np.float32).reshape(4, 6)
+    view = coarser(RgbdView(color, depth_m, (-0.3, 0.3, 0.2, -0.2)), 2)
+    assert view.color[0, 0].tolist() == [188] * 3  # half of the light, as sRGB
+    assert view.depth_m.tolist() == [[1, 2, 4], [12, 14, 16]]  # 0 is missing
+    assert view.tangents == pytest.approx((-0.3, 0.3, 0.2, -0.2))
+
+
+def test_a_place_has_a_direction_for_the_eye_that_looks():
+    picture = a_picture()
+    right = picture.view.tangents[1]
+    middle = picture.place(0.5, 0.5)
+    assert middle.direction_deg((0.0, 0.0)) == pytest.approx((0.0, 0.0))
+    edge = picture.place(1.0, 0.5)
+    assert edge.direction_deg((0.0, 0.0))[0] == pytest.approx(
+        math.degrees(math.atan(right))
+    )
+    # an eye that looks there has it in the middle of its field
+    top = picture.place(0.8, 0.1)
+    h_deg, v_deg = top.direction_deg((0.0, 0.0))
+    assert top.direction_deg((h_deg, v_deg)) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert middle.distance_dpt == pytest.approx(0.5)
+
+
+def test_the_chart_is_as_large_at_every_distance():
+    near, far = chart_picture(4.0), chart_picture(0.0)
+    np.testing.assert_array_equal(near.view.color, far.view.color)
+    assert np.all(near.view.depth_m == 0.25) and np.all(far.view.depth_m == np.inf)
+    assert near.view.color.min() == 0 and near.view.color.max() == 255
+
+
+def test_a_scene_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match=r"“s.obj” is no scene; allowed: .glb, .gltf"):
+        gltf_picture("s.obj", b"")
+
+
+def test_the_small_picture_is_small_enough():
+    view = RgbdView(
+        np.zeros((50, 961, 3), np.uint8), np.ones((50, 961), np.float32), (-1, 1, 1, -1)
+    )
+    assert picture_of("x", view).small.width_px == 320

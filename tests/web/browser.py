@@ -1,0 +1,92 @@
+"""How tests and the benchmark see the page: what is drawn, and what is entered."""
+
+import io
+import shutil
+
+import numpy as np
+from PIL import Image
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+WAIT_MS = 90_000
+DRAWN = "window.ocufilter?.drawn ?? []"
+
+
+def open_browser(playwright):
+    """Start Chromium of the system."""
+    path = next(filter(None, map(shutil.which, BROWSERS)))
+    # as root there is no sandbox; what is opened is our own page
+    return playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+
+
+class PageUnderTest:
+    """The page, as a person sees it."""
+
+    def __init__(self, page) -> None:
+        self.page = page
+        self.errors = []
+        page.set_default_timeout(WAIT_MS)
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+
+    def open(self, address, scene="Primitives") -> None:
+        """Open it and wait for the first full picture."""
+        self.page.goto(address)
+        if scene is not None:
+            self.choose(scene)
+        self.settle()
+
+    def choose(self, text) -> None:
+        """Press what bears a text."""
+        self.page.get_by_role("button", name=text, exact=True).first.click()
+
+    def drawn(self):
+        """Return what was drawn, in order."""
+        return self.page.evaluate(DRAWN)
+
+    def number(self) -> int:
+        """Return the number of the newest wish that was drawn."""
+        return max((entry["number"] for entry in self.drawn()), default=0)
+
+    def settle(self, after: int = 0, eye: str = "OD"):
+        """Wait for a full picture of a newer wish; return what was told of it.
+
+        Newest: no preview of a later wish came before it.
+        """
+        wanted = f"""({DRAWN}).filter(d => d.eye === '{eye}').at(-1)"""
+        self.page.wait_for_function(
+            f"(() => {{ const last = {wanted}; return last && last.kind === 'full' "
+            f"&& last.number > {after}; }})()",
+            timeout=WAIT_MS,
+        )
+        return self.page.evaluate(wanted)
+
+    def seen(self, eye: str = "OD", layer: str = "after"):
+        """Return the pixels that are drawn for an eye, (h, w, 3)."""
+        data = self.page.evaluate(
+            """([eye, layer]) => {
+              const canvas = document.querySelector(
+                `.oc-view[data-eye=${eye}] .oc-${layer}`);
+              return canvas.toDataURL("image/png").split(",")[1];
+            }""",
+            [eye, layer],
+        )
+        return pixels_of(data)
+
+    def entry(self, name, index=0):
+        """Return the entry of a number."""
+        return self.page.locator(f"input[data-name={name}]").nth(index)
+
+    def slider(self, name, index=0):
+        """Return the part of a slider that takes keys."""
+        return self.page.locator(f".q-slider[data-name={name}]").nth(index)
+
+    def box(self, eye: str = "OD"):
+        """Return where the pictures of an eye are."""
+        return self.page.locator(f".oc-view[data-eye={eye}]").bounding_box()
+
+
+def pixels_of(base64_png):
+    """Return the picture in a text."""
+    import base64
+
+    image = Image.open(io.BytesIO(base64.b64decode(base64_png)))
+    return np.asarray(image.convert("RGB"))

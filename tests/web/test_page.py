@@ -1,0 +1,222 @@
+"""The page in a browser: entries, pictures, split, both eyes, files."""
+
+import io
+import json
+import re
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from estimator import parse_profile
+
+
+def _change(first, second):
+    return np.abs(first.astype(int) - second.astype(int)).mean()
+
+
+def _detail(picture):
+    return np.abs(np.diff(picture.astype(int), axis=1)).mean()
+
+
+def test_another_prescription_changes_the_picture(page):
+    before, scene = page.seen(), page.seen(layer="before")
+    assert before.shape == scene.shape == (540, 960, 3)
+    number = page.number()
+    page.entry("sphere_dpt").fill("-5")
+    told = page.settle(after=number)
+    after = page.seen()
+    assert _change(before, after) > 2.0
+    assert _detail(after) < 0.8 * _detail(before)
+    kinds = [entry["kind"] for entry in page.drawn() if entry["number"] > number]
+    assert kinds[0] == "preview" and kinds[-1] == "full"
+    assert told["width_px"] == 960
+    np.testing.assert_array_equal(page.seen(layer="before"), scene)
+
+
+def test_a_slider_moves_the_picture_and_its_words(page):
+    before, number = page.seen(), page.number()
+    thumb = page.slider("pupil_diameter_mm").locator("[tabindex='0']")
+    thumb.focus()
+    for _ in range(20):
+        thumb.press("ArrowRight")
+    told = page.settle(after=number)
+    shown = page.page.locator(".oc-slider", has_text="Pupil").inner_text()
+    assert f"{told['pupil_diameter_mm']:.1f} mm" in shown
+    assert _change(before, page.seen()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("abc", "“abc” is not a number; allowed: −30 to 30 dpt"),
+        ("-99", "-99 is out of range; allowed: −30 to 30 dpt"),
+    ],
+)
+def test_a_wrong_entry_is_explained_and_the_eye_stays(page, text, said):
+    before = page.seen()
+    page.entry("sphere_dpt").fill(text)
+    page.page.get_by_text(said, exact=True).wait_for()
+    page.page.wait_for_timeout(500)
+    np.testing.assert_array_equal(page.seen(), before)
+    number = page.number()
+    page.entry("sphere_dpt").fill("-1")
+    page.settle(after=number)
+    assert page.page.get_by_text(said).count() == 0
+
+
+def test_the_split_is_dragged(page):
+    box = page.box()
+    middle_y = box["y"] + box["height"] / 2
+    page.page.mouse.move(box["x"] + box["width"] / 2, middle_y)
+    page.page.mouse.down()
+    page.page.mouse.move(box["x"] + 0.2 * box["width"], middle_y, steps=8)
+    page.page.mouse.up()
+    assert page.page.evaluate("window.ocufilter.split()") == pytest.approx(20, abs=0.5)
+    shot = _shot(page)
+    columns = shot.shape[1]
+    scene, seen = (_fitted(page.seen(layer=la), shot) for la in ("before", "after"))
+    for part, shown, other in (
+        (slice(int(0.02 * columns), int(0.16 * columns)), scene, seen),
+        (slice(int(0.3 * columns), int(0.8 * columns)), seen, scene),
+    ):
+        rows = slice(60, -50)  # between the labels
+        is_shown = _change(shot[rows, part], shown[rows, part])
+        assert is_shown < _change(shot[rows, part], other[rows, part])
+
+
+def _shot(page):
+    png = page.page.locator(".oc-view").first.screenshot()
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def _fitted(picture, like):
+    size = (like.shape[1], like.shape[0])
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR))
+
+
+def test_both_eyes_are_seen_each_with_its_own_entries(page):
+    number = page.number()
+    page.choose("Both")
+    page.settle(after=number, eye="OS")
+    page.entry("sphere_dpt", 1).fill("-6")
+    page.settle(after=page.number(), eye="OS")
+    right, left = page.seen("OD"), page.seen("OS")
+    assert _detail(left) < 0.8 * _detail(right)
+
+
+def test_a_click_focuses_on_what_is_there(page):
+    box, number = page.box(), page.number()
+    page.page.mouse.click(
+        box["x"] + 0.75 * box["width"], box["y"] + 0.3 * box["height"]
+    )
+    told = page.settle(after=number)
+    assert told["wanted_focus_dpt"] != pytest.approx(4.17, abs=0.05)
+
+
+def test_the_point_under_the_pointer_is_drawn(page):
+    box = page.box()
+    page.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.5 * box["height"])
+    page.page.get_by_text(re.compile(r"Half of its light lies within")).wait_for()
+    png = page.page.locator(".oc-psf img").get_attribute("src")
+    assert png.startswith("data:image/png;base64,")
+
+
+@pytest.mark.parametrize("name", ["Field", "Section", "Wavefront"])
+def test_figures_are_drawn(page, name):
+    page.choose(name)
+    page.page.locator(f".oc-figure img[alt={name}]").wait_for()
+
+
+def test_picture_and_profile_are_downloaded(page):
+    page.entry("cylinder_dpt").fill("-1.25")
+    page.settle(after=page.number())
+    with page.page.expect_download() as download:
+        page.choose("Picture")
+    with Image.open(download.value.path()) as image:
+        np.testing.assert_array_equal(np.asarray(image.convert("RGB")), page.seen())
+    with page.page.expect_download() as download:
+        page.choose("Profile")
+    assert download.value.suggested_filename == "ocufilter_OD.json"
+    with open(download.value.path(), encoding="utf-8") as file:
+        body = json.load(file)
+    assert parse_profile(body).eye_side == "OD"
+    assert body["cylinder_dpt"] == -1.25
+
+
+def test_a_profile_file_is_taken_and_a_wrong_one_explained(page):
+    page.choose("File")
+    upload = page.page.locator(".oc-eye input[type=file]").first
+    upload.set_input_files(
+        {"name": "p.json", "mimeType": "application/json", "buffer": b'{"kind": "x"}'}
+    )
+    page.page.get_by_text(re.compile("'x' is unknown; allowed")).wait_for()
+    number = page.number()
+    body = json.dumps({"kind": "preset", "name": "keratoconus", "age_years": 44})
+    upload.set_input_files(
+        {"name": "p.json", "mimeType": "application/json", "buffer": body.encode()}
+    )
+    page.settle(after=number)
+    assert "44 years" in page.page.locator(".oc-slider", has_text="Age").inner_text()
+    page.page.get_by_text("Keratoconus").wait_for()
+
+
+def test_a_photo_of_ones_own_is_looked_at(page):
+    rows, columns = np.indices((120, 160))
+    color = np.stack([rows, columns, rows + columns], -1).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(color).save(file, "png")
+    number = page.number()
+    page.choose("Photo")
+    page.page.locator(".oc-uploads input[type=file]").first.set_input_files(
+        {"name": "own.png", "mimeType": "image/png", "buffer": file.getvalue()}
+    )
+    page.settle(after=number)
+    np.testing.assert_array_equal(page.seen(layer="before"), color)
+
+
+def test_on_a_phone_nothing_is_wider_than_the_screen(page):
+    page.page.set_viewport_size({"width": 390, "height": 844})
+    page.page.wait_for_timeout(300)
+    assert page.page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize("query", ["", "?token=wrong"])
+def test_without_the_token_nobody_comes_in(address, query):
+    root = address.partition("?")[0]
+    for path in ("", "_nicegui/x/y", "pictures/x"):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(root + path + query)
+        assert refused.value.code == 403
+        assert b"This page wants its token" in refused.value.read()
+
+
+def test_a_page_of_another_origin_gets_no_websocket(browser, address):
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(address)
+    root = address.partition("?")[0].replace("http", "ws")
+    try_it = """address => new Promise(done => {
+      const socket = new WebSocket(address);
+      socket.onopen = () => done("open");
+      socket.onclose = event => done("closed");
+    })"""
+    socket = root + "_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+    assert page.evaluate(try_it, socket) == "open"
+    page.goto("data:text/html,<p>another")
+    assert page.evaluate(try_it, socket) == "closed"
+    context.close()
+
+
+def test_two_pages_do_not_disturb_each_other(browser, page, address):
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    other = type(page)(context.new_page())
+    other.open(address)
+    before = page.seen()
+    other.entry("sphere_dpt").fill("-8")
+    other.settle(after=other.number())
+    np.testing.assert_array_equal(page.seen(), before)
+    assert other.errors == []
+    context.close()
