@@ -120,11 +120,9 @@ class EyePanel:
         return entry
 
     def _file(self) -> None:
-        ui.upload(
-            auto_upload=True, max_files=1, on_upload=self._take_file, label="Profile"
-        ).props(f'accept="{",".join(PROFILE_SUFFIXES)}" flat bordered').classes(
-            "oc-upload oc-wide"
-        ).mark("profile-file")
+        ui.upload(auto_upload=True, on_upload=self._take_file, label="Profile").props(
+            f'accept="{",".join(PROFILE_SUFFIXES)}" flat bordered'
+        ).classes("oc-upload oc-wide").mark("profile-file")
         text = (
             f"In use: {self.form.file_name}"
             if self.form.file_name
@@ -182,6 +180,7 @@ class EyePanel:
         self._changed()
 
     async def _take_file(self, event: events.UploadEventArguments) -> None:
+        event.sender.reset()  # ready for another
         content = await event.file.read()
         try:
             age_years = self.form.take_file(event.file.name, content)

@@ -69,7 +69,7 @@ class ScenePanel:
                 ).classes("oc-hint")
 
     def _upload(self, label: str, accept: str, take) -> None:
-        ui.upload(auto_upload=True, max_files=1, label=label, on_upload=take).props(
+        ui.upload(auto_upload=True, label=label, on_upload=take).props(
             f'accept="{accept}" flat bordered'
         ).classes("oc-upload").mark(label)
 
@@ -88,15 +88,15 @@ class ScenePanel:
             await self._show_photo()
 
     async def _take_gltf(self, event: events.UploadEventArguments) -> None:
-        await self._make(gltf_picture, event.file.name, await event.file.read())
+        await self._make(gltf_picture, *await _sent(event))
 
     async def _take_photo(self, event: events.UploadEventArguments) -> None:
-        self._photo = (event.file.name, await event.file.read())
+        self._photo = await _sent(event)
         self._depth = None  # that of another photo
         await self._show_photo()
 
     async def _take_depth(self, event: events.UploadEventArguments) -> None:
-        self._depth = (event.file.name, await event.file.read())
+        self._depth = await _sent(event)
         if self._photo is None:
             ui.notify("Now the photo that this is the depth of", type="info")
             return
@@ -132,3 +132,9 @@ class ScenePanel:
         if picture is not None and kind == self._kind:  # else another was chosen
             self._on_picture(picture)
         return True
+
+
+async def _sent(event: events.UploadEventArguments) -> tuple[str, bytes]:
+    """Return name and content of a file; the entry is ready for another."""
+    event.sender.reset()
+    return event.file.name, await event.file.read()

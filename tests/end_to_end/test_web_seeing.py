@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clients.web.picture import linear_from_srgb8
 from clients.web.seeing import Seeing
 from clients.web.wishes import Wish
 from filter_service import EyeFilter, FilterSettings
@@ -61,6 +62,12 @@ def pixels(seen):
     return np.asarray(Image.open(io.BytesIO(seen.data)).convert("RGB"))
 
 
+def psnr_db(first, second):
+    """Of linear light."""
+    first, second = map(linear_from_srgb8, (first, second))
+    return -10.0 * np.log10(max(np.mean((first - second) ** 2), 1e-12))
+
+
 def test_small_then_full_and_the_full_one_is_the_filters_own(seeing, screen):
     seeing.wish("page", wish(1))
     preview, full = screen.until("full", 1)
@@ -68,11 +75,13 @@ def test_small_then_full_and_the_full_one_is_the_filters_own(seeing, screen):
     view = wish(1).picture.view
     settings = FilterSettings(focus_range_dpt=(0.0, 8.0))
     with EyeFilter(wish(1).bodies["OD"], view.camera, settings) as other:
+        state = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
+        other.filter([view], **state)
         other.wait()
-        expected = other.filter([view], pupil_diameter_mm=4.0, focus_dpt=0.0)
-    difference = np.abs(pixels(full).astype(int) - expected.color)
-    assert difference.max() <= 1
-    assert np.abs(pixels(full).astype(int) - view.color).max() > 60
+        expected = other.filter([view], **state).color
+    print(psnr_db(pixels(full), expected), psnr_db(view.color, expected))
+    assert psnr_db(pixels(full), expected) > 45.0
+    assert psnr_db(view.color, expected) < 25.0
 
 
 def test_of_wishes_that_wait_the_newest_is_seen(seeing, screen):

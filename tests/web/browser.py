@@ -27,11 +27,9 @@ class PageUnderTest:
         page.set_default_timeout(WAIT_MS)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
 
-    def open(self, address, scene="Primitives") -> None:
+    def open(self, address) -> None:
         """Open it and wait for the first full picture."""
         self.page.goto(address)
-        if scene is not None:
-            self.choose(scene)
         self.settle()
 
     def choose(self, text) -> None:

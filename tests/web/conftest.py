@@ -1,4 +1,4 @@
-"""A real browser and a real page: Debian's Chromium without a window, the program."""
+"""A real browser and a real page: Debian's Chromium, and the program."""
 
 import json
 import shutil

@@ -109,11 +109,13 @@ def test_both_eyes_are_seen_each_with_its_own_entries(page):
 
 def test_a_click_focuses_on_what_is_there(page):
     box, number = page.box(), page.number()
+    # the lantern on the table
     page.page.mouse.click(
-        box["x"] + 0.75 * box["width"], box["y"] + 0.3 * box["height"]
+        box["x"] + 0.46 * box["width"], box["y"] + 0.8 * box["height"]
     )
     told = page.settle(after=number)
-    assert told["wanted_focus_dpt"] != pytest.approx(4.17, abs=0.05)
+    assert 0.8 < told["wanted_focus_dpt"] < 3.0
+    assert told["focus_dpt"] == pytest.approx(told["wanted_focus_dpt"], abs=0.05)
 
 
 def test_the_point_under_the_pointer_is_drawn(page):
