@@ -11,6 +11,7 @@ from typing import Any
 
 from nicegui import Client, app, events, ui
 
+from clients.report import report_html
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.eye_panel import EyePanel
 from clients.web.figure_panel import FigurePanel
@@ -25,6 +26,7 @@ from clients.web.seen_view import SeenView
 from clients.web.slider_row import SliderRow
 from clients.web.studying import Studying
 from clients.web.wishes import Seen
+from filter_service import FilterError
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
@@ -102,6 +104,7 @@ class Page:
         for label, tip, act in (
             ("Picture", "What the eye sees, PNG", self._download_picture),
             ("Profile", "The eye's profile, JSON", self._download_profile),
+            ("Report", "What this eye sees and why, HTML", self._download_report),
         ):
             ui.button(label, icon="download", on_click=act).props(
                 "outline dense no-caps size=sm"
@@ -234,6 +237,27 @@ class Page:
             ui.notify("The full picture is not ready yet", type="warning")
         for side in sides:
             ui.download(self._full(side).data, f"ocufilter_{side}.png")
+
+    async def _download_report(self) -> None:
+        for side in self.state.sides:
+            body = self.state.right.get(side)
+            if body is None:
+                continue
+            title = SIDES[side]
+            waiting = ui.notification(
+                f"Writing the report: {title.lower()} …", spinner=True, timeout=None
+            )
+            try:
+                text = await self.desk.studying.ask(
+                    self.name, f"report {side}", report_html, body, label=title
+                )
+            except (ValueError, FilterError) as error:
+                ui.notify(str(error), type="negative")
+                continue
+            finally:
+                waiting.dismiss()
+            if text is not None:
+                ui.download(text.encode(), f"ocufilter_{side}.html")
 
     def _full(self, side: EyeSide) -> Seen | None:
         seen = self.out.last(side)

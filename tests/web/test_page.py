@@ -148,6 +148,15 @@ def test_picture_and_profile_are_downloaded(page):
     assert body["cylinder_dpt"] == -1.25
 
 
+def test_a_report_is_downloaded(page):
+    with page.page.expect_download() as download:
+        page.choose("Report")
+    with open(download.value.path(), encoding="utf-8") as file:
+        text = file.read()
+    assert download.value.suggested_filename == "ocufilter_OD.html"
+    assert "<html" in text and "Right eye" in text and "<svg" in text
+
+
 def test_a_profile_file_is_taken_and_a_wrong_one_explained(page):
     page.choose("File")
     upload = page.page.locator(".oc-eye input[type=file]").first
