@@ -144,19 +144,15 @@ class Page:
                 "no-caps unelevated spread dense"
             ).classes("oc-toggle oc-shown")
             self.panels: dict[EyeSide, EyePanel] = {}
+            self._boxes: dict[EyeSide, tuple[ui.element, ui.label]] = {}
             for side, title in SIDES.items():
                 with ui.element("div").classes("oc-eye-box") as box:
-                    ui.label(title).classes("oc-eye-title").bind_visibility_from(
-                        self.state, "shown", value="both"
-                    )
+                    heading = ui.label(title).classes("oc-eye-title")
                     self.panels[side] = EyePanel(
                         self.state.eyes[side], self.wish, self._take_age
                     )
-                box.bind_visibility_from(
-                    self.state,
-                    "shown",
-                    lambda shown, side=side: shown in (side, "both"),
-                )
+                self._boxes[side] = (box, heading)
+            self._show_boxes()
             self._problem = ui.label("").classes("oc-problem")
 
     # What happens
@@ -199,9 +195,15 @@ class Page:
 
     def _show(self, event: events.ValueChangeEventArguments) -> None:
         self.state.shown = event.value
+        self._show_boxes()
         self.view.show_eyes(list(self.state.sides))
         self._copy.set_visibility(self.state.shown != "both")
         self.wish()
+
+    def _show_boxes(self) -> None:
+        for side, (box, heading) in self._boxes.items():
+            box.set_visibility(side in self.state.sides)
+            heading.set_visibility(self.state.shown == "both")
 
     def _copy_eye(self) -> None:
         side = self.state.sides[0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import signal
 import socket
 import sys
 import threading
@@ -116,6 +117,8 @@ def serve(options: argparse.Namespace) -> int:
 
     address = address_of(options.host, port, token)
     server = make_server(token, port, profile, on_ready=lambda: _tell(address, options))
+    # the server stops by itself, then hands the signal on: to an orderly end
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.run(sockets=[listening])
     return 0
 

@@ -53,6 +53,7 @@ def make_server(
         title="ocufilter",
         favicon="👁",
         tailwind=False,
+        binding_refresh_interval=None,  # nothing is bound
         message_history_length=MESSAGE_HISTORY,
         show_welcome_message=False,
     )

@@ -8,14 +8,24 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 
 def _begin() -> None:
-    """Load what is slow to load, before it is asked for."""
+    """End with the page's process, however that ends; load what is slow to load."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     from clients.web import eye_figures, point_spread  # noqa: F401
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(0)  # in the midst of whatever it draws: nobody waits for it
 
 
 class Studying:
@@ -23,11 +33,11 @@ class Studying:
 
     def __init__(self) -> None:
         self._pool = ProcessPoolExecutor(
-            1, mp_context=multiprocessing.get_context("spawn")
+            1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin
         )
         self._newest: dict[tuple[str, str], int] = {}
         self._turn = asyncio.Lock()
-        self._pool.submit(_begin)
+        self._pool.submit(int)  # starts the process now
 
     async def ask(
         self, page: str, kind: str, function: Callable[..., Any], *args, **options

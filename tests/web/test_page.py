@@ -109,9 +109,9 @@ def test_both_eyes_are_seen_each_with_its_own_entries(page):
 
 def test_a_click_focuses_on_what_is_there(page):
     box, number = page.box(), page.number()
-    # the lantern on the table
+    # the menu on the table
     page.page.mouse.click(
-        box["x"] + 0.46 * box["width"], box["y"] + 0.8 * box["height"]
+        box["x"] + 0.35 * box["width"], box["y"] + 0.84 * box["height"]
     )
     told = page.settle(after=number)
     assert 0.8 < told["wanted_focus_dpt"] < 3.0
