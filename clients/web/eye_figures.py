@@ -12,8 +12,8 @@ from clients.figures import (
     EyeStudy,
     cross_section_figure,
     draw_wavefront_map,
-    field_maps_figure,
 )
+from clients.figures.field_maps import blur_arcmin, draw_field_map
 
 DOTS_PER_INCH = 220
 FIGURE_TITLES = {
@@ -22,6 +22,7 @@ FIGURE_TITLES = {
     "section": "Section",
 }
 MM_PER_INCH = 25.4
+AXIS_PT = 8.0
 
 
 @lru_cache(maxsize=4)
@@ -42,7 +43,7 @@ def eye_figure(
     """
     study = _study(body)
     if name == "field":
-        figure = field_maps_figure(study)
+        figure = _field_figure(study)
     elif name == "section":
         figure = cross_section_figure(study)
     else:
@@ -52,14 +53,36 @@ def eye_figure(
     return file.getvalue()
 
 
+def _field_figure(study: EyeStudy) -> Figure:
+    """Return refraction and blur over the visual field, as the person sees it."""
+    figure = Figure(figsize=_size(90.0, 112.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1)
+    m_dpt = study.field.power_dpt.T[0]
+    draw_field_map(
+        upper,
+        m_dpt,
+        title="Refraction M",
+        label="dpt",
+        middle=float(m_dpt[m_dpt.size // 2]),
+    )
+    blur = blur_arcmin(study)
+    draw_field_map(lower, blur, title="Blur, looking far", label="arcmin, RMS")
+    for axes in (upper, lower):
+        axes.set_ylabel("up, deg", fontsize=AXIS_PT)
+    lower.set_xlabel("right, deg", fontsize=AXIS_PT)
+    return figure
+
+
+def _size(width_mm: float, height_mm: float) -> tuple[float, float]:
+    return width_mm / MM_PER_INCH, height_mm / MM_PER_INCH
+
+
 def _wavefront_figure(
     study: EyeStudy, pupil_diameter_mm: float, focus_dpt: float
 ) -> Figure:
     """Return the wavefront in this pupil, of the distance that the eye looks at."""
     seen = study.wavefront(pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt)
-    figure = Figure(
-        figsize=(95.0 / MM_PER_INCH, 75.0 / MM_PER_INCH), layout="constrained"
-    )
+    figure = Figure(figsize=_size(95.0, 75.0), layout="constrained")
     draw_wavefront_map(
         figure.subplots(),
         seen.zernike_um,

@@ -14,7 +14,7 @@ from clients.web.eye_form import SIDES, EyeSide
 from clients.web.numbers import distance_text
 from clients.web.page_state import FOCUS, PUPIL, PageState
 from clients.web.point_spread import PointState, point_spread
-from clients.web.studying import Studying
+from clients.web.studying import StudyFailed, Studying
 
 
 def data_url(png: bytes) -> str:
@@ -72,7 +72,7 @@ class FigurePanel:
             return await self._studying.ask(
                 self._page, kind, function, *args, **options
             )
-        except ValueError as error:
+        except StudyFailed as error:
             self._told.text = str(error)
             return None
 

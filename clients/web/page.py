@@ -24,9 +24,8 @@ from clients.web.scene_panel import ScenePanel
 from clients.web.seeing import Seeing
 from clients.web.seen_view import SeenView
 from clients.web.slider_row import SliderRow
-from clients.web.studying import Studying
+from clients.web.studying import StudyFailed, Studying
 from clients.web.wishes import Seen
-from filter_service import FilterError
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
@@ -49,7 +48,7 @@ class Desk:
         self.out: dict[str, PicturesOut] = {}
 
     def close(self) -> None:
-        """End the thread and the process."""
+        """End the thread and the process; closing twice is allowed."""
         self.seeing.close()
         self.studying.close()
 
@@ -119,6 +118,7 @@ class Page:
             self.view.on("point", self._point)
             self.view.on("look", self._look)
             self._note = ui.label("").classes("oc-note")
+            self._notes: dict[EyeSide, str] = {}
 
     def _sliders_card(self) -> None:
         values = self.state.values
@@ -197,6 +197,7 @@ class Page:
         self.state.shown = event.value
         self._show_boxes()
         self.view.show_eyes(list(self.state.sides))
+        self._show_notes()
         self._copy.set_visibility(self.state.shown != "both")
         self.wish()
 
@@ -229,7 +230,16 @@ class Page:
         self.out.put(seen)
         if seen.kind in ("full", "failed"):
             notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
-            self._note.text = "  ".join(_sentence(note) for note in notes if note)
+            self._notes[seen.eye] = " ".join(_sentence(note) for note in notes if note)
+            self._show_notes()
+
+    def _show_notes(self) -> None:
+        lines = [(SIDES[side], self._notes.get(side)) for side in self.state.sides]
+        if len(lines) == 1:
+            self._note.text = lines[0][1] or ""
+        else:
+            told = [f"{title}: {text}" for title, text in lines if text]
+            self._note.text = "\n".join(told)
 
     # Downloads
 
@@ -253,7 +263,7 @@ class Page:
                 text = await self.desk.studying.ask(
                     self.name, f"report {side}", report_html, body, label=title
                 )
-            except (ValueError, FilterError) as error:
+            except StudyFailed as error:
                 ui.notify(str(error), type="negative")
                 continue
             finally:

@@ -83,12 +83,15 @@ class PageState:
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
 
     def take_picture(self, picture: Picture) -> None:
-        """Look at another picture, in the state that it suggests."""
+        """Look at another picture; the first is seen in the state that it suggests."""
+        if self.picture is None:
+            for number, value in (
+                (FOCUS, picture.focus_dpt),
+                (PUPIL, picture.pupil_diameter_mm),
+            ):
+                if value is not None:
+                    self.values[number.name] = min(value, number.high)
         self.picture = picture
-        if picture.focus_dpt is not None:
-            self.values[FOCUS.name] = min(picture.focus_dpt, FOCUS.high)
-        if picture.pupil_diameter_mm is not None:
-            self.values[PUPIL.name] = picture.pupil_diameter_mm
         if picture.distance_dpt is not None:
             self.values[DISTANCE.name] = picture.distance_dpt
 

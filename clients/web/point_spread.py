@@ -108,17 +108,30 @@ def _kernels(
     defocus_dpt = defocus_dpt + eye.vergence.vergence_dpt(state.object_dpt)
     waves = eye.wavefronts(**place, total_defocus_dpt=defocus_dpt)
     side_arcmin = _side_arcmin(waves.zernike_um, waves.circle_diameter_mm)
+    pixel_pitch_mrad = side_arcmin / SIDE_PX / ARCMIN_PER_MRAD
     return [
-        compute_psfs(
+        _kernel(
             waves.zernike_um[k : k + 1],
             pupil_diameter_mm=float(waves.circle_diameter_mm[k]),
             pupil_ellipse=waves.pupil_ellipse[k],
             wavelength_nm=wavelength_nm,
-            pixel_pitch_mrad=side_arcmin / SIDE_PX / ARCMIN_PER_MRAD,
+            pixel_pitch_mrad=pixel_pitch_mrad,
             radius_px=SIDE_PX // 2,
-        )[0].kernel
+        )
         for k, wavelength_nm in enumerate(WAVELENGTHS_NM)
     ], side_arcmin
+
+
+def _kernel(zernike_um: NDArray[np.float64], **state) -> NDArray[np.float64]:
+    """Return one PSF, by waves where they can be had.
+
+    A mix of waves and rays shows its seams where light is faint.
+    """
+    try:
+        found = compute_psfs(zernike_um, method="fourier", accuracy="fine", **state)
+    except ValueError:  # too steep for that
+        found = compute_psfs(zernike_um, **state)
+    return found[0].kernel
 
 
 def _side_arcmin(zernike_um: NDArray, diameter_mm: NDArray) -> float:

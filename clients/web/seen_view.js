@@ -51,7 +51,7 @@ export default {
   },
   watch: {
     eyes() {
-      this.$nextTick(() => Object.values(this.latest).forEach((m) => this.draw(m)));
+      this.$nextTick(() => Object.values(this.latest).forEach((m) => this.drawNext(m)));
     },
   },
   methods: {
@@ -76,6 +76,9 @@ export default {
       const message = { header, data: buffer.slice(4 + length) };
       if (header.eye && header.number < this.latest.scene?.header.number) return;
       this.latest[header.eye ?? "scene"] = message;
+      this.drawNext(message);
+    },
+    drawNext(message) {
       this.queue = this.queue.then(() => this.draw(message));
     },
     async draw(message) {
@@ -87,6 +90,7 @@ export default {
         return;
       }
       const bitmap = await createImageBitmap(new Blob([data]));
+      if (this.latest[place] !== message) return bitmap.close();
       const eyes = header.eye ? [header.eye] : this.eyes;
       for (const eye of eyes) {
         const canvas = this.$refs[(header.eye ? "after" : "before") + eye]?.[0];

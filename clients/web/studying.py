@@ -9,35 +9,35 @@ from __future__ import annotations
 import asyncio
 import multiprocessing
 import os
-import threading
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.connection import Connection
 from typing import Any
 
+from filter_service import FilterError
 
-def _begin() -> None:
-    """End with the page's process, however that ends; load what is slow to load."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    from clients.web import eye_figures, point_spread  # noqa: F401
+NICENESS = 10
+"""Pictures go before figures."""
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(0)  # in the midst of whatever it draws: nobody waits for it
+class StudyFailed(Exception):
+    """There is no answer; the text says why."""
 
 
 class Studying:
     """One process; of the questions of one kind and page that wait, the newest wins."""
 
     def __init__(self) -> None:
-        self._pool = ProcessPoolExecutor(
-            1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin
-        )
         self._newest: dict[tuple[str, str], int] = {}
         self._turn = asyncio.Lock()
-        self._pool.submit(int)  # starts the process now
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._line, theirs = context.Pipe()
+        # not a daemon: a report has a worker of its own
+        self._process = context.Process(target=_answer_all, args=(theirs,))
+        self._process.start()
+        theirs.close()
 
     async def ask(
         self, page: str, kind: str, function: Callable[..., Any], *args, **options
@@ -46,8 +46,8 @@ class Studying:
 
         Raises
         ------
-        Exception
-            What the function raised.
+        StudyFailed
+            The function failed, or the process ended.
         """
         key = (page, kind)
         number = self._newest.get(key, 0) + 1
@@ -55,9 +55,20 @@ class Studying:
         async with self._turn:  # asked one by one: what waits can be dropped
             if self._newest.get(key) != number:
                 return None
-            call = _Call(function, args, options)
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._pool, call)
+            return await asyncio.to_thread(self._answer, (function, args, options))
+
+    def _answer(self, question: tuple) -> Any:
+        try:
+            self._line.send(question)
+            answer, failure = self._line.recv()
+        except (EOFError, OSError):
+            self._start()
+            raise StudyFailed(
+                "The process that draws figures ended; it was started again"
+            ) from None
+        if failure is not None:
+            raise StudyFailed(failure)
+        return answer
 
     def forget(self, page: str) -> None:
         """Let go of a page's questions."""
@@ -65,15 +76,29 @@ class Studying:
             del self._newest[key]
 
     def close(self) -> None:
-        """End the process."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the process, in the midst of whatever it draws."""
+        self._process.terminate()
+        self._process.join()
 
 
-class _Call:
-    """A call that travels to the other process."""
+def _answer_all(line: Connection) -> None:
+    """Answer until the page's process is gone."""
+    os.nice(NICENESS)
+    from clients.web import eye_figures, point_spread  # noqa: F401  (loads slowly)
 
-    def __init__(self, function, args, options) -> None:
-        self.function, self.args, self.options = function, args, options
+    while True:
+        try:
+            function, args, options = line.recv()
+            line.send(_answer_to(function, args, options))
+        except (EOFError, OSError):
+            return
 
-    def __call__(self) -> Any:
-        return self.function(*self.args, **self.options)
+
+def _answer_to(function, args, options) -> tuple[Any, str | None]:
+    """Return an answer, or why there is none; some errors do not travel."""
+    try:
+        return function(*args, **options), None
+    except (ValueError, FilterError) as error:
+        return None, str(error)
+    except Exception as error:
+        return None, f"{type(error).__name__}: {error}"

@@ -116,7 +116,7 @@ HOME = {
     "nicegui": ("clients/web/*",),
     "fastapi": ("clients/web/*",),
     "uvicorn": ("clients/web/server.py",),
-    "playwright": ("tests/web/*",),  # drives a browser
+    "playwright": ("tests/web/*", "tests/benchmarks/bench_web.py"),
     "prometheus_client": ("filter_service/service/metrics.py",),
     "lz4": ("filter_service/wire/compression.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),

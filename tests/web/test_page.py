@@ -154,7 +154,7 @@ def test_a_report_is_downloaded(page):
     with open(download.value.path(), encoding="utf-8") as file:
         text = file.read()
     assert download.value.suggested_filename == "ocufilter_OD.html"
-    assert "<html" in text and "Right eye" in text and "<svg" in text
+    assert "<html" in text and "Right eye" in text and "data:image/" in text
 
 
 def test_a_profile_file_is_taken_and_a_wrong_one_explained(page):

@@ -1,0 +1,66 @@
+"""The process that draws figures: answers, failures, and an end."""
+
+import asyncio
+import json
+
+import pytest
+
+from clients.web.eye_figures import eye_figure
+from clients.web.point_spread import PointState, point_spread
+from clients.web.studying import StudyFailed, Studying
+
+MYOPE = json.dumps({"kind": "prescription", "sphere_dpt": -3.0, "eye_side": "OD"})
+PNG = b"\x89PNG"
+
+
+def _of_a_study(questions):
+    """Return what becomes of questions to one process."""
+
+    async def ask():
+        studying = Studying()
+        try:
+            return await questions(studying)
+        finally:
+            studying.close()
+
+    return asyncio.run(ask())
+
+
+def _seen(state, body=MYOPE):
+    return point_spread(body, state)[1]["half_light_arcmin"]
+
+
+def test_answers_failures_and_newer_questions():
+    async def questions(studying):
+        state = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
+        pictures = [
+            await studying.ask("a", "figure", eye_figure, name, MYOPE, **state)
+            for name in ("wavefront", "section")
+        ]
+        with pytest.raises(StudyFailed, match="'cat' is unknown"):
+            await studying.ask("a", "figure", point_spread, '{"kind": "cat"}', None)
+        waiting = [
+            asyncio.create_task(studying.ask("a", "n", divmod, 7 + k, 2))
+            for k in range(3)
+        ]
+        answers = await asyncio.gather(*waiting)
+        studying._process.kill()
+        with pytest.raises(StudyFailed, match="started again"):
+            await studying.ask("a", "n", divmod, 7, 2)
+        return pictures, answers, await studying.ask("a", "n", divmod, 7, 2)
+
+    pictures, answers, last = _of_a_study(questions)
+    assert all(picture.startswith(PNG) for picture in pictures)
+    assert answers == [(3, 1), None, (4, 1)]  # in hand, dropped, the newest
+    assert last == (3, 1)
+
+
+def test_light_of_a_point_spreads_as_rays_have_it():
+    """A disc of pupil times defocus: half of its light within 1 / sqrt(2) of it."""
+    sharp = PointState((0.0, 0.0), 3.0, 4.0, 0.0)
+    blurred = PointState((0.0, 0.0), 1.0, 4.0, 0.0)
+    body = {"kind": "prescription", "sphere_dpt": -3, "higher_order": "none"}
+    plain = json.dumps(body)
+    expected_arcmin = 2.0 * 4.0 / 2.0 / 2.0**0.5 * 3.43775
+    assert _seen(blurred, plain) == pytest.approx(expected_arcmin, rel=0.12)
+    assert _seen(sharp, plain) < 0.25 * _seen(blurred, plain)
