@@ -55,7 +55,7 @@ def eye_figure(
 
 def _field_figure(study: EyeStudy) -> Figure:
     """Return refraction and blur over the visual field, as the person sees it."""
-    figure = Figure(figsize=_size(90.0, 112.0), layout="constrained")
+    figure = Figure(figsize=_size(90.0, 98.0), layout="constrained")
     upper, lower = figure.subplots(2, 1)
     m_dpt = study.field.power_dpt.T[0]
     draw_field_map(
