@@ -29,6 +29,7 @@ class Studying:
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
         self._turn = asyncio.Lock()
+        self._is_over = False
         self._start()
 
     def _start(self) -> None:
@@ -62,7 +63,8 @@ class Studying:
             self._line.send(question)
             answer, failure = self._line.recv()
         except (EOFError, OSError):
-            self._start()
+            if not self._is_over:
+                self._start()
             raise StudyFailed(
                 "The process that draws figures ended; it was started again"
             ) from None
@@ -77,6 +79,7 @@ class Studying:
 
     def close(self) -> None:
         """End the process, in the midst of whatever it draws."""
+        self._is_over = True  # a question in hand starts no other
         self._process.terminate()
         self._process.join()
 
