@@ -43,7 +43,7 @@ STATES = (
     {"sphere_dpt": 0.0},
     {"sphere_dpt": -5.0},
 )
-COUNT = 20
+COUNT = 8
 DRAG_S, DRAG_STEP_S = 2.0, 0.03
 REFERENCE = "tolerance fine, exact rendering"
 
