@@ -6,7 +6,8 @@
 #   sh setup.sh training  the first, and what training the networks needs (torch)
 #   sh setup.sh batch-ray the first, and Ray in an environment of its own
 #   sh setup.sh examples  an environment of its own that has the package and Jupyter
-#   sh setup.sh web     the first, the page's packages, and a browser for its tests
+#   sh setup.sh page    the first, and what `ocufilter web` needs
+#   sh setup.sh web     the same, and a browser for its tests
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
@@ -33,7 +34,7 @@ VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
-WEB_STAMP=$VENV/.ocufilter-web-installed
+PAGE_STAMP=$VENV/.ocufilter-page-installed
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
@@ -148,7 +149,7 @@ install_packages() {
     wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
-    rm -f $STAMP $TRAINING_STAMP $WEB_STAMP
+    rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
     $pip install -c constraints.txt $COMPILER_PACKAGES
@@ -190,16 +191,22 @@ install_ray() { # in an environment of its own that sees the first
         install -c constraints.txt ray
 }
 
-install_web() { # the page, and what drives a browser; make test needs neither
+install_page() { # what `ocufilter web` needs; make test does not
+    if [ "$(cat $PAGE_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
+    say "installing the packages of the page"
+    $VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt --no-build-isolation -e '.[web]'
+    cp $STAMP $PAGE_STAMP
+}
+
+install_browser() { # and what drives it
     missing=$(missing_packages $BROWSER_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
         say "the browser's tests need one:  $(install_command "$missing")"
     fi
-    if [ "$(cat $WEB_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
-    say "installing the packages of the page and of its tests"
-    $VENV/bin/python -m pip -qq --disable-pip-version-check \
-        install -c constraints.txt --no-build-isolation -e '.[web,web-test]'
-    cp $STAMP $WEB_STAMP
+    $VENV/bin/python -c 'import playwright' 2>/dev/null ||
+        $VENV/bin/python -m pip -qq --disable-pip-version-check \
+            install -c constraints.txt playwright
 }
 
 has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer
@@ -249,5 +256,9 @@ if [ "${1:-}" = test ]; then
     install_javascript_client
 fi
 if [ "${1:-}" = batch-ray ]; then install_ray; fi
-if [ "${1:-}" = web ]; then install_web; fi
+if [ "${1:-}" = page ]; then install_page; fi
+if [ "${1:-}" = web ]; then
+    install_page
+    install_browser
+fi
 if [ "${1:-}" = witness ]; then install_witness; fi

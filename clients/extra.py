@@ -13,4 +13,7 @@ def what_to_install(error: ModuleNotFoundError) -> str:
 
 HEADSET_INSTALL = f"{sys.executable} -m pip install pyopenxr"
 
-WEB_INSTALL = f"{sys.executable} -m pip install 'ocufilter[web,clients]'"
+WEB_INSTALL = (
+    "make web, in a checkout, installs what is missing; elsewhere "
+    f"{sys.executable} -m pip install 'ocufilter[web,clients]'"
+)

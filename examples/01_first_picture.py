@@ -6,13 +6,13 @@ Five lines do it: a scene, an eye, a frame.  Distances are in metres, pupils in
 millimetres, focus in dioptres (1 / metres; 0 is far away).
 """
 
-from common import load_courtyard, save_pictures, still
+from common import load_courtyard, save_pictures
 
 from filter_service import EyeFilter
 
 color, depth_m, camera = load_courtyard()
 with EyeFilter("myopia", camera) as eye:
-    seen = still(eye, color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
+    seen = eye.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0, whole=True)
 
 save_pictures(
     "01_first_picture.png",

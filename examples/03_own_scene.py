@@ -8,7 +8,7 @@ A person of 40, who cannot focus quite as near as 25 cm, looks at each card in t
 """
 
 import numpy as np
-from common import font, save_pictures, still
+from common import font, save_pictures
 from PIL import Image, ImageDraw
 
 from filter_service import Camera, EyeFilter
@@ -43,7 +43,7 @@ pictures = [("the scene", color)]
 with EyeFilter(person, camera) as eye:
     for text, (distance_m, _) in CARDS.items():
         state = {"pupil_diameter_mm": 5.0, "focus_dpt": 1.0 / distance_m}
-        seen = still(eye, color, depth_m, **state)
+        seen = eye.filter(color, depth_m, **state, whole=True)
         caption = f"looking at {text}: focused at {1 / seen.focus_dpt:.2g} m"
         pictures.append((caption, seen.color))
 save_pictures("03_own_scene.png", pictures)

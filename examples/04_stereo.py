@@ -10,7 +10,7 @@ Look at the pair with crossed eyes: the brain mostly takes the sharper one.
 import time
 
 import numpy as np
-from common import PREVIEW_S, font, save_pictures
+from common import font, save_pictures
 from PIL import Image, ImageDraw
 
 from filter_service import Camera, EyeFilter, RgbdView, ViewState, plan_views
@@ -60,10 +60,8 @@ filters = {side: EyeFilter(PROFILES[side], camera) for side in sides}
 for eye_filter in filters.values():
     eye_filter.wait()
 is_complete = False
-while (
-    not is_complete
-):  # it shows previews first; "preparing" where there is not even one
-    time.sleep(PREVIEW_S)
+while not is_complete:  # previews come first; "preparing": there is not even one
+    time.sleep(0.05)
     planned = plan_views(
         filters.get, views, states, pupil_diameter_mm=4.5, focus_dpt=0.5
     )

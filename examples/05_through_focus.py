@@ -7,7 +7,7 @@ eye cannot focus far away: it only adds power, so its focus stays at its far poi
 """
 
 import numpy as np
-from common import font, save_pictures, still
+from common import font, save_pictures
 from PIL import Image, ImageDraw
 
 from filter_service import Camera, EyeFilter, FilterSettings
@@ -45,7 +45,7 @@ with EyeFilter("emmetropia", camera, settings) as eye:
         eye.wait()
         for focus_dpt in FOCI_DPT:
             state = {"pupil_diameter_mm": 4.0, "focus_dpt": focus_dpt}
-            seen = still(eye, color, depth_m, **state)
+            seen = eye.filter(color, depth_m, **state, whole=True)
             caption = f"{name}, at {seen.focus_dpt:.1f} dpt"
             pictures.append((caption, seen.color))
 save_pictures("05_through_focus.png", pictures, columns=len(FOCI_DPT))

@@ -11,7 +11,7 @@ import csv
 import string
 
 import numpy as np
-from common import OUT, font, save_pictures, still
+from common import OUT, font, save_pictures
 from PIL import Image, ImageDraw
 
 from filter_service import Camera, EyeFilter, FilterSettings
@@ -63,7 +63,7 @@ with EyeFilter("emmetropia", camera, settings) as eye:
         eye.wait()
         for letter in letters:
             state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": DISTANCE_DPT}
-            seen = still(eye, drawn(letter), depth_m, **state)
+            seen = eye.filter(drawn(letter), depth_m, **state, whole=True)
             file = f"{letter}_{number:02d}.png"
             Image.fromarray(seen.color).save(folder / file)
             rows.append(

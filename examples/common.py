@@ -4,7 +4,6 @@ The scene is a courtyard of 480 x 270 pixels: colour in a JPEG, distance in a 16
 of millimetres, in which 65535 stands for the sky.
 """
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,6 @@ DATA = Path(__file__).parent / "data"
 OUT = Path("out/examples")
 FIELD_OF_VIEW_DEG = 50.0  # from the scene's lower to its upper edge
 SKY_MM = 65535
-
-PREVIEW_S = 0.05  # between two looks through an eye that is being prepared
 
 CAPTION_PX = 26
 GAP_PX = 6
@@ -31,19 +28,6 @@ def load_courtyard():
     height_px, width_px = depth_m.shape
     camera = Camera.from_fov(FIELD_OF_VIEW_DEG, width_px=width_px, height_px=height_px)
     return color, depth_m.astype(np.float32), camera
-
-
-def still(eye, color, depth_m, **state):
-    """Return one picture, seen through all that the eye needs for it.
-
-    A filter is made for streams: while it prepares for a new eye, pupil or focus it
-    shows a preview, and says so (`is_complete`).  A single picture can wait.
-    """
-    seen = eye.filter(color, depth_m, **state)
-    while not seen.is_complete:
-        time.sleep(PREVIEW_S)
-        seen = eye.filter(color, depth_m, **state)
-    return seen
 
 
 def font(size_px):

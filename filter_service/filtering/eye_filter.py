@@ -286,6 +286,7 @@ class EyeFilter:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
         render_tolerance: float = 1.0,
+        whole: bool = False,
         timeout_s: float = 120.0,
     ) -> Filtered:
         """Filter one frame; waits where its camera or its state is not prepared yet.
@@ -312,6 +313,9 @@ class EyeFilter:
         render_tolerance : float, 0 to 8
             Errors of rendering against the usual, which leaves no visible difference;
             0 is exact, more is faster.
+        whole : bool
+            Wait for the newest eye and for all its PSFs, as a single picture may: a
+            stream would rather see the eye before, or a preview (`is_complete`).
         timeout_s : float
             For the eye to be prepared.
 
@@ -342,6 +346,7 @@ class EyeFilter:
                 merge=merge,
                 render_tolerance=render_tolerance,
                 prepared_only=True,
+                whole_only=whole,
             )
             self.workshop.advance()  # by now it knows what this frame asks for
             if seen is not None:
@@ -360,6 +365,7 @@ class EyeFilter:
         merge: bool = True,
         render_tolerance: float = 1.0,
         prepared_only: bool = False,
+        whole_only: bool = False,
         out: Sequence[NDArray[Any] | None] | None = None,
     ) -> Filtered | None:
         """Filter one frame like `filter`; None while its eye is being prepared.
@@ -369,6 +375,8 @@ class EyeFilter:
         prepared_only : bool
             None as well, and `is_extending`, while only the state of this frame is not
             prepared; else it is seen through the nearest that is.
+        whole_only : bool
+            None, and `is_extending`, while there is an older eye or a preview to show.
         out : sequence of arrays, optional
             Memory for the pictures, which may be used; what is returned counts.
 
@@ -387,6 +395,7 @@ class EyeFilter:
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,
             prepared_only=prepared_only,
+            whole_only=whole_only,
         )
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
@@ -408,6 +417,7 @@ class EyeFilter:
         pupil_diameter_mm: float,
         focus_dpt: float,
         prepared_only: bool = False,
+        whole_only: bool = False,
     ) -> PlannedFrame | None:
         """Return a frame ready to be rendered, before anything else is asked for.
 
@@ -422,7 +432,10 @@ class EyeFilter:
         workshop = self.workshop
         plan = self._eyes.plan([view.camera for view in views], look_at)
         workshop.free_retired(self._eyes)
-        self.is_extending = plan is not None and prepared_only and not plan.is_prepared
+        self.is_extending = plan is not None and (
+            (prepared_only and not plan.is_prepared)
+            or (whole_only and not self._eyes.is_final(plan))
+        )
         if plan is None or self.is_extending:
             return None
         return PlannedFrame(workshop, plan, tuple(views), pupil_diameter_mm, focus_dpt)

@@ -121,6 +121,11 @@ class StreamEyes:
                 raise failure.with_traceback(None)  # raised again for every frame
         return None
 
+    def is_final(self, plan: RenderPlan) -> bool:
+        """Return whether nothing better is to come for the state of the last frame."""
+        is_newest = plan.eye is self.eyes[0]
+        return is_newest and (plan.is_complete or bool(plan.notes))
+
     def add_profile(
         self,
         profile: EyeProfile,
@@ -226,18 +231,16 @@ class StreamEyes:
     def _failures_now(
         self, eye: AcceptedProfile, used: list[PreparedStore]
     ) -> tuple[str, ...]:
-        """Say why the state of the last frame could not be prepared for."""
-        return tuple(
-            dict.fromkeys(
-                f"what this frame asks for could not be prepared: {reason}"
-                for prepared in used
-                if not self._holds(eye, prepared)
-                for reason in (
-                    *prepared.failed.values(),
-                    *filter(None, [eye.failure_for(prepared.camera)]),
-                )
-            )
-        )
+        """Say why there is no more for the state of the last frame."""
+        said = "what this frame asks for could not be prepared"
+        reasons: dict[str, None] = {}
+        for prepared in used:
+            whole = None if prepared.is_complete else eye.failure_for(prepared.camera)
+            if whole is not None:  # its preview is all there is
+                reasons[f"{said}: {whole}"] = None
+            if not self._holds(eye, prepared):
+                reasons |= {f"{said}: {one}": None for one in prepared.failed.values()}
+        return tuple(reasons)
 
     def put_in_place(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
         """Let frames use a loaded store; forget the camera unused for longest.

@@ -85,7 +85,15 @@ def test_every_public_make_target_is_phony_and_explained():
     phony = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
     assert _make_targets() == phony
     explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
-    wanted = {"demo", "test", "test-training", "test-headset", "validate", "witness"}
+    wanted = {
+        "demo",
+        "web",
+        "test",
+        "test-training",
+        "test-headset",
+        "validate",
+        "witness",
+    }
     wanted |= {
         "check",
         "gpu-kit",

@@ -108,6 +108,18 @@ def test_nothing_extends_a_preview_that_is_all_there_is():
     seen = stream.frame(6.0, 3.0)
     assert stream.eyes.next_build() is None
     assert seen.is_prepared and "too large" in seen.notes[0], "nobody waits for it"
+    near = stream.frame(4.0, 0.05)
+    assert not near.is_complete and "too large" in near.notes[0]
+    assert stream.eyes.is_final(near)
+
+
+def test_only_the_newest_whole_eye_is_final():
+    stream = PreviewedStream()
+    assert not stream.eyes.is_final(stream.frame(6.0, 3.0)), "a preview"
+    assert stream.eyes.is_final(stream.frame(4.0, 0.0))
+    stream.eyes.add_profile(None, FilterSettings(), [CAMERA])
+    seen = stream.frame(4.0, 0.0)
+    assert seen.is_complete and not stream.eyes.is_final(seen), "of the eye before"
 
 
 def test_an_eye_was_ready_while_more_of_it_is_previewed():
