@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
 
 from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics import prescription as rx
@@ -90,6 +89,9 @@ class ProgressiveLens(rx.Prescription):
 
     def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
         """Power (..., 2, 2) at points of the lens, x to the person's right, y up."""
+        # A service is ready before it loads scipy.
+        from scipy.special import ndtr
+
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
         wide_mm = np.hypot(self.corridor_mm / 4.0, x)
         z = (-y - self.corridor_mm / 2.0) / wide_mm

@@ -35,6 +35,8 @@ HELD = (
     "filter_service/protocol.schema.json",
     "filter_service/service/ocufilter.service",
     "clients/assets/*",
+    "clients/web/*.css",
+    "clients/web/*.js",
 )
 """Files of the checkout that a wheel holds, and no others."""
 

@@ -10,7 +10,7 @@ from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psfs
 from filter_service import Camera, EyeFilter, FilterSettings
 from filter_service.__main__ import _exit_code
-from filter_service.commands.image_files import write_image
+from filter_service.image_files import write_image
 
 PUPIL_MM = 3.4
 BIFOCAL = {
