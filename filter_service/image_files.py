@@ -64,6 +64,7 @@ def read_depth(
     ----------
     depth_scale : float, optional
         Metres per stored unit; without it 0.001 for integers and 1 for floats.
+        8 bits want it: they are a picture of depth, seldom millimetres.
     option : str
         What asked for it, for the texts of errors; empty where none did.
 
@@ -75,8 +76,8 @@ def read_depth(
     Raises
     ------
     ValueError
-        The file is missing, not of a known kind, not one channel, or the scale is
-        not positive.
+        The file is missing, not of a known kind, not one channel, of 8 bits without
+        a scale, or the scale is not positive.
     """
     suffix = _known_suffix(option, path, DEPTH_SUFFIXES)
     if suffix == ".exr":
@@ -92,6 +93,9 @@ def read_depth(
         found = f"{stored.dtype} of shape {stored.shape}"
         _refuse(option, path, found, "one channel, integer or float")
     if depth_scale is None:
+        if stored.dtype == np.uint8:  # in mm it would end at 25 cm
+            allowed = "16 bits in mm, 32-bit float in m, or 8 bits with a depth scale"
+            _refuse(option, path, "8 bits deep", allowed)
         depth_scale = 1.0 if stored.dtype.kind == "f" else METRES_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
         raise ValueError(f"--depth-scale {depth_scale}: allowed is a positive number")

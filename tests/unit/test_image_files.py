@@ -72,6 +72,14 @@ def test_16_bit_png_is_millimetres_unless_a_scale_is_given(
     np.testing.assert_allclose(depth_m, [[metres, 0.0]], rtol=1e-6)
 
 
+def test_8_bit_depth_wants_a_scale(tmp_path):
+    Image.fromarray(np.array([[150, 0]], np.uint8)).save(tmp_path / "depth.png")
+    with pytest.raises(ValueError, match=r"8 bits deep.*allowed.*16 bits in mm"):
+        read_depth(tmp_path / "depth.png")
+    depth_m = read_depth(tmp_path / "depth.png", depth_scale=0.02)
+    np.testing.assert_allclose(depth_m, [[3.0, 0.0]], rtol=1e-6)
+
+
 def test_float_tiff_and_exr_depth_are_metres(tmp_path, rng):
     metres = rng.random((5, 7), dtype=np.float32)
     Image.fromarray(metres).save(tmp_path / "depth.tif")
