@@ -9,6 +9,7 @@ eye_panel      the entries of one eye
 eye_form       what they say, and the profile that it makes
 numbers        numbers that people type, with their limits
 slider_row     a slider with its name and value
+upload_entry   an entry for a file
 scene_panel    what is looked at, chosen
 picture        a picture with depth, in full and small
 chart          a letter chart as a picture

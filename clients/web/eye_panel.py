@@ -15,6 +15,7 @@ from clients.web.eye_form import (
 )
 from clients.web.numbers import NumberField
 from clients.web.slider_row import THROTTLE_S
+from clients.web.upload_entry import upload_entry
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
@@ -120,9 +121,9 @@ class EyePanel:
         return entry
 
     def _file(self) -> None:
-        ui.upload(auto_upload=True, on_upload=self._take_file, label="Profile").props(
-            f'accept="{",".join(PROFILE_SUFFIXES)}" flat bordered'
-        ).classes("oc-upload oc-wide").mark("profile-file")
+        upload_entry("Profile", ",".join(PROFILE_SUFFIXES), self._take_file).classes(
+            "oc-wide"
+        ).mark("profile-file")
         text = (
             f"In use: {self.form.file_name}"
             if self.form.file_name

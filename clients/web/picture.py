@@ -178,17 +178,33 @@ def photo_picture(
     depth_m = None
     if depth is not None:
         depth_m = _photo_depth(*depth, shape=(height_px, width_px))
-    n = max(math.ceil(width_px / MAX_WIDTH_PX), math.ceil(height_px / MAX_HEIGHT_PX))
+    factor = max(1.0, width_px / MAX_WIDTH_PX, height_px / MAX_HEIGHT_PX)
     right = math.tan(math.radians(width_deg) / 2.0)
     up = right * height_px / width_px
-    if depth_m is None:
-        depth_m = np.ones((height_px, width_px), np.float32)
-    view = coarser(RgbdView(color, depth_m, (-right, right, up, -up)), n)
-    title = Path(name).name[:60]
-    if depth is not None:
+    tangents, title = (-right, right, up, -up), Path(name).name[:60]
+    if depth_m is not None:
+        view = coarser(RgbdView(color, depth_m, tangents), math.ceil(factor))
         return picture_of(title, view)
+    color = _resized(color, round(width_px / factor), round(height_px / factor))
+    view = RgbdView(color, np.ones(color.shape[:2], np.float32), tangents)
     flat = picture_of(title, view, distance_dpt=math.nan)
     return flat.at(distance_dpt)
+
+
+def _resized(
+    color: NDArray[np.uint8], width_px: int, height_px: int
+) -> NDArray[np.uint8]:
+    """Return colour with fewer pixels: each the light around it."""
+    if color.shape[:2] == (height_px, width_px):
+        return color
+    light = linear_from_srgb8(color)
+    planes = [
+        Image.fromarray(light[..., c]).resize(
+            (width_px, height_px), Image.Resampling.HAMMING
+        )
+        for c in range(3)
+    ]
+    return srgb8_from_linear(np.stack([np.asarray(p) for p in planes], axis=-1))
 
 
 def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:

@@ -17,6 +17,7 @@ from clients.web.scene_file import (
     gltf_picture,
     scene_picture,
 )
+from clients.web.upload_entry import upload_entry
 
 KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
@@ -67,11 +68,16 @@ class ScenePanel:
                     f"Depth: {DEPTH_HELP}.  Without depth the photo stands flat at a "
                     "distance."
                 ).classes("oc-hint")
+                self._used = ui.label().classes("oc-note")
+                self._in_use()
 
     def _upload(self, label: str, accept: str, take) -> None:
-        ui.upload(auto_upload=True, label=label, on_upload=take).props(
-            f'accept="{accept}" flat bordered'
-        ).classes("oc-upload").mark(label)
+        upload_entry(label, accept, take).mark(label)
+
+    def _in_use(self) -> None:
+        """Say which files the picture is of."""
+        names = [file[0] for file in (self._photo, self._depth) if file is not None]
+        self._used.text = f"In use: {', '.join(names)}" if names else ""
 
     async def first(self) -> None:
         """Show the first scene."""
@@ -117,6 +123,7 @@ class ScenePanel:
             depth=self._depth,
         ):
             self._depth = None
+        self._in_use()
 
     async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
         """Show the picture that a function makes, or say why there is none."""

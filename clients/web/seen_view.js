@@ -4,6 +4,7 @@
 // Drawn is what came last; `window.ocufilter.drawn` says what was drawn, and when.
 const LABELS = { OD: "Right eye", OS: "Left eye" };
 const KEY_STEP = 2; // percent
+const TALLEST = "72vh"; // of a picture, so that it is seen whole
 const POINT_MS = 90; // between two reports of where the pointer is
 const RECONNECT_MS = 1000;
 
@@ -11,7 +12,7 @@ export default {
   template: `
     <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
       <div v-for="eye in eyes" :key="eye" class="oc-view" :data-eye="eye"
-           :style="{ aspectRatio: aspect }"
+           :style="frame"
            @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
            @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
         <canvas :ref="'before' + eye" class="oc-before"></canvas>
@@ -33,6 +34,9 @@ export default {
     return { split: 50, dragging: false, point: null, states: {}, down: null };
   },
   computed: {
+    frame() {
+      return { aspectRatio: this.aspect, maxWidth: `calc(${TALLEST} * ${this.aspect})` };
+    },
     clip() {
       return { clipPath: `inset(0 0 0 ${this.split}%)` };
     },

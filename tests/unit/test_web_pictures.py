@@ -8,7 +8,12 @@ import pytest
 from PIL import Image
 
 from clients.web.chart import chart_picture
-from clients.web.picture import coarser, photo_picture, picture_of
+from clients.web.picture import (
+    coarser,
+    linear_from_srgb8,
+    photo_picture,
+    picture_of,
+)
 from clients.web.scene_file import gltf_picture
 from filter_service import RgbdView
 from tests.unit.web_parts import a_picture
@@ -79,9 +84,21 @@ def test_a_large_photo_is_made_smaller():
     picture = photo_picture(
         "p.png", _png(np.full((2000, 3001, 3), 90, np.uint8)), **FLAT
     )
-    assert picture.view.color.shape == (500, 750, 3)
-    assert picture.small.color.shape == (250, 375, 3)
+    assert picture.view.color.shape == (640, 960, 3)
+    assert picture.small.color.shape == (320, 480, 3)
     assert np.all(picture.view.color == 90)
+
+
+def test_a_large_photo_fills_the_picture_and_keeps_its_light():
+    color = np.zeros((1080, 1440, 3), np.uint8)  # one and a half times too large
+    color[::2] = 255
+    seen = photo_picture("p.png", _png(color), **FLAT).view.color
+    assert seen.shape == (720, 960, 3)
+    assert 100 < seen.min() < seen.max() < 230  # no row is left out
+    assert linear_from_srgb8(seen).mean() == pytest.approx(0.5, abs=0.01)
+    portrait = np.full((3000, 2000, 3), 90, np.uint8)
+    upright = photo_picture("p.png", _png(portrait), **FLAT).view
+    assert (upright.width_px, upright.height_px) == (480, 720)
 
 
 def test_fewer_pixels_keep_light_nearest_depth_and_directions():

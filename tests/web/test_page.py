@@ -188,6 +188,25 @@ def test_a_photo_of_ones_own_is_looked_at(page):
     np.testing.assert_array_equal(page.seen(layer="before"), color)
 
 
+def test_a_portrait_is_seen_whole_and_a_file_of_another_kind_is_refused(page):
+    file = io.BytesIO()
+    Image.fromarray(np.full((3000, 2000, 3), 90, np.uint8)).save(file, "png")
+    page.choose("Photo")
+    upload = page.page.locator(".oc-uploads input[type=file]").first
+    upload.set_input_files({"name": "a.glb", "mimeType": "", "buffer": b"junk"})
+    page.page.get_by_text("Photo: not such a file; allowed: a picture").wait_for()
+    number = page.number()
+    upload.set_input_files(
+        {"name": "own.png", "mimeType": "image/png", "buffer": file.getvalue()}
+    )
+    told = page.settle(after=number)
+    assert (told["width_px"], told["height_px"]) == (480, 720)
+    page.page.get_by_text("In use: own.png").wait_for()
+    box = page.page.locator(".oc-view").first.bounding_box()
+    assert box["height"] < 0.75 * 800
+    assert box["width"] / box["height"] == pytest.approx(2 / 3, rel=0.01)
+
+
 def test_on_a_phone_nothing_is_wider_than_the_screen(page):
     page.page.set_viewport_size({"width": 390, "height": 844})
     page.page.wait_for_timeout(300)
