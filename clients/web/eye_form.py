@@ -164,10 +164,10 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
     ValueError
         Another kind of file, too large, or not a profile: says what is allowed.
     """
-    suffix = Path(name).suffix.lower()
+    suffix, shown = Path(name).suffix.lower(), Path(name).name[:60]
     if suffix not in PROFILE_SUFFIXES:
         allowed = ", ".join(PROFILE_SUFFIXES)
-        raise ValueError(f"“{Path(name).name:.60}” is no profile; allowed: {allowed}")
+        raise ValueError(f"“{shown}” is no profile; allowed: {allowed}")
     if len(content) > MAX_PROFILE_BYTES:
         raise ValueError(
             f"{len(content) / 1e6:.1f} MB is too much for a profile; allowed: "
@@ -177,12 +177,14 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
         path = Path(folder) / f"profile{suffix}"
         path.write_bytes(content)
         try:
-            body = profile_body(path)
+            body = dict(profile_body(path))
             parse_profile(body)
         except ValueError as error:
-            text = str(error).replace(str(path), Path(name).name)
-            raise ValueError(text) from None
-    return dict(body)
+            text = str(error).replace(str(path), path.name)
+            raise ValueError(text.replace(path.name, shown)) from None
+    if body.get("name") == path.name:  # coefficients are called as their file is
+        body["name"] = shown
+    return body
 
 
 def _is_plain_prescription(body: Mapping[str, Any]) -> bool:

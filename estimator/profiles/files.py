@@ -98,7 +98,9 @@ def _value(text: str, where: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ProfileError(where, f"'{text}' is not a number", "a number") from None
+        raise ProfileError(
+            where, f"'{text}' is not a number", "a number, as -0.25"
+        ) from None
 
 
 def _read_abp(text: str, name: str) -> dict[str, Any]:

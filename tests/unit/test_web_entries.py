@@ -103,6 +103,8 @@ def test_a_file_is_taken_as_what_it_is():
         ("p.json", b"{", r"not JSON.*allowed: one JSON object"),
         ("p.json", b'{"kind": "cat"}', r"'kind'.*'cat' is unknown.*prescription"),
         ("p.csv", b"\xff\xfe\x00", r"is not a text file"),
+        ("my eye.csv", b"n;m;um", r"'my eye.csv, line 1'.*allowed: n,m,um"),
+        ("o.abp", b"Ap = 6,0", r"'o.abp, line 1': '6,0' is not.*as -0.25"),
     ],
 )
 def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
@@ -111,6 +113,12 @@ def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
         form.take_file(name, content)
     assert form == EyeForm("OD")
     assert "/ocufilter-" not in str(refused.value)
+
+
+def test_coefficients_are_called_as_their_file_is():
+    form = EyeForm("OD")
+    form.take_file("my eye.abp", b"Ap = 6\nWa = 555\nZ[2, 0] = 1")
+    assert form.body(age_years=30.0)["name"] == "my eye.abp"
 
 
 def test_a_wrong_entry_leaves_the_eye_as_it_was_and_the_sliders_alive():
