@@ -116,8 +116,8 @@ class Focusing(ABC):
         if focus_dpt <= near_dpt + OUT_OF_REACH_DPT:
             return ()
         reached = (
-            f"is nearer than the near point ({near_dpt:.3g} dpt)"
-            if near_dpt >= 0.0
+            f"is nearer than the near point ({round(near_dpt, 3) + 0.0:.3g} dpt)"
+            if near_dpt > -OUT_OF_REACH_DPT
             else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
         )
         added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(

@@ -167,6 +167,16 @@ def test_out_of_reach_is_said_and_stops_at_the_end_of_the_range(myope):
     assert refraction_dpt(near.parameters, 4.0) == pytest.approx(-near_dpt, abs=3e-3)
 
 
+@pytest.mark.parametrize("near_dpt", [2.74e-15, -2.74e-15])
+def test_a_near_point_at_infinity_is_told_as_0(myope, monkeypatch, near_dpt):
+    monkeypatch.setattr(
+        AccommodatingEye, "focus_limits_dpt", lambda *_: (near_dpt, near_dpt)
+    )
+    eye = AccommodatingEye(myope, amplitude_dpt=0.0)
+    (note,) = eye.focus_notes(2.5, pupil_diameter_mm=4.0)
+    assert "nearer than the near point (0 dpt)" in note
+
+
 def test_the_lens_itself_limits_a_young_eye():
     eye = AccommodatingEye(EyeParameters.mean_eye())
     assert 6.0 < eye.amplitude_dpt == eye.lens_range_dpt < 20.0
