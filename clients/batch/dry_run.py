@@ -38,6 +38,8 @@ def dry_run(
     ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
     mean_ms = float(np.mean(ms)) if ms else math.nan
     sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
+    # a helper beside each worker makes PSFs, once for a profile
+    builds_s = sum(one["build_s"] for one in measured) if n_missing else 0.0
     core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
     report = {
         "layout": batch.layout,
@@ -47,7 +49,7 @@ def dry_run(
         "pictures_missing": n_missing,
         "cores": n_cores,
         "ms_per_picture_and_core": _known(mean_ms, 2),
-        "seconds": _known(n_missing * mean_ms / 1e3 / n_cores, 1),
+        "seconds": _known(n_missing * mean_ms / 1e3 / n_cores + builds_s, 1),
         "output_mb": _known(n_missing * float(np.mean(sizes)) / 1e6, 1)
         if sizes
         else None,

@@ -173,7 +173,7 @@ def _first_difference(name: str, before: Any, now: Any) -> tuple:
 
 
 def _short(value: Any) -> str:
-    text = json.dumps(value)
+    text = "not given" if value is None else json.dumps(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 

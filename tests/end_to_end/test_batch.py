@@ -219,6 +219,8 @@ def test_another_job_in_the_same_folder_is_refused(room, usual, tmp_path, capsys
     error = refusal(capsys, *arguments, "-o", usual, "--pupil-mm", 5)
     assert "settings.pupil_range_mm is [5.0, 5.0], and was [4.0, 4.0]" in error
     assert "--overwrite" in error
+    fewer = refusal(capsys, room, *PROFILES[:2], *MODE, "--fov-deg", 20, "-o", usual)
+    assert "is not given, and was" in fewer
     (tmp_path / "thesis.pdf").touch()
     error = refusal(capsys, *arguments, "-o", tmp_path)
     assert "holds 'thesis.pdf' and no manifest.jsonl" in error
@@ -308,6 +310,8 @@ def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
     assert not out.exists()
     assert (report["frames"], report["pictures_missing"]) == (COUNT, COUNT)
     assert report["cores"] == 2
+    (one,) = report["profiles"]
+    assert report["seconds"] >= round(one["build_s"], 1) > 0.0  # PSFs are counted
     ms = report["ms_per_picture_and_core"]
     assert report["core_hours_per_million"] == pytest.approx(ms / 3.6, rel=0.01)
     assert report["price_per_million"] == pytest.approx(ms / 7.2, rel=0.02)
