@@ -94,7 +94,7 @@ def read_depth(
         _refuse(option, path, found, "one channel, integer or float")
     if depth_scale is None:
         if stored.dtype == np.uint8:  # in mm it would end at 25 cm
-            allowed = "16 bits in mm, 32-bit float in m, or 8 bits with a depth scale"
+            allowed = "16 bits in mm, 32-bit float in m; with --depth-scale also 8 bits"
             _refuse(option, path, "8 bits deep", allowed)
         depth_scale = 1.0 if stored.dtype.kind == "f" else METRES_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):

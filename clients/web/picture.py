@@ -230,7 +230,7 @@ def _photo_depth(
         path = Path(folder) / f"depth{Path(name).suffix.lower()}"
         path.write_bytes(content)
         try:
-            depth_m = read_depth(path)
+            depth_m = read_depth(path, option="")
         except ValueError as error:
             text = str(error).replace(str(path), Path(name).name)
             raise ValueError(text) from None

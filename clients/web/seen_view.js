@@ -4,7 +4,7 @@
 // Drawn is what came last; `window.ocufilter.drawn` says what was drawn, and when.
 const LABELS = { OD: "Right eye", OS: "Left eye" };
 const KEY_STEP = 2; // percent
-const TALLEST = "72vh"; // of a picture, so that it is seen whole
+const TALLEST = "64vh"; // of a picture, so that it is seen whole
 const POINT_MS = 90; // between two reports of where the pointer is
 const RECONNECT_MS = 1000;
 
