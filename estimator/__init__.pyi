@@ -3,6 +3,12 @@ from .acuity.predict import predict_acuity as predict_acuity
 from .acuity.sensitivity import perfect_transfer as perfect_transfer
 from .acuity.transfer import Transfer as Transfer
 from .acuity.transfer import optical_transfer as optical_transfer
+from .corrections.lenslets import Lenslets as Lenslets
+from .corrections.progressive import ProgressiveLens as ProgressiveLens
+from .corrections.rings import DiffractiveRings as DiffractiveRings
+from .corrections.rings import RefractiveZones as RefractiveZones
+from .corrections.rings import Rings as Rings
+from .corrections.worn_lens import WornLens as WornLens
 from .estimate.estimation import EstimatedEye as EstimatedEye
 from .estimate.estimation import estimate_eye as estimate_eye
 from .estimate.plot import draw_section as draw_section

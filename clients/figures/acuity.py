@@ -14,9 +14,16 @@ from estimator import EyeOptics, log_mar_of
 STEP_COUNT, WITHIN_COUNT = 11, 3
 """Distances of a curve, and of its part within the eye's reach."""
 
+FINE_STEP_DPT = 0.25
+"""Of the curve of a lens with several foci: they lie 1 dpt apart."""
+
+PAST_LAST_FOCUS_DPT = 1.0
+
 NEAREST_DPT = 5.0
 PAST_FAR_POINT_DPT = 2.0
 HIGHEST_DPT = 20.0
+LEAST_REACH_DPT = 1e-6
+"""An eye with less does not accommodate."""
 
 
 class Seeing(Protocol):
@@ -62,7 +69,12 @@ def acuity_by_distance(study: Seeing, pupil_diameter_mm: float) -> AcuityByDista
 
 
 def acuity_log_mar(wavefront: PupilWavefront) -> float:
-    """Return the acuity of a wavefront; infinite where it is too steep to be told."""
+    """Return the acuity of a wavefront; infinite where it is too steep to be told.
+
+    NaN through lenslets: nobody has found how people read through them.
+    """
+    if not wavefront.is_readable:
+        return np.nan
     try:
         return log_mar_of(wavefront.transfer())
     except ValueError:
@@ -75,8 +87,16 @@ def distances_dpt(study: Seeing, pupil_diameter_mm: float) -> NDArray[np.float64
     far_dpt, _ = study.optics.focus_limits_dpt(pupil_mm)
     nearest = min(max(NEAREST_DPT, far_dpt + PAST_FAR_POINT_DPT), HIGHEST_DPT)
     even = np.linspace(0.0, np.ceil(nearest), STEP_COUNT)
-    has_peak = 0.0 < far_dpt < nearest
-    return np.union1d(even, [far_dpt]) if has_peak else even
+    peaks_dpt = np.array([far_dpt])
+    seen = study.wavefront(pupil_mm)
+    if seen.rings is not None and seen.is_readable:
+        peaks_dpt = far_dpt + seen.rings.main_dpt(seen.wavelength_nm)
+        last_dpt = float(peaks_dpt.max()) + PAST_LAST_FOCUS_DPT
+        nearest = max(nearest, last_dpt)
+        first_dpt = max(far_dpt - PAST_LAST_FOCUS_DPT, 0.0)
+        fine = np.arange(first_dpt, last_dpt, FINE_STEP_DPT)
+        even = np.union1d(np.linspace(0.0, np.ceil(nearest), STEP_COUNT), fine)
+    return np.union1d(even, peaks_dpt[(peaks_dpt > 0.0) & (peaks_dpt < nearest)])
 
 
 def through_focus_log_mar(
@@ -109,6 +129,8 @@ def accommodated_log_mar(
     """
     pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
     far_dpt, near_dpt = study.optics.focus_limits_dpt(pupil_mm)
+    if near_dpt - far_dpt < LEAST_REACH_DPT:
+        return far_log_mar.copy()
 
     def seen(distances: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array(

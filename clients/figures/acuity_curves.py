@@ -20,6 +20,7 @@ from clients.figures.style import (
     dress,
     legend_below,
     new_figure,
+    say_unknown,
     with_grid,
 )
 
@@ -40,6 +41,8 @@ def draw_through_focus_acuity(axes: Axes, study: EyeStudy) -> None:
     styles = {"accommodating": ACCOMMODATING, "looking far": LOOKING_FAR}
     black = {name: {"color": INK} | style for name, style in styles.items()}
     _finish(axes, found.object_dpt[-1], looks | black, "Acuity by distance")
+    if np.isnan(found.far_log_mar[0]):
+        say_unknown(axes)
 
 
 def draw_acuity_of_several(
@@ -47,14 +50,17 @@ def draw_acuity_of_several(
 ) -> None:
     """Draw the acuity of several eyes that accommodate, through one pupil."""
     colors = dict(zip(labels, (BLUE, GREEN), strict=False))
-    nearest_dpt = 0.0
+    nearest_dpt, is_known = 0.0, True
     for study, color in zip(studies, colors.values(), strict=True):
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)
+        is_known &= not np.isnan(found.far_log_mar[0])
         nearest_dpt = max(nearest_dpt, float(found.object_dpt[-1]))
     looks = {label: {"color": color} for label, color in colors.items()}
     title = f"Acuity by distance, accommodating, {pupil_mm:g} mm"
     _finish(axes, nearest_dpt, looks, title)
+    if not is_known:
+        say_unknown(axes)
 
 
 def _finish(axes: Axes, nearest_dpt: float, looks: dict, title: str) -> None:

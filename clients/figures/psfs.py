@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -49,23 +50,41 @@ def centred(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
     # Z(1,±1) is 2 x / r or 2 y / r, and tilt moves a point by its slope.
     zernike_um[TILTS] -= 0.5 * wavefront.circle_diameter_mm / 2.0 * middle[::-1]
     reach_mrad = np.linalg.norm(slopes - middle, axis=1).max()
+    reach_mrad += main_reach_mrad(wavefront)
     return replace(wavefront, zernike_um=zernike_um), reach_mrad * ARCMIN_PER_MRAD
+
+
+def main_reach_mrad(wavefront: PupilWavefront) -> float:
+    """Return how far rings send light aside to their foci, or lenslets all of it."""
+    rings, radius_mm = wavefront.rings, wavefront.circle_diameter_mm / 2.0
+    if rings is None:
+        return 0.0
+    if not wavefront.is_readable:
+        return float(rings.reach_mrad(radius_mm, wavefront.wavelength_nm))
+    return float(np.abs(rings.main_dpt(wavefront.wavelength_nm)).max() * radius_mm)
 
 
 def psf_picture(
     wavefront: PupilWavefront, *, side_arcmin: float
 ) -> NDArray[np.float64]:
     """Return the light of a point (161, 161), top row first; its sum is 1."""
-    found = compute_psfs(
-        wavefront.zernike_um[None],
-        pupil_diameter_mm=wavefront.circle_diameter_mm,
-        pupil_ellipse=wavefront.pupil_ellipse,
-        wavelength_nm=wavefront.wavelength_nm,
-        pixel_pitch_mrad=side_arcmin / SIDE_PX / ARCMIN_PER_MRAD,
-        radius_px=SIDE_PX // 2,
-        method="fourier",  # a mix with rays shows its seams on a logarithmic scale
-        accuracy="fine",
-    )
+    state: dict[str, Any] = {
+        "pupil_diameter_mm": wavefront.circle_diameter_mm,
+        "pupil_ellipse": wavefront.pupil_ellipse,
+        "wavelength_nm": wavefront.wavelength_nm,
+        "pixel_pitch_mrad": side_arcmin / SIDE_PX / ARCMIN_PER_MRAD,
+        "radius_px": SIDE_PX // 2,
+        "accuracy": "fine",
+    }
+    try:  # a mix with rays shows its seams on a logarithmic scale
+        found = compute_psfs(
+            wavefront.zernike_um[None],
+            method="fourier",
+            pupil_screen=wavefront.rings,
+            **state,
+        )
+    except ValueError:  # too steep for that: by far wider than what rings add
+        found = compute_psfs(wavefront.zernike_um[None], **state)
     return found[0].kernel
 
 

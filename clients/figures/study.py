@@ -18,6 +18,8 @@ from estimator import (
     EyeOptics,
     EyeProfile,
     FieldTable,
+    Lenslets,
+    Rings,
     estimate_eye,
     field_table,
     load_profile,
@@ -146,7 +148,19 @@ class EyeStudy:
             circle_diameter_mm=float(seen.circle_diameter_mm[0]),
             pupil_ellipse=seen.pupil_ellipse[0],
             wavelength_nm=WAVELENGTH_NM,
+            rings=self._rings(float(seen.circle_diameter_mm[0])),
         )
+
+    def _rings(self, circle_diameter_mm: float) -> Rings | None:
+        """Return the worn lens's rings before a pupil; None where it sees none."""
+        if self.optics.rings is None:
+            return None
+        rings = self.optics.rings.seen_from(0.0, 0.0)
+        if not isinstance(rings, Lenslets):
+            return rings
+        clear_mm = rings.inner_mm - rings.diameter_mm / 2.0
+        reach_mm = np.hypot(*np.asarray(rings.centre_mm)) + circle_diameter_mm / 2.0
+        return None if reach_mm <= clear_mm else rings
 
     def acuity(self, pupil_diameter_mm: float) -> AcuityByDistance:
         """Return what is read at each distance through a pupil; kept, as it is slow."""

@@ -72,6 +72,14 @@ def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
     )  # fmt: skip
 
 
+def say_unknown(axes: Axes) -> None:
+    """Say in the middle of axes why there are no curves."""
+    axes.text(
+        0.5, 0.5, "not known through lenslets", fontsize=SMALL_PT, color=SOFT,
+        ha="center", transform=axes.transAxes,
+    )  # fmt: skip
+
+
 def bare(axes: Axes, *, title: str = "") -> None:
     """Leave a picture's axes without ticks and spines."""
     dress(axes, title=title)

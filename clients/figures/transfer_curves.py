@@ -20,6 +20,7 @@ from clients.figures.style import (
     dress,
     legend_below,
     new_figure,
+    say_unknown,
     with_grid,
 )
 from estimator import perfect_transfer
@@ -39,7 +40,8 @@ def modulation(
 ) -> NDArray[np.float64]:
     """Return the modulation transfer (n,) of a far object, mean over all directions.
 
-    NaN where the wavefront is too steep to tell: there, hardly any is left.
+    NaN where the wavefront is too steep to tell: there, hardly any is left.  And
+    through lenslets.
 
     Parameters
     ----------
@@ -81,6 +83,8 @@ def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> No
     for is_corrected, looks in ((True, CORRECTED), (False, AS_IT_IS)):
         values = modulation(study, pupil_mm, is_corrected=is_corrected)
         axes.plot(FREQUENCY_CPD, values, color=color, **looks)
+    if not study.wavefront(pupil_mm).is_readable:
+        say_unknown(axes)
 
 
 def _perfect(pupil_mm: float) -> NDArray[np.float64]:

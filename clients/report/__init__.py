@@ -4,6 +4,7 @@ program     the command
 make        from profiles to a report
 facts       what is told of one eye, computed
 numbers     its numbers
+worn_words  what is worn
 charts      the letter chart near and far
 provenance  what was measured, what is assumed
 sources     papers

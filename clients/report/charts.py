@@ -82,7 +82,11 @@ def picture_side_px(
         at_dpt = 1.0 / distance_m
         seen = study.wavefront(pupil_mm, object_dpt=at_dpt, focus_dpt=at_dpt)
         slopes = np.linalg.norm(ray_directions_mrad(seen), axis=1)
-        reach_mrad = max(reach_mrad, float(slopes.max()))
+        aside_mrad = 0.0
+        if seen.rings is not None:
+            radius_mm = seen.circle_diameter_mm / 2.0
+            aside_mrad = float(seen.rings.reach_mrad(radius_mm, seen.wavelength_nm))
+        reach_mrad = max(reach_mrad, float(slopes.max()) + aside_mrad)
     reach_arcmin = max(reach_mrad * ARCMIN_PER_MRAD, 1e-6)
     fitting = math.floor(LARGEST_BLUR_PX * FIELD_DEG * 60.0 / reach_arcmin)
     return max(min(SIDE_PX, fitting), LEAST_SIDE_PX)

@@ -15,7 +15,16 @@ from clients.figures import (
 from clients.figures.orders import FIRST_HIGHER, on_circle_um
 from clients.figures.study import PUPILS_MM
 from clients.figures.style import TITLE_PT
-from clients.report.blocks import Block, Document, Picture, Plot, Row, Section, Table
+from clients.report.blocks import (
+    Block,
+    Document,
+    Picture,
+    Plot,
+    Row,
+    Section,
+    Table,
+    Words,
+)
 from clients.report.charts import DISTANCES_M
 from clients.report.content import (
     DAY_MM,
@@ -32,11 +41,12 @@ from clients.report.sources import Citations
 from clients.report.tables import (
     REFRACTION_ROWS,
     VISION_ROWS,
-    acuity_words,
     pupil_word,
     refraction_words,
     signed,
+    told_acuity,
 )
+from clients.report.worn_words import limits_words
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
 MAP_MM, PSF_MM = 46.0, 58.0
@@ -81,8 +91,15 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair) for pair in pairs)),
             _charts(before, after, DAY_MM),
+            *(Row((Words(limits),)) for limits in _limits(before, after)),
         ),
     )
+
+
+def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
+    """Return what lenses make true only in part, each once."""
+    of_all = [limits_words(f.study.profile.correction) for f in (before, after)]
+    return tuple(dict.fromkeys(limits for limits in of_all if limits))
 
 
 def _psfs(study: EyeStudy, label: str) -> Plot:
@@ -164,11 +181,11 @@ def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
         if not facts.charts:
             return chart_row(facts, pupil_mm)
         for distance_m, where in ((NEAR_M, "40 cm"), (FAR_M, "6 m")):
-            log_mar = facts.chart_log_mar[pupil_mm, distance_m]
+            told = told_acuity(facts.chart_numbers[pupil_mm, distance_m])
             pictures.append(
                 Picture(
                     facts.charts[pupil_mm, distance_m],
-                    f"{facts.label}, {where}, {pupil_mm:g} mm: {acuity_words(log_mar)}",
+                    f"{facts.label}, {where}, {pupil_mm:g} mm: {told}",
                 )
             )
     return Row(tuple(pictures))

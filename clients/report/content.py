@@ -33,12 +33,13 @@ from clients.report.facts import EyeFacts
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
-    acuity_words,
     coefficient_table,
     field_table_block,
     refraction_table,
+    told_acuity,
     vision_table,
 )
+from clients.report.worn_words import limits_words, subtitle_words
 
 DAY_MM, DUSK_MM = PUPILS_MM
 
@@ -71,7 +72,8 @@ def subtitle(study: EyeStudy) -> str:
     age = "age not given"
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
-    return f"{SIDES[profile.eye_side]}, {age}, from a {KIND_WORDS[profile.kind]}"
+    whose = f"{SIDES[profile.eye_side]}, {age}, from a {KIND_WORDS[profile.kind]}"
+    return whose + subtitle_words(profile)
 
 
 KIND_WORDS = {
@@ -112,7 +114,7 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((_legend(study),)),)),
+            Row((Words((_legend(study), *limits_words(study.profile.correction))),)),
         ),
     )
 
@@ -144,12 +146,12 @@ def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
         return Row((Words((f"No letter charts: {facts.chart_problem}.",)),))
     pictures: list[Block] = []
     for distance_m in DISTANCES_M:
-        log_mar = facts.chart_log_mar[pupil_mm, distance_m]
         where = f"{100 * distance_m:.0f} cm" if distance_m < 1 else f"{distance_m:g} m"
         pictures.append(
             Picture(
                 facts.charts[pupil_mm, distance_m],
-                f"{where}, {pupil_mm:g} mm: logMAR {acuity_words(log_mar)}",
+                f"{where}, {pupil_mm:g} mm: logMAR "
+                f"{told_acuity(facts.chart_numbers[pupil_mm, distance_m])}",
             )
         )
     return Row(tuple(pictures))

@@ -39,10 +39,10 @@ class EyeFacts:
     chart_problem: str = ""
 
     @property
-    def chart_log_mar(self) -> dict[Chart, float | None]:
-        """Return the acuity that is predicted for each chart."""
+    def chart_numbers(self) -> dict[Chart, dict[str, Any]]:
+        """Return what is predicted for each chart."""
         return {
-            (asked_mm, entry["distance_m"]): entry["log_mar"]
+            (asked_mm, entry["distance_m"]): entry
             for asked_mm, entry in zip(
                 np.repeat(PUPILS_MM, len(DISTANCES_M)).tolist(),
                 self.numbers["charts"],

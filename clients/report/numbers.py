@@ -138,9 +138,15 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
             zernike_radius_mm=seen.circle_diameter_mm / 2.0,
             wavelength_nm=seen.wavelength_nm,
             pupil_ellipse=seen.pupil_ellipse,
+            pupil_screen=seen.rings,
         )
-    except ValueError:  # too steep for transfer functions
-        return {"log_mar": None, "visual_strehl_ratio": None, "modulation": None}
+    except ValueError:  # too steep for transfer functions, or lenslets
+        return {
+            "log_mar": None,
+            "visual_strehl_ratio": None,
+            "modulation": None,
+            "is_told": seen.is_readable,
+        }
     modulation = seen.transfer().modulation(np.array(TOLD_CPD))
     return {
         "log_mar": found.log_mar,
@@ -149,6 +155,7 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
             f"{cpd:g}_cpd": float(v)
             for cpd, v in zip(TOLD_CPD, modulation, strict=True)
         },
+        "is_told": True,
     }
 
 
@@ -175,7 +182,7 @@ def is_beyond_measured(study: EyeStudy, pupil_diameter_mm: float) -> bool:
 
 def chart_numbers(
     study: EyeStudy, pupil_diameter_mm: float, distance_m: float
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Return what is read of a chart by an eye that accommodates for it."""
     at_dpt = 1.0 / distance_m
     seen = study.wavefront(pupil_diameter_mm, object_dpt=at_dpt, focus_dpt=at_dpt)
@@ -188,6 +195,7 @@ def chart_numbers(
             at_dpt, pupil_diameter_mm=usable_mm
         ),
         "log_mar": log_mar if np.isfinite(log_mar) else None,
+        "is_told": seen.is_readable,
     }
 
 

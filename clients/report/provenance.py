@@ -5,8 +5,10 @@ from __future__ import annotations
 from clients.figures import EyeStudy
 from clients.figures.study import PUPILS_MM
 from clients.report.blocks import Table
-from clients.report.numbers import is_beyond_measured, written
+from clients.report.numbers import is_beyond_measured
 from clients.report.sources import Citations
+from clients.report.worn_words import worn_words
+from estimator import Prescription, WornLens
 
 WELL_DETERMINED = 0.5
 """Share of the prior's variance that a measurement must take away."""
@@ -60,6 +62,9 @@ def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
         return ("Higher orders", STATED, "of the eye that the profile gives")
     if profile.kind != "prescription":
         return ("Higher orders", MEASURED, f"orders 3 to 6 of {_measurement(study)}")
+    if _replaces_lens(profile.correction):
+        text = "the cornea's and the lens's spherical aberration; no others are known"
+        return ("Higher orders", TYPICAL, text)
     if profile.higher_order == "none":
         return ("Higher orders", STATED, "none, as the profile asks for")
     whose = "a young adult"
@@ -97,6 +102,8 @@ def _periphery(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
 
 def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     profile, amplitude_dpt = study.profile, study.found.amplitude_dpt
+    if _replaces_lens(profile.correction):
+        return ("Accommodation", STATED, "none: the eye's own lens is gone")
     if profile.age_years is None and not profile.add_dpt:
         text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt"
         return ("Accommodation", TYPICAL, text)
@@ -107,6 +114,10 @@ def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
         known.append(f"addition of {profile.add_dpt:g} dpt")
     text = f"{amplitude_dpt:.1f} dpt, by {' and '.join(known)}"
     return ("Accommodation", TYPICAL, text)
+
+
+def _replaces_lens(lens: Prescription | None) -> bool:
+    return isinstance(lens, WornLens) and lens.replaces_lens
 
 
 def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
@@ -142,9 +153,4 @@ def _nerves(cite: Citations) -> tuple[str, ...]:
 
 def _worn(study: EyeStudy) -> tuple[str, ...]:
     lens = study.profile.correction
-    if lens is None:
-        return ()
-    where = (
-        f"{lens.vertex_mm:g} mm before the cornea" if lens.vertex_mm else "a contact"
-    )
-    return ("Correction worn", STATED, f"{written(lens)}, {where}")
+    return () if lens is None else ("Correction worn", STATED, worn_words(lens))

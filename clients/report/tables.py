@@ -8,6 +8,10 @@ from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
 from clients.report.facts import EyeFacts
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
+from clients.report.worn_words import worn_words
+
+THROUGH_LENSLETS = "not known"
+"""Instead of an acuity: the summary says why."""
 
 REFRACTION_ROWS = {
     "sphere, dpt": "sphere_dpt",
@@ -63,7 +67,7 @@ def _refraction_note(facts: EyeFacts) -> str:
     lens = facts.study.profile.correction
     if lens is not None:
         note += (
-            f" Worn: {written(lens)} at {lens.vertex_mm:g} mm; M through it "
+            f" Worn: {worn_words(lens)}; M through it "
             f"{signed(fit['refraction_through_correction_dpt'])} dpt."
         )
     return note
@@ -103,8 +107,8 @@ def distance_words(distance_dpt: float) -> str:
 
 VISION_ROWS: dict[str, Callable[[dict], str]] = {
     "higher orders, RMS, µm": lambda p: f"{p['higher_order_rms_um']:.2f}",
-    "acuity as it is": lambda p: acuity_words(p["as_it_is"]["log_mar"]),
-    "acuity best corrected": lambda p: acuity_words(p["best_corrected"]["log_mar"]),
+    "acuity as it is": lambda p: told_acuity(p["as_it_is"]),
+    "acuity best corrected": lambda p: told_acuity(p["best_corrected"]),
     "visual Strehl as it is": lambda p: _ratio(p["as_it_is"]["visual_strehl_ratio"]),
     "visual Strehl corrected": lambda p: _ratio(
         p["best_corrected"]["visual_strehl_ratio"]
@@ -131,6 +135,11 @@ def _modulations(values: dict | None) -> str:
     if values is None:
         return "–"
     return f"{values['10_cpd']:.2f} / {values['30_cpd']:.2f}"
+
+
+def told_acuity(state: dict) -> str:
+    """Return the acuity of a state, or that nobody knows it."""
+    return acuity_words(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
 
 
 def acuity_words(log_mar: float | None) -> str:

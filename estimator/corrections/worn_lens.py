@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.corrections.intraocular import height_ratio
 from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import Rings
@@ -44,6 +45,10 @@ class WornLens(rx.Prescription):
         Where it has several foci.
     replaces_lens : bool
         Whether the eye's own lens is gone, and accommodation with it.
+    design : str
+        What an intraocular lens is sold as.
+    depth_mm : float
+        Of such a lens behind the cornea; its powers here are those in the pupil.
     """
 
     kind: str = "contact_lens"
@@ -51,6 +56,12 @@ class WornLens(rx.Prescription):
     centre_mm: tuple[float, float] = (0.0, 0.0)
     rings: Rings | None = None
     replaces_lens: bool = False
+    design: str = ""
+    depth_mm: float = 0.0
+
+    def at_lens_dpt(self, power_dpt: float) -> float:
+        """Power of the lens itself that acts as this in the pupil's plane."""
+        return power_dpt / height_ratio(self.depth_mm) ** 2
 
     def looking(self, gaze_deg: tuple[float, float]) -> "WornLens":
         """Return the lens for an eye that looks so much farther aside and up."""

@@ -193,6 +193,8 @@ def _intraocular(body: Mapping[str, Any], *, has_cornea: bool) -> WornLens:
         vertex_mm=-TYPICAL_ENTRANCE_PUPIL_MM,
         rings=_rings(body, design, depth_mm, lens["centre_mm"]),
         replaces_lens=True,
+        design=design,
+        depth_mm=depth_mm,
     )
 
 

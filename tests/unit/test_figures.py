@@ -20,6 +20,7 @@ from clients.figures import (
     through_focus_log_mar,
     wavefront_map_figure,
 )
+from clients.figures.acuity import acuity_log_mar, distances_dpt
 from clients.figures.field_maps import blur_arcmin
 from clients.figures.psfs import centred, psf_picture, ray_directions_mrad
 from clients.figures.study import FIELD_H_DEG, FIELD_V_DEG
@@ -136,6 +137,85 @@ def test_beyond_the_near_point_accommodation_does_not_help():
     near = accommodated_log_mar(old, 3.0, distances_dpt, far)
     assert near == pytest.approx(far, abs=0.02)
     assert near[1] > 0.3
+
+
+IOL = {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70}
+TRIFOCAL = {
+    "kind": "iol",
+    "design": "trifocal",
+    "adds_dpt": [1.66, 3.32],
+    "light_ratio": [0.4, 0.2, 0.3],
+    "spherical_aberration_um": -0.27,
+}
+
+
+def test_three_foci_make_three_humps_where_the_additions_put_them():
+    eye = EyeStudy.of(IOL | {"correction": TRIFOCAL})
+    # a lens 4.6 mm behind a cornea of 43.04 dpt, in light of 555 instead of 550 nm
+    add_dpt = 1.66 * (1 - 0.0046 / 1.3386 * 43.04) ** 2 * 555 / 550
+    foci, between = add_dpt * np.arange(3), add_dpt * np.array([0.5, 1.5, 2.7])
+    tried_dpt = distances_dpt(eye, 4.0)
+    for focus_dpt in foci[1:]:
+        assert np.abs(tried_dpt - focus_dpt).min() < 0.02
+    at_foci = through_focus_log_mar(eye, 4.0, foci)
+    beside = through_focus_log_mar(eye, 4.0, between)
+    assert at_foci.max() < 0.15
+    assert np.all(beside[:2] > np.maximum(at_foci[:-1], at_foci[1:]) + 0.04)
+    assert beside[2] > at_foci[2] + 0.2
+    sharp = accommodated_log_mar(eye, 4.0, foci, at_foci)
+    assert np.array_equal(sharp, at_foci)  # no lens of its own is left
+
+
+def test_the_light_of_a_bifocal_lens_is_halved_in_contrast_and_point():
+    single, double = (
+        EyeStudy.of(IOL | {"correction": lens})
+        for lens in (
+            {"kind": "iol", "spherical_aberration_um": -0.27},
+            {
+                "kind": "iol",
+                "design": "bifocal",
+                "add_dpt": 4.0,
+                "spherical_aberration_um": -0.27,
+            },
+        )
+    )
+    cpd = np.array([30.0])
+    one = modulation(single, 4.0, at_cpd=cpd)[0]
+    # sinc² of half a wave: 0.405 of the light is sharp, the rest has no contrast here
+    assert modulation(double, 4.0, at_cpd=cpd)[0] == pytest.approx(
+        0.405 * one, rel=0.12
+    )
+    peaks = [
+        psf_picture(eye.wavefront(4.0), side_arcmin=100.0).max()
+        for eye in (single, double)
+    ]
+    assert peaks[1] / peaks[0] == pytest.approx(0.405, rel=0.12)
+
+
+def test_through_lenslets_no_acuity_is_told_but_through_their_clear_middle():
+    lens = {"kind": "lenslets", "sphere_dpt": 0.0, "vertex_mm": 12.0}
+    ahead = EyeStudy.of(IOL | {"correction": lens}).wavefront(5.0)
+    down = EyeStudy.of(IOL | {"correction": lens | {"gaze_deg": [0, -25]}})
+    assert ahead.rings is None and math.isfinite(acuity_log_mar(ahead))
+    seen = down.wavefront(5.0)
+    assert seen.rings is not None and math.isnan(acuity_log_mar(seen))
+    kernels = [psf_picture(eye, side_arcmin=40.0) for eye in (ahead, seen)]
+    y, x = np.indices(kernels[0].shape) - kernels[0].shape[0] // 2
+    aside_arcmin = np.hypot(x, y) * 40.0 / kernels[0].shape[0]
+    clear, through = (kernel[aside_arcmin < 2.0].sum() for kernel in kernels)
+    # 396 lenslets of 0.83 mm² have 46 % of their zone: what is left goes straight on
+    # with the square of 0.54, as of any grating
+    assert through == pytest.approx(0.54**2 * clear, abs=0.1)
+    # 3.5 dpt times half of 1.03 mm send the rest up to 6.2 arcmin aside
+    assert kernels[1][(2.0 < aside_arcmin) & (aside_arcmin < 7.5)].sum() > 0.4
+
+
+@pytest.mark.parametrize("sphere_dpt", [-20.0, 15.0])
+def test_the_strongest_prescriptions_have_a_point(sphere_dpt):
+    eye = EyeStudy.of({"kind": "prescription", "sphere_dpt": sphere_dpt})
+    wavefront, reach_arcmin = centred(eye.wavefront(5.0))
+    kernel = psf_picture(wavefront, side_arcmin=2.5 * reach_arcmin)
+    assert kernel.sum() == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_map_faces_the_person_and_has_the_wavefronts_height(cone):

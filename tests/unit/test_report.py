@@ -35,6 +35,8 @@ from clients.report.pdf_text import column_widths_mm, line_mm, lines_of, width_m
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
+from clients.report.worn_words import worn_words
+from estimator import parse_profile
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
 MYOPE = {
@@ -150,7 +152,76 @@ def test_haze_and_the_worn_lens_are_told():
     lens = {"sphere_dpt": -1.0, "vertex_mm": 12.0}
     rows = _rows({"kind": "preset", "name": "cataract", "correction": lens})
     assert "log s 1.22" in rows["Straylight"][1]
-    assert rows["Correction worn"][1] == "−1.00 dpt sph, 12 mm before the cornea"
+    assert rows["Correction worn"][1] == "spectacles −1.00 dpt sph at 12 mm"
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        (
+            {"kind": "iol", "design": "bifocal", "add_dpt": 3.0},
+            "intraocular lens, bifocal, add +3.0 dpt at the lens",
+        ),
+        (
+            {
+                "kind": "iol",
+                "design": "trifocal",
+                "adds_dpt": [2.17, 3.25],
+                "light_ratio": [0.4, 0.2, 0.3],
+                "cylinder_dpt": 1.5,
+                "axis_deg": 20,
+            },
+            "intraocular lens, trifocal, 0.00 dpt sph +1.50 cyl x 20° beyond the "
+            "eye's need, adds +2.17 and +3.25 dpt at the lens",
+        ),
+        (
+            {"kind": "iol", "design": "edof", "add_dpt": 1.75},
+            "intraocular lens, extended depth of focus, add +1.75 dpt at the lens",
+        ),
+        (
+            {
+                "kind": "iol",
+                "design": "zones",
+                "zone_adds_dpt": [2, 0],
+                "zone_diameters_mm": [1.5, 6],
+                "decentration_mm": [0.3, 0.4],
+            },
+            "intraocular lens, zones of several powers, from the middle +2.0, +0.0 dpt "
+            "at the lens, 0.5 mm off the middle of the pupil",
+        ),
+        ({"kind": "iol"}, "intraocular lens, monofocal"),
+        (
+            {"kind": "contact_lens", "sphere_dpt": -3},
+            "contact lens −3.00 dpt sph",
+        ),
+        (
+            {"kind": "progressive", "sphere_dpt": -2, "add_dpt": 2, "vertex_mm": 12},
+            "progressive spectacles −2.00 dpt sph at 12 mm, add +2.0 dpt, corridor "
+            "14 mm, looking straight ahead through −1.95 dpt sph",
+        ),
+        (
+            {"kind": "lenslets", "sphere_dpt": -1, "gaze_deg": [0, -25]},
+            "spectacles with lenslets −1.00 dpt sph at the cornea, lenslets of +3.5 "
+            "dpt, looking 25° down",
+        ),
+    ],
+)
+def test_what_is_worn_is_told_in_plain_words(lens, said):
+    body = {"kind": "prescription", "sphere_dpt": 0.0, "correction": lens}
+    assert worn_words(parse_profile(body).correction) == said
+
+
+def test_a_report_through_lenslets_says_what_is_not_known():
+    lens = {"kind": "lenslets", "sphere_dpt": -3, "gaze_deg": [0, -25]}
+    body = {"kind": "prescription", "sphere_dpt": -3.0, "correction": lens}
+    facts = facts_of(body | {"age_years": 10}, has_charts=False)
+    assert not facts.numbers["pupils"][0]["as_it_is"]["is_told"]
+    assert facts.numbers["charts"][0]["log_mar"] is None
+    text = html_of(document_of([facts]))
+    assert text.count("<td>not known</td>") >= 4
+    assert "no model of how people read through them is known" in text
+    assert "an eye that is looking 25° down" in text
+    json.dumps(facts.numbers, allow_nan=False)
 
 
 def test_citations_are_numbered_as_they_come_and_exist():
@@ -252,7 +323,7 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
     shown = EyeFacts(myope.study, "x", myope.numbers, charts)
     row = document_of([shown]).sections[0].rows[3]
     assert all(isinstance(block, Picture) for block in row.blocks)
-    log_mar = shown.chart_log_mar[3.0, 6.0]
+    log_mar = shown.chart_numbers[3.0, 6.0]["log_mar"]
     assert row.blocks[2].caption == (
         f"6 m, 3 mm: logMAR {log_mar:+.2f} ({10**-log_mar:.2f})"
     )

@@ -1,0 +1,160 @@
+"""What a person wears, in plain words."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from clients.report.numbers import written
+from estimator import (
+    DiffractiveRings,
+    EyeProfile,
+    Lenslets,
+    Prescription,
+    ProgressiveLens,
+    RefractiveZones,
+    WornLens,
+)
+
+DESIGNS = {
+    "monofocal": "monofocal",
+    "bifocal": "bifocal",
+    "trifocal": "trifocal",
+    "edof": "extended depth of focus",
+    "zones": "zones of several powers",
+}
+STRAIGHT_DEG = 0.5
+
+
+def short_words(lens: Prescription) -> str:
+    """Return what is worn in two or three words."""
+    if isinstance(lens, ProgressiveLens):
+        return "progressive spectacles"
+    if not isinstance(lens, WornLens):
+        return "spectacles"
+    if lens.kind == "lenslets":
+        return "spectacles with lenslets"
+    if lens.kind == "contact_lens":
+        return "contact lens"
+    return f"intraocular lens, {DESIGNS[lens.design]}"
+
+
+def worn_words(lens: Prescription) -> str:
+    """Return what is worn, its powers, and where on it the eye looks through."""
+    if isinstance(lens, ProgressiveLens):
+        own, more = lens.distance, _progressive(lens)
+    elif isinstance(lens, WornLens):
+        own, more = lens, _seated(lens)
+    else:
+        own, more = lens, ()
+    if isinstance(lens, WornLens) and lens.replaces_lens:
+        return ", ".join([short_words(lens), *_own_power(lens), *more])
+    return ", ".join([f"{short_words(lens)} {written(own)}{_where(own)}", *more])
+
+
+def _own_power(lens: WornLens) -> tuple[str, ...]:
+    """Return what an intraocular lens has beside what the eye needs."""
+    own = Prescription(
+        lens.at_lens_dpt(lens.sphere_dpt),
+        lens.at_lens_dpt(lens.cylinder_dpt),
+        lens.axis_deg,
+    )
+    has_power = abs(own.sphere_dpt) + abs(own.cylinder_dpt) >= 0.005
+    return (f"{written(own)} beyond the eye's need",) if has_power else ()
+
+
+def _where(lens: Prescription) -> str:
+    if isinstance(lens, WornLens) and lens.kind == "contact_lens":
+        return ""
+    return f" at {lens.vertex_mm:g} mm" if lens.vertex_mm else " at the cornea"
+
+
+def _seated(lens: WornLens) -> tuple[str, ...]:
+    parts = []
+    rings = lens.rings
+    if isinstance(rings, Lenslets):
+        parts.append(f"lenslets of {_power(rings.power_dpt)} dpt")
+        parts.append(gaze_words(rings.gaze_deg))
+    elif isinstance(rings, DiffractiveRings):
+        adds = [_power(lens.at_lens_dpt(d)) for d in design_adds_dpt(rings)]
+        many = "adds" if len(adds) > 1 else "add"
+        parts.append(f"{many} {' and '.join(adds)} dpt at the lens")
+    elif isinstance(rings, RefractiveZones):
+        adds = [_power(lens.at_lens_dpt(d)) for d in rings.powers_dpt]
+        parts.append(f"from the middle {', '.join(adds)} dpt at the lens")
+    if any(lens.centre_mm):
+        aside_mm = math.hypot(*lens.centre_mm)
+        parts.append(f"{aside_mm:.2g} mm off the middle of the pupil")
+    return tuple(parts)
+
+
+def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
+    """Return the additions that a lens is made for, dpt in the pupil, ascending."""
+    lowest, highest = rings.orders
+    orders = np.arange(lowest + 1, highest + 1)
+    middle = orders[:-1]
+    if middle.size > 1:  # of orders between, the one that has the light
+        light = np.abs(rings.kinoform.amplitudes(middle))
+        middle = middle[[int(light.argmax())]]
+    return [float(k - lowest) * rings.spacing_dpt for k in (*middle, highest)]
+
+
+def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
+    words = (
+        f"add {_power(lens.add_dpt)} dpt",
+        f"corridor {lens.corridor_mm:g} mm",
+        gaze_words(lens.gaze_deg),
+    )
+    return (*words[:2], f"{words[2]} through {written(lens)}")
+
+
+def gaze_words(gaze_deg: tuple[float, float]) -> str:
+    """Return where an eye looks."""
+    parts = [
+        f"{abs(angle):.0f}° {names[angle < 0.0]}"
+        for angle, names in zip(
+            gaze_deg, (("right", "left"), ("up", "down")), strict=True
+        )
+        if abs(angle) >= STRAIGHT_DEG
+    ]
+    return f"looking {', '.join(parts) or 'straight ahead'}"
+
+
+def _power(power_dpt: float) -> str:
+    """Return an addition: one digit, two where they matter."""
+    text = f"{power_dpt:+.2f}".replace("-", "\N{MINUS SIGN}")
+    return text[:-1] if text.endswith("0") else text
+
+
+def subtitle_words(profile: EyeProfile) -> str:
+    """Return the end of a report's subtitle."""
+    lens = profile.correction
+    return "" if lens is None else f"; {short_words(lens)}"
+
+
+def limits_words(lens: Prescription | None) -> tuple[str, ...]:
+    """Return what of a report a lens makes true only in part."""
+    if isinstance(lens, ProgressiveLens):
+        return (
+            f"Progressive lens: all of this report is for {_of_gaze(lens.gaze_deg)}; "
+            "elsewhere the lens has another power.",
+        )
+    if not isinstance(lens, WornLens) or lens.rings is None:
+        return ()
+    if isinstance(lens.rings, Lenslets):
+        return (
+            f"Lenslets: all of this report is for {_of_gaze(lens.rings.gaze_deg)}. "
+            "Where they lie before the pupil, acuity and contrast are not told: no "
+            "model of how people read through them is known; wavefronts and field "
+            "maps are those of the spectacles without them.",
+        )
+    return (
+        "Several foci: no Zernike term holds the rings of the lens. Refraction, "
+        "wavefront and field maps are those of its focus for far; point images, "
+        "contrast, acuity and charts go through all of it.",
+    )
+
+
+def _of_gaze(gaze_deg: tuple[float, float]) -> str:
+    return f"an eye that is {gaze_words(gaze_deg)}"
