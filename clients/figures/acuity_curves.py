@@ -30,9 +30,11 @@ LOOKING_FAR: dict = {"linestyle": "--", "linewidth": LINE_PT}
 MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
-def draw_through_focus_acuity(axes: Axes, study: EyeStudy) -> None:
-    """Draw acuity by distance through 3 and 5 mm: looking far, and accommodating."""
-    colors = dict(zip(PUPILS_MM, PUPIL_COLORS, strict=True))
+def draw_through_focus_acuity(
+    axes: Axes, study: EyeStudy, *, pupils_mm: Sequence[float] = PUPILS_MM
+) -> None:
+    """Draw acuity by distance through pupils: looking far, and accommodating."""
+    colors = dict(zip(pupils_mm, PUPIL_COLORS, strict=False))
     for pupil_mm, color in colors.items():
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)

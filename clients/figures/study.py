@@ -31,7 +31,7 @@ PUPILS_MM = (3.0, 5.0)
 """In daylight, and at dusk."""
 
 WAVELENGTH_NM = 555.0
-FOCUS_RANGE_DPT = (-30.0, 20.0)
+FOCUS_RANGE_DPT = (-80.0, 20.0)
 """Relaxed, also of the most far-sighted, to as near as any eye can accommodate for."""
 
 FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)

@@ -175,14 +175,24 @@ def _samples(
     screen: Screen | None,
     radius_mm: float,
 ) -> int:
-    """Return samples across the circle that follow the steepest part of its rim."""
+    """Return samples across the circle that follow the steepest part of its rim.
+
+    As many as there may be for what rings add: beyond their foci there is little light,
+    and of that the rim alone is told wrongly.
+    """
     angles = 2.0 * np.pi * np.arange(72) / 72
     slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
     steepest_um = float(np.linalg.norm(slopes @ zernike_um, axis=-1).max())
-    if screen is not None:
-        steepest_um += radius_mm * float(screen.reach_mrad(radius_mm, wavelength_nm))
-    waves_across = 2.0 * steepest_um * UM_PER_MM / wavelength_nm
-    wanted = max(LEAST_SAMPLES, math.ceil(waves_across / STEP_WAVES))
+
+    def following(slope_um: float) -> int:
+        waves_across = 2.0 * slope_um * UM_PER_MM / wavelength_nm
+        return max(LEAST_SAMPLES, math.ceil(waves_across / STEP_WAVES))
+
+    wanted = following(steepest_um)
+    if screen is not None and wanted <= MOST_SAMPLES:
+        aside_mrad = float(screen.reach_mrad(radius_mm, wavelength_nm))
+        more = following(steepest_um + radius_mm * aside_mrad)
+        wanted = min(more, MOST_SAMPLES)
     if wanted > MOST_SAMPLES:
         raise ValueError(
             f"wavefront of {steepest_um:.0f} um per pupil radius at its rim: transfer "
