@@ -7,6 +7,7 @@ page           the page, and what becomes of every entry
 page_state     what a page holds, without the page
 eye_panel      the entries of one eye
 eye_form       what they say, and the profile that it makes
+worn_form      what is worn, as entries
 numbers        numbers that people type, with their limits
 slider_row     a slider with its name and value
 upload_entry   an entry for a file

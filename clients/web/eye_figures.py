@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from clients.figures import (
     EyeStudy,
     cross_section_figure,
+    draw_through_focus_acuity,
     draw_wavefront_map,
 )
 from clients.figures.field_maps import blur_arcmin, draw_field_map
@@ -20,6 +21,7 @@ FIGURE_TITLES = {
     "wavefront": "Wavefront",
     "field": "Field",
     "section": "Section",
+    "acuity": "Acuity",
 }
 MM_PER_INCH = 25.4
 AXIS_PT = 8.0
@@ -46,6 +48,8 @@ def eye_figure(
         figure = _field_figure(study)
     elif name == "section":
         figure = cross_section_figure(study)
+    elif name == "acuity":
+        figure = _acuity_figure(study, pupil_diameter_mm)
     else:
         figure = _wavefront_figure(study, pupil_diameter_mm, focus_dpt)
     file = io.BytesIO()
@@ -70,6 +74,13 @@ def _field_figure(study: EyeStudy) -> Figure:
     for axes in (upper, lower):
         axes.set_ylabel("up, deg", fontsize=AXIS_PT)
     lower.set_xlabel("right, deg", fontsize=AXIS_PT)
+    return figure
+
+
+def _acuity_figure(study: EyeStudy, pupil_diameter_mm: float) -> Figure:
+    """Return what is read at each distance through this pupil."""
+    figure = Figure(figsize=_size(95.0, 90.0), layout="constrained")
+    draw_through_focus_acuity(figure.subplots(), study, pupils_mm=[pupil_diameter_mm])
     return figure
 
 

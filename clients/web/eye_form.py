@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from clients.web.numbers import NumberField
+from clients.web.worn_form import PRESCRIPTION, WornForm, read_numbers
 from estimator import parse_profile, preset_names, profile_body
 
 EyeSide = Literal["OD", "OS"]
@@ -20,15 +20,6 @@ Source = Literal["prescription", "preset", "file"]
 SIDES: dict[EyeSide, str] = {"OD": "Right eye", "OS": "Left eye"}
 PROFILE_SUFFIXES = (".json", ".csv", ".abp")
 MAX_PROFILE_BYTES = 2_000_000
-
-SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
-CYLINDER = NumberField(
-    "cylinder_dpt", "Cylinder", "dpt", -15.0, 15.0, 0.25, is_signed=True
-)
-AXIS = NumberField("axis_deg", "Axis", "°", 0.0, 180.0, 1.0, digits=0)
-VERTEX = NumberField("vertex_mm", "Vertex", "mm", 0.0, 25.0, 1.0, digits=0)
-PRESCRIPTION = (SPHERE, CYLINDER, AXIS, VERTEX)
-NOTHING = {"sphere_dpt": "0.00", "cylinder_dpt": "0.00", "axis_deg": "0"}
 
 PRESET_TITLES = {
     "emmetropia": "Emmetropia (normal)",
@@ -48,10 +39,6 @@ def preset_titles() -> dict[str, str]:
     }
 
 
-def _plain() -> dict[str, str]:
-    return {**NOTHING, "vertex_mm": "12"}
-
-
 @dataclass
 class EyeForm:
     """The entries for one eye.
@@ -65,19 +52,18 @@ class EyeForm:
     preset : name
     file_body : profile of the file that was read, or None
     file_name : of that
-    wears_correction : whether `worn` is on the nose
-    worn : the worn correction, as typed
+    wears_correction : whether `worn` counts
     """
 
     side: EyeSide
     source: Source = "prescription"
-    texts: dict[str, str] = field(default_factory=_plain)
+    texts: dict[str, str] = field(default_factory=lambda: _as_texts({"vertex_mm": 12}))
     has_higher_order: bool = True
     preset: str = "myopia"
     file_body: dict[str, Any] | None = None
     file_name: str = ""
     wears_correction: bool = False
-    worn: dict[str, str] = field(default_factory=_plain)
+    worn: WornForm = field(default_factory=WornForm)
 
     def body(self, *, age_years: float) -> dict[str, Any]:
         """Return the profile.
@@ -89,7 +75,9 @@ class EyeForm:
         """
         body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
         if self.wears_correction:
-            body["correction"] = read_prescription(self.worn, "Worn correction: ")
+            body["correction"] = self.worn.body()
+            if self.worn.kind == "iol":  # its own lens is gone, and what is typical
+                body.pop("higher_order", None)
         parse_profile(body)
         return body
 
@@ -103,12 +91,13 @@ class EyeForm:
         return {
             "kind": "prescription",
             "higher_order": "typical" if self.has_higher_order else "none",
-            **read_prescription(self.texts),
+            **read_numbers(PRESCRIPTION, self.texts),
         }
 
     def correct_fully(self) -> None:
         """Wear what the prescription says."""
-        self.worn = dict(self.texts)
+        self.worn.kind = "spectacles"
+        self.worn.texts |= self.texts
         self.wears_correction = True
 
     def take_file(self, name: str, content: bytes) -> float | None:
@@ -129,7 +118,7 @@ class EyeForm:
         correction = body.pop("correction", None)
         if correction is not None:
             self.wears_correction = True
-            self.worn = _as_texts(correction)
+            self.worn.take(correction)
         if body.get("kind") == "preset":
             self.source, self.preset = "preset", body["name"]
         elif _is_plain_prescription(body):
@@ -137,23 +126,6 @@ class EyeForm:
             self.has_higher_order = body.get("higher_order", "typical") == "typical"
         else:
             self.source, self.file_body, self.file_name = "file", body, name
-
-
-def read_prescription(texts: Mapping[str, str], where: str = "") -> dict[str, float]:
-    """Return the numbers of a prescription.
-
-    Raises
-    ------
-    ValueError
-        Names the entry, what it is and what is allowed.
-    """
-    values = {}
-    for entry in PRESCRIPTION:
-        try:
-            values[entry.name] = entry.read(texts[entry.name])
-        except ValueError as error:
-            raise ValueError(f"{where}{entry.label}: {error}") from None
-    return values
 
 
 def read_profile_file(name: str, content: bytes) -> dict[str, Any]:

@@ -6,16 +6,11 @@ from collections.abc import Callable
 
 from nicegui import events, ui
 
-from clients.web.eye_form import (
-    PRESCRIPTION,
-    PROFILE_SUFFIXES,
-    SPHERE,
-    EyeForm,
-    preset_titles,
-)
+from clients.web.eye_form import PROFILE_SUFFIXES, EyeForm, preset_titles
 from clients.web.numbers import NumberField
 from clients.web.slider_row import THROTTLE_S
 from clients.web.upload_entry import upload_entry
+from clients.web.worn_form import DESIGNS, HINTS, PRESCRIPTION, SPHERE
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
@@ -144,15 +139,28 @@ class EyePanel:
                     "flat dense no-caps size=sm"
                 ).tooltip("Wear spectacles of the prescription above")
         if form.wears_correction:
-            with ui.element("div").classes("oc-fields oc-worn"):
-                for number in PRESCRIPTION:
-                    self._entry(number, form.worn).props["data-worn"] = ""
+            self._worn()
+
+    def _worn(self) -> None:
+        worn = self.form.worn
+        ui.select(worn.kinds, value=worn.kind, on_change=self._choose_worn).props(
+            "outlined dense options-dense"
+        ).classes("oc-wide oc-worn-kind")
+        if worn.kind == "iol":
+            ui.select(DESIGNS, value=worn.design, on_change=self._choose_design).props(
+                "outlined dense options-dense"
+            ).classes("oc-wide oc-worn-design")
+        with ui.element("div").classes("oc-fields oc-worn"):
+            for number in worn.entries:
+                self._entry(number, worn.texts).props["data-worn"] = ""
+        if worn.kind in HINTS:
+            ui.label(HINTS[worn.kind]).classes("oc-hint")
 
     def copy(self, other: EyeForm) -> None:
         """Take over the entries of the other eye."""
         form = self.form
         form.source, form.preset = other.source, other.preset
-        form.texts, form.worn = dict(other.texts), dict(other.worn)
+        form.texts, form.worn = dict(other.texts), other.worn.copied()
         form.has_higher_order = other.has_higher_order
         form.file_body, form.file_name = other.file_body, other.file_name
         form.wears_correction = other.wears_correction
@@ -174,6 +182,14 @@ class EyePanel:
 
     def _switch_correction(self, event: events.ValueChangeEventArguments) -> None:
         self.form.wears_correction = event.value
+        self._changed()
+
+    def _choose_worn(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.worn.kind = event.value
+        self._changed()
+
+    def _choose_design(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.worn.design = event.value
         self._changed()
 
     def _correct_fully(self) -> None:

@@ -15,6 +15,7 @@ from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
 from clients.web.wishes import Kind, Seen, Wish
+from clients.web.worn_form import turns_with_gaze
 from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, RgbdView
 
 MS_PER_S = 1e3
@@ -90,7 +91,10 @@ class EyeView:
         self._stop_other(wish)
         if self._quick is None:
             self._quick = _Through(EyeFilter())
-        return self._look(self._quick, "preview", wish, QUICK, wish.picture.small)
+        settings = QUICK
+        if turns_with_gaze(wish.bodies[self.side]):
+            settings = QUICK.changed(gaze_deg=wish.gaze_deg)
+        return self._look(self._quick, "preview", wish, settings, wish.picture.small)
 
     def full(self, wish: Wish) -> Seen | None:
         """Return the full picture; None while its eye is being prepared."""

@@ -77,7 +77,7 @@ class FigurePanel:
             return None
 
     def _body(self) -> str | None:
-        body = self._state.right.get(self._side)
+        body = self._state.looking_body(self._side)
         return None if body is None else json.dumps(body, sort_keys=True)
 
     async def _show_point(self) -> None:
@@ -113,7 +113,7 @@ class FigurePanel:
 
     @property
     def _is_of_state(self) -> bool:
-        return self._figure == "wavefront"
+        return self._figure in ("wavefront", "acuity")
 
 
 def point_words(facts: dict[str, float]) -> str:

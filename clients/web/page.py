@@ -252,7 +252,7 @@ class Page:
 
     async def _download_report(self) -> None:
         for side in self.state.sides:
-            body = self.state.right.get(side)
+            body = self.state.looking_body(side)
             if body is None:
                 continue
             title = SIDES[side]

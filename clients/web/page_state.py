@@ -10,6 +10,7 @@ from clients.web.eye_form import SIDES, EyeForm, EyeSide
 from clients.web.numbers import NumberField
 from clients.web.picture import Picture, Place
 from clients.web.wishes import Wish
+from clients.web.worn_form import looking
 
 Shown = Literal["OD", "OS", "both"]
 
@@ -81,6 +82,11 @@ class PageState:
     def gaze_deg(self) -> tuple[float, float]:
         """Return where the eye looks in the picture."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
+
+    def looking_body(self, side: EyeSide) -> dict[str, Any] | None:
+        """Return the last right profile of an eye, its lens as the gaze meets it."""
+        body = self.right.get(side)
+        return None if body is None else looking(body, self.gaze_deg)
 
     def take_picture(self, picture: Picture) -> None:
         """Look at another picture; the first is seen in the state that it suggests."""

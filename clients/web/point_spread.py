@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from clients.web.picture_files import png_of
-from estimator import EyeOptics, compute_psfs, parse_profile, prepare_eye
+from estimator import EyeOptics, Rings, compute_psfs, parse_profile, prepare_eye
 
 SIDE_PX = 129
 SHOWN_PX = 516
@@ -25,6 +25,9 @@ FIELD_DEG = ((-45.0, 45.0), (-35.0, 35.0))
 LEAST_SIDE_ARCMIN = 12.0
 ROOM_RATIO = 3.2
 """Side of the picture over the blur's radius."""
+
+RINGS_ROOM_RATIO = 2.2
+"""And over the radius of the light of another focus."""
 
 GAMMA = 0.45
 """Of the light as it is shown, so that faint parts are seen."""
@@ -107,11 +110,16 @@ def _kernels(
     defocus_dpt = eye.total_defocus_dpt(**place)
     defocus_dpt = defocus_dpt + eye.vergence.vergence_dpt(state.object_dpt)
     waves = eye.wavefronts(**place, total_defocus_dpt=defocus_dpt)
-    side_arcmin = _side_arcmin(waves.zernike_um, waves.circle_diameter_mm)
+    rings = eye.rings and eye.rings.seen_from(h_deg, v_deg)
+    reach_mrad = _rings_reach_mrad(rings, pupil_mm / 2.0)
+    side_arcmin = _side_arcmin(
+        waves.zernike_um, waves.circle_diameter_mm, more_mrad=reach_mrad
+    )
     pixel_pitch_mrad = side_arcmin / SIDE_PX / ARCMIN_PER_MRAD
     return [
         _kernel(
             waves.zernike_um[k : k + 1],
+            rings,
             pupil_diameter_mm=float(waves.circle_diameter_mm[k]),
             pupil_ellipse=waves.pupil_ellipse[k],
             wavelength_nm=wavelength_nm,
@@ -122,19 +130,34 @@ def _kernels(
     ], side_arcmin
 
 
-def _kernel(zernike_um: NDArray[np.float64], **state) -> NDArray[np.float64]:
+def _rings_reach_mrad(rings: Rings | None, radius_mm: float) -> float:
+    """Return how far rings send light aside to their foci, or lenslets all of it."""
+    if rings is None:
+        return 0.0
+    if rings.lattice_mm is not None:
+        return float(rings.reach_mrad(radius_mm, WAVELENGTHS_NM[0]))
+    return float(np.abs(rings.main_dpt(WAVELENGTHS_NM[0])).max() * radius_mm)
+
+
+def _kernel(
+    zernike_um: NDArray[np.float64], rings: Rings | None, **state
+) -> NDArray[np.float64]:
     """Return one PSF, by waves where they can be had.
 
     A mix of waves and rays shows its seams where light is faint.
     """
     try:
-        found = compute_psfs(zernike_um, method="fourier", accuracy="fine", **state)
-    except ValueError:  # too steep for that
+        found = compute_psfs(
+            zernike_um, method="fourier", accuracy="fine", pupil_screen=rings, **state
+        )
+    except ValueError:  # too steep for that: by far wider than what rings add
         found = compute_psfs(zernike_um, **state)
     return found[0].kernel
 
 
-def _side_arcmin(zernike_um: NDArray, diameter_mm: NDArray) -> float:
+def _side_arcmin(
+    zernike_um: NDArray, diameter_mm: NDArray, *, more_mrad: float
+) -> float:
     """Return how large a picture the widest colour needs, on a scale that stays.
 
     The blur's radius at the rim of the pupil is about that of its RMS slope: sqrt(2)
@@ -143,7 +166,8 @@ def _side_arcmin(zernike_um: NDArray, diameter_mm: NDArray) -> float:
     radius_mm = np.asarray(diameter_mm) / 2.0
     spread = np.sqrt((np.asarray(zernike_um)[:, 3:] ** 2).sum(axis=1))
     reach_mrad = 4.0 * math.sqrt(3.0) * spread / radius_mm
-    wanted = float(ROOM_RATIO * reach_mrad.max() * ARCMIN_PER_MRAD)
+    widest_mrad = ROOM_RATIO * float(reach_mrad.max())
+    wanted = max(widest_mrad, RINGS_ROOM_RATIO * more_mrad) * ARCMIN_PER_MRAD
     steps = math.ceil(4.0 * math.log2(max(wanted, LEAST_SIDE_ARCMIN)))
     return 2.0 ** (steps / 4.0)
 

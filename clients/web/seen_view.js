@@ -20,7 +20,7 @@ export default {
         <span class="oc-tag oc-tag-left" :style="{ opacity: split > 12 ? 1 : 0 }">Scene</span>
         <span class="oc-tag oc-tag-right" :style="{ opacity: split < 88 ? 1 : 0 }">
           {{ label(eye) }}</span>
-        <span class="oc-state" :class="'oc-' + state(eye).kind">{{ state(eye).text }}</span>
+        <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
         <span v-if="point && point.eye === eye" class="oc-cross"
               :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
         <div class="oc-split" :style="{ left: split + '%' }" role="slider" tabindex="0"

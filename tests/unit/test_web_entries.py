@@ -4,9 +4,10 @@ import json
 
 import pytest
 
-from clients.web.eye_form import AXIS, SPHERE, EyeForm, preset_titles
+from clients.web.eye_form import EyeForm, preset_titles
 from clients.web.numbers import distance_text
-from clients.web.page_state import AGE, FOCUS, PageState
+from clients.web.page_state import AGE, FOCUS, GAZE_V, PageState
+from clients.web.worn_form import AXIS, DESIGNS, KINDS, SPHERE, WornForm, first_texts
 from estimator import parse_profile, preset_names
 from tests.unit.web_parts import a_picture
 
@@ -68,9 +69,64 @@ def test_the_entries_become_a_profile_with_what_is_worn():
 
 def test_a_wrong_worn_entry_is_told_as_such():
     form = EyeForm("OD", wears_correction=True)
-    form.worn["axis_deg"] = "200"
+    form.worn.texts["axis_deg"] = "200"
     with pytest.raises(ValueError, match=r"Worn correction: Axis: 200 is out of range"):
         form.body(age_years=30.0)
+
+
+@pytest.mark.parametrize("source", ["prescription", "preset"])
+@pytest.mark.parametrize(
+    ("kind", "design"),
+    [(kind, "monofocal") for kind in KINDS] + [("iol", name) for name in DESIGNS],
+)
+def test_every_lens_of_the_page_is_one_that_a_profile_may_have(kind, design, source):
+    form = EyeForm("OD", source=source, wears_correction=True)
+    form.worn.kind, form.worn.design = kind, design
+    form.worn.texts.update(cylinder_dpt="-1.00", axis_deg="20")
+    body = form.body(age_years=70.0)
+    assert parse_profile(body).correction is not None
+    again = EyeForm("OD")
+    again.take_body(body, "p.json")
+    assert again.worn == form.worn
+
+
+def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
+    zones = {"kind": "iol", "design": "zones", "zone_adds_dpt": [2, 0]}
+    zones["zone_diameters_mm"] = [1.5, 6]
+    form = WornForm()
+    form.take(zones)
+    assert form.body() == zones and "file" in form.kinds and form.entries == ()
+    assert "file" not in WornForm(texts=first_texts()).kinds
+
+
+def test_additions_that_no_lens_can_have_are_told():
+    form = EyeForm("OD", wears_correction=True)
+    form.worn.kind, form.worn.design = "iol", "bifocal"
+    form.worn.texts["add_dpt"] = "7"
+    with pytest.raises(
+        ValueError,
+        match=r"Worn correction: Addition: 7 is out of range; allowed: 0\.5 to 6 dpt",
+    ):
+        form.body(age_years=70.0)
+    form.worn.design = "trifocal"
+    form.worn.texts["middle_add_dpt"] = "3.1"
+    with pytest.raises(ValueError, match="a ratio of whole numbers"):
+        form.body(age_years=70.0)
+
+
+def test_the_gaze_slider_turns_a_progressive_lens_of_the_figures():
+    state = PageState(picture=a_picture())
+    form = state.eyes["OD"]
+    form.wears_correction, form.worn.kind = True, "progressive"
+    state.values[GAZE_V.name] = -15.0
+    wish = state.wish()
+    assert "gaze_deg" not in wish.bodies["OD"]["correction"]  # the settings have it
+    seen = parse_profile(state.looking_body("OD")).correction
+    # 25.5 mm before the centre of rotation 15 deg are 6.8 mm, half of the corridor
+    assert seen.sphere_dpt == pytest.approx(2.0 / 2, abs=0.15)
+    form.worn.kind = "contact_lens"
+    state.wish()
+    assert state.looking_body("OD") == state.right["OD"]
 
 
 @pytest.mark.parametrize("name", preset_names())

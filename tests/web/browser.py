@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-WAIT_MS = 90_000
+WAIT_MS = 25_000
 DRAWN = "window.ocufilter?.drawn ?? []"
 
 
@@ -35,6 +35,24 @@ class PageUnderTest:
     def choose(self, text) -> None:
         """Press what bears a text."""
         self.page.get_by_role("button", name=text, exact=True).first.click()
+
+    def pick(self, css, text) -> None:
+        """Choose an option of a list."""
+        self.page.locator(css).first.click()
+        self.page.get_by_role("option", name=text, exact=True).click()
+
+    def wear(self, kind) -> None:
+        """Wear a kind of correction."""
+        if self.page.locator(".oc-worn-kind").count() == 0:
+            self.page.get_by_text("Wears a correction").first.click()
+        self.pick(".oc-worn-kind", kind)
+
+    def press(self, slider, key, count) -> None:
+        """Move a slider by keys."""
+        thumb = self.slider(slider).locator("[tabindex='0']")
+        thumb.focus()
+        for _ in range(count):
+            thumb.press(key)
 
     def drawn(self):
         """Return what was drawn, in order."""

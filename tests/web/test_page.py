@@ -126,7 +126,43 @@ def test_the_point_under_the_pointer_is_drawn(page):
     assert png.startswith("data:image/png;base64,")
 
 
-@pytest.mark.parametrize("name", ["Field", "Section", "Wavefront"])
+def test_a_trifocal_lens_is_chosen_and_sharper_near_than_a_monofocal_one(page):
+    page.choose("Letter chart")
+    page.press("age_years", "PageUp", 4)
+    page.press("distance_dpt", "PageUp", 4)
+    number = page.number()
+    page.wear("Intraocular lens")
+    page.settle(after=number)
+    single, number = page.seen(), page.number()
+    page.pick(".oc-worn-design", "Trifocal")
+    page.settle(after=number)
+    assert page.entry("near_add_dpt").input_value() == "3.32"
+    assert _detail(page.seen()) > 1.2 * _detail(single)
+    page.entry("near_add_dpt").fill("3.1")
+    page.page.get_by_text(re.compile("a ratio of whole numbers up to 4")).wait_for()
+
+
+def test_the_gaze_goes_through_another_part_of_a_progressive_lens(page):
+    number = page.number()
+    page.wear("Progressive spectacles")
+    told = page.settle(after=number)
+    ahead, number = page.seen(), page.number()
+    assert told["focus_dpt"] == pytest.approx(told["wanted_focus_dpt"], abs=0.1)
+    page.press("gaze_v_deg", "ArrowLeft", 15)
+    told = page.settle(after=number)
+    # 25.5 mm before the centre of rotation that is 6.8 mm down: half of the corridor,
+    # half of the addition of 2 dpt, with which nothing farther than 1 m is sharp
+    assert told["focus_dpt"] == pytest.approx(1.0, abs=0.15)
+    assert _change(ahead, page.seen()) > 0.5
+
+
+def test_the_tag_of_the_full_picture_goes_away(page):
+    tag = page.page.locator(".oc-state").first
+    page.page.wait_for_timeout(2500)
+    assert tag.evaluate("tag => getComputedStyle(tag).opacity") == "0"
+
+
+@pytest.mark.parametrize("name", ["Field", "Section", "Wavefront", "Acuity"])
 def test_figures_are_drawn(page, name):
     page.choose(name)
     page.page.locator(f".oc-figure img[alt={name}]").wait_for()
@@ -205,6 +241,24 @@ def test_a_portrait_is_seen_whole_and_a_file_of_another_kind_is_refused(page):
     box = page.page.locator(".oc-view").first.bounding_box()
     assert box["height"] < 0.65 * 800
     assert box["width"] / box["height"] == pytest.approx(2 / 3, rel=0.01)
+
+
+def test_a_3d_file_of_ones_own_is_looked_at(page):
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    box.visual.vertex_colors = [200, 40, 30, 255]
+    box = box.export(file_type="glb")
+    number = page.number()
+    page.choose("3D file")
+    page.page.locator(".oc-uploads input[type=file]").first.set_input_files(
+        {"name": "box.glb", "mimeType": "model/gltf-binary", "buffer": box}
+    )
+    page.settle(after=number)
+    scene = page.seen(layer="before")
+    is_red = scene[..., 0] > 1.5 * scene[..., 1]
+    assert is_red[scene.shape[0] // 2, scene.shape[1] // 2] and not is_red[2, 2]
+    assert 0.05 < is_red.mean() < 0.8
+    assert page.page.evaluate("window.ocufilter.drawn.at(-1).width_px") == 960
 
 
 def test_on_a_phone_nothing_is_wider_than_the_screen(page):

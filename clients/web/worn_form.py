@@ -1,0 +1,196 @@
+"""What a person enters about the correction that is worn, and what it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from clients.web.numbers import NumberField
+
+WornKind = Literal[
+    "spectacles", "progressive", "lenslets", "contact_lens", "iol", "file"
+]
+
+KINDS: dict[WornKind, str] = {
+    "spectacles": "Spectacles",
+    "progressive": "Progressive spectacles",
+    "lenslets": "Spectacles with lenslets",
+    "contact_lens": "Contact lens",
+    "iol": "Intraocular lens",
+}
+AS_IN_FILE = "As in the file"
+DESIGNS = {
+    "monofocal": "Monofocal",
+    "bifocal": "Bifocal",
+    "trifocal": "Trifocal",
+    "edof": "Extended depth of focus",
+}
+HINTS: dict[WornKind, str] = {
+    "progressive": "The gaze sliders look through other parts of it.",
+    "lenslets": "396 lenslets around a clear middle; the gaze sliders look through "
+    "other parts of it.",
+    "iol": "It takes the place of the eye's own lens: what is entered above is what is "
+    "left after the operation, and neither accommodation nor aberrations of the age "
+    "count. Powers are those of the lens.",
+}
+
+SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
+CYLINDER = NumberField(
+    "cylinder_dpt", "Cylinder", "dpt", -15.0, 15.0, 0.25, is_signed=True
+)
+AXIS = NumberField("axis_deg", "Axis", "°", 0.0, 180.0, 1.0, digits=0)
+VERTEX = NumberField("vertex_mm", "Vertex", "mm", 0.0, 25.0, 1.0, digits=0)
+PRESCRIPTION = (SPHERE, CYLINDER, AXIS, VERTEX)
+
+PROGRESSIVE_ADD = NumberField("add_dpt", "Addition", "dpt", 0.25, 4.0, 0.25)
+CORRIDOR = NumberField("corridor_mm", "Corridor", "mm", 8.0, 24.0, 1.0, digits=0)
+BIFOCAL_ADD = NumberField("add_dpt", "Addition", "dpt", 0.5, 6.0, 0.25)
+EDOF_ADD = NumberField("add_dpt", "Addition", "dpt", 0.25, 3.0, 0.25)
+MIDDLE_ADD = NumberField("middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01)
+NEAR_ADD = NumberField("near_add_dpt", "Near add", "dpt", 0.5, 6.0, 0.01)
+ABERRATION = NumberField(
+    *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
+    is_signed=True,
+)
+
+OF_KIND: dict[WornKind, tuple[NumberField, ...]] = {
+    "spectacles": PRESCRIPTION,
+    "progressive": (*PRESCRIPTION, PROGRESSIVE_ADD, CORRIDOR),
+    "lenslets": PRESCRIPTION,
+    "contact_lens": (*PRESCRIPTION[:3], ABERRATION),
+    "iol": (*PRESCRIPTION[:3], ABERRATION),
+    "file": (),
+}
+OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
+    "monofocal": (),
+    "bifocal": (BIFOCAL_ADD,),
+    "trifocal": (MIDDLE_ADD, NEAR_ADD),
+    "edof": (EDOF_ADD,),
+}
+TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
+"""Far, intermediate, near, as a usual trifocal lens has it: 50:20:30 of 86 %."""
+
+
+def first_texts() -> dict[str, str]:
+    """Return what stands in the entries at first."""
+    return {
+        "sphere_dpt": "0.00",
+        "cylinder_dpt": "0.00",
+        "axis_deg": "0",
+        "vertex_mm": "12",
+        "add_dpt": "2.00",
+        "corridor_mm": "14",
+        "middle_add_dpt": "1.66",
+        "near_add_dpt": "3.32",
+        "spherical_aberration_um": "0.00",
+    }
+
+
+def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
+    """Return whether another gaze looks through another part of what is worn."""
+    worn = profile.get("correction") or {}
+    return worn.get("kind") in ("progressive", "lenslets")
+
+
+def looking(
+    profile: Mapping[str, Any], gaze_deg: tuple[float, float]
+) -> dict[str, Any]:
+    """Return a profile whose worn lens is seen through at a gaze."""
+    if not turns_with_gaze(profile):
+        return dict(profile)
+    worn = dict(profile["correction"])
+    own_deg = worn.get("gaze_deg", (0.0, 0.0))
+    worn["gaze_deg"] = [own + more for own, more in zip(own_deg, gaze_deg, strict=True)]
+    return {**profile, "correction": worn}
+
+
+@dataclass
+class WornForm:
+    """The entries for what one eye wears.
+
+    Attributes
+    ----------
+    design : of an intraocular lens
+    texts : by a field's name, as typed
+    file_body : a correction that the entries cannot hold, or None
+    """
+
+    kind: WornKind = "spectacles"
+    design: str = "monofocal"
+    texts: dict[str, str] = field(default_factory=first_texts)
+    file_body: dict[str, Any] | None = None
+
+    @property
+    def kinds(self) -> dict[WornKind, str]:
+        """Return what may be chosen."""
+        return KINDS if self.file_body is None else {**KINDS, "file": AS_IN_FILE}
+
+    @property
+    def entries(self) -> tuple[NumberField, ...]:
+        """Return the numbers that count."""
+        more = OF_DESIGN[self.design] if self.kind == "iol" else ()
+        return (*more, *OF_KIND[self.kind])
+
+    def body(self) -> dict[str, Any]:
+        """Return the correction.
+
+        Raises
+        ------
+        ValueError
+            Names the entry, what it is and what is allowed.
+        """
+        if self.kind == "file":
+            return dict(self.file_body or {})
+        values = read_numbers(self.entries, self.texts, "Worn correction: ")
+        if self.kind == "spectacles":
+            return dict(values)
+        found: dict[str, Any] = {"kind": self.kind, **values}
+        if self.kind != "iol":
+            return found
+        if self.design == "trifocal":
+            adds = [found.pop(entry.name) for entry in OF_DESIGN["trifocal"]]
+            found |= {"adds_dpt": adds, "light_ratio": list(TRIFOCAL_LIGHT)}
+        return found | {"design": self.design}
+
+    def take(self, body: Mapping[str, Any]) -> None:
+        """Take a correction over into the entries, or as it is where they cannot."""
+        kind, design = body.get("kind", "spectacles"), body.get("design", "monofocal")
+        values = dict(body)
+        if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
+            names = [entry.name for entry in OF_DESIGN["trifocal"]]
+            values |= dict(zip(names, values.pop("adds_dpt", ()), strict=False))
+        known = WornForm(kind, design) if kind in KINDS and design in DESIGNS else None
+        names = {entry.name for entry in known.entries} if known else set()
+        if known is None or not set(values) <= {"kind", "design"} | names:
+            self.kind, self.file_body = "file", dict(body)
+            return
+        self.kind, self.design = known.kind, known.design
+        missing = {"vertex_mm": 0.0} if "vertex_mm" in names else {}
+        for entry in known.entries:
+            value = values.get(entry.name, missing.get(entry.name))
+            text = first_texts()[entry.name] if value is None else entry.show(value)
+            self.texts[entry.name] = text
+
+    def copied(self) -> WornForm:
+        """Return the same entries for the other eye."""
+        return WornForm(self.kind, self.design, dict(self.texts), self.file_body)
+
+
+def read_numbers(
+    entries: tuple[NumberField, ...], texts: Mapping[str, str], where: str = ""
+) -> dict[str, float]:
+    """Return the numbers of entries.
+
+    Raises
+    ------
+    ValueError
+        Names the entry, what it is and what is allowed.
+    """
+    values = {}
+    for entry in entries:
+        try:
+            values[entry.name] = entry.read(texts[entry.name])
+        except ValueError as error:
+            raise ValueError(f"{where}{entry.label}: {error}") from None
+    return values
