@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-WAIT_MS = 25_000
+WAIT_MS = 90_000
 DRAWN = "window.ocufilter?.drawn ?? []"
 
 
