@@ -19,14 +19,14 @@ processor time.
 Then a batch is killed 20 times by SIGKILL at random moments, workers with it or left
 behind, and finished: what is lost, half written or another.
 
-Load of the machine stands beside each figure; "busy" where others keep it at work.
+What others do with the machine in the second before stands beside each figure; "busy"
+where that is more than a tenth of it.
 
 Writes results/batch.json.
 """
 
 import argparse
 import json
-import os
 import random
 import sys
 import tempfile
@@ -72,6 +72,7 @@ WARM_FRAMES = 8
 WAYS = {"1 worker": (1, 1), "2 workers": (2, 1), "1 worker, 2 threads": (1, 2)}
 FOV_DEG = 50.0
 WINDOW_PX = 64
+BUSY_RATIO = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,8 +88,24 @@ class Rate:
     core_hours_per_million: float
     cpu_hours_per_million: float
     psnr_db: float
-    load_before: float
+    others_ratio: float
     is_busy: bool
+
+
+def _work_of_others() -> float:
+    """Return the share of all processors that is at work while we sleep for 1 s."""
+    before = _processor_times()
+    time.sleep(1.0)
+    spent = [
+        after - first for after, first in zip(_processor_times(), before, strict=True)
+    ]
+    idle = spent[3] + spent[4]  # and waiting for a disk
+    return 1.0 - idle / max(sum(spent), 1)
+
+
+def _processor_times() -> list[int]:
+    with open("/proc/stat", encoding="ascii") as stat:
+        return [int(ticks) for ticks in stat.readline().split()[1:9]]
 
 
 def write_walk(walk: Walk, folder: Path, count: int) -> list[SourceFrame]:
@@ -170,7 +187,7 @@ def measured(
     """Run a batch one way; return what it costs."""
     (eye,) = job.profiles
     n_workers, n_threads = WAYS[way]
-    load = os.getloadavg()[0]
+    others_ratio = _work_of_others()
     done_s: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
@@ -205,8 +222,8 @@ def measured(
             float(np.median(cpu_ms)) * MILLION / MS_PER_HOUR, 2
         ),
         psnr_db=round(psnr_db, 2),
-        load_before=round(load, 2),
-        is_busy=load > 0.5,
+        others_ratio=round(others_ratio, 2),
+        is_busy=others_ratio > BUSY_RATIO,
     )
     parts = {
         "frame": np.diff(done_s[first:]) * 1e3,
