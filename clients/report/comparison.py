@@ -52,6 +52,9 @@ NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
 MAP_MM, PSF_MM = 46.0, 58.0
 """Heights at which the first page holds all that belongs on it."""
 
+CURVES_MM = 64.0
+"""Height of curves of both eyes."""
+
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
     """Return the report of two eyes: what differs first, then each of them."""
@@ -193,26 +196,21 @@ def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
 
 def _curves(before: EyeFacts, after: EyeFacts) -> Section:
     studies, labels = (before.study, after.study), (before.label, after.label)
-    mtfs = tuple(
-        on_axes(
-            lambda axes, pupil_mm=pupil_mm: draw_mtf_of_several(
-                axes, studies, labels=labels, pupil_mm=pupil_mm
-            ),
-            64.0,
-            f"Modulation transfer of both, {pupil_mm:g} mm",
+
+    def by_pupil(draw, told: str) -> tuple:
+        return tuple(
+            on_axes(
+                lambda axes, mm=pupil_mm: draw(
+                    axes, studies, labels=labels, pupil_mm=mm
+                ),
+                CURVES_MM,
+                f"{told}, {pupil_mm:g} mm",
+            )
+            for pupil_mm in PUPILS_MM
         )
-        for pupil_mm in PUPILS_MM
-    )
-    acuities = tuple(
-        on_axes(
-            lambda axes, pupil_mm=pupil_mm: draw_acuity_of_several(
-                axes, studies, labels=labels, pupil_mm=pupil_mm
-            ),
-            64.0,
-            f"Acuity of both by distance, {pupil_mm:g} mm",
-        )
-        for pupil_mm in PUPILS_MM
-    )
+
+    mtfs = by_pupil(draw_mtf_of_several, "Modulation transfer of both")
+    acuities = by_pupil(draw_acuity_of_several, "Acuity of both by distance")
     return Section(
         "Contrast and acuity, before and after",
         (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from fastapi import WebSocket, WebSocketDisconnect
+from fastapi.websockets import WebSocketState
 
 from clients.web.wishes import Seen
 
@@ -45,10 +46,18 @@ class PicturesOut:
                 while self._waiting and not gone.done():
                     place = next(iter(self._waiting))
                     await socket.send_bytes(self._waiting.pop(place).packed())
-        except (WebSocketDisconnect, RuntimeError):
+        except WebSocketDisconnect:
             pass  # it went while something was being sent
+        except RuntimeError:
+            if _is_open(socket) and not gone.done():
+                raise  # another fault is ours
         finally:
             gone.cancel()
+
+
+def _is_open(socket: WebSocket) -> bool:
+    states = socket.client_state, socket.application_state
+    return all(state is WebSocketState.CONNECTED for state in states)
 
 
 async def _gone(socket: WebSocket) -> None:

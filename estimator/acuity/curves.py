@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.acuity.predict import predict_acuity
 from estimator.acuity.retina import retina_log_mar
-from estimator.acuity.transfer import Screen
 from estimator.optics.prescription import C20
+from estimator.optics.pupil_screen import PupilScreen
 from estimator.optics.units import SPHERE_PER_C20
 
 
@@ -43,7 +43,7 @@ def acuity_through_focus(
     object_dpt: ArrayLike,
     wavelength_nm: float = 555.0,
     pupil_ellipse: NDArray[np.float64] | None = None,
-    pupil_screen: Screen | None = None,
+    pupil_screen: PupilScreen | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return acuity, logMAR, and visual Strehl ratio (n,) at distances (n,).
@@ -56,7 +56,7 @@ def acuity_through_focus(
         Distances from the entrance pupil; negative ones lie behind the eye, as a plus
         lens puts them.
     pupil_ellipse : (5,), optional
-    pupil_screen : Screen, optional
+    pupil_screen : PupilScreen, optional
         See `optical_transfer`.
 
     Raises

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from estimator.acuity.sensitivity import mean_eye_transfer, neural_sensitivity
-from estimator.acuity.transfer import Screen, Transfer, optical_transfer
+from estimator.acuity.transfer import Transfer, optical_transfer
+from estimator.optics.pupil_screen import PupilScreen
 
 TILTS = slice(1, 3)
 
@@ -66,7 +67,7 @@ def predict_acuity(
     zernike_radius_mm: float,
     wavelength_nm: float = 555.0,
     pupil_ellipse: NDArray[np.float64] | None = None,
-    pupil_screen: Screen | None = None,
+    pupil_screen: PupilScreen | None = None,
 ) -> Acuity:
     """Return the acuity of a wavefront, as far as the optics decide it.
 
@@ -75,7 +76,7 @@ def predict_acuity(
     zernike_um : (28,)
         Object distance included: of an eye out of focus its C(2,0).
     pupil_ellipse : (5,), optional
-    pupil_screen : Screen, optional
+    pupil_screen : PupilScreen, optional
         See `optical_transfer`.
 
     Raises

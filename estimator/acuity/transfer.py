@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from estimator.optics.pupil_screen import PupilScreen
 from estimator.optics.zernike import (
     EXPONENTS,
     MAX_RADIAL_ORDER,
@@ -26,28 +26,6 @@ STEP_WAVES = 0.25
 
 NM_PER_MM = 1e6
 UM_PER_MM = 1e3
-
-
-class Screen(Protocol):
-    """Rings in the pupil, see `psf.screens.PupilScreen`."""
-
-    @property
-    def centre_mm(self) -> tuple[float, float]:
-        """From the middle of the circle."""
-
-    @property
-    def lattice_mm(self) -> tuple[float, float, float] | None:
-        """None of rings about one centre."""
-
-    def reach_mrad(
-        self, radius_mm: ArrayLike, wavelength_nm: float
-    ) -> NDArray[np.float64]:
-        """How far light goes aside at distances from the centre."""
-
-    def transmission(
-        self, square_mm2: ArrayLike, wavelength_nm: float
-    ) -> NDArray[np.complex128]:
-        """Complex amplitude at squared distances from the centre."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +88,7 @@ def optical_transfer(
     zernike_radius_mm: float,
     wavelength_nm: float,
     pupil_ellipse: NDArray[np.float64] | None = None,
-    pupil_screen: Screen | None = None,
+    pupil_screen: PupilScreen | None = None,
 ) -> Transfer:
     """Return the transfer function of a wavefront, for light of one wavelength.
 
@@ -120,7 +98,7 @@ def optical_transfer(
     pupil_ellipse : (5,), optional
         Centre x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
         the whole circle if not given.
-    pupil_screen : Screen, optional
+    pupil_screen : PupilScreen, optional
         Rings of a lens with several foci, as an eye's ``rings`` are.
 
     Raises
@@ -172,7 +150,7 @@ def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
 def _samples(
     zernike_um: NDArray,
     wavelength_nm: float,
-    screen: Screen | None,
+    screen: PupilScreen | None,
     radius_mm: float,
 ) -> int:
     """Return samples across the circle that follow the steepest part of its rim.

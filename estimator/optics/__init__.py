@@ -11,6 +11,7 @@ raytrace          rays through a stack of surfaces, each with its status
 raytrace_kernels  its compiled loops
 paraxial          vergences and pupils near the axis
 vergence          the plane of the entrance pupil: distances, spectacles
+pupil_screen      rings in the pupil, as wave optics asks of them
 pinhole           directions and local scale of a pinhole image
 """
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.optics.pupil_screen import PupilScreen
 from estimator.optics.zernike import wavefront_polynomial
 from estimator.psf.arguments import (
     checked_choice,
@@ -29,7 +30,7 @@ from estimator.psf.kernel_types import (
     empty_buffer,
 )
 from estimator.psf.pupil import pupil_ellipses, pupil_frames
-from estimator.psf.screens import PupilScreen, ScreenTables
+from estimator.psf.screens import ScreenTables
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.psf.survey import (
     PIXEL_CORNER_PX,

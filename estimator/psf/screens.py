@@ -6,11 +6,12 @@ their centre, where the rings of a lens are about equally wide.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+
+from estimator.optics.pupil_screen import PupilScreen
 
 TABLE_COUNT = 1 << 15
 """Entries of a table: rings of 40 waves over the pupil have 800 each."""
@@ -22,28 +23,6 @@ BEYOND_EDGE = 1.5
 
 ONE_CENTRE = (0.0, 0.0, 0.0)
 """Stands for no honeycomb."""
-
-
-class PupilScreen(Protocol):
-    """What rings do to the light, about one centre or many."""
-
-    @property
-    def centre_mm(self) -> ArrayLike:
-        """Of the rings, from the pupil's centre: (2,), or (P, 2) for each pupil."""
-
-    @property
-    def lattice_mm(self) -> tuple[float, float, float] | None:
-        """Pitch of a honeycomb of rings, and the radii between which it lies."""
-
-    def reach_mrad(
-        self, radius_mm: ArrayLike, wavelength_nm: float
-    ) -> NDArray[np.float64]:
-        """How far light goes aside at distances from the centre."""
-
-    def transmission(
-        self, square_mm2: ArrayLike, wavelength_nm: float
-    ) -> NDArray[np.complex128]:
-        """Complex amplitude at squared distances from the centre of rings."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.optics.pupil_screen import PupilScreen
 from estimator.psf.arguments import checked_choice, checked_zernike_um
 from estimator.psf.compute import (
     ACCURACY,
@@ -32,7 +33,6 @@ from estimator.psf.compute import (
 )
 from estimator.psf.fourier import fourier_kernels
 from estimator.psf.kernel_types import KernelBuffer, empty_buffer
-from estimator.psf.screens import PupilScreen
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.threads import thread_count
 from filter_service.gl.gpu import Gpu
