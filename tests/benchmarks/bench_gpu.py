@@ -24,6 +24,7 @@ import numpy as np
 
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
+from filter_service.planning.grid import GridSpec
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rendering.gl.renderer import FilterRenderer
@@ -126,8 +127,8 @@ class Case:
         )
 
 
-def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Case:
-    """Build an eye's store, load it, and judge a frame."""
+def view_and_spec(size_px: tuple[int, int]) -> tuple[RgbdView, GridSpec]:
+    """Return the courtyard at a size, and what its PSFs are made for."""
     width_px, height_px = size_px
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
     spec = grid_spec(
@@ -138,6 +139,12 @@ def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Cas
         focus_range_dpt=(0.0, 1.0),
         mode="dynamic",
     )
+    return view, spec
+
+
+def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Case:
+    """Build an eye's store, load it, and judge a frame."""
+    view, spec = view_and_spec(size_px)
     traced, _ = eye_for_spec(parse_profile(EYES[eye]), spec)
     store = build_psf_store(traced, spec)
     state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}

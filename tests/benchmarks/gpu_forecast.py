@@ -27,10 +27,14 @@ from estimator.profiles.parse import parse_profile
 from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.rendering.native import NativeRenderer
-from tests.benchmarks.bench_gpu import EYES, FOCUS_DPT, PUPIL_MM, VIEWS
+from tests.benchmarks.bench_gpu import (
+    EYES,
+    FOCUS_DPT,
+    PUPIL_MM,
+    VIEWS,
+    view_and_spec,
+)
 from tests.benchmarks.harness import RESULTS, commit_id, machine_info, write_report
-from tests.grid_specs import grid_spec
-from tests.numerical.scene_frames import scene_view
 
 CLOCK_MHZ = 1980.0
 """The card's own, at which forecasts are told."""
@@ -62,22 +66,12 @@ class Work:
         return [getattr(self, name) for name in names]
 
 
-def counted_work(eye: str, setting: str, *, is_traced: bool) -> Work:
-    """Count the work of a frame of `bench_gpu`."""
-    (width_px, height_px), view_count = VIEWS[setting]
-    view = scene_view("courtyard", width_px=width_px, height_px=height_px)
-    spec = grid_spec(
-        width_px=width_px,
-        height_px=height_px,
-        tangents=view.tangents,
-        pupil_range_mm=(4.0, 5.0),
-        focus_range_dpt=(0.0, 1.0),
-        mode="dynamic",
-    )
+def counted_work(eye: str, setting: str, *, is_now: bool) -> Work:
+    """Count the work of a frame of `bench_gpu`, as it is now or as it was measured."""
+    size_px, view_count = VIEWS[setting]
+    view, spec = view_and_spec(size_px)
     profile = parse_profile(EYES[eye])
-    store = build_psf_store(
-        eye_for_spec(profile, spec)[0] if is_traced else profile, spec
-    )
+    store = build_psf_store(eye_for_spec(profile, spec)[0] if is_now else profile, spec)
     renderer = NativeRenderer()
     seen = renderer.render(
         view,
@@ -87,9 +81,10 @@ def counted_work(eye: str, setting: str, *, is_traced: bool) -> Work:
     )
     renderer.close()
     return Work(
-        view_count * width_px * height_px,
+        view_count * size_px[0] * size_px[1],
         view_count * seen.entry_count,
-        view_count * seen.kernel_texel_count * FORESEEN_RATIO,
+        # the measured frames asked the GPU which kernels they use
+        view_count * seen.kernel_texel_count * (FORESEEN_RATIO if is_now else 1.0),
     )
 
 
@@ -117,8 +112,8 @@ def forecast() -> list[dict]:
     """Return a row for each stage, eye and view."""
     measured = json.loads((RESULTS / "gpu.json").read_text(encoding="utf-8"))
     cases = [(eye, setting) for setting in VIEWS for eye in EYES]
-    then = {case: counted_work(*case, is_traced=False) for case in cases}
-    now = {case: counted_work(*case, is_traced=True) for case in cases}
+    then = {case: counted_work(*case, is_now=False) for case in cases}
+    now = {case: counted_work(*case, is_now=True) for case in cases}
     rows = []
     for stage, names in PRICED_BY.items():
         price_ms, off = prices(stage, measured["rows"], then)
