@@ -1,8 +1,10 @@
 """How one frame is to be filtered, checked."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from filter_service.checked import checked
 from filter_service.errors import BadMessage, CameraMismatch
@@ -78,6 +80,28 @@ def frame_options(
     return FrameOptions(
         accumulation == "paper", merge, tolerance, output, used_deg, notes
     )
+
+
+def picture_room(
+    view: RgbdView, options: FrameOptions, out: NDArray[Any] | None
+) -> NDArray[Any]:
+    """Return where the picture of a view goes: the caller's memory, if there is some.
+
+    Raises
+    ------
+    BadMessage
+        It has another shape or type, or cannot be written from end to end.
+    """
+    shape, dtype = view.color.shape, np.dtype(OUTPUT_DTYPES[options.output])
+    if out is None:
+        return np.empty(shape, dtype)
+    if out.shape != shape or out.dtype != dtype or not out.flags.carray:
+        raise BadMessage(
+            f"an array {out.shape} of {out.dtype}",
+            field="out",
+            allowed=f"{shape} of {dtype}, contiguous and writeable",
+        )
+    return out
 
 
 def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:

@@ -101,16 +101,3 @@ def test_a_frame_between_the_parts_of_another_changes_neither(lanes, eyes):
     assert seen.color.tobytes() == alone.tobytes()
     stages_ms = seen.stage_times_ms
     assert stages_ms["rests_ms"] > 0.5 * sum(stages_ms.values())
-
-
-def test_a_picture_goes_where_it_is_wanted(lanes, eyes):
-    store, view = eyes[0]
-    handle = lanes.load(store)
-    room = np.full(view.color.shape, 7, np.uint8)
-    usual = lanes.render(view, handle, **STATE, output="srgb8").color
-    seen = lanes.render(view, handle, **STATE, output="srgb8", out=room)
-    assert seen.color is room
-    assert room.tobytes() == usual.tobytes()
-    for wrong in (room[:-1], room.astype(np.float32), room[:, ::-1]):
-        with pytest.raises(ValueError, match=r"out: .* contiguous"):
-            lanes.render(view, handle, **STATE, output="srgb8", out=wrong)

@@ -57,9 +57,6 @@ def test_merging_does_not_depend_on_the_unit_of_light(bench, rng):
 
 
 @pytest.mark.both_engines
-@pytest.mark.both_engines
-@pytest.mark.both_engines
-@pytest.mark.both_engines
 def test_eight_bit_output_is_the_encoded_linear_output(bench, rng):
     color = rng.integers(0, 256, (101, 150, 3), dtype=np.uint8)
     view = bench.view(color, depth_scene())
@@ -69,6 +66,18 @@ def test_eight_bit_output_is_the_encoded_linear_output(bench, rng):
     # pow() of the shader may round a value that lies on a step the other way
     assert np.abs(encoded.astype(int) - twin).max() <= 1
     assert np.mean(encoded != twin) < 1e-3
+
+
+@pytest.mark.both_engines
+@pytest.mark.parametrize("output", ["srgb8", "linear", "linear16"])
+def test_a_picture_goes_where_it_is_wanted(bench, view, output):
+    usual = bench.render(view, output=output).color
+    room = np.full_like(usual, 7)
+    assert bench.render(view, output=output, out=room).color is room
+    assert room.tobytes() == usual.tobytes()
+    for wrong in (room[:-1], room.astype(np.float64), room[:, ::-1]):
+        with pytest.raises(BadMessage, match=r"out: .* contiguous"):
+            bench.render(view, output=output, out=wrong)
 
 
 @pytest.mark.both_engines

@@ -80,18 +80,20 @@ class FramePasses:
         )
         self.lists.run()
 
-    def read_back(self, output: str) -> NDArray:
+    def read_back(self, output: str, room: NDArray | None = None) -> NDArray:
         """Fetch the filtered picture, encoded as asked, and all that was counted."""
-        self.begin_read(output)
+        self.begin_read(output, room)
         return self.end_read()
 
-    def begin_read(self, output: str) -> None:
-        """Have the picture and the counts sent."""
+    def begin_read(self, output: str, room: NDArray | None = None) -> None:
+        """Have the picture and the counts sent, the picture to ``room`` if given."""
         self._output = output
         name, pixels_per_thread, dtype = ENCODERS[output]
         self._encode(name, pixels_per_thread)
         width, height = self.strip.size
-        self._picture = np.empty((height, width, RGB), dtype)
+        if room is None:
+            room = np.empty((height, width, RGB), dtype)
+        self._picture = room
         self._totals = np.empty(TOTAL_WORDS, np.uint32)
         with self.strip.timer.wall("readback_ms"):
             self._arrived = self.strip.gpu.begin_read(
@@ -116,7 +118,7 @@ class FramePasses:
         if not self.strip.gpu.is_owner(PASSES, self):
             return None
         self.lists.splat_bands()
-        self.begin_read(self._output)
+        self.begin_read(self._output, self._picture)
         with self.strip.timer.wall("readback_ms"):
             self._arrived()
         return self._picture

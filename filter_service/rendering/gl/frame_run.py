@@ -48,6 +48,8 @@ class FrameRun:
 
     Parameters
     ----------
+    room : (height, width, 3) array
+        Where the picture goes, of the type of the output.
     fill_depth : bool
         Look for them first, as the frame before had some.
 
@@ -62,6 +64,7 @@ class FrameRun:
         kept: KeptEye,
         view: RgbdView,
         options: FrameOptions,
+        room: NDArray,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
@@ -69,6 +72,7 @@ class FrameRun:
     ):
         self.timer = StageTimer(gpu)
         self._gpu, self._kept, self._options = gpu, kept, options
+        self._room = room
         self._missing_count: int | None = None
         self.layers: FrameLayers = kept.states.layers(
             self.timer, kept.handle, pupil_diameter_mm, focus_dpt, options.tolerance
@@ -147,20 +151,23 @@ class FrameRun:
 
     def _joined(self, plan: _Plan, runs: "list[_StripRun]") -> tuple[NDArray, Counts]:
         """Finish strips, and put their pictures together."""
-        pictures, counts = [], Counter[str]()
+        counts = Counter[str]()
         shape = (plan.state.image.count, words_per_cell(self.layers))
         used_words = np.zeros(shape, np.uint32)
+        pictures = []
         for run in runs:
             pictures.append(run.finish()[run.rows.kept])
             counts.update(run.passes.counts())
             used_words |= run.passes.fragments.used_words
         self._kept.kernels.note(plan.state, used_words)
-        picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
-        rows, columns = (
-            slice(plan.border_px, plan.border_px + n)
-            for n in (self._view.height_px, self._view.width_px)
-        )
-        return np.ascontiguousarray(picture[rows, columns]), dict(counts)
+        if self.room_of(plan) is None:
+            picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
+            rows, columns = (
+                slice(plan.border_px, plan.border_px + n)
+                for n in (self._view.height_px, self._view.width_px)
+            )
+            np.copyto(self._room, picture[rows, columns])
+        return self._room, dict(counts)
 
     # ----- what its strips ask for
 
@@ -204,6 +211,10 @@ class FrameRun:
             handle.store, handle.pages, state, self.timer
         )
 
+    def room_of(self, plan: _Plan) -> NDArray | None:
+        """Return where a strip's picture goes at once, if it is the whole's."""
+        return None if plan.border_px or len(plan.strips) > 1 else self._room
+
     @property
     def output(self) -> str:
         """How the picture is encoded."""
@@ -221,7 +232,7 @@ class _StripRun:
     def begin(self) -> None:
         """Have the GPU do it, and send the picture."""
         self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
-        self.passes.begin_read(self._frame.output)
+        self.passes.begin_read(self._frame.output, self._room)
         self._is_begun = True
 
     def finish(self) -> NDArray:
@@ -233,8 +244,12 @@ class _StripRun:
             used = self.passes.fragments.used
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self._run(self.passes, used=used)
-            picture = self.passes.read_back(self._frame.output)
+            picture = self.passes.read_back(self._frame.output, self._room)
         return picture
+
+    @property
+    def _room(self) -> NDArray | None:
+        return self._frame.room_of(self.plan)
 
     def _run(self, passes: FramePasses, **options) -> None:
         image = self.plan.state.image

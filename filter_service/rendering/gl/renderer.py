@@ -12,7 +12,11 @@ from filter_service.constants import STORE_SIDE
 from filter_service.gl.gpu import Gpu, Pages
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
-from filter_service.rendering.frame_options import FrameOptions, frame_options
+from filter_service.rendering.frame_options import (
+    FrameOptions,
+    frame_options,
+    picture_room,
+)
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.gl.kept_eyes import KeptEyes
@@ -133,7 +137,7 @@ class FilterRenderer:
         render_tolerance : float
             Errors of merging and layers against the usual; 0 is exact.
         out : array, optional
-            Not used: pictures come through memory of the driver's.
+            Memory for the picture, of its shape and type.
 
         Raises
         ------
@@ -159,6 +163,7 @@ class FilterRenderer:
                 self._kept.of(handle),
                 view,
                 options,
+                picture_room(view, options, out),
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
                 fill_depth=self._lacks_depth,

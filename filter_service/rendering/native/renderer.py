@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.threads import thread_count
-from filter_service.errors import BadMessage, RenderFailed
+from filter_service.errors import RenderFailed
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
 from filter_service.rendering.frame_options import (
-    OUTPUT_DTYPES,
     FrameOptions,
     frame_options,
+    picture_room,
 )
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native import native_store
@@ -193,7 +193,7 @@ class NativeRenderer:
             self._loops.run("merge", frame.c)
         sizes = self._blend(timer, frame, plan, kept)
         with timer.wall("splat_ms"):
-            picture = _room(view.color.shape, OUTPUT_DTYPES[options.output], out)
+            picture = picture_room(view, options, out)
             frame.set_picture(picture)
             self._loops.run("splat", frame.c)
         if frame.c.failed:
@@ -271,19 +271,6 @@ class NativeRenderer:
             self._loops.run("blend", frame.c)
         kept.blended = plan, levels.copy(), sizes
         return sizes
-
-
-def _room(shape, dtype, out: NDArray[Any] | None) -> NDArray[Any]:
-    """Return where a picture goes."""
-    if out is None:
-        return np.empty(shape, dtype)
-    if out.shape != shape or out.dtype != dtype or not out.flags.carray:
-        raise BadMessage(
-            f"an array {out.shape} of {out.dtype}",
-            field="out",
-            allowed=f"{shape} of {np.dtype(dtype)}, contiguous and writeable",
-        )
-    return out
 
 
 class StageTimes:
