@@ -105,6 +105,7 @@ class _NoGpu(Gpu):
         self.max_block_bytes = 1 << 30
         self.asked: set[Variant] = set()
         self._owners, self._uniforms, self._queries = {}, {}, []
+        self._bound: dict = {}
 
     def storage(self, name, n_bytes):
         return _Memory(name, n_bytes)

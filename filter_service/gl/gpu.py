@@ -34,6 +34,10 @@ ATLAS_BYTES = 1 << 30
 ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
 """Of atlases that are buffers, by the name of their texture."""
 
+POINTS = {
+    name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
+}
+
 PASS_BLOCKS = 9
 """Storage blocks of the pass with most, if an atlas is one of them."""
 
@@ -94,11 +98,13 @@ class Gpu:
         self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
         self._buffers: dict[str, moderngl.Buffer] = {}
         self._programs: dict[tuple, moderngl.ComputeShader] = {}
+        self._variants: dict[tuple, moderngl.ComputeShader] = {}
         self._atlases: dict[str, moderngl.Texture] = {}
         self._uniforms: dict[moderngl.ComputeShader, dict] = {}
         self._queries: list[moderngl.Query] = []
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
+        self._bound: dict[int, Buffer | BufferPart] = {}
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
         # On a software renderer all memory is the host's: a copy more gains nothing.
         self.use_staging(not self.is_software)
@@ -326,6 +332,9 @@ class Gpu:
 
     def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
+        program = self._variants.get((name, *defines.items()))
+        if program is not None:
+            return program
         key = (name, *sorted(defines.items()))
         if key not in self._programs:
             text, files = load_shader(f"passes/{name}.comp.glsl", **defines)
@@ -333,6 +342,7 @@ class Gpu:
                 self._programs[key] = self.context.compute_shader(text)
             except moderngl.Error as error:
                 raise ShaderError(legend(str(error), files)) from error
+        self._variants[name, *defines.items()] = self._programs[key]
         return self._programs[key]
 
     def dispatch(
@@ -364,20 +374,11 @@ class Gpu:
         indirect : (buffer, byte), optional
             Where on the GPU the groups stand; ``groups`` are not looked at.
         """
-        buffers, defines = dict(buffers), dict(defines or {})
-        images, textures = dict(images or {}), dict(textures or {})
-        for named in (images, textures):
-            for key in [k for k, v in named.items() if isinstance(v, Buffer)]:
-                buffers[ATLAS_BINDINGS[key]] = named.pop(key)
-                defines["ATLAS_IS_BUFFER"] = 1
-        program = self.program(name, **defines)
+        program, images, textures = self._variant_of(
+            name, defines or {}, buffers, images or {}, textures or {}
+        )
         for binding, buffer in buffers.items():
-            point = constants.BINDINGS[f"BINDING_{binding}"]
-            if isinstance(buffer, BufferPart):
-                whole, first, size = buffer
-                whole.bind_to_storage_buffer(point, offset=first, size=size)
-            else:
-                buffer.bind_to_storage_buffer(point)
+            self._bind(POINTS[binding], buffer)
         self._set_uniforms(program, uniforms or {})
         for name_of, image in images.items():
             unit = getattr(constants, f"IMAGE_{name_of}")
@@ -389,6 +390,35 @@ class Gpu:
         else:
             program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
         self.context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
+
+    def _variant_of(
+        self, name: str, defines: dict, buffers: dict, images: dict, textures: dict
+    ) -> tuple[moderngl.ComputeShader, dict, dict]:
+        """Return a pass and its images and textures; buffers among them are bound."""
+        is_buffer = False
+        for named in (images, textures):
+            for key, atlas in named.items():
+                if isinstance(atlas, Buffer):
+                    self._bind(POINTS[ATLAS_BINDINGS[key]], atlas)
+                    is_buffer = True
+        if is_buffer:
+            defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            images, textures = _no_buffers(images), _no_buffers(textures)
+        return self.program(name, **defines), images, textures
+
+    def _bind(self, point: int, buffer: moderngl.Buffer | BufferPart) -> None:
+        """Bind a buffer, unless it is: from frame to frame most of them stay.
+
+        What is kept here is the buffer itself, so that no other takes its place.
+        """
+        if self._bound.get(point) == buffer:
+            return
+        if isinstance(buffer, BufferPart):
+            whole, first, size = buffer
+            whole.bind_to_storage_buffer(point, offset=first, size=size)
+        else:
+            buffer.bind_to_storage_buffer(point)
+        self._bound[point] = buffer
 
     def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
         """Set those that differ from the last dispatch's: each is a driver call."""
@@ -429,6 +459,10 @@ def _context_on(index: int) -> moderngl.Context:
     return moderngl.create_context(
         standalone=True, require=430, backend="egl", device_index=index
     )
+
+
+def _no_buffers(named: dict) -> dict:
+    return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}
 
 
 def _bytes_of(array: NDArray) -> NDArray[np.uint8]:
