@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from filter_service import constants
-from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Buffer, Gpu
+from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Gpu
+from filter_service.gl.passes import Buffer, Passes
 from filter_service.psfs.gpu_build_constants import FFT_RADICES
 from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.gpu_build_passes import PsfPasses
@@ -22,7 +23,7 @@ from filter_service.rendering.gl.renderer import FilterRenderer
 
 @dataclass(frozen=True)
 class Variant:
-    """A pass and its defines, as (name, value) in order: the key of `Gpu.program`."""
+    """A pass and its defines, as (name, value) in order: a key of `Passes`."""
 
     name: str
     defines: tuple[tuple[str, int | float | str], ...]
@@ -94,6 +95,18 @@ class _AtOnce(Pace):
         yield 0, len(works)
 
 
+class _NoPasses(Passes):
+    """Passes that do nothing but be noted."""
+
+    def __init__(self, asked: set[Variant]):
+        super().__init__(_Anything())
+        self._asked = asked
+
+    def program(self, name, **defines):
+        self._asked.add(Variant(name, tuple(sorted(defines.items()))))
+        return _Anything()
+
+
 class _NoGpu(Gpu):
     """A `Gpu` whose memory holds nothing and whose passes do nothing but be noted."""
 
@@ -104,8 +117,8 @@ class _NoGpu(Gpu):
         self.atlas_is_buffer = kind.atlas_is_buffer
         self.max_block_bytes = 1 << 30
         self.asked: set[Variant] = set()
-        self._owners, self._uniforms, self._queries = {}, {}, []
-        self._bound: dict = {}
+        self._owners, self._queries = {}, []
+        self.passes = _NoPasses(self.asked)
 
     def storage(self, name, n_bytes):
         return _Memory(name, n_bytes)
@@ -129,10 +142,6 @@ class _NoGpu(Gpu):
         for buffer, _, out in parts:
             out.reshape(-1).view(np.uint8)[:] = 255 if buffer.name == "USED" else 0
         return lambda: None
-
-    def program(self, name, **defines):
-        self.asked.add(Variant(name, tuple(sorted(defines.items()))))
-        return _Anything()
 
     def take_query(self):
         return _Anything()

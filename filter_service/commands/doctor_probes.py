@@ -111,7 +111,7 @@ def probe_shaders() -> dict:
         return {"error": " ".join(str(error).split())}
     else:
         return {
-            "program_count": gpu.program_count,
+            "program_count": len(gpu.passes.programs),
             "frame_error": change,
             "psf_error": float(np.abs(wave - rays).sum()),
         }

@@ -1,4 +1,4 @@
-"""The OpenGL context, buffers and programs: the home of moderngl."""
+"""The OpenGL context and its memory: buffers, textures, what comes and goes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,18 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service import constants
-from filter_service.errors import OutOfGpuMemory, RenderFailed, ShaderError
+from filter_service.errors import OutOfGpuMemory, RenderFailed
 from filter_service.gl.choose_device import open_on_device
 from filter_service.gl.copying import copy_bytes
 from filter_service.gl.hardware import is_software_renderer
-from filter_service.gl.shader_source import legend, load_shader
+from filter_service.gl.passes import Atlas, Buffer, Pages, Passes
 from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_storage
 from filter_service.gl_device import checked_gl_device, wanted_gl_device
 
-Buffer = moderngl.Buffer
 Query = moderngl.Query
-Pages = moderngl.TextureArray
-Atlas = moderngl.Buffer | moderngl.Texture
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than asked, so that slowly rising needs
@@ -31,39 +28,8 @@ ATLAS_TEXEL_BYTES = 16
 ATLAS_BYTES = 1 << 30
 """More than an atlas ever takes: twice the kernels of a frame."""
 
-ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
-"""Of atlases that are buffers, by the name of their texture."""
-
-POINTS = {
-    name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
-}
-
 PASS_BLOCKS = 9
 """Storage blocks of the pass with most, if an atlas is one of them."""
-
-
-_BARRIERS = (
-    moderngl.SHADER_STORAGE_BARRIER_BIT
-    | moderngl.COMMAND_BARRIER_BIT  # sizes of dispatches that a pass has written
-    | moderngl.BUFFER_UPDATE_BARRIER_BIT  # copies to mapped memory
-)
-_IMAGE_BARRIERS = (
-    _BARRIERS
-    | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
-    | moderngl.TEXTURE_FETCH_BARRIER_BIT
-)
-"""What comes after a pass and may read what it wrote."""
-
-
-class BufferPart(NamedTuple):
-    """Some bytes of a buffer, for a pass that has them as its own.
-
-    It begins at a multiple of 256 bytes: any device allows that.
-    """
-
-    buffer: Buffer
-    first_byte: int
-    n_bytes: int
 
 
 class Gpu:
@@ -81,6 +47,7 @@ class Gpu:
         plans with.
     is_software : bool
         Whether a CPU does the work.
+    passes : Passes
     """
 
     def __init__(self, device: str | None = None) -> None:
@@ -96,15 +63,12 @@ class Gpu:
         }
         self.is_software = is_software_renderer(self.info["renderer"])
         self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
-        self._buffers: dict[str, moderngl.Buffer] = {}
-        self._programs: dict[tuple, moderngl.ComputeShader] = {}
-        self._variants: dict[tuple, moderngl.ComputeShader] = {}
+        self._buffers: dict[str, Buffer] = {}
+        self.passes = Passes(self.context)
         self._atlases: dict[str, moderngl.Texture] = {}
-        self._uniforms: dict[moderngl.ComputeShader, dict] = {}
         self._queries: list[moderngl.Query] = []
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
-        self._bound: dict[int, Buffer | BufferPart] = {}
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
         # On a software renderer all memory is the host's: a copy more gains nothing.
         self.use_staging(not self.is_software)
@@ -128,18 +92,16 @@ class Gpu:
         with self.context:  # without one, the driver frees nothing
             for memory in (*self._buffers.values(), *self._atlases.values()):
                 memory.release()
-            for program in self._programs.values():
-                program.release()
+            self.passes.release()
             for block in (self._staging or {}).values():
                 block.release()
         self._buffers.clear()
         self._atlases.clear()
-        self._programs.clear()
         self.context.release()
 
     # ----- buffers
 
-    def storage(self, name: str, n_bytes: int) -> moderngl.Buffer:
+    def storage(self, name: str, n_bytes: int) -> Buffer:
         """Buffer of at least this size; its contents are lost when it grows.
 
         Raises
@@ -168,7 +130,7 @@ class Gpu:
         self._buffers[name] = created
         return created
 
-    def upload(self, name: str, *arrays: NDArray) -> moderngl.Buffer:
+    def upload(self, name: str, *arrays: NDArray) -> Buffer:
         """Copy arrays to the start of a named buffer, one behind the other."""
         buffer = self.storage(name, sum(data.nbytes for data in arrays))
         start = 0
@@ -177,7 +139,7 @@ class Gpu:
             start += data.nbytes
         return buffer
 
-    def write(self, buffer: moderngl.Buffer, data: NDArray, *, offset: int = 0) -> None:
+    def write(self, buffer: Buffer, data: NDArray, *, offset: int = 0) -> None:
         """Copy an array into a buffer."""
         if not data.nbytes:
             return
@@ -267,19 +229,17 @@ class Gpu:
         """Return whether nobody else has filled it since."""
         return self._owners.get(name) is owner
 
-    def read(self, buffer: moderngl.Buffer, shape: tuple, dtype) -> NDArray:
+    def read(self, buffer: Buffer, shape: tuple, dtype) -> NDArray:
         """Read the start of a buffer as an array; waits for the GPU."""
         out = np.empty(shape, dtype=dtype)
         self.read_into((buffer, 0, out))
         return out
 
-    def read_into(self, *parts: tuple[moderngl.Buffer, int, NDArray]) -> None:
+    def read_into(self, *parts: tuple[Buffer, int, NDArray]) -> None:
         """Fill arrays from buffers, each from a byte on; waits for the GPU once."""
         self.begin_read(*parts)()
 
-    def begin_read(
-        self, *parts: tuple[moderngl.Buffer, int, NDArray]
-    ) -> Callable[[], None]:
+    def begin_read(self, *parts: tuple[Buffer, int, NDArray]) -> Callable[[], None]:
         """Have buffers sent; call what is returned to wait for it and fill the arrays.
 
         What is dispatched between may change the buffers.  Without mapped memory it is
@@ -323,113 +283,7 @@ class Gpu:
         texels = sum(a.width * a.height for a in self._atlases.values())
         return (buffers + ATLAS_TEXEL_BYTES * texels) / 1e6
 
-    # ----- programs
-
-    @property
-    def program_count(self) -> int:
-        """Passes compiled so far, each variant by itself."""
-        return len(self._programs)
-
-    def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
-        """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
-        program = self._variants.get((name, *defines.items()))
-        if program is not None:
-            return program
-        key = (name, *sorted(defines.items()))
-        if key not in self._programs:
-            text, files = load_shader(f"passes/{name}.comp.glsl", **defines)
-            try:
-                self._programs[key] = self.context.compute_shader(text)
-            except moderngl.Error as error:
-                raise ShaderError(legend(str(error), files)) from error
-        self._variants[name, *defines.items()] = self._programs[key]
-        return self._programs[key]
-
-    def dispatch(
-        self,
-        name: str,
-        groups: tuple[int, ...],
-        *,
-        buffers: dict[str, moderngl.Buffer | BufferPart],
-        uniforms: dict | None = None,
-        defines: dict | None = None,
-        images: dict[str, Atlas] | None = None,
-        textures: dict[str, Atlas | Pages] | None = None,
-        indirect: tuple[moderngl.Buffer, int] | None = None,
-    ) -> None:
-        """Run a pass and order its writes before what follows.
-
-        Parameters
-        ----------
-        groups : (x, y) or (x, y, z)
-        buffers : dict
-            Binding name without the ``BINDING_`` prefix to buffer, or a part of one.
-        uniforms : dict, optional
-            A uniform that the compiler removed is skipped.
-        defines : dict, optional
-            Variant of the pass.
-        images, textures : dict, optional
-            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture, or to what
-            `atlas` returned.
-        indirect : (buffer, byte), optional
-            Where on the GPU the groups stand; ``groups`` are not looked at.
-        """
-        program, images, textures = self._variant_of(
-            name, defines or {}, buffers, images or {}, textures or {}
-        )
-        for binding, buffer in buffers.items():
-            self._bind(POINTS[binding], buffer)
-        self._set_uniforms(program, uniforms or {})
-        for name_of, image in images.items():
-            unit = getattr(constants, f"IMAGE_{name_of}")
-            image.bind_to_image(unit, read=True, write=True)
-        for name_of, texture in textures.items():
-            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
-        if indirect is not None:
-            program.run_indirect(*indirect)
-        else:
-            program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
-        self.context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
-
-    def _variant_of(
-        self, name: str, defines: dict, buffers: dict, images: dict, textures: dict
-    ) -> tuple[moderngl.ComputeShader, dict, dict]:
-        """Return a pass and its images and textures; buffers among them are bound."""
-        is_buffer = False
-        for named in (images, textures):
-            for key, atlas in named.items():
-                if isinstance(atlas, Buffer):
-                    self._bind(POINTS[ATLAS_BINDINGS[key]], atlas)
-                    is_buffer = True
-        if is_buffer:
-            defines = {**defines, "ATLAS_IS_BUFFER": 1}
-            images, textures = _no_buffers(images), _no_buffers(textures)
-        return self.program(name, **defines), images, textures
-
-    def _bind(self, point: int, buffer: moderngl.Buffer | BufferPart) -> None:
-        """Bind a buffer, unless it is: from frame to frame most of them stay.
-
-        What is kept here is the buffer itself, so that no other takes its place.
-        """
-        if self._bound.get(point) == buffer:
-            return
-        if isinstance(buffer, BufferPart):
-            whole, first, size = buffer
-            whole.bind_to_storage_buffer(point, offset=first, size=size)
-        else:
-            buffer.bind_to_storage_buffer(point)
-        self._bound[point] = buffer
-
-    def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
-        """Set those that differ from the last dispatch's: each is a driver call."""
-        known = self._uniforms.setdefault(program, {})
-        for key, value in uniforms.items():
-            if key in known and known[key] == value:
-                continue
-            known[key] = value
-            member = program.get(key, None)
-            if member is not None:
-                member.value = value
+    # ----- timers and errors
 
     def take_query(self) -> moderngl.Query:
         """Return a timer that is not in use; see `give_queries`."""
@@ -459,10 +313,6 @@ def _context_on(index: int) -> moderngl.Context:
     return moderngl.create_context(
         standalone=True, require=430, backend="egl", device_index=index
     )
-
-
-def _no_buffers(named: dict) -> dict:
-    return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}
 
 
 def _bytes_of(array: NDArray) -> NDArray[np.uint8]:

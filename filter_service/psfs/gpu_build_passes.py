@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.geometric import fresnel_table
-from filter_service.gl.gpu import Buffer, Gpu
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import Buffer
 from filter_service.psfs.gpu_build_constants import (
     CLEAR_THREADS,
     DEFINES,
@@ -90,7 +91,7 @@ class PsfPasses:
         first_of = {"first_record": chunk.first + first}
 
         def run(name, groups, defines, uniforms, *bindings) -> None:
-            self._gpu.dispatch(
+            self._gpu.passes.dispatch(
                 name,
                 (groups, count),
                 buffers={b: buffers[b] for b in bindings},
@@ -149,7 +150,7 @@ class PsfPasses:
 
     def _clear_images(self, chunk: Chunk, buffers: dict) -> None:
         n_quads = _groups(chunk.scratch_count, 4)
-        self._gpu.dispatch(
+        self._gpu.passes.dispatch(
             "psf_ray_clear",
             (_groups(n_quads, CLEAR_THREADS), 1),
             buffers={"PSF_IMAGES": buffers["PSF_IMAGES"]},
@@ -163,7 +164,7 @@ class PsfPasses:
         uniforms = {"first_record": chunk.first + first}
 
         def run(name, groups, bindings, **variant) -> None:
-            self._gpu.dispatch(
+            self._gpu.passes.dispatch(
                 name,
                 (groups, count),
                 buffers={f"PSF_{b}": buffers[f"PSF_{b}"] for b in bindings},

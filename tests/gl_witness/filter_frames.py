@@ -124,7 +124,7 @@ def filter_with_gl(views: dict[str, RgbdView]) -> Filtered:
     with gpu.context:
         for name, arguments in _psf_batches(views):
             filtered.arrays[name] = gpu_psf_batch(gpu, **arguments).flat_kernels
-    programs = [Variant(name, tuple(defines)) for name, *defines in gpu._programs]
+    programs = [Variant(name, tuple(defines)) for name, *defines in gpu.passes.programs]
     filtered.programs = sorted(map(str, programs))
     return filtered
 

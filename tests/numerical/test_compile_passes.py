@@ -32,11 +32,11 @@ def compiled_loops():
 def test_no_program_is_compiled_by_the_first_frames(rng):
     gpu = Gpu()
     compile_passes(FilterRenderer(gpu))
-    compiled = gpu.program_count
-    sorts = sum(name == "sort_bins" for name, *_ in gpu._programs)
+    compiled = len(gpu.passes.programs)
+    sorts = sum(name == "sort_bins" for name, *_ in gpu.passes.programs)
     assert sorts == 2 * (len(SORT_CAPACITIES) + 1)
     known = renderer_variants(Kind(gpu.is_software, gpu.atlas_is_buffer))
-    assert set(gpu._programs) == {(v.name, *v.defines) for v in known}
+    assert set(gpu.passes.programs) == {(v.name, *v.defines) for v in known}
     bench = Bench(
         Engine("gl", gpu),
         {"kind": "preset", "name": "myopia"},
@@ -54,6 +54,6 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
         for accumulation in ("coverage", "paper"):
             for output in ("srgb8", "linear", "linear16"):
                 bench.render(view, accumulation=accumulation, output=output)
-    assert gpu.program_count == compiled
+    assert len(gpu.passes.programs) == compiled
     assert compiled_loops() == loops
     gpu.close()

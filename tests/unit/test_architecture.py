@@ -100,6 +100,7 @@ HOME = {
     ),
     "moderngl": (
         "filter_service/gl/gpu.py",  # one owner of the context
+        "filter_service/gl/passes.py",  # and of what runs in it
         "filter_service/gl/staging.py",  # names its types
         "clients/window.py",  # shows frames in a window of its own
         "clients/headset/*",  # renders for both eyes of a headset

@@ -11,7 +11,7 @@ from filter_service.commands.doctor_checks import (
 )
 from filter_service.commands.doctor_probes import probe_native, probe_shaders
 from filter_service.gl import shader_source
-from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import Passes
 from filter_service.rendering.native import library
 
 GOOD = {"program_count": 27, "frame_error": 0.0, "psf_error": 0.04}
@@ -19,13 +19,13 @@ GOOD = {"program_count": 27, "frame_error": 0.0, "psf_error": 0.04}
 
 def test_the_probe_runs_every_pass_and_all_is_well(monkeypatch):
     compiled = set()
-    program = Gpu.program
+    program = Passes.program
 
-    def noting(gpu, name, **defines):
+    def noting(passes, name, **defines):
         compiled.add(f"{name}.comp.glsl")
-        return program(gpu, name, **defines)
+        return program(passes, name, **defines)
 
-    monkeypatch.setattr(Gpu, "program", noting)
+    monkeypatch.setattr(Passes, "program", noting)
     found = probe_shaders()
     check = check_shaders({}, found)
     assert check.ok and not check.fix, check

@@ -16,7 +16,7 @@ from filter_service.constants import (
     THREADS,
     TILE_SIZE_PX,
 )
-from filter_service.gl.gpu import Atlas
+from filter_service.gl.passes import Atlas
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from filter_service.constants import BITS_PER_WORD, MAX_LAYERS, USED_PARTS
 from filter_service.errors import GridTooLarge
-from filter_service.gl.gpu import Atlas, BufferPart, Gpu, Pages
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import Atlas, BufferPart, Pages
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame_kernels import (
@@ -168,7 +169,7 @@ class KernelMaker:
             count = tables.parts[work][1] // 2
             if not count:
                 return
-            gpu.dispatch(
+            gpu.passes.dispatch(
                 name,
                 grid_of(count),
                 buffers={"WORK": parts[work], **{key: parts[key] for key in bindings}},

@@ -17,7 +17,7 @@ from filter_service.constants import (
     TILES_PER_BIN,
     TOTAL_WORDS,
 )
-from filter_service.gl.gpu import Atlas, Buffer
+from filter_service.gl.passes import Atlas, Buffer
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.list_bands import ENTRY_BYTES
 from filter_service.rendering.gl.strip import Strip

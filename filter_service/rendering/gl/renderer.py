@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import STORE_SIDE
-from filter_service.gl.gpu import Gpu, Pages
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import Pages
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame_options import (

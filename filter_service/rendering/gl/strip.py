@@ -1,7 +1,8 @@
 """One frame, or a strip of it, on its way through the passes: its size, its buffers."""
 
 from filter_service.constants import BIN_TILES, TILE_SIZE_PX
-from filter_service.gl.gpu import Buffer, Gpu
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import Buffer
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers
 from filter_service.rgbd_view import RgbdView
@@ -71,7 +72,7 @@ class Strip:
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
         indirect = uniforms.pop("indirect", None)
-        self.gpu.dispatch(
+        self.gpu.passes.dispatch(
             name,
             groups,
             buffers={binding: self.buffers[binding] for binding in bindings},

@@ -1,0 +1,177 @@
+"""The passes: compiled once for each variant, run on buffers by name."""
+
+from typing import NamedTuple
+
+import moderngl
+
+from filter_service import constants
+from filter_service.errors import ShaderError
+from filter_service.gl.shader_source import legend, load_shader
+
+Buffer = moderngl.Buffer
+Pages = moderngl.TextureArray
+Atlas = moderngl.Buffer | moderngl.Texture
+
+ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
+"""Of atlases that are buffers, by the name of their texture."""
+
+POINTS = {
+    name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
+}
+
+
+_BARRIERS = (
+    moderngl.SHADER_STORAGE_BARRIER_BIT
+    | moderngl.COMMAND_BARRIER_BIT  # sizes of dispatches that a pass has written
+    | moderngl.BUFFER_UPDATE_BARRIER_BIT  # copies to mapped memory
+)
+_IMAGE_BARRIERS = (
+    _BARRIERS
+    | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
+    | moderngl.TEXTURE_FETCH_BARRIER_BIT
+)
+"""What comes after a pass and may read what it wrote."""
+
+
+class BufferPart(NamedTuple):
+    """Some bytes of a buffer, for a pass that has them as its own.
+
+    It begins at a multiple of 256 bytes: any device allows that.
+    """
+
+    buffer: Buffer
+    first_byte: int
+    n_bytes: int
+
+
+class Passes:
+    """Programs of a context, and what is bound in it.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+
+    Attributes
+    ----------
+    programs : dict
+        Compiled so far, by name and defines in order.
+    """
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self.programs: dict[tuple, moderngl.ComputeShader] = {}
+        self._variants: dict[tuple, moderngl.ComputeShader] = {}
+        self._uniforms: dict[moderngl.ComputeShader, dict] = {}
+        self._bound: dict[int, Buffer | BufferPart] = {}
+
+    def release(self) -> None:
+        """Free all programs."""
+        for program in self.programs.values():
+            program.release()
+        for known in (self.programs, self._variants, self._uniforms, self._bound):
+            known.clear()
+
+    def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
+        """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
+        program = self._variants.get((name, *defines.items()))
+        if program is not None:
+            return program
+        key = (name, *sorted(defines.items()))
+        if key not in self.programs:
+            text, files = load_shader(f"passes/{name}.comp.glsl", **defines)
+            try:
+                self.programs[key] = self._context.compute_shader(text)
+            except moderngl.Error as error:
+                raise ShaderError(legend(str(error), files)) from error
+        self._variants[name, *defines.items()] = self.programs[key]
+        return self.programs[key]
+
+    def dispatch(
+        self,
+        name: str,
+        groups: tuple[int, ...],
+        *,
+        buffers: dict[str, Buffer | BufferPart],
+        uniforms: dict | None = None,
+        defines: dict | None = None,
+        images: dict[str, Atlas] | None = None,
+        textures: dict[str, Atlas | Pages] | None = None,
+        indirect: tuple[Buffer, int] | None = None,
+    ) -> None:
+        """Run a pass and order its writes before what follows.
+
+        Parameters
+        ----------
+        groups : (x, y) or (x, y, z)
+        buffers : dict
+            Binding name without the ``BINDING_`` prefix to buffer, or a part of one.
+        uniforms : dict, optional
+            A uniform that the compiler removed is skipped.
+        defines : dict, optional
+            Variant of the pass.
+        images, textures : dict, optional
+            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture, or to what
+            `atlas` returned.
+        indirect : (buffer, byte), optional
+            Where on the GPU the groups stand; ``groups`` are not looked at.
+        """
+        program, images, textures = self._variant_of(
+            name, defines or {}, buffers, images or {}, textures or {}
+        )
+        for binding, buffer in buffers.items():
+            self._bind(POINTS[binding], buffer)
+        self._set_uniforms(program, uniforms or {})
+        for name_of, image in images.items():
+            unit = getattr(constants, f"IMAGE_{name_of}")
+            image.bind_to_image(unit, read=True, write=True)
+        for name_of, texture in textures.items():
+            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
+        if indirect is not None:
+            program.run_indirect(*indirect)
+        else:
+            program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
+        self._context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
+
+    def _variant_of(
+        self, name: str, defines: dict, buffers: dict, images: dict, textures: dict
+    ) -> tuple[moderngl.ComputeShader, dict, dict]:
+        """Return a pass and its images and textures; buffers among them are bound."""
+        is_buffer = False
+        for named in (images, textures):
+            for key, atlas in named.items():
+                if isinstance(atlas, Buffer):
+                    self._bind(POINTS[ATLAS_BINDINGS[key]], atlas)
+                    is_buffer = True
+        if is_buffer:
+            defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            images, textures = _no_buffers(images), _no_buffers(textures)
+        return self.program(name, **defines), images, textures
+
+    def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
+        """Bind a buffer, unless it is: from frame to frame most of them stay.
+
+        What is kept here is the buffer itself, so that no other takes its place.
+        """
+        if self._bound.get(point) == buffer:
+            return
+        if isinstance(buffer, BufferPart):
+            whole, first, size = buffer
+            whole.bind_to_storage_buffer(point, offset=first, size=size)
+        else:
+            buffer.bind_to_storage_buffer(point)
+        self._bound[point] = buffer
+
+    def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
+        """Set those that differ from the last dispatch's: each is a driver call."""
+        known = self._uniforms.setdefault(program, {})
+        for key, value in uniforms.items():
+            if key in known and known[key] == value:
+                continue
+            known[key] = value
+            member = program.get(key, None)
+            if member is not None:
+                member.value = value
+
+
+def _no_buffers(named: dict) -> dict:
+    return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}
