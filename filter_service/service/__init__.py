@@ -13,6 +13,7 @@ load            how busy one was of late
 metrics         counters for Prometheus
 patience        how many wrong messages are answered
 asking          a question to a running service
+reception       who comes and who goes
 guests          all sessions, with a client or without
 session         one client: its waiting frame, its credit, its profiles
 sharing         memory that clients share

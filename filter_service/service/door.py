@@ -17,21 +17,15 @@ from typing import Any
 
 from filter_service.errors import (
     BadMessage,
-    BuildCancelled,
     FilterError,
-    NoSession,
     NotAllowed,
-    TooManySessions,
 )
 from filter_service.keys import KeyRing
 from filter_service.messages import (
-    Accepted,
-    Alive,
     Bye,
     Closing,
     Dropped,
     ErrorReply,
-    EyeName,
     Frame,
     Hello,
     Part,
@@ -41,7 +35,6 @@ from filter_service.messages import (
     Reply,
     Share,
     Unshare,
-    Welcome,
     decode_request,
     encode,
     peek_ids,
@@ -54,9 +47,10 @@ from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
 from filter_service.service.metrics import serve_metrics
 from filter_service.service.patience import Patience
 from filter_service.service.process_info import resident_memory_mb
+from filter_service.service.reception import Reception
 from filter_service.service.render_end import RenderEnd
 from filter_service.service.served_devices import ServedDevice, ServedDevices
-from filter_service.service.session import EyeProfiles, Session
+from filter_service.service.session import Session
 from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
@@ -82,16 +76,13 @@ class Door:
         self.config = config
         self._limits = config.limits
         self._keeper = keeper
-        self._greetings: list[tuple[bytes, Hello]] = []  # until renderers are known
         self._guests = Guests()
         self._patience = Patience()
         self._devices = ServedDevices(
             *(config.device_names, config.max_image_mb * MB, self._guests, self._send)
         )
         self._n_faults = 0
-        now_s = time.monotonic()
-        self._next_alive_s = now_s + config.alive_interval_s
-        self._next_trim_s = now_s + TRIM_INTERVAL_S
+        self._next_trim_s = time.monotonic() + TRIM_INTERVAL_S
         self._mailbox = Mailbox(
             config.bind,
             config.max_message_part_bytes,
@@ -100,6 +91,10 @@ class Door:
         )
         self.endpoint = self._mailbox.endpoint
         self._sharing = Sharing(config, self.endpoint, self._render_of)
+        self._reception = Reception(
+            *(config, self.endpoint, self._guests),
+            *(self._devices, self._sharing, self._send),
+        )
         if config.metrics_port:
             serve_metrics(config.metrics_port, self.metrics)
 
@@ -151,7 +146,7 @@ class Door:
         elif message[0] == "lost":
             self._give_up(self._devices[message[1]])
         elif message[0] == "config":
-            self.config = message[1]
+            self.config = self._reception.config = message[1]
             self._limits = self.config.limits
         return bool(message[0] != "stop")
 
@@ -175,7 +170,7 @@ class Door:
         soon_s = self._devices.wait_s(now_s)
         if soon_s is not None:
             return soon_s
-        due_s = min(self._next_alive_s, self._next_trim_s)
+        due_s = min(self._reception.next_alive_s, self._next_trim_s)
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
     def _close(self) -> None:
@@ -189,10 +184,7 @@ class Door:
         now_s = time.monotonic()
         for device in self._devices:
             device.frames.tidy()
-        self._probe_clients()
-        for session in self._guests.away:
-            if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
-                self._forget(session, "its client did not come back")
+        self._reception.tidy()
         if now_s >= self._next_trim_s:
             self._next_trim_s = now_s + TRIM_INTERVAL_S
             for device in self._devices:
@@ -216,7 +208,7 @@ class Door:
                 if kind == "answer":
                     device.frames.take_answer(*rest)
                 elif kind == "tell":
-                    self._pass_on(*rest)
+                    self._reception.pass_on(*rest)
                 elif kind == "state":
                     device.memory_mb, device.stores_mb, device.is_building = rest
                 elif kind == "here":
@@ -233,70 +225,15 @@ class Door:
     ) -> None:
         """Learn which eyes there are; bring both sides to the same sessions."""
         device.server, device.render.may_rest = server, may_rest
-        known, held = {s.key for s in self._guests}, {key for key, *_ in eyes}
-        for session in self._guests:
-            if session.device == device.index and session.key not in held:
-                self._open(session)
-        for key, session_id, profiles in eyes:
-            if key not in known:  # a door before this one knew its client
-                session = Session(session_id, None, "", self.config.credit, key=key)
-                session.device = device.index
-                for name, (profile_id, generation) in profiles.items():
-                    eye = session.eye(name)
-                    eye.profile_id, eye.generation = profile_id, generation
-                session.leave(time.monotonic())
-                self._guests.remember(session)
+        self._reception.meet(device, eyes)
         device.render.is_ready = True
-        self._greet_who_waits()
-
-    def _greet_who_waits(self) -> None:
-        """Answer those who said hello before all devices had said who they are."""
-        if not self._devices.are_known:
-            return
-        for identity, hello in self._greetings:
-            try:
-                self._greet(identity, hello)
-            except FilterError as error:
-                self._send(identity, ErrorReply.from_exception(error))
-        self._greetings = []
+        self._reception.greet_who_waits()
 
     def _give_up(self, device: ServedDevice) -> None:
         """End the sessions of a device that is gone; they begin anew on another."""
         device.give_up()
         device.frames.lose_held()
-        for session in self._guests:
-            if session.device == device.index:
-                device.frames.lose_waiting(session)
-                self._forget(session, "its device is gone")
-        self._greet_who_waits()
-
-    def _open(self, session: Session) -> None:
-        """Have the render loop hold the eyes of a session, with their profiles."""
-        generations = {name: eye.generation for name, eye in session.eyes.items()}
-        render = self._render_of(session)
-        render.tell("open", session.key, session.session_id, generations)
-        for eye in session.eyes.values():
-            profile = eye.asked_profile or eye.profile
-            if profile is not None:
-                eye.asked_profile = profile
-                render.tell("profile", session.key, profile)
-
-    def _pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
-        """Tell a session what the render loop says of the profile of an eye."""
-        session = self._guests.by_key(key)
-        if session is None:
-            return
-        eye = session.eye(name)
-        asked = eye.asked_profile
-        if asked is not None and isinstance(reply, Accepted | ErrorReply):
-            if isinstance(reply, Accepted):
-                eye.profile, eye.profile_id = asked, reply.profile_id
-                eye.generation = reply.generation
-            if reply.profile_id == asked.profile_id:
-                eye.asked_profile = None
-                self._ask_next_profile(session, eye)
-        if session.identity is not None:
-            self._send(session.identity, reply)
+        self._reception.give_up(device)
 
     # Messages
 
@@ -322,7 +259,7 @@ class Door:
             except Exception:  # whatever it is, other clients shall not notice
                 self._n_faults += 1
                 log.exception("fault %d: a refusal failed", self._n_faults)
-                self._end_session(received[0])
+                self._reception.end_session(received[0])
         for session, frame in superseded:
             dropped = Dropped(frame.frame_id, "superseded")
             self._frames_of(session).answer(session, frame, dropped)
@@ -344,7 +281,7 @@ class Door:
                 )
             request = decode_request(parts, self._limits)
             if isinstance(request, Frame):
-                session = self._session_at(identity)
+                session = self._reception.session_at(identity)
                 frames = self._frames_of(session)
                 older = frames.take_in(session, request, received_s)
                 superseded += [(session, older)] if older is not None else []
@@ -370,29 +307,23 @@ class Door:
         if isinstance(request, Ping):
             self._send(identity, self._pong(request))
         elif isinstance(request, Hello):
-            self._greet(identity, request)
+            self._reception.greet(identity, request)
         elif isinstance(request, Bye):
-            self._end_session(identity)
+            self._reception.end_session(identity)
         elif isinstance(request, ProfileRequest):
-            self._take_profile(self._session_at(identity), request)
+            self._reception.take_profile(self._reception.session_at(identity), request)
         elif isinstance(request, Share):
-            shared = self._sharing.share(self._session_at(identity), request)
+            shared = self._sharing.share(self._reception.session_at(identity), request)
             self._send(identity, shared)
         elif isinstance(request, Unshare):
-            self._sharing.unshare(self._session_at(identity), request)
+            self._sharing.unshare(self._reception.session_at(identity), request)
 
     def _turn_out(self, refused: Refused) -> None:
         """End the session of a client whose key was taken from the list."""
         log.warning("a client's key is not allowed any more")
-        self._end_session(refused.identity)
+        self._reception.end_session(refused.identity)
         error = NotAllowed(str(refused))
         self._send(refused.identity, ErrorReply.from_exception(error))
-
-    def _session_at(self, identity: bytes) -> Session:
-        session = self._guests.at(identity)
-        if session is None:
-            raise NoSession("hello was not said", allowed="hello before anything else")
-        return session
 
     def _pong(self, ping: Ping) -> Pong:
         states = self._devices.states()
@@ -414,116 +345,7 @@ class Door:
         """Send a reply; a client that does not read loses its session."""
         outcome, tracker = self._mailbox.send(identity, encode(reply))
         if outcome is Outcome.GONE:
-            self._leave(identity)
+            self._reception.leave(identity)
         elif outcome is Outcome.STALLED:
-            self._end_session(identity, outcome)
+            self._reception.end_session(identity, outcome)
         return tracker
-
-    # Sessions
-
-    def _greet(self, identity: bytes, hello: Hello) -> None:
-        if not self._devices.are_known:  # one is about to say who it is
-            self._greetings.append((identity, hello))
-            return
-        session, is_resumed = self._guests.at(identity), False
-        if session is None:
-            session = self._guests.by_key(hello.session_key)
-            is_resumed = session is not None
-            if session is None:
-                session = self._new_session(identity, hello)
-            else:
-                self._end_sharing(session)
-                self._guests.come_back(session, identity, hello.client)
-                log.info("session %d goes on (%r)", session.session_id, hello.client)
-        transports = [self.endpoint.split("://", 1)[0]]
-        if self._sharing.is_offered:
-            transports.append("shm")
-        welcome = Welcome(
-            session.session_id,
-            self._devices.of(session).server or {},
-            self._limits,
-            session.credit,
-            tuple(transports),
-            session_key=session.key,
-            session_keep_s=self.config.session_keep_s,
-            is_resumed=is_resumed,
-            profile_id=session.profile_ids.get("both") if is_resumed else None,
-            profile_ids=session.profile_ids if is_resumed else {},
-        )
-        self._send(identity, welcome)
-
-    def _new_session(self, identity: bytes, hello: Hello) -> Session:
-        most = self.config.max_sessions
-        if len(self._guests) >= most:
-            self._probe_clients(is_due=True)
-        while len(self._guests) >= most and self._guests.away:
-            self._forget(self._guests.away[0], "its place is needed")
-        if len(self._guests) >= most:
-            raise TooManySessions(
-                f"{len(self._guests)} clients are being served",
-                allowed=f"{most} clients",
-            )
-        device = self._devices.least_busy()
-        session = self._guests.begin(
-            identity, hello.client, self.config.credit, device=device.index
-        )
-        self._open(session)
-        where = f" on device {device.index}" if len(self._devices) > 1 else ""
-        log.info("session %d begins (%r)%s", session.session_id, hello.client, where)
-        return session
-
-    def _take_profile(self, session: Session, request: ProfileRequest) -> None:
-        """Ask for a profile; of several that wait for their turn the newest counts."""
-        eye = session.eye(request.eye)
-        replaced, eye.next_profile = eye.next_profile, request
-        if replaced is not None and session.identity is not None:
-            error = BuildCancelled(
-                f"profile {request.profile_id} took the place of profile "
-                f"{replaced.profile_id}"
-            )
-            reply = ErrorReply.from_exception(error, profile_id=replaced.profile_id)
-            self._send(session.identity, reply)
-        if eye.asked_profile is None:
-            self._ask_next_profile(session, eye)
-
-    def _ask_next_profile(self, session: Session, eye: EyeProfiles) -> None:
-        request, eye.next_profile = eye.next_profile, None
-        if request is not None:
-            eye.asked_profile = request
-            self._render_of(session).tell("profile", session.key, request)
-
-    def _probe_clients(self, *, is_due: bool = False) -> None:
-        """Send every client a sign of life; who is gone is found out by that."""
-        now_s = time.monotonic()
-        if is_due or now_s >= self._next_alive_s:
-            self._next_alive_s = now_s + self.config.alive_interval_s
-            for session in self._guests.present:
-                if session.identity is not None:
-                    self._send(session.identity, Alive())
-
-    def _leave(self, identity: bytes) -> None:
-        """Keep the session of a client that is gone for a while."""
-        session = self._guests.at(identity)
-        if session is not None:
-            self._end_sharing(session)
-            self._guests.leave(session, time.monotonic())
-            log.info("session %d: its client is gone", session.session_id)
-
-    def _end_session(self, identity: bytes, outcome: Outcome | None = None) -> None:
-        session = self._guests.at(identity)
-        if session is not None:
-            why = "" if outcome is None else f"the client is {outcome.value}"
-            self._forget(session, why)
-
-    def _forget(self, session: Session, why: str) -> None:
-        self._guests.remove(session)
-        self._end_sharing(session)
-        session.identity = None
-        self._frames_of(session).forget(session)
-        self._render_of(session).tell("close", session.key)
-        log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
-
-    def _end_sharing(self, session: Session) -> None:
-        """Give up the memory of a client that is gone."""
-        self._sharing.end(session)
-        self._frames_of(session).leave(session)

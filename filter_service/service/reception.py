@@ -1,0 +1,278 @@
+"""Who comes and who goes: sessions begun, found again and ended, and their profiles."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+from filter_service.errors import (
+    BuildCancelled,
+    FilterError,
+    NoSession,
+    TooManySessions,
+)
+from filter_service.messages import (
+    Accepted,
+    Alive,
+    ErrorReply,
+    EyeName,
+    Hello,
+    ProfileRequest,
+    Reply,
+    Welcome,
+)
+from filter_service.service.config import ServiceConfig
+from filter_service.service.guests import Guests
+from filter_service.service.mailbox import Outcome, Tracker
+from filter_service.service.served_devices import ServedDevice, ServedDevices
+from filter_service.service.session import EyeProfiles, Session
+from filter_service.service.sharing import Sharing
+
+log = logging.getLogger("ocufilter")
+
+
+class Reception:
+    """Sessions of clients, each on a device.
+
+    Parameters
+    ----------
+    config : ServiceConfig
+    endpoint : str
+        Where the socket is.
+    guests : Guests
+    devices : ServedDevices
+    sharing : Sharing
+    send : callable
+        Sends a reply to an identity.
+
+    Attributes
+    ----------
+    config : ServiceConfig
+        As it was read last.
+    """
+
+    def __init__(
+        self,
+        config: ServiceConfig,
+        endpoint: str,
+        guests: Guests,
+        devices: ServedDevices,
+        sharing: Sharing,
+        send: Callable[[bytes, Reply], Tracker | None],
+    ) -> None:
+        self.config = config
+        self._endpoint = endpoint
+        self._guests, self._devices, self._sharing = guests, devices, sharing
+        self._send = send
+        self._greetings: list[tuple[bytes, Hello]] = []  # until devices are known
+        self._next_alive_s = time.monotonic() + config.alive_interval_s
+
+    @property
+    def next_alive_s(self) -> float:
+        """When clients get a sign of life next, on the monotonic clock."""
+        return self._next_alive_s
+
+    # Coming
+
+    def session_at(self, identity: bytes) -> Session:
+        """Return the session of a client.
+
+        Raises
+        ------
+        NoSession
+        """
+        session = self._guests.at(identity)
+        if session is None:
+            raise NoSession("hello was not said", allowed="hello before anything else")
+        return session
+
+    def greet(self, identity: bytes, hello: Hello) -> None:
+        """Welcome a client: to its session, to one it had before, or to a new one.
+
+        Raises
+        ------
+        TooManySessions
+        """
+        if not self._devices.are_known:  # one is about to say who it is
+            self._greetings.append((identity, hello))
+            return
+        session, is_resumed = self._guests.at(identity), False
+        if session is None:
+            session = self._guests.by_key(hello.session_key)
+            is_resumed = session is not None
+            if session is None:
+                session = self._new_session(identity, hello)
+            else:
+                self._end_sharing(session)
+                self._guests.come_back(session, identity, hello.client)
+                log.info("session %d goes on (%r)", session.session_id, hello.client)
+        transports = [self._endpoint.split("://", 1)[0]]
+        if self._sharing.is_offered:
+            transports.append("shm")
+        welcome = Welcome(
+            session.session_id,
+            self._devices.of(session).server or {},
+            self.config.limits,
+            session.credit,
+            tuple(transports),
+            session_key=session.key,
+            session_keep_s=self.config.session_keep_s,
+            is_resumed=is_resumed,
+            profile_id=session.profile_ids.get("both") if is_resumed else None,
+            profile_ids=session.profile_ids if is_resumed else {},
+        )
+        self._send(identity, welcome)
+
+    def greet_who_waits(self) -> None:
+        """Answer those who said hello before all devices had said who they are."""
+        if not self._devices.are_known:
+            return
+        for identity, hello in self._greetings:
+            try:
+                self.greet(identity, hello)
+            except FilterError as error:
+                self._send(identity, ErrorReply.from_exception(error))
+        self._greetings = []
+
+    def _new_session(self, identity: bytes, hello: Hello) -> Session:
+        most = self.config.max_sessions
+        if len(self._guests) >= most:
+            self._probe_clients(is_due=True)
+        while len(self._guests) >= most and self._guests.away:
+            self._forget(self._guests.away[0], "its place is needed")
+        if len(self._guests) >= most:
+            raise TooManySessions(
+                f"{len(self._guests)} clients are being served",
+                allowed=f"{most} clients",
+            )
+        device = self._devices.least_busy()
+        session = self._guests.begin(
+            identity, hello.client, self.config.credit, device=device.index
+        )
+        self._open(session)
+        where = f" on device {device.index}" if len(self._devices) > 1 else ""
+        log.info("session %d begins (%r)%s", session.session_id, hello.client, where)
+        return session
+
+    def meet(self, device: ServedDevice, eyes: list[tuple[Any, ...]]) -> None:
+        """Bring a device that is here, with eyes of sessions, to the same sessions."""
+        known, held = {s.key for s in self._guests}, {key for key, *_ in eyes}
+        for session in self._guests:
+            if session.device == device.index and session.key not in held:
+                self._open(session)
+        for key, session_id, profiles in eyes:
+            if key not in known:  # a door before this one knew its client
+                session = Session(session_id, None, "", self.config.credit, key=key)
+                session.device = device.index
+                for name, (profile_id, generation) in profiles.items():
+                    eye = session.eye(name)
+                    eye.profile_id, eye.generation = profile_id, generation
+                session.leave(time.monotonic())
+                self._guests.remember(session)
+
+    def _open(self, session: Session) -> None:
+        """Have the render loop hold the eyes of a session, with their profiles."""
+        generations = {name: eye.generation for name, eye in session.eyes.items()}
+        render = self._devices.of(session).render
+        render.tell("open", session.key, session.session_id, generations)
+        for eye in session.eyes.values():
+            profile = eye.asked_profile or eye.profile
+            if profile is not None:
+                eye.asked_profile = profile
+                render.tell("profile", session.key, profile)
+
+    # Profiles
+
+    def take_profile(self, session: Session, request: ProfileRequest) -> None:
+        """Ask for a profile; of several that wait for their turn the newest counts."""
+        eye = session.eye(request.eye)
+        replaced, eye.next_profile = eye.next_profile, request
+        if replaced is not None and session.identity is not None:
+            error = BuildCancelled(
+                f"profile {request.profile_id} took the place of profile "
+                f"{replaced.profile_id}"
+            )
+            reply = ErrorReply.from_exception(error, profile_id=replaced.profile_id)
+            self._send(session.identity, reply)
+        if eye.asked_profile is None:
+            self._ask_next_profile(session, eye)
+
+    def _ask_next_profile(self, session: Session, eye: EyeProfiles) -> None:
+        request, eye.next_profile = eye.next_profile, None
+        if request is not None:
+            eye.asked_profile = request
+            self._devices.of(session).render.tell("profile", session.key, request)
+
+    def pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
+        """Tell a session what the render loop says of the profile of an eye."""
+        session = self._guests.by_key(key)
+        if session is None:
+            return
+        eye = session.eye(name)
+        asked = eye.asked_profile
+        if asked is not None and isinstance(reply, Accepted | ErrorReply):
+            if isinstance(reply, Accepted):
+                eye.profile, eye.profile_id = asked, reply.profile_id
+                eye.generation = reply.generation
+            if reply.profile_id == asked.profile_id:
+                eye.asked_profile = None
+                self._ask_next_profile(session, eye)
+        if session.identity is not None:
+            self._send(session.identity, reply)
+
+    # Going
+
+    def tidy(self) -> None:
+        """Find out who is gone, and forget who did not come back."""
+        self._probe_clients()
+        now_s = time.monotonic()
+        for session in self._guests.away:
+            if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
+                self._forget(session, "its client did not come back")
+
+    def give_up(self, device: ServedDevice) -> None:
+        """End the sessions of a device that is gone; they begin anew on another."""
+        for session in self._guests:
+            if session.device == device.index:
+                device.frames.lose_waiting(session)
+                self._forget(session, "its device is gone")
+        self.greet_who_waits()
+
+    def _probe_clients(self, *, is_due: bool = False) -> None:
+        """Send every client a sign of life; who is gone is found out by that."""
+        now_s = time.monotonic()
+        if is_due or now_s >= self._next_alive_s:
+            self._next_alive_s = now_s + self.config.alive_interval_s
+            for session in self._guests.present:
+                if session.identity is not None:
+                    self._send(session.identity, Alive())
+
+    def leave(self, identity: bytes) -> None:
+        """Keep the session of a client that is gone for a while."""
+        session = self._guests.at(identity)
+        if session is not None:
+            self._end_sharing(session)
+            self._guests.leave(session, time.monotonic())
+            log.info("session %d: its client is gone", session.session_id)
+
+    def end_session(self, identity: bytes, outcome: Outcome | None = None) -> None:
+        """Forget a client's session, if it has one."""
+        session = self._guests.at(identity)
+        if session is not None:
+            why = "" if outcome is None else f"the client is {outcome.value}"
+            self._forget(session, why)
+
+    def _forget(self, session: Session, why: str) -> None:
+        self._guests.remove(session)
+        self._end_sharing(session)
+        session.identity = None
+        self._devices.of(session).frames.forget(session)
+        self._devices.of(session).render.tell("close", session.key)
+        log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
+
+    def _end_sharing(self, session: Session) -> None:
+        """Give up the memory of a client that is gone."""
+        self._sharing.end(session)
+        self._devices.of(session).frames.leave(session)
