@@ -26,6 +26,7 @@ from tests.batch_kills import (
     wait_for_orphans,
     workers_of,
 )
+from tests.numerical.synthetic import psnr_db
 
 TIMEOUT_S = 120
 WIDTH_PX, HEIGHT_PX = 64, 48
@@ -125,6 +126,17 @@ def test_two_workers_of_two_threads_make_the_same_bytes(room, usual, tmp_path):
     common = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
     run(*common, "--workers", 2, "--threads", 2)
     assert pictures(tmp_path / "out") == pictures(usual)
+
+
+def test_the_other_engine_makes_the_same_pictures_and_says_so(room, usual, tmp_path):
+    out = tmp_path / "out"
+    run(room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--engine", "gl")
+    job = json.loads((out / "manifest.jsonl").read_text().splitlines()[0])
+    assert job["engine"] == "gl"
+    for name in sorted(path.relative_to(usual) for path in usual.glob("*/*.png")):
+        found, native = (read_color(folder / name) for folder in (out, usual))
+        # Whether some pixels merge may hang on the last bit of a number.
+        assert psnr_db(found / 255.0, native / 255.0) >= 50.0, name
 
 
 def finish_after_kills(room, out, n_kills):
