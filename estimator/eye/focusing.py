@@ -12,8 +12,12 @@ import numpy as np
 from estimator.corrections.rings import Rings
 from estimator.optics.vergence import ObjectVergence
 
-OUT_OF_REACH_DPT = 1e-6
-"""A request farther than this from what the eye can do is said to be out of reach."""
+OUT_OF_REACH_DPT = 0.01
+"""A request farther than this from what the eye can do is said to be out of reach.
+
+As near as a traced eye comes to its prescription; nobody sees it, for through 6 mm it
+moves rays by 0.1 arcmin to either side.
+"""
 
 RANGE_PUPIL_COUNT = 5
 """Pupils of a range at which the accommodation for a focus is looked at: it changes
@@ -116,7 +120,7 @@ class Focusing(ABC):
         if focus_dpt <= near_dpt + OUT_OF_REACH_DPT:
             return ()
         reached = (
-            f"is nearer than the near point ({round(near_dpt, 3) + 0.0:.3g} dpt)"
+            f"is nearer than the near point ({max(0.0, round(near_dpt, 3)):.3g} dpt)"
             if near_dpt > -OUT_OF_REACH_DPT
             else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
         )

@@ -177,6 +177,18 @@ def test_a_near_point_at_infinity_is_told_as_0(myope, monkeypatch, near_dpt):
     assert "nearer than the near point (0 dpt)" in note
 
 
+@pytest.mark.parametrize(("aside_dpt", "is_told"), [(0.003, False), (0.03, True)])
+def test_what_a_fit_leaves_of_far_and_near_point_is_not_told(
+    myope, monkeypatch, aside_dpt, is_told
+):
+    eye = AccommodatingEye(myope, amplitude_dpt=0.0)
+    for end_dpt in (aside_dpt, -aside_dpt):
+        monkeypatch.setattr(
+            AccommodatingEye, "focus_limits_dpt", lambda *_, at=end_dpt: (at, at)
+        )
+        assert bool(eye.focus_notes(0.0, pupil_diameter_mm=4.0)) == is_told
+
+
 def test_the_lens_itself_limits_a_young_eye():
     eye = AccommodatingEye(EyeParameters.mean_eye())
     assert 6.0 < eye.amplitude_dpt == eye.lens_range_dpt < 20.0

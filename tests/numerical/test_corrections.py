@@ -360,3 +360,17 @@ def test_an_eye_with_rings_is_stored_and_read():
     again = unpack(*pack(eye))
     assert again.rings == eye.rings
     assert np.array_equal(again.zernike_um, eye.zernike_um)
+
+
+def test_a_traced_eye_with_an_intraocular_lens_is_not_said_to_be_out_of_reach():
+    """Its fit leaves 0.0002 dpt of what the lens corrects."""
+    body = {"kind": "iol", "design": "bifocal", "add_dpt": 3.0}
+    profile = parse_profile(
+        {"kind": "prescription", "sphere_dpt": 0.0, "correction": body}
+    )
+    eye, _ = prepare_eye(
+        profile, pupil_diameters_mm=[4.0], field_range_deg=((-5.0, 5.0), (-5.0, 5.0))
+    )
+    far_dpt, _ = eye.focus_limits_dpt(4.0)
+    assert 1e-5 < abs(far_dpt) < 1e-3
+    assert eye.notes(pupil_diameter_mm=4.0, focus_dpt=0.0) == ()
