@@ -72,6 +72,10 @@ class Lenslets:
         """Powers at which something is sharp: lenslets make no focus of their own."""
         return np.zeros(1)
 
+    def main_light_ratio(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
+        """Share (1, ...) of a pupil's light there; of the lenslets' some is, too."""
+        return np.ones((1, *np.shape(radius_mm)))
+
     def reach_mrad(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
         """How far light goes aside, by the lenslets and by their edges."""
         by_lens = abs(self.power_dpt) * self.diameter_mm / 2.0

@@ -82,8 +82,22 @@ class DiffractiveRings:
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Power (n,) of those that have much of the light."""
-        is_main = np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
-        return self.added_dpt(wavelength_nm)[is_main]
+        return self.added_dpt(wavelength_nm)[self._is_main(wavelength_nm)]
+
+    def main_light_ratio(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """Share (n, ...) of a pupil's light in each of those."""
+        is_main = self._is_main(wavelength_nm)
+        light = np.abs(self.amplitudes(wavelength_nm)[is_main]) ** 2
+        is_far = self.followed_orders[is_main] == self.far_order
+        by_rings = np.minimum(self.diameter_mm / 2.0 / np.asarray(radius_mm), 1.0) ** 2
+        return np.multiply.outer(light, by_rings) + np.multiply.outer(
+            is_far, 1.0 - by_rings
+        )
+
+    def _is_main(self, wavelength_nm: float) -> NDArray[np.bool_]:
+        return np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
 
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float
@@ -134,6 +148,16 @@ class RefractiveZones:
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Power (n,) of all rings."""
         return np.unique(self.powers_dpt)
+
+    def main_light_ratio(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[np.float64]:
+        """Share (n, ...) of a pupil's light in each of those: of its area."""
+        square = np.square(np.asarray(radius_mm, dtype=np.float64))
+        ends = np.square([0.0, *self.outer_mm[:-1], np.inf])
+        within = np.diff(np.minimum(square[..., None], ends)) / square[..., None]
+        of_power = np.unique(self.powers_dpt)[:, None] == np.array(self.powers_dpt)
+        return np.moveaxis(within @ of_power.T.astype(float), -1, 0)
 
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float

@@ -17,8 +17,13 @@ from filter_service.planning.error_law import (
     spot_covariance,
 )
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.sampled_use import Use, axis_error, moved
-from filter_service.planning.slopes import slopes_px, state_frames
+from filter_service.planning.sampled_use import (
+    Use,
+    axis_error,
+    focus_slopes_px,
+    light_of_foci,
+    moved,
+)
 
 TOLERANCE_DB = {"loose": 43.0, "normal": 49.0, "fine": 55.0}
 """PSNR that interpolation may cost down to.  Frames planned for 49 dB, unmerged,
@@ -86,17 +91,17 @@ def _needed_over_ladder(
     some = use.taken(np.arange(count))
     repeated = use.taken(np.tile(np.arange(count), ladder.size))
     states = moved(repeated, axis, np.repeat(ladder, count))
-    frames = state_frames(
-        use.eye, use.spec, states, pixel_from_mrad=repeated.pixel_from_mrad
-    )
-    slopes = slopes_px(frames)
-    slopes = slopes.reshape(ladder.size, count, *slopes.shape[1:])
-    difference_px = np.sqrt(mean_square(np.diff(slopes, axis=0)))
-    allowed_px = allowed_difference_px(
-        spot_covariance(0.5 * (slopes[1:] + slopes[:-1])),
-        unit_px=some.unit_px,
-        half_way_error=half_way_error(axis, allowed_error),
-    )
-    # The mean square error goes with the fourth power of the difference.
-    dense = np.mean((difference_px / allowed_px) ** 4, axis=1) ** 0.25
+    power = np.zeros((ladder.size - 1, count))
+    for light_ratio, added_dpt in light_of_foci(some):
+        slopes = focus_slopes_px(some, states, np.tile(added_dpt, ladder.size))
+        slopes = slopes.reshape(ladder.size, count, *slopes.shape[1:])
+        difference_px = np.sqrt(mean_square(np.diff(slopes, axis=0)))
+        allowed_px = allowed_difference_px(
+            spot_covariance(0.5 * (slopes[1:] + slopes[:-1])),
+            unit_px=some.unit_px,
+            half_way_error=half_way_error(axis, allowed_error),
+        )
+        # The mean square error goes with the fourth power of the difference.
+        power += light_ratio**2 * (difference_px / allowed_px) ** 4
+    dense = power.mean(axis=1) ** 0.25
     return np.concatenate([[0.0], np.cumsum(dense + 0.1 * dense.mean() + 1e-12)])

@@ -29,6 +29,7 @@ from filter_service.planning.readable import ReadableDefocus, joined_ranges
 from filter_service.planning.slopes import (
     PupilStates,
     main_foci_dpt,
+    main_light_ratio,
     slopes_px,
     state_frames,
 )
@@ -124,6 +125,8 @@ class _Rays:
         RMS error half-way between nodes.
     foci_dpt : (n_foci,)
         Defocus at which light is in focus: 0, and more with a lens that has several.
+    light_ratio : (n_foci, P)
+        Share of the light that has each of those.
     reach_px : (P,)
         How much farther than rays such a lens sends light.
     """
@@ -133,6 +136,7 @@ class _Rays:
     unit_px: NDArray[np.float64]
     half_way_error: float
     foci_dpt: NDArray[np.float64]
+    light_ratio: NDArray[np.float64]
     reach_px: NDArray[np.float64]
 
     @classmethod
@@ -158,6 +162,7 @@ class _Rays:
             unit_px,
             error,
             main_foci_dpt(eye, spec),
+            main_light_ratio(eye, spec, groups.pupil_diameter_mm / 2.0),
             _reach_px(eye, spec, groups),
         )
 
@@ -202,13 +207,15 @@ class _Rays:
         difference_px = np.sqrt(mean_square(per_dpt)) * steps_dpt
         middles = lows + steps_dpt * (np.arange(_LADDER - 1)[:, None] + 0.5)
         allowed_px = np.full(middles.shape, np.inf)
-        for shift, focus_dpt in product(shifts, self.foci_dpt.tolist()):
+        light_ratio = self.light_ratio[:, index]
+        foci = list(zip(self.foci_dpt.tolist(), light_ratio, strict=True))
+        for shift, (focus_dpt, light) in product(shifts, foci):
             x = (middles + shift - focus_dpt)[..., None]
             covariance = at_zero + x * (at_one - at_zero - spread) + x * x * spread
             of_channel_px = allowed_difference_px(
                 covariance,
                 unit_px=self.unit_px[index],
-                half_way_error=self.half_way_error,
+                half_way_error=self.half_way_error / light,
             )
             allowed_px = np.minimum(allowed_px, of_channel_px)
         needed = np.zeros((lows.size, _LADDER))

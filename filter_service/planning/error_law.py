@@ -107,7 +107,7 @@ def blend_error(
 
 
 def allowed_difference_px(
-    covariance_px2: NDArray, *, unit_px: NDArray, half_way_error: float
+    covariance_px2: NDArray, *, unit_px: NDArray, half_way_error: float | NDArray
 ) -> NDArray[np.float64]:
     """RMS difference (P,) of neighbours whose blend has a given RMS error half-way.
 

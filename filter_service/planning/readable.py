@@ -104,8 +104,12 @@ def readable_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> Readable
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     objects_dpt = eye.vergence.vergence_dpt(_roomy(spec.object_ranges_dpt))
     near_far = np.stack([lows, highs], axis=-1)[..., None, :, :] + objects_dpt[:, None]
-    # A pupil between two nodes reads both at equal blur, up to the other's own.
-    scaled = near_far * pupils_mm[:, None, None, None, None]
+    # A pupil between two nodes reads both at equal blur, up to the other's own; one
+    # with several foci reads them at the same defocus.
+    is_scaled = eye.rings is None
+    by = (p if is_scaled else np.ones(len(p)) for p in (pupils_mm, axes.pupils_mm))
+    of_reader, of_node = (p[:, None, None, None, None] for p in by)
+    scaled = near_far * of_reader
     ranges = np.stack(
         [
             _over(scaled[..., 0], 2, of_pupil, np.min),
@@ -113,7 +117,7 @@ def readable_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> Readable
         ],
         axis=-1,
     )
-    ranges /= axes.pupils_mm[:, None, None, None, None]
+    ranges /= of_node
     return ReadableDefocus(
         ranges.reshape(-1, *ranges.shape[4:]),
         (at_nodes_dpt - at_nodes_dpt[..., GREEN, None]).reshape(-1, 3),

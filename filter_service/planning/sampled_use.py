@@ -172,15 +172,23 @@ def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
     """Neighbouring states (P,) at which a frame's states are read along an axis.
 
     Along the field and accommodation the total defocus stays, along the pupil the
-    geometric blur.  The paper's grids are read at the distance of the object.
+    geometric blur, or with several foci the defocus.  The paper's grids are read at the
+    distance of the object.
     """
     columns = vars(use.states) | {FIELD_OF_AXIS[axis]: to}
     total_dpt = columns.pop("total_defocus_dpt")
     if axis == "pupil":
-        total_dpt = total_dpt * use.states.pupil_diameter_mm / to
+        total_dpt = total_dpt * _blur_scale(use, to)
     elif axis in ("h", "v") and not use.spec.blends_at_equal_blur:
         total_dpt = use.eye.total_defocus_dpt(**columns) + use.vergence_dpt
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
+
+
+def _blur_scale(use: Use, pupils_mm: NDArray) -> NDArray[np.float64]:
+    """Defocus (P,) at which pupils are read, over that of the states."""
+    if use.eye.rings is not None:  # foci stay where they are in any pupil
+        return np.ones(pupils_mm.shape)
+    return use.states.pupil_diameter_mm / pupils_mm
 
 
 def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
@@ -219,7 +227,7 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
         np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
     shift_dpt = plan.channel_shift_dpt[groups, channel]
-    scale = states.pupil_diameter_mm / plan.pupils_mm[corner[2]]
+    scale = _blur_scale(use, plan.pupils_mm[corner[2]])
     read_dpt = (states.total_defocus_dpt + own_dpt) * scale - shift_dpt
     lower, upper, share = plan.defocus.bracket(groups, read_dpt)
     columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
@@ -240,12 +248,54 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
 
 def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
     """Mean square error with all lower neighbours and then all upper ones."""
+    found = np.zeros(share.size)
+    for light_ratio, added_dpt in light_of_foci(use):
+        lower_px, upper_px = np.split(
+            focus_slopes_px(use, neighbours, np.tile(added_dpt, 2)), 2
+        )
+        found += light_ratio**2 * blend_error(
+            lower_px,
+            upper_px,
+            use.exact_px
+            if use.eye.rings is None
+            else focus_slopes_px(use, use.states, added_dpt),
+            share_ratio=share,
+            unit_px=use.unit_px,
+        )
+    return float(found.mean())
+
+
+def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Light and power, dpt, (P,) of each focus that an eye has.
+
+    What blending costs an image is that of each focus times its light, as amplitudes:
+    where one is sharp the others hardly err.
+    """
+    states, rings = use.states, use.eye.rings
+    if rings is None:
+        return [(np.ones(states.h_deg.size), np.zeros(states.h_deg.size))]
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    for wavelength_nm in np.unique(states.wavelength_nm).tolist():
+        own = np.flatnonzero(states.wavelength_nm == wavelength_nm)
+        radius_mm = states.pupil_diameter_mm[own] / 2.0
+        ratios = rings.main_light_ratio(radius_mm, wavelength_nm)
+        for k, added_dpt in enumerate(rings.main_dpt(wavelength_nm).tolist()):
+            if k == len(found):
+                found.append((np.zeros(states.h_deg.size), np.zeros(states.h_deg.size)))
+            found[k][0][own], found[k][1][own] = ratios[k], added_dpt
+    return found
+
+
+def focus_slopes_px(
+    use: Use, states: PupilStates, added_dpt: NDArray
+) -> NDArray[np.float64]:
+    """Slopes (m P, n, 2), px, of light for a focus, in the pixels of a use's states."""
+    count = states.h_deg.size // use.states.h_deg.size
     scale = use.pixel_from_mrad
     if scale is not None:
-        scale = np.tile(scale, (2, 1, 1))
-    frames = state_frames(use.eye, use.spec, neighbours, pixel_from_mrad=scale)
-    lower_px, upper_px = np.split(slopes_px(frames), 2)
-    errors = blend_error(
-        lower_px, upper_px, use.exact_px, share_ratio=share, unit_px=use.unit_px
+        scale = np.tile(scale, (count, 1, 1))
+    total_dpt = states.total_defocus_dpt - added_dpt
+    columns = vars(states) | {"total_defocus_dpt": total_dpt}
+    return slopes_px(
+        state_frames(use.eye, use.spec, PupilStates(**columns), pixel_from_mrad=scale)
     )
-    return float(errors.mean())

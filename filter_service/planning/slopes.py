@@ -93,12 +93,27 @@ def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSu
     )
 
 
+LEAST_LIGHT = 0.02
+"""Of a focus: with less it is planned for as with this."""
+
+
 def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
     """Total defocus (n,) at which some channel is sharp."""
     if eye.rings is None:
         return np.zeros(1)
     channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
-    return np.unique(np.concatenate([eye.rings.main_dpt(nm) for nm in channels_nm]))
+    return np.concatenate([eye.rings.main_dpt(nm) for nm in channels_nm])
+
+
+def main_light_ratio(
+    eye: EyeOptics, spec: GridSpec, radius_mm: NDArray
+) -> NDArray[np.float64]:
+    """Share (n, P) of its channel's light that has each focus, in pupils (P,)."""
+    if eye.rings is None:
+        return np.ones((1, radius_mm.size))
+    channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
+    ratios = [eye.rings.main_light_ratio(radius_mm, nm) for nm in channels_nm]
+    return np.maximum(np.concatenate(ratios), LEAST_LIGHT)
 
 
 def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:

@@ -111,6 +111,7 @@ def exact_kernels(eye, spec, states):
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=spec.pixel_from_mrad(states.h_deg, states.v_deg),
         diffraction=spec.settings.diffraction,
+        pupil_screen=eye.rings and eye.rings.seen_from(states.h_deg, states.v_deg),
         min_energy_ratio=1.0 - 0.2 * (1.0 - spec.kept_energy_ratio),
         workers=2,
     )
@@ -122,6 +123,13 @@ class _Corners:
 
     states: PupilStates
     weights: np.ndarray
+
+
+def blur_scale(eye, states, pupil_mm):
+    """Defocus at which a pupil is read, over that of states; several foci stay."""
+    if eye.rings is not None:
+        return 1.0
+    return states.pupil_diameter_mm / pupil_mm
 
 
 def _corners(eye, spec, plan, states, object_dpt, axes):
@@ -158,7 +166,7 @@ def _corners(eye, spec, plan, states, object_dpt, axes):
             )
             for pupil_index, pupil_mm, pupil_share in pupil_ends:
                 for used_index, used_dpt, used_share in used_ends:
-                    at_dpt = total_dpt * states.pupil_diameter_mm / pupil_mm
+                    at_dpt = total_dpt * blur_scale(eye, states, pupil_mm)
                     share = v_share * h_share * pupil_share * used_share
                     columns = {
                         "h_deg": h_deg,

@@ -6,7 +6,7 @@ import pytest
 from estimator.acuity import acuity_through_focus, optical_transfer
 from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.progressive import ProgressiveLens, progressive_polynomial
-from estimator.corrections.rings import DiffractiveRings
+from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.corrections.worn_lens import (
     WornLens,
     own_polynomial,
@@ -58,6 +58,18 @@ def test_a_sawtooth_shares_light_as_sinc_squared(step_waves, color_ratio):
     found = Kinoform.sawtooth(step_waves).amplitudes(orders, color_ratio=color_ratio)
     expected = np.sinc(step_waves * color_ratio - orders) ** 2
     assert np.abs(found) ** 2 == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_light_of_foci_is_that_of_the_rings_a_pupil_sees():
+    half, wavelength_nm = np.sinc(0.5) ** 2, 550.0
+    rings = DiffractiveRings(2.2, Kinoform.sawtooth(0.5), diameter_mm=3.0)
+    assert rings.main_light_ratio([1.0, 3.0], wavelength_nm) == pytest.approx(
+        np.array([[half, 0.25 * half + 0.75], [half, 0.25 * half]]), abs=1e-5
+    )
+    zones = RefractiveZones((1.0, 2.0), (0.0, 2.5))
+    assert zones.main_light_ratio([0.5, 2.0, 4.0], wavelength_nm) == pytest.approx(
+        np.array([[1.0, 0.25, 1.0 / 16.0], [0.0, 0.75, 15.0 / 16.0]])
+    )
 
 
 def test_two_combs_are_one_where_the_other_has_no_height():

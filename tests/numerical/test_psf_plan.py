@@ -23,6 +23,7 @@ from filter_service.planning.nodes import (
 from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
 from filter_service.planning.sampled_use import sample_use
 from filter_service.psfs.build_store import build_psf_store
+from tests.lens_truth import worn_eye
 from tests.numerical.plan_cases import (
     mean_db,
     node_errors,
@@ -237,6 +238,28 @@ def test_errors_are_predicted_within_a_factor_of_two(name, settings):
     plan = plan_cache(eye, spec)
     measured_db = mean_db(sampled_errors(eye, spec, plan, count=64, seed=3))
     assert abs(measured_db - plan.prediction.interpolation_db) < FACTOR_TWO_DB
+
+
+def test_errors_are_predicted_behind_a_lens_with_several_foci():
+    """Frames read its pupils at the same defocus: for equal blur they had 38 dB."""
+    eye, spec = worn_eye(design="bifocal", add_dpt=3.0), spec_for(mode="dynamic")
+    plan = plan_cache(eye, spec)
+    measured_db = mean_db(sampled_errors(eye, spec, plan, count=24))
+    assert measured_db == pytest.approx(plan.prediction.interpolation_db, abs=3.0)
+
+
+def test_foci_that_share_the_light_need_fewer_psfs(monkeypatch):
+    def planned():
+        return plan_cache(eye, spec_for(mode="dynamic")).prediction.psf_count
+
+    eye = worn_eye(design="bifocal", add_dpt=3.0)
+    count = planned()
+    monkeypatch.setattr(
+        type(eye.rings),
+        "main_light_ratio",
+        lambda rings, mm, nm: np.ones((rings.main_dpt(nm).size, np.size(mm))),
+    )
+    assert count < 0.7 * planned()
 
 
 @pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
