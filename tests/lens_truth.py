@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.corrections.lenslets import Lenslets
+from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import DiffractiveRings, Rings
 from estimator.optics.units import NM_PER_UM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -173,3 +174,16 @@ def lenslets_truth(
         line = np.fft.ifft((np.abs(spectrum) ** 2).sum(axis=0)).real
         found.append(np.interp(steps, np.arange(count), line[:count]) / line[0])
     return np.mean(found, axis=0)
+
+
+def lens_surface_um(lens: ProgressiveLens, place_mm, u) -> NDArray[np.float64]:
+    """How far a progressive lens holds light back at points (n, 2) about a place.
+
+    Its powers, integrated twice from there.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    found = np.zeros(len(u))
+    for s, weight in zip((nodes + 1.0) / 2.0, weights / 2.0, strict=True):
+        powers = lens.power_matrices_dpt(*(np.array(place_mm) + s * u).T)
+        found += weight * (1.0 - s) * np.einsum("ni,nij,nj->n", u, powers, u)
+    return found

@@ -6,6 +6,10 @@ it has the power F(y) in every meridian, from far to the addition; beside it the
 astigmatism 2 |F'(y)| x with an oblique axis that no smooth surface can be without
 (Minkwitz, Optica Acta 10, 1963), which levels off at 0.8 of the addition.  F is the
 normal distribution itself, a quarter of the corridor wide.
+
+Power changes over the pupil too, which makes coma and trefoil: 0.07 um through 4 mm in
+the middle of a corridor of 14 mm to 2 dpt.  With the surface's third derivatives 0.005
+um of the wavefront are left out there, and 0.02 um at the corridor's ends.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
+from estimator.optics.zernike import EXPONENTS, N_TERMS
 from estimator.wavefront.field_wavefronts import polynomial_in_mm
+
+CUBES = [EXPONENTS.tolist().index([a, 3 - a]) for a in (3, 2, 1, 0)]
+"""Places of the monomials x³, x²y, xy² and y³."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +100,39 @@ class ProgressiveLens(rx.Prescription):
         # A service is ready before it loads scipy.
         from scipy.special import ndtr
 
-        x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
-        wide_mm = np.hypot(self.corridor_mm / 4.0, x)
-        z = (-y - self.corridor_mm / 2.0) / wide_mm
+        z, aside, _ = self._places(x_mm, y_mm)
         power_dpt = self.add_dpt * ndtr(z)
-        bell_dpt = self.add_dpt * np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)
-        aside = x / wide_mm
-        found = np.empty((*x.shape, 2, 2))
+        bell_dpt = self.add_dpt * _bell(z)
+        found = np.empty((*z.shape, 2, 2))
         found[..., 0, 0] = power_dpt - bell_dpt * z * aside**2
         found[..., 1, 1] = power_dpt
         found[..., 0, 1] = found[..., 1, 0] = -bell_dpt * aside
         m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
         return found + np.array([[m + j0, j45], [j45, m - j0]])
+
+    def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
+        """Monomials (..., 28) that it takes off as its power changes over the pupil.
+
+        By the third derivatives of its surface at the point that is looked through.
+        """
+        z, aside, wide_mm = self._places(x_mm, y_mm)
+        slope_dpt_mm = self.add_dpt * _bell(z) / wide_mm
+        derivatives = [
+            z * aside * ((3.0 - z * z) * aside**2 - 3.0),  # xxx
+            -1.0 - (z * z - 1.0) * aside**2,  # xxy
+            -z * aside,  # xyy
+            -np.ones_like(z),  # yyy
+        ]
+        found = np.zeros((*z.shape, N_TERMS))
+        for place, times, third in zip(CUBES, (1, 3, 3, 1), derivatives, strict=True):
+            found[..., place] = -slope_dpt_mm * times * third / 6.0
+        return found
+
+    def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray, ...]:
+        """How far along the corridor and beside it, over how wide it is smoothed."""
+        x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
+        wide_mm = np.hypot(self.corridor_mm / 4.0, x)
+        return (-y - self.corridor_mm / 2.0) / wide_mm, x / wide_mm, wide_mm
 
 
 def progressive_polynomial(
@@ -115,9 +144,11 @@ def progressive_polynomial(
 ) -> NDArray[np.float64]:
     """Monomials (..., 28) that a lens takes off at field directions (...).
 
-    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1.
+    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1, and by how power
+    changes over the pupil.
     """
-    power = lens.power_matrices_dpt(*lens.lens_point_mm(h_deg, v_deg))
+    place_mm = lens.lens_point_mm(h_deg, v_deg)
+    power = lens.power_matrices_dpt(*place_mm)
     before_m = (lens.vertex_mm + entrance_pupil_mm) / MM_PER_M
     at_pupil = power @ np.linalg.inv(np.eye(2) - before_m * power)
     m = (at_pupil[..., 0, 0] + at_pupil[..., 1, 1]) / 2.0
@@ -129,4 +160,8 @@ def progressive_polynomial(
         ]
     )
     parts = np.stack([m, j0, at_pupil[..., 0, 1]], axis=-1)
-    return parts @ polynomial_in_mm(unit, 1.0)
+    return parts @ polynomial_in_mm(unit, 1.0) + lens.uneven_polynomial(*place_mm)
+
+
+def _bell(z: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)

@@ -95,6 +95,9 @@ def worn_polynomial(
     Its power as `correction_polynomial` has it, less its own aberration.
     """
     taken_um = correction_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
+    if isinstance(correction, ProgressiveLens):
+        place_mm = correction.lens_point_mm(0.0, 0.0)
+        taken_um = taken_um + correction.uneven_polynomial(*place_mm)
     if isinstance(correction, WornLens) and correction.spherical_aberration_um:
         taken_um = taken_um - own_polynomial(correction)
     return taken_um

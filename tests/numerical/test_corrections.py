@@ -5,16 +5,22 @@ import pytest
 
 from estimator.acuity import acuity_through_focus, optical_transfer
 from estimator.corrections.kinoform import Kinoform
-from estimator.corrections.progressive import ProgressiveLens, progressive_polynomial
+from estimator.corrections.progressive import (
+    CUBES,
+    ProgressiveLens,
+    progressive_polynomial,
+)
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.corrections.worn_lens import (
     WornLens,
     own_polynomial,
     shifted_polynomial,
+    worn_polynomial,
     worn_refraction,
 )
 from estimator.field.prepare import prepare_eye
 from estimator.optics import prescription as rx
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.optics.zernike import EXPONENTS, index_from_nm
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
@@ -31,6 +37,7 @@ from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
     Truth,
+    lens_surface_um,
     lenslet_eye,
     lenslets_truth,
     modulation,
@@ -221,8 +228,31 @@ def test_a_progressive_lens_takes_off_what_spectacles_of_its_power_do():
         rx.Prescription(-4.0, -1.0, 30.0, 12.0), add_dpt=2.0, corridor_mm=14.0
     ).looking((8.0, -20.0))
     found = progressive_polynomial(lens, 0.0, 0.0, entrance_pupil_mm=3.0)
-    expected = correction_polynomial(lens, entrance_pupil_mm=3.0)
+    expected = worn_polynomial(lens, entrance_pupil_mm=3.0)
     assert found == pytest.approx(expected, abs=1e-9)
+    even = correction_polynomial(lens, entrance_pupil_mm=3.0)
+    assert np.flatnonzero(np.abs(found - even) > 1e-9).tolist() == CUBES
+
+
+@pytest.mark.parametrize("place_mm", [(0.0, -7.0), (0.0, -10.0), (4.0, -7.0)])
+def test_a_pupil_sees_the_lens_s_surface(place_mm):
+    """Coma and trefoil are what powers, twice integrated over the pupil, have."""
+    lens = ProgressiveLens.of(rx.Prescription(0.0), add_dpt=2.0, corridor_mm=14.0)
+    u = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 33)] * 2), axis=-1)
+    u = u[np.hypot(*np.moveaxis(u, -1, 0)) <= 2.0]
+    seen_um = lens_surface_um(lens, place_mm, u)
+    even = np.einsum("ni,ij,nj->n", u, lens.power_matrices_dpt(*place_mm), u) / 2.0
+    h_deg, v_deg = np.degrees(np.arctan(np.array(place_mm) / TYPICAL_ENTRANCE_PUPIL_MM))
+    taken = progressive_polynomial(lens, h_deg, v_deg, entrance_pupil_mm=0.0)
+    held_um = -(u[:, :1] ** EXPONENTS[:, 0] * u[:, 1:] ** EXPONENTS[:, 1]) @ taken
+    tilt = np.column_stack([np.ones(len(u)), u])
+
+    def rms(um):
+        return np.std(um - tilt @ np.linalg.lstsq(tilt, um, rcond=None)[0])
+
+    assert rms(seen_um - even) > 0.02
+    assert rms(seen_um - held_um) < 0.02
+    assert rms(seen_um - held_um) < 0.4 * rms(seen_um - even)
 
 
 def test_a_traced_eye_sees_through_each_part_of_a_progressive_lens():
