@@ -9,6 +9,10 @@
   would be if the light of the foci did not interfere.
 - ``published``: lenses on optical benches, ours less theirs; sources stand in
   tests/data/published_lenses.json.
+- ``people``: what people were found to read through an intraocular lens of extended
+  depth of focus and through lenslets, ours less theirs; no bench's numbers of these
+  lenses could be read.  And how wide a progressive lens's corridor is said to be.
+- ``plan``: PSNR that blended PSFs have, less what their plan predicts.
 - ``kernels``: time of a PSF with and without rings in the pupil.
 
 Writes results/corrections.json and corrections.png.
@@ -29,6 +33,8 @@ from estimator.psf.compute import compute_psf_batch
 from estimator.wavefront.field_wavefronts import zernike_from_polynomial
 from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish, time_calls
 from tests.benchmarks.lens_picture import draw_lenses
+from tests.benchmarks.lens_plans import STATES, planned_and_measured
+from tests.benchmarks.people_rows import found_in_people
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,
@@ -111,6 +117,14 @@ def closed_form_rows() -> list[Row]:
         *(-0.3 * 0.5 / 3.0 * 2.0 * np.sqrt(10.0), "um", "-2 sqrt(10) C40 d / r"),
     )
     step = worn(kind="iol", design="bifocal", add_dpt=3.0).rings
+    deep = worn(kind="iol", design="edof", add_dpt=1.75).rings
+    for order in (1, 2):
+        waves = 1.5 * DESIGN_NM / BLUE_NM
+        add(
+            *("extended depth", f"share of order {order}, 453 nm"),
+            lambda order=order: float(share_of(deep, order, BLUE_NM)),
+            *(np.sinc(waves - order) ** 2, "ratio", "sinc²(h - k)"),
+        )
     for order in (0, 1):
         add(
             *("diffractive", f"share of order {order}, 550 nm"),
@@ -362,6 +376,38 @@ def toric_rows() -> list[Row]:
     return rows
 
 
+def people_rows() -> list[Row]:
+    """Return rows of what people read, beside what ours let them."""
+    found, times_ms = _timed(lambda: list(found_in_people()))
+    return [
+        _row("people", case, setting, times_ms, name, error, source)
+        for case, setting, name, error, source in found
+    ]
+
+
+def plan_rows() -> list[Row]:
+    """Return rows of blended PSFs, less what their plans predict."""
+    rows = []
+    bodies = {name: {"kind": "iol"} | body for name, body in LINES.items()}
+    bodies["monofocal"] = {"kind": "iol"}
+    bodies["lenslets"] = {"kind": "lenslets", "sphere_dpt": 0.0, "vertex_mm": 12.0}
+    for name, body in bodies.items():
+        for eye_model in ("traced", "wavefront"):
+            found, times_ms = _timed(
+                lambda body=body, model=eye_model: list(
+                    planned_and_measured(body, eye_model=model)
+                )
+            )
+            rows += [
+                _row(
+                    *("plan", name, setting, times_ms, "dB", measured - predicted),
+                    *("exact PSFs at random states", STATES),
+                )
+                for setting, predicted, measured in found
+            ]
+    return rows
+
+
 def kernel_rows() -> list[Row]:
     """Return the time of a PSF with rings and without, one thread."""
     rows = []
@@ -431,9 +477,9 @@ def main() -> None:
     pupils_mm = (3.0,) if options.quick else PUPILS_MM
     rows += diffraction_rows(pupils_mm) + lenslet_rows(pupils_mm)
     published, curves = transfer_rows()
-    rows += published + distance_rows()
+    rows += published + distance_rows() + people_rows()
     if not options.quick:
-        rows += kernel_rows()
+        rows += kernel_rows() + plan_rows()
         draw_lenses(RESULTS / "corrections.png", THROUGH_FOCUS_DPT, curves)
     publish("corrections", rows, as_json=options.json, is_whole=not options.quick)
 

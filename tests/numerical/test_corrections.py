@@ -43,6 +43,11 @@ from tests.lens_truth import (
     modulation,
     worn_eye,
 )
+from tests.worn_by_people import (
+    corridor_width_mm,
+    lost_by_lenslets,
+    read_through_focus,
+)
 
 AT_CPD = np.arange(2.0, 40.0, 2.0)
 OBJECTS_DPT = np.array([0.0, 0.6, 1.2, 2.2])
@@ -416,3 +421,29 @@ def test_a_traced_eye_with_an_intraocular_lens_is_not_said_to_be_out_of_reach():
     far_dpt, _ = eye.focus_limits_dpt(4.0)
     assert 1e-5 < abs(far_dpt) < 1e-3
     assert eye.notes(pupil_diameter_mm=4.0, focus_dpt=0.0) == ()
+
+
+def test_people_read_so_much_through_an_extended_depth_of_focus():
+    table = PUBLISHED["people"]["edof"]
+    limit = table["tolerance_log_mar"]
+    ahead, *behind = read_through_focus([0.0, *map(float, table["log_mar_by_dpt"])])
+    assert ahead == pytest.approx(table["best_log_mar"], abs=limit)
+    expected = list(table["log_mar_by_dpt"].values())
+    assert behind == pytest.approx(expected, abs=limit)
+
+
+def test_people_lose_so_much_behind_lenslets():
+    table = PUBLISHED["people"]["lenslets"]
+    log_mar, log_contrast = lost_by_lenslets()
+    for lost, name in (
+        (log_mar, "lost_log_mar"),
+        (log_contrast, "lost_log_contrast"),
+    ):
+        for published in table[name].values():
+            assert lost == pytest.approx(published, abs=table["tolerance"])
+
+
+def test_a_corridor_is_about_as_wide_as_it_is_said_to_be():
+    table = PUBLISHED["people"]["progressive"]
+    expected_mm = pytest.approx(table["width_mm"], abs=table["tolerance_mm"])
+    assert corridor_width_mm() == expected_mm
