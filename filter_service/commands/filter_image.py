@@ -283,7 +283,7 @@ def _report(summary: dict) -> None:
     say(
         f"{summary['out']}: {summary['width_px']}x{summary['height_px']} through "
         f"{summary['profile']}, pupil {summary['pupil_diameter_mm']:g} mm, "
-        f"focus {summary['focus_dpt']:.3g} dpt; "
+        f"focus {round(summary['focus_dpt'], 3) + 0.0:.3g} dpt; "
         f"PSFs {summary['build_ms']:.0f} ms, start {summary['start_ms']:.0f} ms, "
         f"frame {summary['render_ms']:.0f} ms on {summary['renderer']}"
     )
