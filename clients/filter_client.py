@@ -56,7 +56,7 @@ from filter_service.messages import (
     encode,
     tangents_from_fov,
 )
-from filter_service.settings import DepthKind
+from filter_service.settings import DepthKind, as_settings
 
 __all__ = [
     "Event",
@@ -272,11 +272,11 @@ class FilterClient:
         cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
         if isinstance(body, str):
             body = {"kind": "preset", "name": body}
-        if not isinstance(settings, FilterSettings):
-            settings = FilterSettings(**settings)
         if eye not in EYE_NAMES:
             raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
-        return ProfileRequest(self._next_profile_id, dict(body), settings, cameras, eye)
+        return ProfileRequest(
+            self._next_profile_id, dict(body), as_settings(settings), cameras, eye
+        )
 
     def _ask(self, request: ProfileRequest, parts: list[Any]) -> None:
         self._camera = next(iter(request.views), self._camera)

@@ -6,6 +6,7 @@ and a line in PROTOCOL.md, beside what reads it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -14,6 +15,7 @@ from msgspec import Meta
 
 from filter_service.checked import RISING, Record, check_rising, checked
 from filter_service.displays import display_wavelengths_nm
+from filter_service.errors import BadMessage
 
 MIN_PUPIL_MM = 0.5
 MAX_PUPIL_MM = 9.0
@@ -193,6 +195,32 @@ def setting_types() -> dict[str, Any]:
     """Return the annotated type of each setting."""
     hints = get_type_hints(FilterSettings, include_extras=True)
     return {field.name: hints[field.name] for field in fields(FilterSettings)}
+
+
+def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
+    """Return settings, which may be given as a mapping of some by name.
+
+    Raises
+    ------
+    BadMessage
+        Something else, a name that there is not, or a value out of range.
+    """
+    if isinstance(settings, FilterSettings):
+        return settings
+    if not isinstance(settings, Mapping):
+        raise BadMessage(
+            f"a {type(settings).__name__}",
+            field="settings",
+            allowed="FilterSettings, or a mapping of settings by name",
+        )
+    for name in settings:
+        if name not in setting_types():
+            raise BadMessage(
+                f"{name!r} is none",
+                field="settings",
+                allowed=", ".join(setting_types()),
+            )
+    return FilterSettings(**settings)
 
 
 def setting_help(name: str) -> str:

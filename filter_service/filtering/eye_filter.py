@@ -40,6 +40,7 @@ from filter_service.settings import (
     Output,
     PupilMm,
     VergenceDpt,
+    as_settings,
 )
 
 WAIT_SLICE_S = 0.02
@@ -77,7 +78,7 @@ class EyeFilter:
     camera : Camera, or several, optional
         What to prepare for; other cameras are prepared for when their frames come.
         Frames given as bare arrays are taken with the first.
-    settings : FilterSettings, optional
+    settings : FilterSettings or mapping, optional
     on_event : callable, optional
         Told of every `BuildingEye`, `EyeReady` and `EyeFailed`.
     workshop : Workshop, optional
@@ -102,7 +103,7 @@ class EyeFilter:
         self,
         profile: Profile | None = None,
         camera: Camera | Sequence[Camera] = (),
-        settings: FilterSettings = DEFAULTS,
+        settings: FilterSettings | Mapping[str, Any] = DEFAULTS,
         *,
         on_event: Callable[[EyeEvent], None] | None = None,
         workshop: Workshop | None = None,
@@ -112,7 +113,7 @@ class EyeFilter:
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
-        self.settings = settings
+        self.settings = as_settings(settings)
         self._on_event = on_event
         self._shared = shared(engine) if workshop is None else None
         self._workshop: Workshop | None = workshop or shared(engine).take()
@@ -175,7 +176,7 @@ class EyeFilter:
         self,
         profile: Profile,
         *,
-        settings: FilterSettings | None = None,
+        settings: FilterSettings | Mapping[str, Any] | None = None,
         cameras: Sequence[Camera] = (),
         profile_id: int | None = None,
     ) -> AcceptedProfile:
@@ -183,7 +184,7 @@ class EyeFilter:
 
         Parameters
         ----------
-        settings : FilterSettings, optional
+        settings : FilterSettings or mapping, optional
             Those of the filter where it is None.
         cameras : sequence of Camera, optional
             What to prepare for; else the cameras of the last frame, else those of the
@@ -199,7 +200,7 @@ class EyeFilter:
         self._newest = self.workshop.accept(
             self._eyes,
             as_profile(profile),
-            settings or self.settings,
+            self.settings if settings is None else as_settings(settings),
             cameras,
             profile_id=profile_id,
         )

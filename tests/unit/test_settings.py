@@ -17,6 +17,7 @@ from filter_service.errors import BadMessage
 from filter_service.settings import (
     DEFAULTS,
     FilterSettings,
+    as_settings,
     setting_help,
     setting_types,
 )
@@ -134,3 +135,23 @@ def test_an_option_out_of_range_is_named_as_an_option():
     choices = Literal["a", "b"]
     with pytest.raises(BadMessage, match="one of a, b"):
         checked("c", choices, "x")
+
+
+def test_some_settings_may_be_given_by_name():
+    settings = FilterSettings(mode="quality", gaze_deg=(1.0, 2.0))
+    assert as_settings(settings) is settings
+    assert as_settings({"mode": "quality", "gaze_deg": [1, 2]}) == settings
+    assert as_settings({}) == FilterSettings()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"mod": "quality"}, r"settings: .*'mod'.* \(allowed: mode, grid, "),
+        ({"mode": "best"}, r"mode: .*'best'"),
+        ("quality", r"settings: .*str.* \(allowed: FilterSettings, or"),
+    ],
+)
+def test_settings_that_there_are_not_are_named(settings, words):
+    with pytest.raises(BadMessage, match=words):
+        as_settings(settings)
