@@ -63,6 +63,16 @@ def as_profile(profile: Profile) -> EyeProfile:
     return profile
 
 
+def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
+    found = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
+    for camera in found:
+        if not isinstance(camera, Camera):
+            raise BadMessage(
+                f"{camera!r}", field="camera", allowed="a Camera, or several"
+            )
+    return found
+
+
 class EyeFilter:
     """One stream of frames through one person's eye, which may change on the way.
 
@@ -112,7 +122,7 @@ class EyeFilter:
         engine: Engine = "auto",
     ) -> None:
         first = None if profile is None else as_profile(profile)
-        self.cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+        self.cameras = _as_cameras(camera)
         self.settings = as_settings(settings)
         self._on_event = on_event
         self._shared = shared(engine) if workshop is None else None
@@ -201,7 +211,7 @@ class EyeFilter:
             self._eyes,
             as_profile(profile),
             self.settings if settings is None else as_settings(settings),
-            cameras,
+            _as_cameras(cameras),
             profile_id=profile_id,
         )
         return self._newest

@@ -126,9 +126,13 @@ def test_a_program_with_many_open_files_can_wait():
             assert made.wait(10.0).is_complete
 
 
-def test_a_filter_that_could_not_be_made_holds_nothing(workshop):
-    with pytest.raises(AttributeError):
-        EyeFilter(eye(1), CAMERA, {"mode": "on-axis"}, workshop=workshop)
+def test_a_filter_that_could_not_be_made_holds_nothing(workshop, monkeypatch):
+    def fails(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(workshop, "accept", fails)
+    with pytest.raises(MemoryError):
+        EyeFilter(eye(1), CAMERA, workshop=workshop)
     assert workshop.streams == []
 
 
@@ -190,6 +194,10 @@ def test_what_is_missing_or_wrong_is_named(eye_filter, workshop):
         eye_filter.filter(COLOR, DEPTH_M, pupil_diameter_mm=30.0, focus_dpt=0.0)
     with pytest.raises(ValueError, match="is out of range"):
         eye_filter.set_profile({"kind": "prescription", "sphere_dpt": -100})
+    with pytest.raises(BadMessage, match=r"camera: .*64x36"):
+        EyeFilter(eye(1), ["64x36"], workshop=workshop)
+    with pytest.raises(BadMessage, match=r"settings: .*'mod'"):
+        EyeFilter(eye(1), CAMERA, {"mod": "quality"}, workshop=workshop)
     with EyeFilter(eye(1), workshop=workshop) as blind:
         with pytest.raises(BadMessage, match="camera: it is not known"):
             blind.filter(COLOR, DEPTH_M, **SEE)
