@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from clients.frame_packer import FramePacker, check_limits
 from clients.link import Event, FilteredFrame, ServiceLink
 from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
-from filter_service.errors import FilterError, ServiceTimeout
+from filter_service.errors import BadMessage, FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
 from filter_service.messages import (
     COMPRESSIONS,
@@ -73,7 +73,12 @@ DEFAULT_SETTINGS = FilterSettings()
 
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
     """Return numpy's numbers as Python's; the service refuses what is no pair."""
-    return cast("tuple[float, float]", tuple(map(float, pair)))
+    try:
+        return cast("tuple[float, float]", tuple(map(float, pair)))
+    except (TypeError, ValueError):
+        raise BadMessage(
+            f"it is {pair!r}", field="gaze_deg", allowed="two numbers"
+        ) from None
 
 
 EXTENDING_S = 0.03
@@ -192,7 +197,7 @@ class FilterClient:
         *,
         eye: EyeName = "both",
         settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
-        views: Sequence[Camera | RgbdView] = (),
+        views: Camera | RgbdView | Sequence[Camera | RgbdView] = (),
         wait: bool | str = True,
         on_progress: Callable[[Progress], None] | None = None,
         timeout_s: float = 120.0,
@@ -209,7 +214,7 @@ class FilterClient:
             their `ViewState` says otherwise, or the left or the right one.
         settings : FilterSettings or mapping, optional
             Or its fields that differ from the defaults.
-        views : sequence, optional
+        views : camera or view, or several, optional
             The cameras to prepare for.  Without them the service prepares for those
             of the last frame; before any frame there is nothing to prepare, and
             Accepted is returned with ``is_building`` false.
@@ -248,7 +253,7 @@ class FilterClient:
         *,
         eye: EyeName = "both",
         settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
-        views: Sequence[Camera | RgbdView] = (),
+        views: Camera | RgbdView | Sequence[Camera | RgbdView] = (),
     ) -> int:
         """Ask for another eye like `set_profile`, and wait for nothing.
 
@@ -267,11 +272,19 @@ class FilterClient:
         body: Mapping[str, Any] | str,
         eye: EyeName,
         settings: FilterSettings | Mapping[str, Any],
-        views: Sequence[Camera | RgbdView],
+        views: Camera | RgbdView | Sequence[Camera | RgbdView],
     ) -> ProfileRequest:
+        if isinstance(views, Camera | RgbdView):
+            views = (views,)
         cameras = tuple(v.camera if isinstance(v, RgbdView) else v for v in views)
         if isinstance(body, str):
             body = {"kind": "preset", "name": body}
+        if not isinstance(body, Mapping):
+            raise BadMessage(
+                f"a {type(body).__name__}",
+                field="profile",
+                allowed="a mapping, or a preset's name",
+            )
         if eye not in EYE_NAMES:
             raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
         return ProfileRequest(

@@ -145,7 +145,8 @@ def as_views(
     Raises
     ------
     BadMessage
-        Arrays without depth or without a camera, or views with depth beside them.
+        Arrays without depth or without a camera, views with depth beside them, or
+        something else.
     """
     if isinstance(color, np.ndarray):
         if depth_m is None:
@@ -155,8 +156,21 @@ def as_views(
                 "it is not known", field="camera", allowed="a camera, or an RgbdView"
             )
         return (RgbdView(color, depth_m, camera.tangents),)
+    _check_views(color)
     if depth_m is not None:
         raise BadMessage(
             "it is given twice", field="depth", allowed="arrays, or an RgbdView"
         )
     return (color,) if isinstance(color, RgbdView) else tuple(color)
+
+
+def _check_views(color: object) -> None:
+    views = color if isinstance(color, Sequence) else [color]
+    for view in views:
+        if not isinstance(view, RgbdView):
+            inside = f" of {type(view).__name__}" if view is not color else ""
+            raise BadMessage(
+                f"a {type(color).__name__}{inside}",
+                field="color",
+                allowed="an array (height, width, 3), an RgbdView, or several",
+            )

@@ -64,7 +64,7 @@ class ViewState(Record):
 def check_states(
     states: Sequence[ViewState], pupil_diameter_mm: float, focus_dpt: float
 ) -> None:
-    """Refuse two pupils, or two focuses, for one eye.
+    """Refuse two pupils, or two focuses, for one eye, and what is no state.
 
     Parameters
     ----------
@@ -80,13 +80,15 @@ def check_states(
     usual = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
     first_of: dict[EyeName, ViewState] = {}
     for i, state in enumerate(states):
+        if not isinstance(state, ViewState):
+            raise BadMessage(f"{state!r}", field=f"states[{i}]", allowed="a ViewState")
         first = first_of.setdefault(state.eye, state)
         for name, of_frame in usual.items():
             wanted, found = (
                 of_frame if own is None else own
                 for own in (getattr(first, name), getattr(state, name))
             )
-            if found != wanted:
+            if found is not wanted and found != wanted:
                 raise BadMessage(
                     f"it is {found}",
                     field=f"views[{i}].{name}",

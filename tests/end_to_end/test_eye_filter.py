@@ -190,6 +190,9 @@ def test_what_is_missing_or_wrong_is_named(eye_filter, workshop):
         eye_filter.filter(COLOR, DEPTH_M, **SEE)
     with pytest.raises(BadMessage, match="depth: it is missing"):
         eye_filter.filter(COLOR, **SEE)
+    for wrong in (COLOR.tolist(), None, ["view"]):
+        with pytest.raises(BadMessage, match=r"color: .* an RgbdView, or several"):
+            eye_filter.filter(wrong, DEPTH_M, **SEE)
     with pytest.raises(ValueError, match=r"pupil_diameter_mm: it is 30\.0"):
         eye_filter.filter(COLOR, DEPTH_M, pupil_diameter_mm=30.0, focus_dpt=0.0)
     with pytest.raises(ValueError, match="is out of range"):

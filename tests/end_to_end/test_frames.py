@@ -130,6 +130,25 @@ def test_a_frame_that_cannot_be_filtered_is_an_error_and_the_next_one_works(clie
     assert client.filter(view, **SEE).color[0, 0, 0] == 7
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"gaze_deg": 3.0}, r"gaze_deg: .*3\.0.* two numbers"),
+        ({"states": [1]}, r"states\[0\]: 1 .* a ViewState"),
+        ({"color": [1]}, r"color: a list of int .* an RgbdView, or several"),
+        ({"pupil_diameter_mm": np.nan}, r"pupil_diameter_mm: it is nan .* 0\.5 to 9"),
+    ],
+)
+def test_a_wrong_argument_is_named_and_the_next_frame_works(client, change, words):
+    view = make_view()
+    client.set_profile(double(7), views=view)  # one view needs no list
+    with pytest.raises(errors.BadMessage, match=words):
+        client.filter(**{"color": view, **SEE, **change})
+    assert client.filter(view, **SEE).color[0, 0, 0] == 7
+    with pytest.raises(errors.BadMessage, match=r"profile: a NoneType .* mapping"):
+        client.set_profile(None)
+
+
 def test_images_too_large_for_the_service_are_refused_by_the_client(client):
     with pytest.raises(ValueError, match="4097 x 300"):
         client.submit(make_view(4097, 300), **SEE)
