@@ -6,7 +6,8 @@
 # It has wheels, the loaders of OpenGL, the tree of the last commit, and run.sh.
 # From the environment:
 #   PYTHON_VERSION  the Python of that machine; 3.12
-#   WITH            more packages to carry, of those that it is expected to have
+#   WITH            more packages to carry, with what they need, of those that it is
+#                   expected to have
 #   PYTHON          whose pip fetches the wheels; .venv/bin/python
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
@@ -41,9 +42,11 @@ fail() {
 fetch_wheels() {
     set --
     for platform in $PLATFORMS; do set -- "$@" --platform "$platform"; done
-    "$python" -m pip --disable-pip-version-check download -qq --no-deps \
-        --only-binary=:all: --implementation cp --python-version "$version" "$@" \
-        -c constraints.txt -d "$kit/wheels" $CARRIED ${WITH:-} ||
+    set -- "$@" --only-binary=:all: --implementation cp --python-version "$version" \
+        -c constraints.txt -d "$kit/wheels"
+    "$python" -m pip --disable-pip-version-check download -qq --no-deps "$@" $CARRIED &&
+        { [ -z "${WITH:-}" ] ||
+            "$python" -m pip --disable-pip-version-check download -qq "$@" $WITH; } ||
         fail "a wheel for Python $version is missing; its name stands above"
 }
 
