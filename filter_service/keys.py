@@ -7,12 +7,34 @@ service's public key; the service keeps no copy of the secret.
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
 import re
+import stat
+import time
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from filter_service.log_lines import ONCE_A_SECOND
+from filter_service.whole_files import write_atomically
+
+MAX_FILE_BYTES = 4096
+"""Of a key file; ours have 300."""
+
+MAX_CLIENTS = 10_000
+RESCAN_S = 1.0
+"""How often the clients' files are looked at one by one; one that comes or goes is
+noticed at once, by the time stamp of the folder."""
+
+RETRY_S = 0.1
+
+OUT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE)
+
+log = logging.getLogger("ocufilter")
 
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 """32 bytes in Z85 (ZeroMQ RFC 32)."""
@@ -70,8 +92,10 @@ class KeyRing:
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
         self._clients = self.folder / "clients"
+        self._keys: dict[str, tuple[tuple[int, ...], str | None]] = {}  # by file name
         self._allowed: frozenset[str] = frozenset()
-        self._seen: object = None
+        self._folder_stamp_ns = -1
+        self._next_scan_s = self._retry_s = 0.0
 
     @property
     def server(self) -> KeyPair:
@@ -84,6 +108,33 @@ class KeyRing:
         values = _read(self.folder / "server.toml", ("public", "secret"))
         return KeyPair(values["public"], values["secret"])
 
+    def check(self) -> None:
+        """Check what a service needs before it starts: rights, and a pair that fits.
+
+        Raises
+        ------
+        ValueError, OSError
+            Others may write to the folder or read the service's key, or its public key
+            does not belong to its secret one.
+        """
+        for path, bad_bits, what in (
+            (self.folder, 0o022, "other users may change it"),
+            (self.folder / "server.toml", 0o077, "other users may read it"),
+        ):
+            mode = stat.S_IMODE(path.stat().st_mode)
+            if mode & bad_bits:
+                good = 0o600 if path.suffix else 0o700
+                raise ValueError(
+                    f"{path} has mode {mode:04o}: {what}; expected {good:04o} "
+                    f"(chmod {good:o} '{path}')"
+                )
+        pair = self.server
+        if _public_of(pair.secret) != pair.public:
+            raise ValueError(
+                f"{self.folder / 'server.toml'}: 'public' does not belong to 'secret'; "
+                "expected a pair that `ocufilter keys` has made"
+            )
+
     def create(self) -> KeyPair:
         """Make the folder and the service's pair, unless it is there; return it."""
         self._clients.mkdir(parents=True, exist_ok=True)
@@ -91,7 +142,9 @@ class KeyRing:
         file = self.folder / "server.toml"
         if not file.exists():
             pair = _new_pair()
-            _write(file, {"public": pair.public, "secret": pair.secret})
+            values = {"public": pair.public, "secret": pair.secret}
+            with suppress(FileExistsError):  # made by another process meanwhile
+                _write(file, values)
         return self.server
 
     def add(self, name: str, client_file: Path) -> ClientKey:
@@ -139,13 +192,56 @@ class KeyRing:
         return sorted(file.stem for file in self._clients.glob("*.toml"))
 
     def allowed(self) -> frozenset[str]:
-        """Return the public keys of all clients, read again when the folder changes."""
-        files = sorted(self._clients.glob("*.toml"))
-        seen = [(str(file), file.stat().st_mtime_ns) for file in files]
-        if seen != self._seen:
-            self._allowed = frozenset(_read(f, ("public",))["public"] for f in files)
-            self._seen = seen
+        """Return the public keys of all clients, read again where the folder changes.
+
+        A file that is no key is skipped and named once in the log; where the folder
+        cannot be read, the last keys stay allowed.
+        """
+        now_s = time.monotonic()
+        if now_s < self._retry_s:
+            return self._allowed
+        try:
+            stamp_ns = self._clients.stat().st_mtime_ns
+            if stamp_ns != self._folder_stamp_ns or now_s >= self._next_scan_s:
+                self._scan()
+                self._folder_stamp_ns = stamp_ns
+                self._next_scan_s = now_s + RESCAN_S
+        except OSError as error:
+            self._retry_s = now_s + RETRY_S
+            log.warning(
+                *("%s cannot be read (%s)", self._clients, error.strerror),
+                extra=ONCE_A_SECOND,
+            )
         return self._allowed
+
+    def _scan(self) -> None:
+        """Read the files that are new or have changed."""
+        found: dict[str, tuple[tuple[int, ...], str | None]] = {}
+        with os.scandir(self._clients) as entries:
+            names = sorted(e.name for e in entries if e.name.endswith(".toml"))
+        if len(names) > MAX_CLIENTS:
+            log.warning("%s: only the first %d keys count", self._clients, MAX_CLIENTS)
+        for name in names[:MAX_CLIENTS]:
+            path = self._clients / name
+            try:
+                status = path.stat()
+                identity = (status.st_ino, status.st_mtime_ns, status.st_size)
+                known = self._keys.get(name)
+                if known is not None and known[0] == identity:
+                    found[name] = known
+                    continue
+                found[name] = identity, _read(path, ("public",))["public"]
+            except (ValueError, OSError) as error:
+                if isinstance(error, OSError) and error.errno in OUT_OF_DESCRIPTORS:
+                    raise
+                if isinstance(error, FileNotFoundError) and not path.is_symlink():
+                    continue  # taken out meanwhile
+                if (self._keys.get(name) or (None,))[0] != (identity := _stamp(path)):
+                    log.warning("a key file is skipped: %s", error)
+                found[name] = identity, None
+        self._keys = found
+        keys = (key for _, key in found.values())
+        self._allowed = frozenset(key for key in keys if key is not None)
 
     def _file_of(self, name: str) -> Path:
         if not NAME.fullmatch(name):
@@ -163,10 +259,34 @@ def _new_pair() -> KeyPair:
     return KeyPair(public.decode(), secret.decode())
 
 
+def _public_of(secret: str) -> str:
+    import zmq
+
+    return zmq.curve_public(secret.encode()).decode()
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Return what changes with a file, of a link that leads nowhere too."""
+    status = path.lstat()
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
 def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
+    """Read a key file, whatever lies there: no wait for a pipe, nothing large."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError(f"{path} is no regular file; expected a key file")
+        content = os.read(descriptor, MAX_FILE_BYTES + 1)
+    finally:
+        os.close(descriptor)
+    if len(content) > MAX_FILE_BYTES:
+        raise ValueError(
+            f"{path} has more than {MAX_FILE_BYTES} bytes; expected a key file"
+        )
+    try:
+        values = tomllib.loads(content.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is no key file: {error}") from None
     for name in wanted:
         if not isinstance(values.get(name), str) or not KEY.fullmatch(values[name]):
@@ -175,8 +295,6 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
 
 
 def _write(path: Path, values: dict[str, str]) -> None:
-    """Write a file that is its owner's alone from the start, and new."""
+    """Write a new file of its owner alone, as a whole or not at all."""
     text = HEAD + "".join(f"{name} = '{value}'\n" for name, value in values.items())
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    with os.fdopen(os.open(path, flags, 0o600), "w", encoding="utf-8") as file:
-        file.write(text)
+    write_atomically(path, text, is_new=True)

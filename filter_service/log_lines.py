@@ -11,6 +11,12 @@ FORMAT_VARIABLE = "OCUFILTER_LOG_FORMAT"
 LOG_FORMATS = ("text", "json")
 TEXT = "%(asctime)s ocufilter {name} %(levelname)s: %(message)s"
 
+MAX_REPEATS = 10
+"""Lines with the same wording within a second; a hostile client causes thousands."""
+
+ONCE_A_SECOND = {"max_repeats": 1}
+"""`extra` of a log call whose line shall appear at most once a second."""
+
 
 class JsonLines(logging.Formatter):
     """One JSON object a line: time, process, level, message, maybe a traceback."""
@@ -34,6 +40,32 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, ensure_ascii=False)
 
 
+class RepeatFilter(logging.Filter):
+    """Leaves out lines that repeat too often; the next one says how many."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ends_s = 0.0
+        self._counts: dict[str, int] = {}
+        self._left_out: dict[str, int] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is written."""
+        now_s, wording = time.monotonic(), str(record.msg)
+        if now_s >= self._ends_s:
+            self._ends_s = now_s + 1.0
+            self._counts.clear()
+        count = self._counts[wording] = self._counts.get(wording, 0) + 1
+        if count > getattr(record, "max_repeats", MAX_REPEATS):
+            self._left_out[wording] = self._left_out.get(wording, 0) + 1
+            return False
+        n_left_out = self._left_out.pop(wording, 0)
+        if n_left_out:
+            text = record.getMessage()
+            record.msg, record.args = f"{text} ({n_left_out} like it left out)", None
+        return True
+
+
 def start_log(process_name: str) -> None:
     """Log to the standard error stream, in the format that the environment names."""
     handler = logging.StreamHandler()
@@ -41,4 +73,5 @@ def start_log(process_name: str) -> None:
         handler.setFormatter(JsonLines(process_name))
     else:
         handler.setFormatter(logging.Formatter(TEXT.format(name=process_name)))
+    handler.addFilter(RepeatFilter())
     logging.basicConfig(level=logging.INFO, handlers=[handler])

@@ -130,6 +130,7 @@ __all__ = [
     "decode_request",
     "encode",
     "encoded_depth",
+    "is_bye",
     "peek_ids",
     "tangents_from_fov",
 ]
@@ -183,6 +184,14 @@ def encode(message: Message) -> list[Any]:
             f"at most {MAX_HEADER_BYTES} are allowed"
         )
     return [packed, *message.parts()]
+
+
+def is_bye(parts: Sequence[Part]) -> bool:
+    """Return whether a message says that its client is leaving."""
+    try:
+        return bool(parts) and unpack_header(parts[0]).get("type") == Bye.type_name
+    except BadMessage:
+        return False
 
 
 def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Message:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -65,8 +66,9 @@ class Slot:
         """
         size_bytes = -(-max(size_bytes, 1) // PAGE_BYTES) * PAGE_BYTES
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
-        descriptor = os.memfd_create("ocufilter-slot", flags)
+        descriptor = -1
         try:
+            descriptor = os.memfd_create("ocufilter-slot", flags)
             os.posix_fallocate(descriptor, 0, size_bytes)
             fcntl.fcntl(
                 descriptor,
@@ -75,7 +77,8 @@ class Slot:
             )
             return cls(number, size_bytes, descriptor)
         except OSError as error:
-            os.close(descriptor)
+            if descriptor >= 0:
+                os.close(descriptor)
             raise OutOfMemory(
                 f"{size_bytes / 1e6:.0f} MB of shared memory are not to be had: "
                 f"{error.strerror}"
@@ -145,10 +148,20 @@ class SlotPool:
     ----------
     max_bytes : int
         Of all slots together.
+    max_count : int
+        Of slots: each takes a file descriptor.
+    reserve : callable, optional
+        Returns a context in which this process may open descriptors.
     """
 
-    def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
+    def __init__(
+        self,
+        max_bytes: int,
+        max_count: int = 1024,
+        reserve: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
+        self.max_bytes, self.max_count = max_bytes, max_count
+        self._reserve = reserve
         self._slots: dict[int, Slot] = {}
         self._free: list[Slot] = []
         self._next_number = 1
@@ -189,7 +202,13 @@ class SlotPool:
                 "MB in use are asked for",
                 allowed=f"{self.max_bytes / 1e6:.0f} MB for images in all",
             )
-        slot = Slot.create(self._next_number, size_bytes)
+        if len(self._slots) >= self.max_count:
+            raise OutOfMemory(
+                f"{len(self._slots)} pieces of shared memory are in use",
+                allowed=f"{self.max_count} in all",
+            )
+        with self._reserve():
+            slot = Slot.create(self._next_number, size_bytes)
         self._slots[slot.number] = slot
         self._next_number += 1
         return slot

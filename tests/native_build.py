@@ -11,10 +11,10 @@ COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
 def extension():
-    """The extension module as pyproject.toml has it."""
+    """The extension module of the loops as pyproject.toml has it."""
     content = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    (found,) = content["tool"]["setuptools"]["ext-modules"]
-    return found
+    modules = content["tool"]["setuptools"]["ext-modules"]
+    return next(module for module in modules if module["name"].endswith("_loops"))
 
 
 def build_library(folder: Path, *flags: str) -> Path:

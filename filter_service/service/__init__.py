@@ -1,17 +1,20 @@
 """The service: a door with the socket, a process that filters, a keeper of both.
 
 launch          starting: signals, the line that says it is ready
-keeper          starts the processes, and starts again what dies or stands still
+keeper          the supervisor: starts the processes, restarts those that end
 child           what those processes have in common
 devices         what filters side by side, as the settings name it
 door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
-gate            who may connect to it
+authenticator   the ZAP handler: numbers connections, checks their keys
+connections     open connections, with a limit to their number
+descriptors     file descriptors: the limit, and a reserve
+dropped_parts   the rest of a message that has too many parts
+rate_limit      how many messages a connection may send
 served_devices  the devices as the door knows them
 load            how busy one was of late
 metrics         counters for Prometheus
-patience        how many wrong messages are answered
 asking          a question to a running service
 reception       who comes and who goes
 guests          all sessions, with a client or without
@@ -20,7 +23,7 @@ sharing         memory that clients share
 frame_desk      frames on their way, and their answers
 places          whether a frame's images lie where they may
 render_end      the door's end of what follows
-turns           whose frame is next
+turns           whose frame is next: fair queuing
 render_process  the process that filters
 render_loop     its loop
 session_eyes    a filter for each eye of a session

@@ -88,6 +88,9 @@ class ServiceConfig:
     frame_limit_s : float
         The longest that filtering one frame, or anything else in the process that does
         it, may take: then it is taken for hung, and started again.
+    give_up_after_s : float
+        End with an error where a process of the service has ended again and again for
+        so long; 0: never.  The service restarts it after pauses of up to a minute.
     standby : bool
         A second process that filters stands by: after a fault of the first, frames go
         on a second sooner.  It takes some hundred megabytes, for each of several
@@ -134,6 +137,7 @@ class ServiceConfig:
     alive_interval_s: float = 5.0
     session_keep_s: float = 30.0
     frame_limit_s: float = 60.0
+    give_up_after_s: float = 0.0
     standby: bool = False
     max_image_mb: int = 2000
     shared_memory: bool = True
@@ -231,6 +235,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "metrics_port": (0, 65535),
     "session_keep_s": (0.0, 86_400.0),
     "frame_limit_s": (0.1, 3600.0),
+    "give_up_after_s": (0.0, 86_400.0),
     "max_image_mb": (1, 1_000_000),
     "max_socket_mb": (200, 1_000_000),
 }
@@ -238,7 +243,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 CHANGEABLE = (
     *("credit", "max_sessions", "max_width_px", "max_height_px"),
-    *("alive_interval_s", "session_keep_s", "frame_limit_s"),
+    *("alive_interval_s", "session_keep_s", "frame_limit_s", "give_up_after_s"),
 )
 """What a running service takes from the file at SIGHUP; of a session those of its
 beginning hold where it was told of them."""

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 from filter_service.errors import (
     BadMessage,
+    BuildCancelled,
     FilterError,
     NotAllowed,
 )
@@ -26,9 +26,9 @@ from filter_service.messages import (
     Closing,
     Dropped,
     ErrorReply,
+    EyeName,
     Frame,
     Hello,
-    Part,
     Ping,
     Pong,
     ProfileRequest,
@@ -37,20 +37,30 @@ from filter_service.messages import (
     Unshare,
     decode_request,
     encode,
+    is_bye,
     peek_ids,
 )
 from filter_service.service.config import ServiceConfig
+from filter_service.service.connections import Connections, Peer
+from filter_service.service.descriptors import DescriptorLimit
 from filter_service.service.frame_desk import FrameDesk
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
-from filter_service.service.mailbox import Mailbox, Outcome, Refused, Tracker
+from filter_service.service.mailbox import (
+    Mailbox,
+    Outcome,
+    Received,
+    Refused,
+    Tracker,
+    socket_family,
+)
 from filter_service.service.metrics import serve_metrics
-from filter_service.service.patience import Patience
 from filter_service.service.process_info import resident_memory_mb
+from filter_service.service.rate_limit import Verdict
 from filter_service.service.reception import Reception
 from filter_service.service.render_end import RenderEnd
 from filter_service.service.served_devices import ServedDevice, ServedDevices
-from filter_service.service.session import Session
+from filter_service.service.session import Session, SessionRecord
 from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
@@ -77,9 +87,17 @@ class Door:
         self._limits = config.limits
         self._keeper = keeper
         self._guests = Guests()
-        self._patience = Patience()
+        self._descriptors = DescriptorLimit(config.max_sessions)
+        self._connections = Connections(
+            self._descriptors.max_connections,
+            self._guests.connections,
+            socket_family(config.bind),
+        )
+        self._n_unheard = 0
+        self._is_degraded = False
         self._devices = ServedDevices(
-            *(config.device_names, config.max_image_mb * MB, self._guests, self._send)
+            *(config.device_names, config.max_image_mb * MB, self._descriptors),
+            *(self._guests, self._send),
         )
         self._n_faults = 0
         self._next_trim_s = time.monotonic() + TRIM_INTERVAL_S
@@ -87,13 +105,19 @@ class Door:
             config.bind,
             config.max_message_part_bytes,
             1 + MAX_PARTS_PER_VIEW * self._limits.max_views,
-            keys=KeyRing(config.keys_dir) if config.keys_dir else None,
+            connections=self._connections,
+            keys=_checked_keys(config.keys_dir),
         )
         self.endpoint = self._mailbox.endpoint
         self._sharing = Sharing(config, self.endpoint, self._render_of)
         self._reception = Reception(
-            *(config, self.endpoint, self._guests),
-            *(self._devices, self._sharing, self._send),
+            config,
+            self.endpoint,
+            self._guests,
+            self._devices,
+            self._sharing,
+            self._send,
+            self._record,
         )
         if config.metrics_port:
             serve_metrics(config.metrics_port, self.metrics)
@@ -103,12 +127,15 @@ class Door:
         desks = [device.frames for device in self._devices]
         return {
             "ocufilter_ready": float(self._devices.are_ready),
+            "ocufilter_degraded": float(self._is_degraded),
+            "ocufilter_connections": len(self._connections),
+            "ocufilter_connections_evicted_total": self._connections.n_evicted,
             "ocufilter_sessions": len(self._guests.present),
             "ocufilter_sessions_away": len(self._guests.away),
             "ocufilter_frames_filtered_total": sum(d.n_rendered for d in desks),
             "ocufilter_frames_dropped_total": sum(d.n_dropped for d in desks),
             "ocufilter_filter_seconds_total": sum(d.filtered_s for d in desks),
-            "ocufilter_messages_unheard_total": self._patience.n_unheard,
+            "ocufilter_messages_unheard_total": self._n_unheard,
             "ocufilter_faults_total": self._n_faults,
             "ocufilter_memory_bytes": MB * self._memory_mb,
             "ocufilter_psfs_bytes": MB * sum(d.stores_mb for d in self._devices),
@@ -130,12 +157,18 @@ class Door:
     def run(self) -> None:
         """Serve until the keeper says so, or is gone."""
         try:
-            while all([self.take_control(*said) for said in self._keeper.receive()]):
+            while self._listen_to_keeper():
                 self._turn()
         except LinkClosed:
             log.error("the process that owns this one is gone")
         finally:
             self._close()
+
+    def _listen_to_keeper(self) -> bool:
+        """Do what the keeper says; return whether to go on."""
+        with self._descriptors.reserve():  # links to new processes come this way
+            messages = self._keeper.receive()
+        return all([self.take_control(*message) for message in messages])
 
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
         """Do what the keeper says; return whether to go on."""
@@ -143,8 +176,14 @@ class Door:
             device = self._devices[message[1]]
             device.frames.lose_held()
             device.render.join(Link.from_descriptor(descriptors[0]))
+        elif message[0] == "sessions":
+            self._reception.restore(message[1])
         elif message[0] == "lost":
             self._give_up(self._devices[message[1]])
+        elif message[0] == "found":
+            self._devices[message[1]].is_lost = False
+        elif message[0] == "degraded":
+            self._is_degraded = message[1]
         elif message[0] == "config":
             self.config = self._reception.config = message[1]
             self._limits = self.config.limits
@@ -160,6 +199,8 @@ class Door:
         self._keeper.flush()
         for device in self._devices:
             self._listen_to(device)
+        for number in self._mailbox.take_ended():
+            self._reception.lose(number)
         self._take_in_messages()
         for device in self._devices:
             device.frames.hand_over_one()
@@ -167,6 +208,8 @@ class Door:
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
+        if self._mailbox.is_dropping:
+            return 0.0
         soon_s = self._devices.wait_s(now_s)
         if soon_s is not None:
             return soon_s
@@ -176,7 +219,8 @@ class Door:
     def _close(self) -> None:
         for session in self._guests.present:
             with suppress(Exception):
-                self._mailbox.send(session.identity or b"", encode(Closing()))
+                if session.peer is not None:
+                    self._mailbox.send(session.peer, encode(Closing()))
         self._mailbox.close(linger_ms=CLOSING_LINGER_MS)
 
     def _tidy(self) -> None:
@@ -208,13 +252,21 @@ class Door:
                 if kind == "answer":
                     device.frames.take_answer(*rest)
                 elif kind == "tell":
-                    self._reception.pass_on(*rest)
+                    self._pass_on(*rest)
                 elif kind == "state":
                     device.memory_mb, device.stores_mb, device.is_building = rest
                 elif kind == "here":
                     self._begin_with(device, *rest)
         except LinkClosed:
             device.frames.lose_held()
+
+    def _pass_on(self, key: str, eye: EyeName, reply: Reply) -> None:
+        """Tell a client what became of its profile; a wrong one counts against it."""
+        session = self._guests.by_key(key)
+        if session is not None and session.peer is not None:
+            if isinstance(reply, ErrorReply) and reply.code != BuildCancelled.code:
+                self._connections.note_refusal(session.peer.connection)
+        self._reception.pass_on(key, eye, reply)
 
     def _begin_with(
         self,
@@ -252,78 +304,98 @@ class Door:
                 continue
             if received is None:
                 break
-            if self._patience.is_over(received[0], time.monotonic()):
+            if not self._is_heard(received):
                 continue
             try:
-                self._take_in(*received, superseded)
+                self._take_in(received, superseded)
             except Exception:  # whatever it is, other clients shall not notice
                 self._n_faults += 1
                 log.exception("fault %d: a refusal failed", self._n_faults)
-                self._reception.end_session(received[0])
+                self._reception.end_session(received.peer)
         for session, frame in superseded:
             dropped = Dropped(frame.frame_id, "superseded")
             self._frames_of(session).answer(session, frame, dropped)
 
+    def _is_heard(self, received: Received) -> bool:
+        """Return whether a message is handled; a flood of them ends its connection."""
+        if received.connection is None:
+            # Its client is gone: it wants nothing more than to say so.
+            if is_bye(received.parts):
+                self._reception.end_session(received.peer)
+            return False
+        verdict = received.connection.rates.verdict(time.monotonic())
+        if verdict is Verdict.HANDLE:
+            return True
+        self._n_unheard += 1
+        if verdict is Verdict.CLOSE:
+            self._connections.close(received.peer.connection, "too many messages")
+        return False
+
     def _take_in(
-        self,
-        identity: bytes,
-        parts: list[memoryview],
-        n_left_out: int,
-        superseded: list[tuple[Session, Frame]],
+        self, received: Received, superseded: list[tuple[Session, Frame]]
     ) -> None:
         received_s = time.monotonic()
+        peer, parts = received.peer, received.parts
         try:
-            if n_left_out:
+            if received.n_left_out:
+                if received.connection is not None:
+                    received.connection.rates.end_patience()
                 raise BadMessage(
-                    f"{len(parts) + n_left_out - 1} parts follow the header",
+                    f"{len(parts) + received.n_left_out - 1} parts follow the header",
                     field="parts",
                     allowed=f"at most {len(parts) - 1}",
                 )
             request = decode_request(parts, self._limits)
             if isinstance(request, Frame):
-                session = self._reception.session_at(identity)
+                session = self._reception.session_at(peer)
                 frames = self._frames_of(session)
                 older = frames.take_in(session, request, received_s)
                 superseded += [(session, older)] if older is not None else []
             else:
-                self._handle(identity, request)
+                self._note_request(received)
+                self._handle(peer, request)
         except Exception as error:
-            self._refuse(identity, parts, error)
+            self._refuse(received, error)
 
-    def _refuse(self, identity: bytes, parts: Sequence[Part], error: Exception) -> None:
+    def _note_request(self, received: Received) -> None:
+        if received.connection is not None:
+            received.connection.rates.note_request()
+
+    def _refuse(self, received: Received, error: Exception) -> None:
         """Tell a client what is wrong with its message; the service lives on."""
-        self._patience.note(identity)
+        if received.connection is not None:
+            received.connection.rates.note_refusal()
         if not isinstance(error, FilterError):
             self._n_faults += 1
             log.error("a message could not be handled", exc_info=error)
             error = FilterError(f"{type(error).__name__}: {error}")
-        frame_id, profile_id = peek_ids(parts)
+        frame_id, profile_id = peek_ids(received.parts)
         reply = ErrorReply.from_exception(
             error, frame_id=frame_id, profile_id=profile_id
         )
-        self._send(identity, reply)
+        self._send(received.peer, reply)
 
-    def _handle(self, identity: bytes, request: Message) -> None:
+    def _handle(self, peer: Peer, request: Message) -> None:
         if isinstance(request, Ping):
-            self._send(identity, self._pong(request))
+            self._send(peer, self._pong(request))
         elif isinstance(request, Hello):
-            self._reception.greet(identity, request)
+            self._reception.greet(peer, request)
         elif isinstance(request, Bye):
-            self._reception.end_session(identity)
+            self._reception.end_session(peer)
         elif isinstance(request, ProfileRequest):
-            self._reception.take_profile(self._reception.session_at(identity), request)
+            self._reception.take_profile(self._reception.session_at(peer), request)
         elif isinstance(request, Share):
-            shared = self._sharing.share(self._reception.session_at(identity), request)
-            self._send(identity, shared)
+            shared = self._sharing.share(self._reception.session_at(peer), request)
+            self._send(peer, shared)
         elif isinstance(request, Unshare):
-            self._sharing.unshare(self._reception.session_at(identity), request)
+            self._sharing.unshare(self._reception.session_at(peer), request)
 
     def _turn_out(self, refused: Refused) -> None:
         """End the session of a client whose key was taken from the list."""
         log.warning("a client's key is not allowed any more")
-        self._reception.end_session(refused.identity)
+        self._reception.end_session(refused.peer)
         error = NotAllowed(str(refused))
-        self._send(refused.identity, ErrorReply.from_exception(error))
+        self._send(refused.peer, ErrorReply.from_exception(error))
 
     def _pong(self, ping: Ping) -> Pong:
         states = self._devices.states()
@@ -336,16 +408,43 @@ class Door:
             n_dropped=sum(device.frames.n_dropped for device in self._devices),
             is_building=any(state.is_building for state in states),
             is_ready=self._devices.are_ready,
+            is_degraded=self._is_degraded,
+            n_connections=len(self._connections),
             is_filtering=any(state.is_filtering for state in states),
             render_silent_s=self._devices.silent_s,
             devices=states,
         )
 
-    def _send(self, identity: bytes, reply: Reply) -> Tracker | None:
-        """Send a reply; a client that does not read loses its session."""
-        outcome, tracker = self._mailbox.send(identity, encode(reply))
+    def _record(self, key: str, record: SessionRecord | None) -> None:
+        """Have the keeper keep a session, for the front end after this one."""
+        with suppress(LinkClosed):  # this process ends then
+            self._keeper.send(("session", key, record))
+
+    def _send(self, peer: Peer, reply: Reply) -> Tracker | None:
+        """Send a reply; a client that does not read loses session and connection."""
+        outcome, tracker = self._mailbox.send(peer, encode(reply))
         if outcome is Outcome.GONE:
-            self._reception.leave(identity)
+            self._reception.leave(peer)
         elif outcome is Outcome.STALLED:
-            self._reception.end_session(identity, outcome)
+            # Each further reply would be waited for.
+            self._connections.close(peer.connection, "it does not read")
+            self._reception.end_session(peer, outcome)
         return tracker
+
+
+def _checked_keys(folder: str) -> KeyRing | None:
+    """Return the keys of a service that has some.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be used as it is.
+    """
+    if not folder:
+        return None
+    keys = KeyRing(folder)
+    try:
+        keys.check()
+    except ValueError as error:
+        raise OSError(f"keys_dir: {error}") from None
+    return keys

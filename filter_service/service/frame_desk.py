@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from filter_service.errors import OutOfMemory, RenderFailed
 from filter_service.messages import Dropped, ErrorReply, Frame, Reply, Result
+from filter_service.service.connections import Peer
 from filter_service.service.load import Load
 from filter_service.service.mailbox import Tracker
 from filter_service.service.places import check_places
@@ -37,7 +38,7 @@ class FrameDesk:
         Returns those that have a client and live on its device.
     render : RenderEnd
     send : callable
-        ``send(identity, reply)`` returns what tracks a large one.
+        ``send(peer, reply)`` returns what tracks a large one.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class FrameDesk:
         self,
         sessions: Callable[[], Sequence[Session]],
         render: RenderEnd,
-        send: Callable[[bytes, Reply], Tracker | None],
+        send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
         self.n_rendered = self.n_dropped = 0
         self.filtered_s = 0.0
@@ -97,7 +98,7 @@ class FrameDesk:
         waiting = WaitingFrame(frame, received_s, time.monotonic())
         superseded = session.take_in(waiting)
         session.lend(frame)
-        self._turns.arrive(session.key, waiting.decoded_s)
+        self._turns.arrive(session.key)
         return None if superseded is None else superseded.frame
 
     def _is_takeable(self, session: Session) -> bool:
@@ -111,12 +112,20 @@ class FrameDesk:
         said not to read.
         """
         session.unsent = self._render.still_unsent(session.unsent)
-        if len(session.unsent) < MAX_UNSENT_RESULTS:
+        if not self._is_behind(session):
             session.behind_since_s = None
             return True
         if session.behind_since_s is None:
             session.behind_since_s = now_s
         return now_s - session.behind_since_s > MARK_SENT_S
+
+    def _is_behind(self, session: Session) -> bool:
+        """Return whether a client has too much to read before it may have more."""
+        n_bytes = sum(slot.size_bytes for _, slot in session.unsent)
+        return (
+            len(session.unsent) >= MAX_UNSENT_RESULTS
+            or n_bytes > self._render.session_quota_bytes
+        )
 
     def hand_over_one(self) -> None:
         """Hand over the frame whose turn it is, if one may be handed over."""
@@ -134,7 +143,7 @@ class FrameDesk:
         if waiting is None:
             return
         frame = waiting.frame
-        if len(session.unsent) >= MAX_UNSENT_RESULTS:
+        if self._is_behind(session):
             dropped = Dropped(frame.frame_id, "slow_consumer")
             self.answer(session, frame, dropped)
             return
@@ -157,7 +166,7 @@ class FrameDesk:
         held = self._render.take_back(number)
         if held is None:
             return
-        self._turns.note(held.session.key, used_s, ended_s)
+        self._turns.note(held.session.key, used_s)
         self.filtered_s += used_s
         self.load.note(used_s, ended_s)
         if isinstance(reply, Result):
@@ -171,20 +180,20 @@ class FrameDesk:
         self._render.give_back(slot)
         if tracker is None:
             self._render.give_back(result_slot)
-        elif held.session.identity is None:
+        elif held.session.peer is None:
             self._leaving.append((tracker, result_slot))
         else:
             held.session.unsent.append((tracker, result_slot))
 
     def _answer_held(self, held: Held, answer: Answer) -> Tracker | None:
         """Answer a frame, if its client is where it was: else it counts it as lost."""
-        if held.identity is None or held.session.identity != held.identity:
+        if held.peer is None or held.session.peer != held.peer:
             return None
         return self.answer(held.session, held.waiting.frame, answer)
 
     def answer(self, session: Session, frame: Frame, answer: Answer) -> Tracker | None:
         """Answer a frame that counts against the credit."""
-        if session.identity is None:
+        if session.peer is None:
             return None  # its client is away
         session.n_unanswered = max(0, session.n_unanswered - 1)
         session.get_back(frame)
@@ -192,7 +201,7 @@ class FrameDesk:
             self.n_rendered += 1
         else:
             self.n_dropped += 1
-        return self._send(session.identity, answer)
+        return self._send(session.peer, answer)
 
     def lose_waiting(self, session: Session) -> None:
         """Answer the frame of a session that can be handed over no more."""

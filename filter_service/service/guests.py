@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
+from filter_service.service.connections import Peer
 from filter_service.service.session import Session
 
 
 class Guests:
-    """Sessions by the routing id of their client, and by key while it is away."""
+    """Sessions by the connection of their client, and by key while it is away."""
 
     def __init__(self) -> None:
-        self._present: dict[bytes, Session] = {}
+        self._present: dict[int, Session] = {}
         self._away: dict[str, Session] = {}
         self._next_id = 1
 
@@ -24,6 +25,11 @@ class Guests:
         return iter([*self._present.values(), *self._away.values()])
 
     @property
+    def connections(self) -> Collection[int]:
+        """Return the connections that have a session, as they are at any time."""
+        return self._present.keys()
+
+    @property
     def present(self) -> list[Session]:
         """Return the sessions that have a client."""
         return list(self._present.values())
@@ -33,9 +39,18 @@ class Guests:
         """Return the sessions that have none, longest away first."""
         return sorted(self._away.values(), key=lambda s: s.away_since_s or 0.0)
 
-    def at(self, identity: bytes) -> Session | None:
+    def at(self, peer: Peer) -> Session | None:
         """Return the session of a client."""
-        return self._present.get(identity)
+        return self._present.get(peer.connection)
+
+    def on_connection(self, number: int) -> Session | None:
+        """Return the session whose client has a connection, or had it last."""
+        found = self._present.get(number)
+        if found is not None:
+            return found
+        return next(
+            (s for s in self._away.values() if s.last_connection == number), None
+        )
 
     def by_key(self, key: str) -> Session | None:
         """Return the session with a key."""
@@ -46,24 +61,26 @@ class Guests:
         return [s for s in self._present.values() if s.device == device]
 
     def begin(
-        self, identity: bytes, client: str, credit: int, *, device: int = 0
+        self, peer: Peer, client: str, credit: int, *, device: int = 0
     ) -> Session:
         """Return a new session on a device."""
-        session = Session(self._next_id, identity, client, credit, device=device)
+        session = Session(
+            *(self._next_id, peer, client, credit), owner=peer.key, device=device
+        )
         self._next_id += 1
-        self._present[identity] = session
+        self._present[peer.connection] = session
         return session
 
     def remember(self, session: Session) -> None:
-        """Take in a session that was there before this process; its client is away."""
+        """Add a session that was there before this process; its client is away."""
         self._away[session.key] = session
         self._next_id = max(self._next_id, session.session_id + 1)
 
-    def come_back(self, session: Session, identity: bytes, client: str) -> None:
+    def come_back(self, session: Session, peer: Peer, client: str) -> None:
         """Give a session to a client that knows its key."""
         self.remove(session)
-        session.come_back(identity, client)
-        self._present[identity] = session
+        session.come_back(peer, client)
+        self._present[peer.connection] = session
 
     def leave(self, session: Session, now_s: float) -> None:
         """Keep a session whose client is gone."""
@@ -73,6 +90,6 @@ class Guests:
 
     def remove(self, session: Session) -> None:
         """Forget a session."""
-        if session.identity is not None:
-            self._present.pop(session.identity, None)
+        if session.peer is not None:
+            self._present.pop(session.peer.connection, None)
         self._away.pop(session.key, None)

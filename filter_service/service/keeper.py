@@ -1,10 +1,11 @@
-"""The keeper: starts the processes of the service, and starts again what dies.
+"""The supervisor: starts the processes of the service and restarts those that end.
 
 The door owns the socket, a render process the eyes, those of one device where there are
-several.  Each outlives the others; a new one is given a link to those that are there.
-What stands still for long, stopped from outside or hung, is ended and started again; a
-device that cannot be is given up where others are left.  The keeper itself does nothing
-else, so there is little that could end it.
+several.  Each outlives the others; a new one is given a link to those that are there,
+and a new door the sessions that there were.  A process that hangs or was stopped is
+killed and restarted.  Once the service has been ready, no fault ends it: a process that
+ends again and again is restarted after ever longer pauses, and a device among several
+is given up meanwhile, so that its sessions go to another one.
 """
 
 from __future__ import annotations
@@ -16,10 +17,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from filter_service.building.helper_process import (
     end,
@@ -34,8 +34,16 @@ DOOR_MODULE = "filter_service.service.door_process"
 RENDER_MODULE = "filter_service.service.render_process"
 DOOR, RENDER = "door", "render"
 OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
-MAX_RESTARTS = 8
-RESTART_WINDOW_S = 60.0
+STABLE_S = 60.0
+"""A process that has run for so long starts a new row of deaths when it ends."""
+
+FIRST_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
+"""Before a restart: none the first two times, then ever twice as long."""
+
+DEATHS_WITHOUT_PAUSE = 2
+GIVE_UP_DEVICE_DEATHS = 4
+"""Deaths in a row after which a device's sessions go to others, where there are any."""
+
 CHECK_INTERVAL_S = 0.5
 STOPPED_LIMIT_S = 3.0
 """Stopped by a signal for longer, a process is taken for one that stays so."""
@@ -50,7 +58,7 @@ log = logging.getLogger("ocufilter")
 
 
 class ServiceFailed(Exception):
-    """A process of the service cannot start, or does not stay."""
+    """A process of the service cannot start, or does not stay for too long."""
 
 
 @dataclass
@@ -61,6 +69,7 @@ class _Child:
     link: Link | None = None
     is_ready: bool = False
     stopped_since_s: float | None = None
+    started_s: float = field(default_factory=time.monotonic)
 
     def tell(self, message: object, descriptors: Sequence[int] = ()) -> None:
         """Send a message; that a process is gone is found out by listening to it."""
@@ -78,6 +87,28 @@ class _Child:
         return how
 
 
+@dataclass
+class _Restarts:
+    """The deaths of one process, and when it is started next."""
+
+    n_deaths: int = 0  # in a row
+    failing_since_s: float | None = None
+    due_s: float | None = None
+
+    def note_death(self, started_s: float, now_s: float) -> float:
+        """Count a death; return the pause before the restart."""
+        if now_s - started_s > STABLE_S:
+            self.n_deaths, self.failing_since_s = 0, None
+        self.n_deaths += 1
+        if self.failing_since_s is None:
+            self.failing_since_s = now_s
+        n_paused = self.n_deaths - DEATHS_WITHOUT_PAUSE
+        doubled_s = FIRST_PAUSE_S * 2.0 ** min(n_paused - 1, 10)
+        pause_s = min(doubled_s, MAX_PAUSE_S) if n_paused > 0 else 0.0
+        self.due_s = now_s + pause_s
+        return pause_s
+
+
 class Keeper:
     """Keeps a door and a render process going, or one for each of several devices.
 
@@ -87,7 +118,10 @@ class Keeper:
     open_workshop : str
         ``module:function``, see `render_process`.
     when_ready : callable
-        Called with the endpoint once frames may come.
+        Called with the endpoint once frames may come, and again after each time that
+        they could not.
+    when_not_ready : callable
+        Called when a process has ended and is not restarted at once.
     read_again : callable, optional
         Returns the settings as they are now.
     """
@@ -98,11 +132,13 @@ class Keeper:
         *,
         open_workshop: str = OPEN_WORKSHOP,
         when_ready: Callable[[str], None],
+        when_not_ready: Callable[[], None] = lambda: None,
         read_again: Callable[[], ServiceConfig] | None = None,
     ) -> None:
         self._config = config
         self._open_workshop = open_workshop
-        self._when_ready: Callable[[str], None] | None = when_ready
+        self._when_ready, self._when_not_ready = when_ready, when_not_ready
+        self._was_ready = self._is_announced = False
         self._read_again = read_again
         self._is_to_read_again = False
         self._endpoint = ""
@@ -116,11 +152,10 @@ class Keeper:
         )
         self._children = {name: _Child() for name in (DOOR, *self._devices)}
         self._standbys: dict[str, _Child] = {}
-        self._lost: list[int] = []  # devices that were given up
+        self._lost: set[int] = set()  # devices that are given up for now
         self._spawned_s = 0.0  # the last process of all
-        self._starts_s: dict[str, deque[float]] = {
-            name: deque() for name in self._children
-        }
+        self._restarts = {name: _Restarts() for name in self._children}
+        self._sessions: dict[str, object] = {}  # by key, for the next door
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
@@ -144,7 +179,8 @@ class Keeper:
         Raises
         ------
         ServiceFailed
-            A process cannot start, or ends again and again.
+            A process cannot start the first time, or one ends again and again for
+            longer than `give_up_after_s`.
         """
         try:
             for name in (*self._devices, DOOR):  # the last takes least
@@ -161,7 +197,7 @@ class Keeper:
             for child in self._all_children:
                 if child.link is not None:
                     selector.register(child.link, selectors.EVENT_READ)
-            selector.select(CHECK_INTERVAL_S)
+            selector.select(self._wait_s())
         try:
             self._wake_reader.recv(4096)
         except BlockingIOError:
@@ -172,9 +208,21 @@ class Keeper:
         for name, child in list(self._children.items()):
             self._listen(name, child)
             self._check_stopped(name, child)
+        for name, restarts in self._restarts.items():
+            if restarts.due_s is not None and time.monotonic() >= restarts.due_s:
+                restarts.due_s = None
+                self._start(name)
+                self._join(name)
         if self._config.standby:
             for name in list(self._devices):
                 self._keep_standby(name)
+
+    def _wait_s(self) -> float:
+        now_s = time.monotonic()
+        due_s = [
+            r.due_s - now_s for r in self._restarts.values() if r.due_s is not None
+        ]
+        return max(0.0, min([CHECK_INTERVAL_S, *due_s]))
 
     @property
     def _all_children(self) -> list[_Child]:
@@ -182,17 +230,13 @@ class Keeper:
 
     def _start(self, name: str) -> None:
         """Start a process, or let the one that stands by take its place."""
-        starts_s, now_s = self._starts_s[name], time.monotonic()
-        starts_s.append(now_s)
-        while now_s - starts_s[0] > RESTART_WINDOW_S:
-            starts_s.popleft()
-        if len(starts_s) > MAX_RESTARTS:
-            raise ServiceFailed(
-                f"its {name} process was started {MAX_RESTARTS} times within "
-                f"{RESTART_WINDOW_S:g} s and ended each time"
-            )
         standby = self._standbys.pop(name, None)
-        self._children[name] = standby or self._spawned(name)
+        try:
+            self._children[name] = standby or self._spawned(name)
+        except OSError as error:  # no memory, processes or descriptors for it now
+            if not self._was_ready:
+                raise ServiceFailed(f"its {name} process: {error}") from None
+            self._note_death(name, time.monotonic(), f"cannot be started ({error})")
 
     def _spawned(self, name: str) -> _Child:
         self._spawned_s = time.monotonic()
@@ -214,6 +258,8 @@ class Keeper:
         theirs.close()
         child = _Child(process, link)
         child.tell(("config", config))
+        if name == DOOR:
+            child.tell(("sessions", list(self._sessions.values())))
         return child
 
     def _keep_standby(self, name: str) -> None:
@@ -232,7 +278,7 @@ class Keeper:
             self._check_stopped("standby", standby)
         except LinkClosed:
             del self._standbys[name]
-            self._bury("standby", standby)
+            log.error("the standby process %s; a new one is started", standby.end())
 
     def _change_settings(self) -> None:
         """Take what may change while the service runs; say what may not."""
@@ -254,14 +300,16 @@ class Keeper:
     def _join(self, new: str) -> None:
         """Give the door, and each render process that it lacks, the ends of a link."""
         for name, index in self._devices.items():
-            if new in (DOOR, name):
+            if new in (DOOR, name) and self._children[name].link is not None:
                 ours, theirs = socket.socketpair()
                 self._children[name].tell(("link", index), [ours.fileno()])
                 self._children[DOOR].tell(("link", index), [theirs.fileno()])
                 ours.close()
                 theirs.close()
-        for index in self._lost:
-            self._children[DOOR].tell(("lost", index))
+        if new == DOOR:
+            for index in self._lost:
+                self._children[DOOR].tell(("lost", index))
+            self._tell_degraded()
 
     def _listen(self, name: str, child: _Child) -> None:
         try:
@@ -271,54 +319,108 @@ class Keeper:
                 if kind == "ready":
                     child.is_ready = True
                     self._endpoint = rest[0] or self._endpoint
-                    self._tell_ready()
+                    self._tell_ready(name)
                 elif kind == "failed":
-                    self._fail(name, rest[0])
+                    self._fail(name, child, rest[0])
                     return
                 elif kind == "hung":
                     self._kill_device(rest[0])
+                elif kind == "session":
+                    self._keep_session(*rest)
         except LinkClosed:
             self._restart(name, child)
 
-    def _tell_ready(self) -> None:
-        if self._when_ready is not None and all(
+    def _keep_session(self, key: str, record: object | None) -> None:
+        if record is None:
+            self._sessions.pop(key, None)
+        else:
+            self._sessions[key] = record
+
+    def _tell_ready(self, name: str) -> None:
+        index = self._devices.get(name)
+        if index in self._lost:
+            self._lost.discard(index)
+            self._children[DOOR].tell(("found", index))
+            log.info("the %s process is there again", name)
+        self._tell_degraded()
+        if not self._is_announced and all(
             child.is_ready for child in self._children.values()
         ):
+            self._is_announced = self._was_ready = True
             self._when_ready(self._endpoint)
-            self._when_ready = None
+
+    def _tell_degraded(self) -> None:
+        """Have the door say so while a process is down for longer than a restart."""
+        is_degraded = bool(self._lost) or any(
+            restarts.n_deaths > DEATHS_WITHOUT_PAUSE
+            and not self._children[name].is_ready
+            for name, restarts in self._restarts.items()
+        )
+        self._children[DOOR].tell(("degraded", is_degraded))
 
     def _restart(self, name: str, child: _Child) -> None:
-        self._bury(name, child)
-        try:
-            self._start(name)
-        except ServiceFailed as error:
-            self._fail(name, str(error))
+        """Bury a process that has ended; have another one started when it is time."""
+        how = child.end()
+        if name in self._standbys:
+            log.error("the %s process %s; the one that stood by takes over", name, how)
+            self._restarts[name].due_s = time.monotonic()
+            self._children[name] = _Child()
             return
-        self._join(name)
+        self._note_death(name, child.started_s, how)
 
-    def _fail(self, name: str, why: str) -> None:
-        """Give up a device where others are left, once all had been ready.
+    def _note_death(self, name: str, started_s: float, how: str) -> None:
+        """Decide when a process is started again.
 
         Raises
         ------
         ServiceFailed
-            The service cannot go on.
+            It has never been ready, or the service is to give up by now.
         """
-        if name not in self._devices or len(self._devices) < 2 or self._when_ready:
-            raise ServiceFailed(why)
-        log.error("the %s process is given up: %s", name, why)
-        for child in (self._children.pop(name), self._standbys.pop(name, None)):
-            if child is not None:
-                child.end()
-        self._lost.append(self._devices.pop(name))
-        self._children[DOOR].tell(("lost", self._lost[-1]))
+        now_s, restarts = time.monotonic(), self._restarts[name]
+        pause_s = restarts.note_death(started_s, now_s)
+        self._children[name] = _Child()
+        failing_s = now_s - (restarts.failing_since_s or now_s)
+        limit_s = self._config.give_up_after_s
+        if not self._was_ready:
+            raise ServiceFailed(f"its {name} process {how} before it was ready")
+        if limit_s and failing_s > limit_s:
+            raise ServiceFailed(
+                f"its {name} process {how}; it has not stayed for {failing_s:.0f} s "
+                f"(give_up_after_s is {limit_s:g})"
+            )
+        when = f"in {pause_s:g} s" if pause_s else "now"
+        log.error("the %s process %s; a new one is started %s", name, how, when)
+        if pause_s and self._is_announced:
+            self._is_announced = False
+            self._when_not_ready()
+        index = self._devices.get(name)
+        if index is not None and restarts.n_deaths >= GIVE_UP_DEVICE_DEATHS:
+            self._give_up_device(name, index)
+        self._tell_degraded()
 
-    def _bury(self, name: str, child: _Child) -> None:
-        how = child.end()
-        following = "a new one is started"
-        if name in self._standbys:
-            following = "the one that stood by takes over"
-        log.error("the %s process %s; %s", name, how, following)
+    def _give_up_device(self, name: str, index: int) -> None:
+        """Have the sessions of a device go to others, where there are any."""
+        if index in self._lost or len(self._lost) + 1 >= len(self._devices):
+            return
+        log.error("the %s process is given up until it stays", name)
+        self._lost.add(index)
+        self._children[DOOR].tell(("lost", index))
+
+    def _fail(self, name: str, child: _Child, why: str) -> None:
+        """Handle a process that says that it cannot work.
+
+        Raises
+        ------
+        ServiceFailed
+            The service has not been ready yet.
+        """
+        if not self._was_ready:
+            raise ServiceFailed(why)
+        child.end()
+        restarts = self._restarts[name]
+        # It would say the same again at once.
+        restarts.n_deaths = max(restarts.n_deaths, GIVE_UP_DEVICE_DEATHS - 1)
+        self._note_death(name, time.monotonic(), f"cannot work ({why})")
 
     def _check_stopped(self, name: str, child: _Child) -> None:
         """End a process that was stopped by a signal and is not let go on."""

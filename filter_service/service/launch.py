@@ -11,6 +11,7 @@ from functools import partial
 from filter_service.log_lines import FORMAT_VARIABLE, start_log
 from filter_service.service.config import ServiceConfig
 from filter_service.service.keeper import OPEN_WORKSHOP, Keeper, ServiceFailed
+from filter_service.whole_files import write_atomically
 
 log = logging.getLogger("ocufilter")
 
@@ -42,7 +43,8 @@ def run(
     keeper = Keeper(
         config,
         open_workshop=open_workshop,
-        when_ready=partial(_announce, config),
+        when_ready=Announcement(config).ready,
+        when_not_ready=partial(_remove_ready_file, config),
         read_again=read_again,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -55,14 +57,25 @@ def run(
         raise OSError(str(error)) from None
     finally:
         signal.set_wakeup_fd(-1)
-        if config.ready_file is not None:
-            config.ready_file.unlink(missing_ok=True)
+        _remove_ready_file(config)
 
 
-def _announce(config: ServiceConfig, endpoint: str) -> None:
-    """Say that the service is ready; the file appears complete or not at all."""
+class Announcement:
+    """Says that the service is ready, in its output once and in its ready file."""
+
+    def __init__(self, config: ServiceConfig) -> None:
+        self._config = config
+        self._is_printed = False
+
+    def ready(self, endpoint: str) -> None:
+        """Write the ready file, and the line of output the first time."""
+        if self._config.ready_file is not None:
+            write_atomically(self._config.ready_file, endpoint + "\n")
+        if not self._is_printed:
+            self._is_printed = True
+            print(f"ocufilter: serving on {endpoint}", flush=True)
+
+
+def _remove_ready_file(config: ServiceConfig) -> None:
     if config.ready_file is not None:
-        unfinished = config.ready_file.with_suffix(".unfinished")
-        unfinished.write_text(endpoint + "\n", encoding="utf-8")
-        unfinished.replace(config.ready_file)
-    print(f"ocufilter: serving on {endpoint}", flush=True)
+        config.ready_file.unlink(missing_ok=True)

@@ -74,10 +74,14 @@ class Link:
         LinkClosed
         """
         body = pickle.dumps(message, protocol=5)
-        head = HEAD.pack(len(body), len(descriptors))
-        copies = [os.dup(descriptor) for descriptor in descriptors]
-        self._unsent.append((memoryview(head + body), copies))
-        self.flush()
+        data = memoryview(HEAD.pack(len(body), len(descriptors)) + body)
+        if not self._unsent:
+            # Most messages go at once; a copy of a descriptor may not be to be had.
+            count = self._sent(data, descriptors)
+            if count == len(data):
+                return
+            data, descriptors = data[count:], () if count else descriptors
+        self._unsent.append((data, [os.dup(number) for number in descriptors]))
 
     def flush(self) -> None:
         """Send what the socket takes now.
@@ -88,21 +92,31 @@ class Link:
         """
         while self._unsent:
             data, descriptors = self._unsent[0]
-            try:
-                if descriptors:
-                    count = socket.send_fds(self._socket, [data], descriptors)
-                else:
-                    count = self._socket.send(data)
-            except BlockingIOError:
+            count = self._sent(data, descriptors)
+            if count == 0:
                 return
-            except OSError as error:
-                raise LinkClosed(str(error)) from None
             for descriptor in descriptors:
                 os.close(descriptor)
             if count < len(data):
                 self._unsent[0] = (data[count:], [])
             else:
                 self._unsent.popleft()
+
+    def _sent(self, data: memoryview, descriptors: Sequence[int]) -> int:
+        """Send what the socket takes of a message; return the number of bytes.
+
+        Raises
+        ------
+        LinkClosed
+        """
+        try:
+            if descriptors:
+                return socket.send_fds(self._socket, [data], descriptors)
+            return self._socket.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise LinkClosed(str(error)) from None
 
     def receive(self) -> list[tuple[Any, list[int]]]:
         """Return the messages that have come, each with its descriptors, now ours.
@@ -142,6 +156,8 @@ class Link:
             end = start + HEAD.size + length
             if len(held) < end:
                 break
+            if len(self._descriptors) < count:  # the system had none for them
+                raise LinkClosed("descriptors of a message are lost")
             message = pickle.loads(held[start + HEAD.size : end])
             descriptors = [self._descriptors.popleft() for _ in range(count)]
             messages.append((message, descriptors))

@@ -1,19 +1,27 @@
-"""The service's ROUTER socket: parts in, parts out, and who is gone."""
+"""The service's ROUTER socket: messages in, replies out, connections and their ends."""
 
 from __future__ import annotations
 
+import ctypes
 import enum
+import math
+import os
+import secrets
+import struct
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from socket import AF_UNIX, SOCK_STREAM
+from socket import AF_INET, AF_INET6, AF_UNIX, SOCK_STREAM, AddressFamily
 from socket import socket as unix_socket
 from typing import Any
 
 import zmq
 
 from filter_service.keys import KeyRing
-from filter_service.service.gate import Gate
+from filter_service.service.authenticator import Authenticator, connection_of
+from filter_service.service.connections import Connection, Connections, Peer
+from filter_service.service.dropped_parts import drop_parts
 
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 # With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
@@ -21,8 +29,23 @@ SEND_HIGH_WATER_MARK = 128
 # Counts messages, so it is what bounds memory: with the default of 1000 an overload of
 # 720p frames took 1.5 GB.  More wait in the kernel, and the client is held back.
 RECEIVE_HIGH_WATER_MARK = 4
+# Longer, so that the first packet of a client is not lost where many connect at once:
+# the system sends it again only after a second.
+BACKLOG = 1024
+HANDSHAKE_LIMIT_MS = 10_000
 RETRY_S = 0.001
 KEEPALIVE_IDLE_S = 20
+MAX_PARTS_DROPPED = 200_000
+"""Parts of an oversized message that are dropped before other work goes on (20 ms)."""
+
+MONITOR_PAUSE_S = 0.005
+"""Between looks at connections that come and go, where nothing else happens: thousands
+of them a second would otherwise wake the front end one by one."""
+
+MONITOR_ENDPOINT = "inproc://ocufilter.monitor"
+EVENT = struct.Struct("=HI")  # what happened, and to which descriptor
+MONITORED = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+SEED_VARIABLE = "OCUFILTER_TEST_RANDOM_SEED"
 
 Tracker = zmq.MessageTracker
 
@@ -47,6 +70,13 @@ def _check_path_is_free(bind: str) -> None:
     raise FileExistsError(f"another service listens on {path}")
 
 
+def socket_family(bind: str) -> AddressFamily:
+    """Return of what kind the connections of an endpoint are."""
+    if bind.startswith("ipc://"):
+        return AF_UNIX
+    return AF_INET6 if bind.startswith("tcp://[") else AF_INET
+
+
 class Outcome(enum.Enum):
     """What became of a reply."""
 
@@ -56,11 +86,32 @@ class Outcome(enum.Enum):
 
 
 class Refused(Exception):
-    """A message of somebody who is not allowed in any more; the identity is its."""
+    """A message from a client whose key is no longer allowed."""
 
-    def __init__(self, identity: bytes) -> None:
+    def __init__(self, peer: Peer) -> None:
         super().__init__("the key is not allowed any more")
-        self.identity = identity
+        self.peer = peer
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message as it came.
+
+    Attributes
+    ----------
+    peer : Peer
+    connection : Connection, optional
+        None where it has ended since.
+    parts : list of memoryview
+        Nothing is copied.
+    n_left_out : int
+        Parts beyond the most that a message may have; they were dropped unread.
+    """
+
+    peer: Peer
+    connection: Connection | None
+    parts: list[memoryview]
+    n_left_out: int = 0
 
 
 class Mailbox:
@@ -73,9 +124,17 @@ class Mailbox:
     max_part_bytes : int
         A client that sends a larger part is cut off.
     max_parts : int
-        Of one message, after the identity; more are thrown away unread.
+        Of one message, after the routing id; more are dropped unread.
+    connections : Connections
+        Kept up to date with what the socket's monitor reports.
     keys : KeyRing, optional
         Only its clients are let in, and what travels is encrypted.
+
+    Attributes
+    ----------
+    is_dropping : bool
+        The rest of an oversized message is being dropped; nothing else is received
+        until that is done.
     """
 
     def __init__(
@@ -84,11 +143,16 @@ class Mailbox:
         max_part_bytes: int,
         max_parts: int,
         *,
+        connections: Connections,
         keys: KeyRing | None = None,
     ) -> None:
         self._max_parts = max_parts
+        self._connections = connections
+        self._oversized: Received | None = None
+        self._ended: list[int] = []
+        _seed_random()
         self._context = zmq.Context()
-        self._gate = None if keys is None else Gate(self._context, keys)
+        self._authenticator = Authenticator(self._context, keys)
         self._socket = self._context.socket(zmq.ROUTER)
         socket = self._socket
         socket.linger = 0
@@ -96,18 +160,25 @@ class Mailbox:
         socket.sndhwm = SEND_HIGH_WATER_MARK
         socket.rcvhwm = RECEIVE_HIGH_WATER_MARK
         socket.maxmsgsize = max_part_bytes
+        socket.backlog = BACKLOG
+        socket.handshake_ivl = HANDSHAKE_LIMIT_MS
         # No heartbeats of our own: libzmq aborts the process (stream_engine_base.cpp)
         # where one is due on a connection that has ended while more messages of it
-        # wait than the mark above.  `Alive` finds out who is gone, and answers to the
-        # clients' heartbeats are sent all the same.
+        # wait than the mark above.  `Alive` and the monitor find out who is gone, and
+        # answers to the clients' heartbeats are sent all the same.
         socket.heartbeat_ivl = 0
         socket.tcp_keepalive = 1
         socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
         if bind.startswith("tcp://["):
             socket.ipv6 = 1
+        self._monitor = self._context.socket(zmq.PAIR)
+        self._monitor.linger = 0
+        # Without a limit: libzmq's thread would wait for this one while it is full.
+        self._monitor.rcvhwm = 0
         try:
-            if self._gate is not None:
-                self._gate.guard(socket)
+            socket.monitor(MONITOR_ENDPOINT, MONITORED)
+            self._monitor.connect(MONITOR_ENDPOINT)
+            self._authenticator.guard(socket)
             _check_path_is_free(bind)
             socket.bind(bind)
         except (zmq.ZMQError, OSError, ValueError) as error:
@@ -117,10 +188,15 @@ class Mailbox:
         if self.endpoint.startswith("ipc://"):
             Path(self.endpoint.removeprefix("ipc://")).chmod(0o600)
         self._poller = zmq.Poller()
-        self._poller.register(socket, zmq.POLLIN)
-        if self._gate is not None:
-            self._poller.register(self._gate.socket, zmq.POLLIN)
+        for watched in (socket, self._authenticator.socket, self._monitor):
+            self._poller.register(watched, zmq.POLLIN)
         self._watched: set[int] = set()
+        self._next_monitored_s = 0.0
+
+    @property
+    def is_dropping(self) -> bool:
+        """Return whether the rest of an oversized message is being dropped."""
+        return self._oversized is not None
 
     def watch(self, readable: set[int], writable: set[int]) -> None:
         """Let `wait` also return when one of these can be read, or written."""
@@ -134,55 +210,92 @@ class Mailbox:
 
     def wait(self, timeout_s: float) -> None:
         """Return when there is something to read, or in time."""
-        self._poller.poll(max(0, round(1000 * timeout_s)))
-        if self._gate is not None:
-            self._gate.answer()
+        pause_s = self._next_monitored_s - time.monotonic()
+        if pause_s > 0.0:
+            self._poller.modify(self._monitor, 0)
+            timeout_s = min(timeout_s, pause_s)
+        self._poller.poll(max(0, math.ceil(1000 * timeout_s)))
+        if pause_s > 0.0:
+            self._poller.modify(self._monitor, zmq.POLLIN)
+        # In this order: a connection is known before it is given a number.
+        self._read_monitor()
+        self._authenticator.answer()
+        self._connections.check_unread(time.monotonic())
 
-    def receive(self) -> tuple[bytes, list[memoryview], int] | None:
-        """Return (identity, parts, number left out) of one message, or None.
+    def take_ended(self) -> list[int]:
+        """Return the numbers of the connections that have ended since the last call."""
+        ended, self._ended = self._ended, []
+        return ended
 
-        Nothing is copied.  The whole message is taken off the socket whatever its
-        number of parts: what is left of it would be read as the next one.
+    def _read_monitor(self) -> None:
+        """Take in which connections have come and gone."""
+        receive, count = self._monitor.recv, 0
+        try:
+            while True:
+                event, descriptor = EVENT.unpack(receive(zmq.NOBLOCK))
+                receive()  # the endpoint, which is ours
+                count += 1
+                if event == zmq.EVENT_ACCEPTED:
+                    number = self._authenticator.next_number
+                    self._connections.add(descriptor, number)
+                elif (ended := self._connections.remove(descriptor)) is not None:
+                    self._ended.append(ended)
+        except zmq.Again:
+            pass
+        if count:
+            self._next_monitored_s = time.monotonic() + MONITOR_PAUSE_S
+            self._connections.evict()
+
+    def receive(self) -> Received | None:
+        """Return a message, or None where none has come whole.
+
+        The whole message is taken off the socket whatever its number of parts: what
+        is left of it would be read as the next one.
 
         Raises
         ------
         Refused
             The sender's key is not allowed any more.
         """
+        if self._oversized is not None:
+            return self._drop_rest(self._oversized)
         try:
             frame = self._socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        identity, left_out = frame.bytes, 0
-        is_allowed = self._gate is None
-        parts: list[memoryview] = []
-        while frame.more:
-            if len(parts) < self._max_parts:
-                frame = self._socket.recv(copy=False)
-                parts.append(frame.buffer)
-                is_allowed = is_allowed or self._is_allowed(frame)
-                continue
-            left_out += self._skip()
-            break
-        if not is_allowed:
-            raise Refused(identity)
-        return identity, parts, left_out
+        routing_id, (number, key) = frame.bytes, connection_of(str(frame["User-Id"]))
+        descriptor = int(frame.get(zmq.SRCFD))
+        connection = self._connections.of_message(number, descriptor)
+        received = Received(Peer(routing_id, number, key), connection, [])
+        parts = received.parts
+        while frame.more and len(parts) < self._max_parts:
+            frame = self._socket.recv(copy=False)
+            parts.append(frame.buffer)
+        if frame.more:
+            return self._drop_rest(received)
+        if not self._authenticator.lets_in(key):
+            raise Refused(received.peer)
+        return received
 
-    def _is_allowed(self, frame: zmq.Frame) -> bool:
-        """Return whether the key that a part came with is still allowed."""
-        return self._gate is not None and self._gate.lets_in(str(frame["User-Id"]))
+    def _drop_rest(self, received: Received) -> Received | None:
+        """Drop parts of a message that has too many, in slices: it may have millions.
 
-    def _skip(self) -> int:
-        """Throw away the rest of a message; return how many parts it had."""
-        receive, count = self._socket.recv, 1  # there may be millions of them
-        while receive(copy=False).more:
-            count += 1
-        return count
+        Nothing of it is held meanwhile but the parts that it may have.
+        """
+        count, has_more = drop_parts(self._socket, MAX_PARTS_DROPPED)
+        received = replace(received, n_left_out=received.n_left_out + count)
+        self._oversized = received if has_more else None
+        return None if has_more else received
 
     def send(
-        self, identity: bytes, parts: Sequence[Any]
+        self, peer: Peer, parts: Sequence[Any]
     ) -> tuple[Outcome, zmq.MessageTracker | None]:
         """Send a message; large parts are not copied and must not change.
+
+        Another client may have taken the routing id of one that has just gone.  libzmq
+        chooses the connection when it is given the routing id; by then its monitor has
+        reported the end of the one before, so that end is looked for afterwards, and
+        the reply is not sent: the other client receives one empty part.
 
         Returns
         -------
@@ -191,8 +304,14 @@ class Mailbox:
             Of the last large part: done once libzmq has let go of it.
         """
         tracker = None
+        if not self._connections.is_open(peer.connection):
+            return Outcome.GONE, None
         try:
-            self._send_identity(identity)
+            self._send_routing_id(peer.routing_id)
+            self._read_monitor()
+            if not self._connections.is_open(peer.connection):
+                self._socket.send(b"", zmq.NOBLOCK)
+                return Outcome.GONE, None
             for i, part in enumerate(parts):
                 more = zmq.SNDMORE if i < len(parts) - 1 else 0
                 large = memoryview(part).nbytes >= COPY_BELOW_BYTES
@@ -208,22 +327,32 @@ class Mailbox:
             raise
         return Outcome.SENT, tracker
 
-    def _send_identity(self, identity: bytes) -> None:
+    def _send_routing_id(self, routing_id: bytes) -> None:
         """Name the receiver; whether it can take a message is decided here."""
         flags = zmq.NOBLOCK | zmq.SNDMORE
         try:
-            self._socket.send(identity, flags)
+            self._socket.send(routing_id, flags)
         except zmq.Again:
             # Room that a client has made is noticed about once per millisecond.
             time.sleep(RETRY_S)
-            self._socket.send(identity, flags)
+            self._socket.send(routing_id, flags)
 
     def close(self, *, linger_ms: int = 0) -> None:
         """Close; what is not sent then is lost."""
         endpoint = getattr(self, "endpoint", "")
         self._socket.close(linger=linger_ms)
-        if self._gate is not None:
-            self._gate.close()
+        self._authenticator.close()
+        self._monitor.close(linger=0)
         self._context.term()
         if endpoint.startswith("ipc://"):
             Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+
+
+def _seed_random() -> None:
+    """Have libzmq begin its routing ids at a number that nobody can know.
+
+    It takes them from the C library's generator, which it never seeds: the first
+    routing id of every process was the same.
+    """
+    seed = os.environ.get(SEED_VARIABLE)
+    ctypes.CDLL(None).srand(int(seed) if seed else secrets.randbits(32))

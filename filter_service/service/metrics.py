@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
 HOST = "127.0.0.1"
+REQUEST_LIMIT_S = 1.0
 
 METRICS = {
     # name: what it is; those in _total only grow
     "ocufilter_ready": "1 while frames can be filtered",
+    "ocufilter_degraded": "1 while a process does not stay up, or a device is missing",
+    "ocufilter_connections": "open connections, with a session or without",
+    "ocufilter_connections_evicted_total": "closed because too many were open",
     "ocufilter_sessions": "sessions with a client",
     "ocufilter_sessions_away": "sessions whose client is gone and may come back",
     "ocufilter_frames_filtered_total": "frames answered with a picture",
@@ -35,7 +40,9 @@ def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
     NoMetrics
     """
     try:
-        from prometheus_client import CollectorRegistry, start_http_server
+        from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+        from prometheus_client import CollectorRegistry, make_wsgi_app
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
     except ImportError:
         raise NoMetrics(
@@ -51,10 +58,19 @@ def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
                 family = CounterMetricFamily if is_counter else GaugeMetricFamily
                 yield family(name, text, value=found[name])
 
+    class Handler(WSGIRequestHandler):
+        timeout = REQUEST_LIMIT_S
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Say nothing of each request."""
+
     registry = CollectorRegistry()
     registry.register(Collector())
     try:
-        server, _ = start_http_server(port, addr=HOST, registry=registry)
+        # One request at a time, each with a limit: a server with a thread for each
+        # connection would give descriptors and memory to whoever connects.
+        server = make_server(HOST, port, make_wsgi_app(registry), handler_class=Handler)
     except OSError as error:
         raise NoMetrics(f"metrics_port is {port}: {error.strerror}") from None
+    threading.Thread(target=server.serve_forever, daemon=True).start()
     return server

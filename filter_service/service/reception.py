@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from filter_service.errors import (
@@ -24,11 +24,15 @@ from filter_service.messages import (
     Welcome,
 )
 from filter_service.service.config import ServiceConfig
+from filter_service.service.connections import Peer
 from filter_service.service.guests import Guests
 from filter_service.service.mailbox import Outcome, Tracker
 from filter_service.service.served_devices import ServedDevice, ServedDevices
-from filter_service.service.session import EyeProfiles, Session
+from filter_service.service.session import EyeProfiles, Session, SessionRecord
 from filter_service.service.sharing import Sharing
+
+MAX_GREETINGS = 256
+"""Clients that wait for the answer to hello while a device is started."""
 
 log = logging.getLogger("ocufilter")
 
@@ -45,7 +49,9 @@ class Reception:
     devices : ServedDevices
     sharing : Sharing
     send : callable
-        Sends a reply to an identity.
+        Sends a reply to a peer.
+    record : callable
+        ``record(key, session)`` keeps what a session is, or that it has ended (None).
 
     Attributes
     ----------
@@ -60,13 +66,14 @@ class Reception:
         guests: Guests,
         devices: ServedDevices,
         sharing: Sharing,
-        send: Callable[[bytes, Reply], Tracker | None],
+        send: Callable[[Peer, Reply], Tracker | None],
+        record: Callable[[str, SessionRecord | None], None],
     ) -> None:
         self.config = config
         self._endpoint = endpoint
         self._guests, self._devices, self._sharing = guests, devices, sharing
-        self._send = send
-        self._greetings: list[tuple[bytes, Hello]] = []  # until devices are known
+        self._send, self._record = send, record
+        self._greetings: list[tuple[Peer, Hello]] = []  # until devices are known
         self._next_alive_s = time.monotonic() + config.alive_interval_s
 
     @property
@@ -76,19 +83,19 @@ class Reception:
 
     # Coming
 
-    def session_at(self, identity: bytes) -> Session:
+    def session_at(self, peer: Peer) -> Session:
         """Return the session of a client.
 
         Raises
         ------
         NoSession
         """
-        session = self._guests.at(identity)
+        session = self._guests.at(peer)
         if session is None:
             raise NoSession("hello was not said", allowed="hello before anything else")
         return session
 
-    def greet(self, identity: bytes, hello: Hello) -> None:
+    def greet(self, peer: Peer, hello: Hello) -> None:
         """Welcome a client: to its session, to one it had before, or to a new one.
 
         Raises
@@ -96,17 +103,20 @@ class Reception:
         TooManySessions
         """
         if not self._devices.are_known:  # one is about to say who it is
-            self._greetings.append((identity, hello))
+            self._greetings = [g for g in self._greetings if g[0] != peer]
+            self._greetings = [*self._greetings[1 - MAX_GREETINGS :], (peer, hello)]
             return
-        session, is_resumed = self._guests.at(identity), False
+        session, is_resumed = self._guests.at(peer), False
         if session is None:
             session = self._guests.by_key(hello.session_key)
+            if session is not None and session.owner != peer.key:
+                session = None  # another client's
             is_resumed = session is not None
             if session is None:
-                session = self._new_session(identity, hello)
+                session = self._new_session(peer, hello)
             else:
                 self._end_sharing(session)
-                self._guests.come_back(session, identity, hello.client)
+                self._guests.come_back(session, peer, hello.client)
                 log.info("session %d goes on (%r)", session.session_id, hello.client)
         transports = [self._endpoint.split("://", 1)[0]]
         if self._sharing.is_offered:
@@ -123,20 +133,20 @@ class Reception:
             profile_id=session.profile_ids.get("both") if is_resumed else None,
             profile_ids=session.profile_ids if is_resumed else {},
         )
-        self._send(identity, welcome)
+        self._send(peer, welcome)
 
     def greet_who_waits(self) -> None:
         """Answer those who said hello before all devices had said who they are."""
         if not self._devices.are_known:
             return
-        for identity, hello in self._greetings:
+        for peer, hello in self._greetings:
             try:
-                self.greet(identity, hello)
+                self.greet(peer, hello)
             except FilterError as error:
-                self._send(identity, ErrorReply.from_exception(error))
+                self._send(peer, ErrorReply.from_exception(error))
         self._greetings = []
 
-    def _new_session(self, identity: bytes, hello: Hello) -> Session:
+    def _new_session(self, peer: Peer, hello: Hello) -> Session:
         most = self.config.max_sessions
         if len(self._guests) >= most:
             self._probe_clients(is_due=True)
@@ -149,28 +159,42 @@ class Reception:
             )
         device = self._devices.least_busy()
         session = self._guests.begin(
-            identity, hello.client, self.config.credit, device=device.index
+            peer, hello.client, self.config.credit, device=device.index
         )
+        self._record(session.key, session.record())
         self._open(session)
         where = f" on device {device.index}" if len(self._devices) > 1 else ""
         log.info("session %d begins (%r)%s", session.session_id, hello.client, where)
         return session
 
-    def meet(self, device: ServedDevice, eyes: list[tuple[Any, ...]]) -> None:
-        """Bring a device that is here, with eyes of sessions, to the same sessions."""
-        known, held = {s.key for s in self._guests}, {key for key, *_ in eyes}
+    def restore(self, records: Sequence[SessionRecord]) -> None:
+        """Take over the sessions of the front end before this one."""
+        for record in records:
+            self._guests.remember(Session.restored(record, time.monotonic()))
+
+    def meet(self, device: ServedDevice, eyes: Sequence[tuple[Any, ...]]) -> None:
+        """Bring a device that is there to the sessions that there are.
+
+        Parameters
+        ----------
+        eyes : sequence of (key, profiles)
+            Sessions whose eyes it has; ``profiles`` are (profile id, generation) by
+            eye.
+        """
+        held = dict(eyes)
         for session in self._guests:
-            if session.device == device.index and session.key not in held:
+            if session.device != device.index:
+                continue
+            if session.key not in held:
                 self._open(session)
-        for key, session_id, profiles in eyes:
-            if key not in known:  # a door before this one knew its client
-                session = Session(session_id, None, "", self.config.credit, key=key)
-                session.device = device.index
-                for name, (profile_id, generation) in profiles.items():
-                    eye = session.eye(name)
-                    eye.profile_id, eye.generation = profile_id, generation
-                session.leave(time.monotonic())
-                self._guests.remember(session)
+                continue
+            for name, (profile_id, generation) in held.pop(session.key).items():
+                eye = session.eye(name)
+                if eye.generation != generation:  # accepted as the front end ended
+                    eye.profile = None
+                eye.profile_id, eye.generation = profile_id, generation
+        for key in held:
+            device.render.tell("close", key)
 
     def _open(self, session: Session) -> None:
         """Have the render loop hold the eyes of a session, with their profiles."""
@@ -189,13 +213,13 @@ class Reception:
         """Ask for a profile; of several that wait for their turn the newest counts."""
         eye = session.eye(request.eye)
         replaced, eye.next_profile = eye.next_profile, request
-        if replaced is not None and session.identity is not None:
+        if replaced is not None and session.peer is not None:
             error = BuildCancelled(
                 f"profile {request.profile_id} took the place of profile "
                 f"{replaced.profile_id}"
             )
             reply = ErrorReply.from_exception(error, profile_id=replaced.profile_id)
-            self._send(session.identity, reply)
+            self._send(session.peer, reply)
         if eye.asked_profile is None:
             self._ask_next_profile(session, eye)
 
@@ -216,11 +240,12 @@ class Reception:
             if isinstance(reply, Accepted):
                 eye.profile, eye.profile_id = asked, reply.profile_id
                 eye.generation = reply.generation
+                self._record(key, session.record())
             if reply.profile_id == asked.profile_id:
                 eye.asked_profile = None
                 self._ask_next_profile(session, eye)
-        if session.identity is not None:
-            self._send(session.identity, reply)
+        if session.peer is not None:
+            self._send(session.peer, reply)
 
     # Going
 
@@ -246,20 +271,24 @@ class Reception:
         if is_due or now_s >= self._next_alive_s:
             self._next_alive_s = now_s + self.config.alive_interval_s
             for session in self._guests.present:
-                if session.identity is not None:
-                    self._send(session.identity, Alive())
+                if session.peer is not None:
+                    self._send(session.peer, Alive())
 
-    def leave(self, identity: bytes) -> None:
+    def leave(self, peer: Peer) -> None:
         """Keep the session of a client that is gone for a while."""
-        session = self._guests.at(identity)
-        if session is not None:
+        self.lose(peer.connection)
+
+    def lose(self, connection: int) -> None:
+        """Note that a connection has ended; keep its session for a while."""
+        session = self._guests.on_connection(connection)
+        if session is not None and session.peer is not None:
             self._end_sharing(session)
             self._guests.leave(session, time.monotonic())
             log.info("session %d: its client is gone", session.session_id)
 
-    def end_session(self, identity: bytes, outcome: Outcome | None = None) -> None:
+    def end_session(self, peer: Peer, outcome: Outcome | None = None) -> None:
         """Forget a client's session, if it has one."""
-        session = self._guests.at(identity)
+        session = self._guests.on_connection(peer.connection)
         if session is not None:
             why = "" if outcome is None else f"the client is {outcome.value}"
             self._forget(session, why)
@@ -267,7 +296,8 @@ class Reception:
     def _forget(self, session: Session, why: str) -> None:
         self._guests.remove(session)
         self._end_sharing(session)
-        session.identity = None
+        self._record(session.key, None)
+        session.peer = None
         self._devices.of(session).frames.forget(session)
         self._devices.of(session).render.tell("close", session.key)
         log.info("session %d ends%s", session.session_id, f": {why}" if why else "")

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from filter_service.errors import OutOfMemory
 from filter_service.messages import Frame, Result, SharedPlaces
+from filter_service.service.connections import Peer
+from filter_service.service.descriptors import DescriptorLimit
 from filter_service.service.link import Link, LinkClosed
 from filter_service.service.mailbox import Tracker
 from filter_service.service.places import result_sizes
@@ -27,6 +29,14 @@ MS_PER_S = 1000.0
 SMALLER_RATIO = 4
 """A frame may come between the parts of one that has so many times its pixels."""
 
+SESSION_QUOTA = 0.25
+"""Of the memory for images: what one session may share, or leave unread."""
+
+SHARED_QUOTA = 0.5
+"""What all clients may share; the rest is for frames that travel as parts."""
+
+MB = 1e6
+
 Unsent = list[tuple[Tracker, Slot]]
 
 
@@ -36,7 +46,7 @@ class Held:
 
     number: int
     session: Session
-    identity: bytes | None
+    peer: Peer | None
     waiting: WaitingFrame
     places: SharedPlaces
     own_slots: tuple[Slot, ...]  # not the client's: what is sent, and is given back
@@ -50,6 +60,7 @@ class RenderEnd:
     ----------
     max_image_bytes : int
         Of all slots.
+    descriptors : DescriptorLimit
 
     Attributes
     ----------
@@ -62,12 +73,15 @@ class RenderEnd:
         The loop has said which eyes it has, and was told of the others.
     """
 
-    def __init__(self, max_image_bytes: int) -> None:
+    def __init__(self, max_image_bytes: int, descriptors: DescriptorLimit) -> None:
         self.held: dict[int, Held] = {}
         self.is_ready = False
         self.may_rest = False
         self._link: Link | None = None
-        self._slots = SlotPool(max_image_bytes)
+        self._slots = SlotPool(
+            max_image_bytes, descriptors.max_slots, descriptors.reserve
+        )
+        self._shared: set[int] = set()  # numbers of the slots of clients
         self._next_number = 1
         self._heard_s = self._excused_s = time.monotonic()
 
@@ -145,19 +159,38 @@ class RenderEnd:
 
     # Memory
 
+    @property
+    def session_quota_bytes(self) -> int:
+        """Return the memory that one session may hold between its frames."""
+        return int(SESSION_QUOTA * self._slots.max_bytes)
+
     def share(self, size_bytes: int) -> Slot:
         """Return memory that no other client has had.
 
         Raises
         ------
         OutOfMemory
+            Also where only what is reserved for ordinary frames is left.
         """
+        held = [slot for slot in self._slots if slot.number in self._shared]
+        most_bytes = int(SHARED_QUOTA * self._slots.max_bytes)
+        held_bytes = sum(slot.size_bytes for slot in held)
+        if held_bytes + size_bytes > most_bytes:
+            raise OutOfMemory(
+                f"{size_bytes / MB:.0f} MB more than the {held_bytes / MB:.0f} MB that "
+                "clients share are asked for",
+                allowed=f"{most_bytes / MB:.0f} MB in all",
+            )
+        if len(held) >= self._slots.max_count * SHARED_QUOTA:
+            raise OutOfMemory(f"{len(held)} pieces of memory are shared already")
         slot = self._slots.create(size_bytes)
+        self._shared.add(slot.number)
         self._send_slot(slot)
         return slot
 
     def drop(self, slot: Slot) -> None:
         """Give up memory for good."""
+        self._shared.discard(slot.number)
         self._slots.drop(slot)
         self.tell("drop_slot", slot.number)
 
@@ -222,7 +255,7 @@ class RenderEnd:
         number, self._next_number = self._next_number, self._next_number + 1
         self._heard_s = now_s = time.monotonic()
         self.held[number] = Held(
-            *(number, session, session.identity, waiting, places, own_slots),
+            *(number, session, session.peer, waiting, places, own_slots),
             handed_s=now_s,
         )
         arrays = [array for images in frame.images for array in images.arrays]

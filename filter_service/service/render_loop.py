@@ -140,10 +140,7 @@ class RenderLoop:
             "renderer": self._workshop.engine.name,
             "gl_renderer": self._workshop.engine.name,  # what it was called before
         }
-        eyes = [
-            (key, session.session_id, session.profiles)
-            for key, session in self._sessions.items()
-        ]
+        eyes = [(key, session.profiles) for key, session in self._sessions.items()]
         self._send(("here", server, eyes, self._may_rest))
 
     # The loop

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from filter_service.messages import DeviceState, Reply
+from filter_service.service.connections import Peer
+from filter_service.service.descriptors import DescriptorLimit
 from filter_service.service.frame_desk import FrameDesk
 from filter_service.service.guests import Guests
 from filter_service.service.mailbox import Tracker
@@ -27,6 +29,8 @@ class ServedDevice:
         As the settings have it.
     max_image_bytes : int
         Of the images of its sessions.
+    descriptors : DescriptorLimit
+        Of this process.
     guests : Guests
     send : callable
         See `FrameDesk`.
@@ -49,12 +53,13 @@ class ServedDevice:
         index: int,
         name: str,
         max_image_bytes: int,
+        descriptors: DescriptorLimit,
         guests: Guests,
-        send: Callable[[bytes, Reply], Tracker | None],
+        send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
         self.index = index
         self.name = name
-        self.render = RenderEnd(max_image_bytes)
+        self.render = RenderEnd(max_image_bytes, descriptors)
         self.frames = FrameDesk(partial(guests.present_on, index), self.render, send)
         self.server: dict[str, str] | None = None
         self.memory_mb = self.stores_mb = 0.0
@@ -90,7 +95,7 @@ class ServedDevices:
     names : sequence of str
     max_image_bytes : int
         Of all of them; each has an equal part, so that none can use up another's.
-    guests, send
+    descriptors, guests, send
         See `ServedDevice`.
     """
 
@@ -98,12 +103,16 @@ class ServedDevices:
         self,
         names: Sequence[str],
         max_image_bytes: int,
+        descriptors: DescriptorLimit,
         guests: Guests,
-        send: Callable[[bytes, Reply], Tracker | None],
+        send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
         self._guests = guests
         self._devices = [
-            ServedDevice(index, name, max_image_bytes // len(names), guests, send)
+            ServedDevice(
+                *(index, name, max_image_bytes // len(names)),
+                *(descriptors, guests, send),
+            )
             for index, name in enumerate(names)
         ]
 

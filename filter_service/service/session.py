@@ -7,13 +7,18 @@ from __future__ import annotations
 
 import secrets
 from dataclasses import dataclass, field
+from typing import Self
 
 from filter_service.errors import CreditExceeded
 from filter_service.messages import EyeName, Frame, ProfileRequest
+from filter_service.service.connections import Peer
 from filter_service.service.mailbox import Tracker
 from filter_service.slots import Slot
 
 KEY_BYTES = 16
+MAX_RECORDED_BYTES = 65_536
+"""Of a profile's body, as JSON: 100 measurements of 28 coefficients take 60,000.  The
+client of a larger one sends it again where the service has lost it."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,28 @@ class EyeProfiles:
     profile_id: int | None = None
     generation: int = 0
 
+    def record(self) -> EyeProfiles:
+        """Return the accepted profile alone, without its body where that is large."""
+        profile = self.profile
+        if profile is not None and len(profile.parts()[0]) > MAX_RECORDED_BYTES:
+            profile = None
+        return EyeProfiles(
+            profile, profile_id=self.profile_id, generation=self.generation
+        )
+
+
+@dataclass(frozen=True)
+class SessionRecord:
+    """A session as the supervisor keeps it, in case the front end ends."""
+
+    session_id: int
+    key: str
+    owner: str
+    client: str
+    credit: int
+    device: int
+    eyes: dict[EyeName, EyeProfiles]
+
 
 @dataclass(eq=False)
 class Session:
@@ -48,23 +75,27 @@ class Session:
     Parameters
     ----------
     session_id : int
-    identity : bytes, optional
-        The client's routing id; None while it is away.
+    peer : Peer, optional
+        The client's connection; None while it is away.
     client : str
         What it calls itself.
     credit : int
         Frames it may have unanswered.
     key : str
         With which it may come back.
+    owner : str
+        The CURVE key of the client that began it, which alone may come back; empty
+        where the service has no keys.
     device : int
         Index of the device that its eyes are on.
     """
 
     session_id: int
-    identity: bytes | None
+    peer: Peer | None
     client: str
     credit: int
     key: str = field(default_factory=new_key)
+    owner: str = ""
     device: int = 0
     n_unanswered: int = 0
     waiting: WaitingFrame | None = None
@@ -73,11 +104,32 @@ class Session:
     shared: dict[int, Slot] = field(default_factory=dict)  # memory of the client
     lent: set[int] = field(default_factory=set)  # of those, in use by frames
     away_since_s: float | None = None
+    last_connection: int = 0
     eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
 
     def eye(self, name: EyeName) -> EyeProfiles:
         """Return the profiles of an eye."""
         return self.eyes.setdefault(name, EyeProfiles())
+
+    def record(self) -> SessionRecord:
+        """Return what is kept of the session while this process is started again."""
+        return SessionRecord(
+            *(self.session_id, self.key, self.owner, self.client, self.credit),
+            *(self.device, {name: eye.record() for name, eye in self.eyes.items()}),
+        )
+
+    @classmethod
+    def restored(cls, record: SessionRecord, now_s: float) -> Self:
+        """Return a session as it was; its client is away."""
+        session = cls(
+            *(record.session_id, None, record.client, record.credit),
+            key=record.key,
+            owner=record.owner,
+            device=record.device,
+            eyes=dict(record.eyes),
+        )
+        session.leave(now_s)
+        return session
 
     @property
     def profile_ids(self) -> dict[EyeName, int]:
@@ -123,14 +175,16 @@ class Session:
 
     def leave(self, now_s: float) -> None:
         """Note that the client is away; what it waited for it does not wait for."""
-        self.identity = None
+        if self.peer is not None:
+            self.last_connection = self.peer.connection
+        self.peer = None
         self.away_since_s = now_s
         self.waiting = None
         self.n_unanswered = 0
 
-    def come_back(self, identity: bytes, client: str) -> None:
+    def come_back(self, peer: Peer, client: str) -> None:
         """Note that the client is there again, or from somewhere else."""
-        self.identity, self.client = identity, client
+        self.peer, self.client = peer, client
         self.away_since_s = None
         self.waiting = None
         self.n_unanswered = 0

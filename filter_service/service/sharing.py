@@ -52,8 +52,15 @@ class Sharing:
             return Shared(
                 reason=f"{request.size_bytes} bytes are more than a frame has"
             )
+        render = self._render_of(session)
+        held_bytes = sum(slot.size_bytes for slot in session.shared.values())
+        if held_bytes + request.size_bytes > render.session_quota_bytes:
+            return Shared(
+                reason=f"{request.size_bytes} bytes more than the {held_bytes} that "
+                f"this session has; allowed: {render.session_quota_bytes} in all"
+            )
         try:
-            slot = self._render_of(session).share(request.size_bytes)
+            slot = render.share(request.size_bytes)
         except OutOfMemory as error:
             return Shared(reason=str(error))
         session.shared[slot.number] = slot

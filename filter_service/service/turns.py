@@ -1,4 +1,4 @@
-"""Whose frame is next: clients share time, not numbers of frames."""
+"""Whose frame is next: sessions share processor time, not numbers of frames."""
 
 from __future__ import annotations
 
@@ -8,29 +8,40 @@ from typing import Generic, TypeVar
 
 Client = TypeVar("Client", bound=Hashable)
 
-PAUSE_S = 1.0
-"""Who asks for nothing for longer has no claim on the time that passed meanwhile."""
+MAX_CLAIM_S = 0.5
+"""Of the time that others used while a session asked for nothing, it may catch up so
+much: enough for the round trip between two frames, and no more than makes a heavy
+client wait for a second or two where many light ones pause."""
+
+MAX_DEBT_S = 20.0
+"""What one frame may cost its session in turns; a frame that hung for a minute would
+otherwise keep it waiting for that long beside each other session."""
 
 
 @dataclass
 class _Share:
     used_s: float
-    active_s: float  # when it last asked for something, or was answered
+    is_waiting: bool = False
 
 
 class Turns(Generic[Client]):
-    """Time used by each client; of those who wait, who has used least is next."""
+    """Fair queuing: of the sessions that wait, the one that has used least is next.
+
+    A session that begins to wait has used as much as the one served last, less
+    `MAX_CLAIM_S` at most.  So nobody owes more than its own last frame, and nobody can
+    save up claims.
+    """
 
     def __init__(self) -> None:
         self._shares: dict[Client, _Share] = {}
-        self._level_s = 0.0  # what the client served last had used before
+        self._level_s = 0.0  # what the session served last had used before
 
-    def arrive(self, client: Client, now_s: float) -> None:
-        """Note that a client asks for something."""
-        share = self._shares.setdefault(client, _Share(self._level_s, now_s))
-        if now_s - share.active_s > PAUSE_S:
-            share.used_s = max(share.used_s, self._level_s)
-        share.active_s = now_s
+    def arrive(self, client: Client) -> None:
+        """Note that a session has a frame waiting."""
+        share = self._shares.setdefault(client, _Share(self._level_s))
+        if not share.is_waiting:
+            share.used_s = max(share.used_s, self._level_s - MAX_CLAIM_S)
+            share.is_waiting = True
 
     def next_of(self, waiting: Iterable[Client]) -> Client | None:
         """Return whose turn it is; all of those who wait have arrived."""
@@ -38,16 +49,17 @@ class Turns(Generic[Client]):
             waiting, key=lambda client: self._shares[client].used_s, default=None
         )
         if chosen is not None:
-            self._level_s = max(self._level_s, self._shares[chosen].used_s)
+            share = self._shares[chosen]
+            self._level_s = max(self._level_s, share.used_s)
+            share.is_waiting = False
         return chosen
 
-    def note(self, client: Client, time_s: float, now_s: float) -> None:
-        """Note what a client's frame has taken."""
+    def note(self, client: Client, time_s: float) -> None:
+        """Note what a session's frame has taken."""
         share = self._shares.get(client)
         if share is not None:
-            share.used_s += time_s
-            share.active_s = now_s
+            share.used_s += min(time_s, MAX_DEBT_S)
 
     def forget(self, client: Client) -> None:
-        """Forget a client that is gone."""
+        """Forget a session that has ended."""
         self._shares.pop(client, None)

@@ -353,6 +353,8 @@ class Pong(Message):
     n_dropped: Count = 0
     is_building: bool = False
     is_ready: bool = True
+    is_degraded: bool = False
+    n_connections: Count = 0
     is_filtering: bool = False
     render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
     devices: Annotated[tuple[DeviceState, ...], Meta(max_length=MAX_DEVICES)] = ()

@@ -219,10 +219,10 @@ def test_none_uses_up_the_memory_of_another(start_service, raw_client):
     first, second = raw_client(service), raw_client(service)
     first.ask(Hello("greedy"))
     second.ask(Hello("modest"))
-    assert first.ask(Share(8_000_000)).path
-    refused = first.ask(Share(8_000_000))
-    assert not refused.path and "MB more than" in refused.reason
-    assert second.ask(Share(8_000_000)).path
+    assert first.ask(Share(2_000_000)).path
+    refused = first.ask(Share(2_000_000))
+    assert not refused.path and "allowed: 2500000 in all" in refused.reason
+    assert second.ask(Share(2_000_000)).path
 
 
 def test_a_device_that_does_not_come_again_is_given_up(

@@ -109,7 +109,8 @@ HOME = {
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
         "filter_service/service/mailbox.py",  # the server's socket and nothing else
-        "filter_service/service/gate.py",  # and who may connect to it
+        "filter_service/service/authenticator.py",  # who may connect to it
+        "filter_service/service/dropped_parts.py",  # messages of too many parts
         "filter_service/service/asking.py",  # one ping
         "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else

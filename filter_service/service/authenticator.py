@@ -1,0 +1,91 @@
+"""The ZAP handler (ZeroMQ RFC 27): numbers connections and checks their keys."""
+
+from __future__ import annotations
+
+import logging
+
+import zmq
+from zmq.utils import z85
+
+from filter_service.keys import KeyRing
+
+ENDPOINT = "inproc://zeromq.zap.01"
+VERSION = b"1.0"
+DOMAIN = b"ocufilter"
+MAX_REQUESTS_PER_TURN = 64
+
+log = logging.getLogger("ocufilter")
+
+
+class Authenticator:
+    """Gives every connection a number, and lets in only those with an allowed key.
+
+    Parameters
+    ----------
+    context : zmq.Context
+        Of the socket to guard, which must be bound after this is made.
+    keys : KeyRing, optional
+        Without it every connection is let in.
+
+    Attributes
+    ----------
+    next_number : int
+        Of the next connection that is let in.
+    """
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], keys: KeyRing | None
+    ) -> None:
+        self._keys = keys
+        self.next_number = 1
+        self.socket = context.socket(zmq.REP)
+        self.socket.linger = 0
+        self.socket.bind(ENDPOINT)
+
+    def guard(self, socket: zmq.Socket[bytes]) -> None:
+        """Have libzmq ask about each connection of a socket before it is bound."""
+        socket.zap_domain = DOMAIN
+        if self._keys is not None:
+            pair = self._keys.server
+            socket.curve_server = True
+            socket.curve_secretkey = pair.secret.encode()
+            socket.curve_publickey = pair.public.encode()
+
+    def answer(self) -> None:
+        """Answer the requests that wait."""
+        for _ in range(MAX_REQUESTS_PER_TURN):
+            try:
+                request = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self.socket.send_multipart(self._reply(request))
+
+    def lets_in(self, key: str) -> bool:
+        """Return whether a client's public key is allowed now."""
+        return self._keys is None or key in self._keys.allowed()
+
+    def _reply(self, request: list[bytes]) -> list[bytes]:
+        _, request_id, _, address, _, mechanism, *credentials = request
+        key = ""
+        if self._keys is not None:
+            key = z85.encode(credentials[0]).decode() if credentials else ""
+            if mechanism != b"CURVE" or not self.lets_in(key):
+                log.warning(
+                    "a client at %s has no key that is allowed", address.decode()
+                )
+                return [
+                    *(VERSION, request_id, b"400", b"no key that is allowed", b"", b"")
+                ]
+        user_id = f"{self.next_number} {key}".strip()
+        self.next_number += 1
+        return [VERSION, request_id, b"200", b"OK", user_id.encode(), b""]
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close(linger=0)
+
+
+def connection_of(user_id: str) -> tuple[int, str]:
+    """Return the number and the key of a connection from its ``User-Id``."""
+    number, _, key = user_id.partition(" ")
+    return int(number), key

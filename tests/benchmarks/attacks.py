@@ -1,0 +1,350 @@
+"""Hostile clients of the filter service: ``python -m`` this NAME ENDPOINT SECONDS.
+
+Each runs in a process of its own for a while and prints what it counted as JSON.  The
+endpoints are services of this machine that a benchmark or a test has started.
+"""
+
+import json
+import random
+import resource
+import socket
+import struct
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import zmq
+
+from filter_service.messages import (
+    Frame,
+    Hello,
+    Ping,
+    ProfileRequest,
+    Share,
+    ViewHeader,
+    ViewImages,
+    decode_reply,
+    encode,
+)
+
+N_BARE = 1500
+N_PARTS = 6_000_000
+PROFILE_BYTES = 1_000_000
+PINGS_HZ = 20_000
+FIRST_ID = 0x6B8B4567
+"""Where libzmq's ids began in every process without a seed of its own."""
+
+
+def as_address(endpoint: str) -> tuple[str, int]:
+    """Return host and port."""
+    host, port = endpoint.removeprefix("tcp://").split(":")
+    return host, int(port)
+
+
+def raise_limit() -> None:
+    """Let this process open as many files as it may."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def dealer(endpoint: str, *, identity: bytes = b"", **options):
+    """Return a context and a DEALER that is connected."""
+    context = zmq.Context()
+    client = context.socket(zmq.DEALER)
+    client.linger = 0
+    client.sndtimeo = 200
+    for name, value in options.items():
+        setattr(client, name, value)
+    if identity:
+        client.setsockopt(zmq.IDENTITY, identity)
+    client.connect(endpoint)
+    return context, client
+
+
+def small_frame(frame_id: int, size_px=(320, 180)) -> Frame:
+    """Return a frame of grey."""
+    width, height = size_px
+    header = (
+        ViewHeader.of_size(width, height) if hasattr(ViewHeader, "of_size") else None
+    )
+    color = np.full((height, width, 3), 128, np.uint8)
+    depth_m = np.full((height, width), 2.0, np.float32)
+    if header is None:
+        from clients.filter_client import RgbdView
+        from filter_service.camera import tangents_from_fov
+
+        view = RgbdView(color, depth_m, tangents_from_fov(60.0, width, height))
+        header = ViewHeader.describing(view)
+    images = (ViewImages(color, depth_m),)
+    return Frame(frame_id, (header,), 4.0, 0.0, images=images)
+
+
+def bare(endpoint: str, duration_s: float) -> dict:
+    """1,500 connections that say nothing; those that are closed are opened again."""
+    raise_limit()
+    address, held, counts = as_address(endpoint), [], Counter()
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        if len(held) < N_BARE:
+            connection = socket.socket()
+            connection.settimeout(0.5)
+            try:
+                connection.connect(address)
+                connection.setblocking(False)
+                held.append(connection)
+                counts["opened"] += 1
+            except OSError:
+                connection.close()
+                counts["refused"] += 1
+            continue
+        counts["held"] = 1
+        alive = []
+        for connection in held:
+            try:
+                closed = not connection.recv(4096)
+            except BlockingIOError:
+                closed = False
+            except OSError:
+                closed = True
+            if closed:
+                connection.close()
+                counts["closed"] += 1
+            else:
+                alive.append(connection)
+        held = alive
+        time.sleep(0.05)
+    return counts
+
+
+GREETING = b"\xff" + b"\0" * 8 + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" * 32
+READY = b"\x05READY\x0bSocket-Type" + struct.pack(">I", 6) + b"DEALER"
+
+
+def spoken_to(endpoint: str) -> socket.socket:
+    """Return a connection after the handshake of ZMTP 3.0, as a DEALER."""
+    connection = socket.create_connection(as_address(endpoint), 5.0)
+    connection.sendall(GREETING + b"\x04" + bytes([len(READY)]) + READY)
+    received = b""
+    while b"ROUTER" not in received:  # what comes before the answer ends the connection
+        data = connection.recv(4096)
+        if not data:
+            raise ConnectionError("closed during the handshake")
+        received += data
+    return connection
+
+
+def half_greeted(endpoint: str, duration_s: float) -> dict:
+    """Connections that begin the handshake and never end it, 400 at a time."""
+    raise_limit()
+    address, held, counts = as_address(endpoint), [], Counter()
+    end_s = time.monotonic() + duration_s
+    rng = random.Random(1)
+    while time.monotonic() < end_s:
+        connection = socket.socket()
+        connection.settimeout(0.5)
+        try:
+            connection.connect(address)
+            connection.sendall(GREETING[: rng.randrange(65)])
+            held.append(connection)
+            counts["opened"] += 1
+        except OSError:
+            connection.close()
+            counts["refused"] += 1
+        if len(held) > 400:
+            held.pop(rng.randrange(len(held))).close()
+        time.sleep(0.001)
+    return counts
+
+
+def silent_dealers(endpoint: str, duration_s: float) -> dict:
+    """Finished handshakes that say nothing, 600 of them in one context."""
+    raise_limit()
+    context = zmq.Context()
+    context.max_sockets = 2000
+    sockets = []
+    for _ in range(600):
+        client = context.socket(zmq.DEALER)
+        client.linger = 0
+        client.connect(endpoint)
+        sockets.append(client)
+    time.sleep(duration_s)
+    for client in sockets:
+        client.close(linger=0)
+    context.term()
+    return {"opened": len(sockets)}
+
+
+def chosen_ids(endpoint: str, duration_s: float) -> dict:
+    """DEALERs that take the routing ids that libzmq would hand out next."""
+    counts, start, n = Counter(), FIRST_ID, 0
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        pairs = []
+        for first in (FIRST_ID, 0xE43C9869):
+            for k in range(20):
+                identity = b"\0" + struct.pack(">I", (first + n + k) % 2**32)
+                pairs.append(dealer(endpoint, identity=identity))
+        n += 7
+        for _ in range(5):  # libzmq gives these ids of its own
+            context, client = dealer(endpoint)
+            client.send_multipart(encode(Hello("id")))
+            if client.poll(500):
+                reply = decode_reply(client.recv_multipart())
+                counts[getattr(reply, "code", reply.type_name)] += 1
+            else:
+                counts["silent"] += 1
+            pairs.append((context, client))
+        for context, client in pairs:
+            client.close(linger=0)
+            context.term()
+        counts["tried"] += len(pairs)
+    counts.pop("start", start)
+    return counts
+
+
+def bad_profile(kind: int) -> list[bytes]:
+    """Return a profile of a megabyte that is none."""
+    header = encode(ProfileRequest(5, {"kind": "preset", "name": "x"}))[0]
+    count = PROFILE_BYTES // (3 if kind == 0 else 2) - 40
+    item = b"[]," if kind == 0 else b"1,"
+    body = b'{"kind":"preset","name":[' + item * count + item[:-1] + b"]}"
+    return [bytes(header), body]
+
+
+def profiles(endpoint: str, duration_s: float, rate_hz: float = 20.0) -> dict:
+    """Profiles of a megabyte, faster than once a second."""
+    context, client = dealer(endpoint)
+    client.send_multipart(encode(Hello("profiles")))
+    counts, end_s, n = Counter(), time.monotonic() + duration_s, 0
+    while time.monotonic() < end_s:
+        try:
+            client.send_multipart(bad_profile(n % 2))
+            n += 1
+        except zmq.Again:
+            counts["held back"] += 1
+        _read(client, counts)
+        time.sleep(1 / rate_hz)
+    counts["sent"] = n
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
+def _read(client, counts: Counter) -> None:
+    while client.poll(0):
+        reply = decode_reply(client.recv_multipart())
+        counts[getattr(reply, "code", reply.type_name)] += 1
+
+
+def pings(endpoint: str, duration_s: float) -> dict:
+    """20,000 pings a second."""
+    context, client = dealer(endpoint, sndhwm=0, rcvhwm=0)
+    parts, counts = [bytes(p) for p in encode(Ping(1.0))], Counter()
+    start_s = time.monotonic()
+    while (passed_s := time.monotonic() - start_s) < duration_s:
+        while counts["sent"] < passed_s * PINGS_HZ:
+            try:
+                client.send_multipart(parts, zmq.NOBLOCK)
+                counts["sent"] += 1
+            except zmq.Again:
+                break
+        _read(client, counts)
+        time.sleep(0.001)
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
+def unread(endpoint: str, duration_s: float) -> dict:
+    """Frames as fast as they go, of a client that reads nothing after `ready`."""
+    counts, end_s = Counter(), time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        context, client = dealer(endpoint, rcvhwm=1)
+        frame = small_frame(1)
+        camera = frame.views[0].camera
+        client.send_multipart(encode(Hello("unread")))
+        body = {"kind": "double", "mark": 9}
+        client.send_multipart(encode(ProfileRequest(1, body, views=(camera,))))
+        client.poll(500)
+        parts = [bytes(part) for part in encode(frame)]
+        stop_s = min(end_s, time.monotonic() + 3.0)
+        while time.monotonic() < stop_s:
+            try:
+                client.send_multipart(parts, zmq.NOBLOCK)
+                counts["sent"] += 1
+            except zmq.Again:
+                time.sleep(0.001)
+        client.close(linger=0)
+        context.term()
+        counts["connections"] += 1
+    return counts
+
+
+def _send_parts(endpoint: str, duration_s: float, opening: bytes) -> dict:
+    counts, end_s = Counter(), time.monotonic() + duration_s
+    data = b"\x01\x01x" * (N_PARTS - 1) + b"\0\x01x"
+    while time.monotonic() < end_s:
+        try:
+            with spoken_to(endpoint) as connection:
+                connection.settimeout(2.0)
+                connection.sendall(opening + data)
+                counts["messages"] += 1
+                time.sleep(0.3)
+        except OSError:
+            counts["cut off"] += 1
+    return counts
+
+
+def parts(endpoint: str, duration_s: float) -> dict:
+    """Messages of six million one-byte parts."""
+    return _send_parts(endpoint, duration_s, b"")
+
+
+def parts_in_session(endpoint: str, duration_s: float) -> dict:
+    """The same of clients that said hello."""
+    (hello,) = encode(Hello("parts"))
+    opening = b"\0" + bytes([len(hello)]) + bytes(hello)
+    return _send_parts(endpoint, duration_s, opening)
+
+
+def hoard(endpoint: str, duration_s: float) -> dict:
+    """Sessions that ask for all the shared memory there is."""
+    counts, end_s = Counter(), time.monotonic() + duration_s
+    context, client = dealer(endpoint, rcvtimeo=1000)
+    client.send_multipart(encode(Hello("hoard")))
+    while time.monotonic() < end_s:
+        for size_mb in (400, 125, 60, 10, 1):
+            client.send_multipart(encode(Share(size_mb * 10**6)))
+            try:
+                reply = decode_reply(client.recv_multipart())
+            except zmq.Again:
+                counts["silent"] += 1
+                continue
+            if getattr(reply, "slot", None) is not None:
+                counts["mb"] += size_mb
+            else:
+                counts["refused"] += 1
+        time.sleep(0.2)
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
+ATTACKS = {
+    function.__name__: function
+    for function in (
+        *(bare, half_greeted, silent_dealers, chosen_ids),
+        *(profiles, pings, unread, parts, parts_in_session, hoard),
+    )
+}
+
+
+def main() -> None:
+    """Run one attack; print what it counted."""
+    name, endpoint, duration_s = sys.argv[1:]
+    print(json.dumps(ATTACKS[name](endpoint, float(duration_s))))
+
+
+if __name__ == "__main__":
+    main()
