@@ -24,6 +24,7 @@ HEARTBEAT_TIMEOUT_MS = 2000
 RECONNECT_INTERVAL_MS = 50
 RECONNECT_MAX_MS = 1000
 CLOSE_LINGER_MS = 200
+MAX_BROKEN_HANDSHAKES = 5
 SEND_HIGH_WATER_MARK = 64
 # Results are bounded by the credit.  What adds up are signs of life, one every 5 s,
 # while a program does not read: beyond the mark the connection is taken for dead.
@@ -120,6 +121,7 @@ class Connection:
     def __init__(self, endpoint: str, key: ClientKey | None = None) -> None:
         self.endpoint = endpoint
         self.has_failed_handshake = False
+        self._n_broken_handshakes = 0
         self.is_up = False
         self.state = "not connected yet"
         self.n_connections = 0
@@ -170,13 +172,22 @@ class Connection:
             if kind & _UP:
                 self.is_up, self.state = True, "connected"
                 self.has_failed_handshake = False
+                self._n_broken_handshakes = 0
                 self.n_connections += 1
                 changes.append(True)
             elif kind & _DOWN:
                 self.is_up, self.state = False, "connection lost, trying again"
                 changes.append(False)
             else:
-                self.has_failed_handshake = True
+                # Without a reason it may be a wrong key, or a service under attack
+                # that had to close connections.
+                self._n_broken_handshakes += (
+                    kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+                )
+                self.has_failed_handshake = (
+                    kind != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+                    or self._n_broken_handshakes >= MAX_BROKEN_HANDSHAKES
+                )
                 self.state = f"the service refused the handshake ({event['value']})"
         return changes
 

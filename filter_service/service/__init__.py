@@ -7,6 +7,7 @@ devices         what filters side by side, as the settings name it
 door_process    the process of the door
 door            its loop: sessions, credit, answers while a frame is filtered
 mailbox         the ROUTER socket
+listening       the socket that it listens on
 authenticator   the ZAP handler: numbers connections, checks their keys
 connections     open connections, with a limit to their number
 descriptors     file descriptors: the limit, and a reserve

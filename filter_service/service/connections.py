@@ -13,9 +13,8 @@ import os
 import socket
 import struct
 import sys
-from collections import deque
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from filter_service.log_lines import ONCE_A_SECOND
@@ -29,13 +28,13 @@ CHECK_INTERVAL_S = 0.01
 MAX_CHECKED = 64
 """Connections looked at in one interval, 0.006 ms each."""
 
+GREETING_BYTES = 64
+"""Of ZMTP: what a client of ZeroMQ sends before anything else."""
+
 TCP_INFO_BYTES = 136
 BYTES_RECEIVED = struct.Struct("=Q")
 BYTES_RECEIVED_AT = 128
 """Place of `tcpi_bytes_received` in Linux's ``struct tcp_info``."""
-
-KEPT_RATIO = 0.9
-"""Of the most connections: so many are left when some have to go."""
 
 log = logging.getLogger("ocufilter")
 
@@ -81,7 +80,7 @@ class Connection:
     first_number: int
     number: int | None = None
     is_ended: bool = False
-    has_sent: bool = False  # a byte, at least
+    has_greeted: bool = False
     has_had_session: bool = False
     counted_bytes: int | None = None  # received, when its last message was complete
     rates: RateLimit = field(default_factory=RateLimit)
@@ -91,8 +90,8 @@ class Connections:
     """All connections, with a limit to their number.
 
     Where too many are open, the oldest ones without a session are closed, those first
-    that have sent nothing, and of the address that has most of them.  A client says
-    hello within milliseconds of connecting, so silent connections keep nobody out.
+    that have not sent a greeting, and of the address that has most of them.  A client
+    says hello within milliseconds of connecting, so others keep it out seldom.
 
     Parameters
     ----------
@@ -120,6 +119,8 @@ class Connections:
         self._with_session = with_session
         self._open: dict[int, Connection] = {}  # by descriptor, oldest first
         self._numbered: dict[int, Connection] = {}
+        # By address, those that may be closed for others, in the order to do so.
+        self._candidates: dict[str, dict[int, Connection]] = {}
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
         self._n_ending = 0  # shut down, and not reported as ended yet
@@ -144,6 +145,7 @@ class Connections:
         self.remove(descriptor)
         connection = Connection(descriptor, inode, address, next_number)
         self._open[descriptor] = connection
+        self._candidates.setdefault(address, {})[descriptor] = connection
 
     def remove(self, descriptor: int) -> int | None:
         """Note that a connection has ended; return its number if it has one."""
@@ -151,9 +153,17 @@ class Connections:
         if connection is None:
             return None
         self._n_ending -= connection.is_ended
+        self._forget_candidate(connection)
         if connection.number is not None:
             self._numbered.pop(connection.number, None)
         return connection.number
+
+    def _forget_candidate(self, connection: Connection) -> None:
+        candidates = self._candidates.get(connection.address)
+        if candidates is not None:
+            candidates.pop(connection.descriptor, None)
+            if not candidates:
+                del self._candidates[connection.address]
 
     def of_message(self, number: int, descriptor: int) -> Connection | None:
         """Return the connection of a message; None where it has ended meanwhile.
@@ -172,7 +182,6 @@ class Connections:
             found.number = number
             self._numbered[number] = found
         found.counted_bytes = None
-        found.has_had_session |= number in self._with_session
         return None if found.is_ended else found
 
     def is_open(self, number: int) -> bool:
@@ -195,36 +204,38 @@ class Connections:
 
     def evict(self) -> None:
         """Close connections without a session where there are too many."""
-        n_open = len(self._open) - self._n_ending
-        if n_open <= self.max_count:
+        n_surplus = len(self._open) - self._n_ending - self.max_count
+        if n_surplus <= 0:
             return
-        # Some more than necessary: to choose them takes 0.1 ms.
-        n_surplus = n_open - int(KEPT_RATIO * self.max_count)
-        idle = [
-            connection
-            for connection in self._open.values()
-            if connection.number not in self._with_session and not connection.is_ended
-        ]
-        # Before all others those that have not sent a byte: a handshake takes longer
-        # than a flood of them needs to come round.
-        silent: dict[str, deque[Connection]] = {}
-        others: dict[str, deque[Connection]] = {}
-        n_silent = 0
-        for connection in idle:
-            if not connection.has_sent and n_silent < n_surplus:
-                connection.has_sent = self._bytes_received(connection) > 0
-            n_silent += not connection.has_sent
-            found = others if connection.has_sent else silent
-            found.setdefault(connection.address, deque()).append(connection)
-        for _ in range(min(n_surplus, len(idle))):
-            from_queues = silent if any(silent.values()) else others
-            self._shut_down(max(from_queues.values(), key=len).popleft())
+        for _ in range(n_surplus):
+            candidates = max(self._candidates.values(), key=len, default=None)
+            if not candidates:
+                return
+            self._evict_one(candidates)
             self.n_evicted += 1
         log.warning(
             "%d connections are open, of %d; the oldest without a session are closed",
             *(len(self._open), self.max_count),
             extra=ONCE_A_SECOND,
         )
+
+    def _evict_one(self, candidates: dict[int, Connection]) -> None:
+        """Close the oldest connection without a greeting, else the oldest.
+
+        A handshake takes longer than a flood of connections needs to come round.
+        """
+        for _ in range(len(candidates)):
+            connection = next(iter(candidates.values()))
+            if connection.number in self._with_session:
+                del candidates[connection.descriptor]
+                continue
+            n_bytes = 0 if connection.has_greeted else self._bytes_received(connection)
+            if connection.has_greeted or n_bytes < GREETING_BYTES:
+                break
+            connection.has_greeted = True  # it is the last to go
+            candidates[connection.descriptor] = candidates.pop(connection.descriptor)
+        if candidates:
+            self._shut_down(next(iter(candidates.values())))
 
     def check_unread(self, now_s: float) -> None:
         """Close connections that fill libzmq's memory before they say hello."""
@@ -236,6 +247,7 @@ class Connections:
         checked = self._to_check[-MAX_CHECKED:]
         del self._to_check[-MAX_CHECKED:]
         for connection in checked:
+            connection.has_had_session |= connection.number in self._with_session
             if connection.has_had_session or connection.is_ended:
                 continue
             n_bytes = self._bytes_received(connection)
@@ -252,47 +264,45 @@ class Connections:
         """Have libzmq find the connection ended; it closes the descriptor itself."""
         connection.is_ended = True
         self._n_ending += 1
-        with suppress(OSError), self._socket_of(connection) as end:
-            end.shutdown(socket.SHUT_RDWR)
+        self._forget_candidate(connection)
+        end = self._borrowed(connection)
+        if end is not None:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.detach()
 
     def _bytes_received(self, connection: Connection) -> int:
         """Return what the system has received on a TCP connection; 0 for others."""
+        end = self._borrowed(connection)
+        if end is None:
+            return 0
         try:
-            with self._socket_of(connection) as end:
-                info = end.getsockopt(
-                    socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_BYTES
-                )
-            (n_bytes,) = BYTES_RECEIVED.unpack_from(info, BYTES_RECEIVED_AT)
+            info = end.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_BYTES)
+            return int(BYTES_RECEIVED.unpack_from(info, BYTES_RECEIVED_AT)[0])
         except (OSError, struct.error):  # a Unix socket, or an old kernel
             return 0
-        return int(n_bytes)
+        finally:
+            end.detach()
+
+    def _borrowed(self, connection: Connection) -> socket.socket | None:
+        """Return libzmq's socket, to be detached; None where it is another's by now."""
+        try:
+            if os.fstat(connection.descriptor).st_ino != connection.inode:
+                return None
+        except OSError:
+            return None
+        return self._socket_at(connection.descriptor)
+
+    def _socket_at(self, descriptor: int) -> socket.socket:
+        return socket.socket(self._family, socket.SOCK_STREAM, 0, fileno=descriptor)
 
     def _address(self, descriptor: int) -> str:
         """Return who is at the other end of a connection."""
-        with self._borrowed(descriptor) as end:
+        end = self._socket_at(descriptor)
+        try:
             if self._family != socket.AF_UNIX:
                 return str(end.getpeername()[0])
             credentials = end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
             return f"process {int.from_bytes(credentials[:4], sys.byteorder)}"
-
-    @contextmanager
-    def _socket_of(self, connection: Connection) -> Iterator[socket.socket]:
-        """Borrow libzmq's socket of a connection.
-
-        Raises
-        ------
-        OSError
-            The descriptor is another file's by now.
-        """
-        if os.fstat(connection.descriptor).st_ino != connection.inode:
-            raise OSError("the connection has ended")
-        with self._borrowed(connection.descriptor) as end:
-            yield end
-
-    @contextmanager
-    def _borrowed(self, descriptor: int) -> Iterator[socket.socket]:
-        end = socket.socket(self._family, socket.SOCK_STREAM, 0, fileno=descriptor)
-        try:
-            yield end
         finally:
             end.detach()

@@ -46,13 +46,13 @@ from filter_service.service.descriptors import DescriptorLimit
 from filter_service.service.frame_desk import FrameDesk
 from filter_service.service.guests import Guests
 from filter_service.service.link import Link, LinkClosed
+from filter_service.service.listening import socket_family
 from filter_service.service.mailbox import (
     Mailbox,
     Outcome,
     Received,
     Refused,
     Tracker,
-    socket_family,
 )
 from filter_service.service.metrics import serve_metrics
 from filter_service.service.process_info import resident_memory_mb

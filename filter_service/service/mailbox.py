@@ -12,8 +12,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from socket import AF_INET, AF_INET6, AF_UNIX, SOCK_STREAM, AddressFamily
-from socket import socket as unix_socket
 from typing import Any
 
 import zmq
@@ -22,6 +20,11 @@ from filter_service.keys import KeyRing
 from filter_service.service.authenticator import Authenticator, connection_of
 from filter_service.service.connections import Connection, Connections, Peer
 from filter_service.service.dropped_parts import drop_parts
+from filter_service.service.listening import (
+    BACKLOG,
+    check_path_is_free,
+    deferring_listener,
+)
 
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 # With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
@@ -29,9 +32,6 @@ SEND_HIGH_WATER_MARK = 128
 # Counts messages, so it is what bounds memory: with the default of 1000 an overload of
 # 720p frames took 1.5 GB.  More wait in the kernel, and the client is held back.
 RECEIVE_HIGH_WATER_MARK = 4
-# Longer, so that the first packet of a client is not lost where many connect at once:
-# the system sends it again only after a second.
-BACKLOG = 1024
 HANDSHAKE_LIMIT_MS = 10_000
 RETRY_S = 0.001
 KEEPALIVE_IDLE_S = 20
@@ -48,33 +48,6 @@ MONITORED = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 SEED_VARIABLE = "OCUFILTER_TEST_RANDOM_SEED"
 
 Tracker = zmq.MessageTracker
-
-
-def _check_path_is_free(bind: str) -> None:
-    """Refuse an ``ipc://`` path that holds a file or a live endpoint.
-
-    Binding removes whatever is at the path; only a dead socket may go that way.
-    """
-    if not bind.startswith("ipc://"):
-        return
-    path = Path(bind.removeprefix("ipc://"))
-    if not path.exists():
-        return
-    if not path.is_socket():
-        raise FileExistsError(f"{path} is there already and is no socket")
-    with unix_socket(AF_UNIX, SOCK_STREAM) as probe:
-        try:
-            probe.connect(str(path))
-        except OSError:
-            return
-    raise FileExistsError(f"another service listens on {path}")
-
-
-def socket_family(bind: str) -> AddressFamily:
-    """Return of what kind the connections of an endpoint are."""
-    if bind.startswith("ipc://"):
-        return AF_UNIX
-    return AF_INET6 if bind.startswith("tcp://[") else AF_INET
 
 
 class Outcome(enum.Enum):
@@ -179,8 +152,13 @@ class Mailbox:
             socket.monitor(MONITOR_ENDPOINT, MONITORED)
             self._monitor.connect(MONITOR_ENDPOINT)
             self._authenticator.guard(socket)
-            _check_path_is_free(bind)
+            check_path_is_free(bind)
+            listener = deferring_listener(bind)
+            if listener is not None:
+                socket.use_fd = listener.fileno()
             socket.bind(bind)
+            if listener is not None:
+                listener.detach()  # it is libzmq's now
         except (zmq.ZMQError, OSError, ValueError) as error:
             self.close()
             raise OSError(f"cannot listen on {bind}: {error}") from None

@@ -82,6 +82,15 @@ def small_frame(frame_id: int, size_px=(320, 180)) -> Frame:
 
 def bare(endpoint: str, duration_s: float) -> dict:
     """1,500 connections that say nothing; those that are closed are opened again."""
+    return _hold(endpoint, duration_s, b"")
+
+
+def one_byte(endpoint: str, duration_s: float) -> dict:
+    """The same with one byte each."""
+    return _hold(endpoint, duration_s, b"\xff")
+
+
+def _hold(endpoint: str, duration_s: float, opening: bytes) -> dict:
     raise_limit()
     address, held, counts = as_address(endpoint), [], Counter()
     end_s = time.monotonic() + duration_s
@@ -91,6 +100,7 @@ def bare(endpoint: str, duration_s: float) -> dict:
             connection.settimeout(0.5)
             try:
                 connection.connect(address)
+                connection.sendall(opening)
                 connection.setblocking(False)
                 held.append(connection)
                 counts["opened"] += 1
@@ -334,7 +344,7 @@ def hoard(endpoint: str, duration_s: float) -> dict:
 ATTACKS = {
     function.__name__: function
     for function in (
-        *(bare, half_greeted, silent_dealers, chosen_ids),
+        *(bare, one_byte, half_greeted, silent_dealers, chosen_ids),
         *(profiles, pings, unread, parts, parts_in_session, hoard),
     )
 }

@@ -57,10 +57,16 @@ def cpu_s(pid):
 
 
 @pytest.mark.parametrize(
-    ("n_files", "has_keys"),
-    [(256, True), pytest.param(1024, False, marks=pytest.mark.slow), (160, False)],
+    ("attack_name", "n_files", "has_keys"),
+    [
+        ("one_byte", 256, True),
+        pytest.param("one_byte", 1024, False, marks=pytest.mark.slow),
+        ("bare", 160, False),
+    ],
 )
-def test_silent_connections_keep_nobody_out(ring, tmp_path, n_files, has_keys):
+def test_connections_without_a_session_keep_nobody_out(
+    ring, tmp_path, attack_name, n_files, has_keys
+):
     settings = {"keys_dir": str(ring.folder)} if has_keys else {}
     key_file = tmp_path / "lab.toml" if has_keys else None
     view = make_view()
@@ -71,7 +77,7 @@ def test_silent_connections_keep_nobody_out(ring, tmp_path, n_files, has_keys):
         streaming.set_profile(EYE, views=[view])
         before = service.pids()
         attack = subprocess.Popen(
-            [*ATTACK, "bare", service.endpoint, "4"],
+            [*ATTACK, attack_name, service.endpoint, "4"],
             cwd=CHECKOUT,
             stdout=subprocess.PIPE,
             text=True,
@@ -87,9 +93,10 @@ def test_silent_connections_keep_nobody_out(ring, tmp_path, n_files, has_keys):
                 n_newcomers += 1
         assert n_newcomers > 3
         counts, _ = attack.communicate()
-        assert json.loads(counts)["opened"] > 1500
+        assert json.loads(counts)["opened"] >= 1500
         assert service.pids() == before
-        assert "the oldest without a session are closed" in service.log
+        if attack_name == "one_byte":  # the others never got out of the kernel
+            assert "the oldest without a session are closed" in service.log
         time.sleep(0.5)
         begin_s = cpu_s(before["door"])
         time.sleep(1.0)
