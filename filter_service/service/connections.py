@@ -289,9 +289,9 @@ class Connections:
         try:
             if os.fstat(connection.descriptor).st_ino != connection.inode:
                 return None
-        except OSError:
+            return self._socket_at(connection.descriptor)
+        except OSError:  # libzmq closes it at any time
             return None
-        return self._socket_at(connection.descriptor)
 
     def _socket_at(self, descriptor: int) -> socket.socket:
         return socket.socket(self._family, socket.SOCK_STREAM, 0, fileno=descriptor)

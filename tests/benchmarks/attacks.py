@@ -12,8 +12,8 @@ import struct
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 
-import numpy as np
 import zmq
 
 from filter_service.messages import (
@@ -27,6 +27,7 @@ from filter_service.messages import (
     decode_reply,
     encode,
 )
+from tests.benchmarks.mutated_messages import examples, mutated, view_of
 
 N_BARE = 1500
 N_PARTS = 6_000_000
@@ -63,21 +64,10 @@ def dealer(endpoint: str, *, identity: bytes = b"", **options):
 
 
 def small_frame(frame_id: int, size_px=(320, 180)) -> Frame:
-    """Return a frame of grey."""
-    width, height = size_px
-    header = (
-        ViewHeader.of_size(width, height) if hasattr(ViewHeader, "of_size") else None
-    )
-    color = np.full((height, width, 3), 128, np.uint8)
-    depth_m = np.full((height, width), 2.0, np.float32)
-    if header is None:
-        from clients.filter_client import RgbdView
-        from filter_service.camera import tangents_from_fov
-
-        view = RgbdView(color, depth_m, tangents_from_fov(60.0, width, height))
-        header = ViewHeader.describing(view)
-    images = (ViewImages(color, depth_m),)
-    return Frame(frame_id, (header,), 4.0, 0.0, images=images)
+    """Return a frame of noise."""
+    view = view_of(size_px)
+    header, images = ViewHeader.describing(view), ViewImages(view.color, view.depth_m)
+    return Frame(frame_id, (header,), 4.0, 0.0, images=(images,))
 
 
 def bare(endpoint: str, duration_s: float) -> dict:
@@ -341,11 +331,78 @@ def hoard(endpoint: str, duration_s: float) -> dict:
     return counts
 
 
+def garbage(endpoint: str, rng: random.Random) -> None:
+    """Random bytes, before and after the greeting."""
+    with socket.create_connection(as_address(endpoint), 5.0) as connection:
+        start = rng.choice([b"", GREETING[: rng.randrange(65)], GREETING])
+        connection.sendall(start + rng.randbytes(rng.randrange(1, 400)))
+
+
+def claim(endpoint: str, rng: random.Random) -> socket.socket:
+    """A part that says it is very long, and never comes."""
+    connection = spoken_to(endpoint)
+    size = rng.choice([2**62, 2**63 - 1, 2**40, 90_000_000])
+    connection.sendall(b"\x03" + struct.pack(">Q", size) + b"x" * 10_000)
+    return connection
+
+
+def endless(endpoint: str, n_bytes: int) -> socket.socket:
+    """A message of parts that never ends."""
+    connection = spoken_to(endpoint)
+    part = b"\x03" + struct.pack(">Q", 10**6) + bytes(10**6)
+    try:
+        for _ in range(n_bytes // 10**6):
+            connection.sendall(part)
+    except OSError:
+        pass
+    return connection
+
+
+def raw_sockets(endpoint: str, duration_s: float) -> dict:
+    """Garbage, idle connections, claims of 2^62 bytes, messages without an end."""
+    raise_limit()
+    rng, counts = random.Random(1), Counter()
+    held: list[socket.socket] = []
+    end_s = time.monotonic() + duration_s
+    for _ in range(500):
+        held.append(socket.create_connection(as_address(endpoint), 5.0))
+    for _ in range(8):
+        with suppress(OSError):
+            held.append(endless(endpoint, 45_000_000))
+    while time.monotonic() < end_s:
+        with suppress(OSError):
+            garbage(endpoint, rng)
+            held.append(claim(endpoint, rng))
+            counts["connections"] += 2
+        time.sleep(0.002)
+        if len(held) > 800:
+            held.pop(300).close()
+    for connection in held:
+        connection.close()
+    return counts
+
+
+def mutated_messages(endpoint: str, duration_s: float) -> dict:
+    """Messages with something wrong, as fast as they go; the answers by kind."""
+    rng, kinds, counts = random.Random(1), examples(), Counter()
+    context, client = dealer(endpoint)
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        with suppress(zmq.Again):
+            client.send_multipart(mutated(rng, rng.choice(kinds)) or [b""])
+            counts["sent"] += 1
+        _read(client, counts)
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
 ATTACKS = {
     function.__name__: function
     for function in (
         *(bare, one_byte, half_greeted, silent_dealers, chosen_ids),
         *(profiles, pings, unread, parts, parts_in_session, hoard),
+        *(raw_sockets, mutated_messages),
     )
 }
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from clients.filter_client import Dropped, FilterClient, FilteredFrame
 from clients.service_process import ServiceProcess
-from tests.benchmarks.bench_abuse import view_of
 from tests.benchmarks.harness import Row, publish
+from tests.benchmarks.mutated_messages import view_of
 
 SIZE_PX = (640, 360)
 RATE_HZ = 10.0

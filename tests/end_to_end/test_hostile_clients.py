@@ -143,6 +143,7 @@ def test_a_routing_id_opens_no_session(start_service, named):
     victim = named(service, b"camera")
     welcome = victim.begin(mark=7)
     victim.socket.close(linger=0)  # without a word
+    wait_until(lambda: "its client is gone" in service.log)
     thief = named(service, b"camera")
     refused = thief.ask(small_frame(1))
     assert (refused.code, refused.frame_id) == ("no_session", 1)
@@ -189,6 +190,7 @@ def test_a_session_key_is_worth_nothing_with_another_client_s_key(
     victim = named(service, b"one", tmp_path / "lab.toml")
     key = victim.begin(mark=7).session_key
     victim.socket.close(linger=0)
+    wait_until(lambda: "its client is gone" in service.log)
     thief = named(service, b"one", tmp_path / "other.toml")
     assert not thief.ask(Hello("thief", key)).is_resumed
     assert thief.ask(small_frame(1)).code == "no_profile"
