@@ -1,8 +1,10 @@
 """A page in people's hands: `ocufilter web`.
 
 program        the command
-server         NiceGUI within a guard, and a websocket for pictures
+server         NiceGUI within a guard and limits, and a websocket for pictures
 guard          who may open the page
+bounds         limits on requests
+connections    and on connections
 page           the page, and what becomes of every entry
 page_state     what a page holds, without the page
 eye_panel      the entries of one eye
@@ -11,6 +13,7 @@ worn_form      what is worn, as entries
 numbers        numbers that people type, with their limits
 slider_row     a slider with its name and value
 upload_entry   an entry for a file
+file_names     names of files, made safe
 scene_panel    what is looked at, chosen
 picture        a picture with depth, in full and small
 chart          a letter chart as a picture

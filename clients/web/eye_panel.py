@@ -6,7 +6,12 @@ from collections.abc import Callable
 
 from nicegui import events, ui
 
-from clients.web.eye_form import PROFILE_SUFFIXES, EyeForm, preset_titles
+from clients.web.eye_form import (
+    MAX_PROFILE_BYTES,
+    PROFILE_SUFFIXES,
+    EyeForm,
+    preset_titles,
+)
 from clients.web.numbers import NumberField
 from clients.web.slider_row import THROTTLE_S
 from clients.web.upload_entry import upload_entry
@@ -116,9 +121,9 @@ class EyePanel:
         return entry
 
     def _file(self) -> None:
-        upload_entry("Profile", ",".join(PROFILE_SUFFIXES), self._take_file).classes(
-            "oc-wide"
-        ).mark("profile-file")
+        upload_entry(
+            "Profile", ",".join(PROFILE_SUFFIXES), MAX_PROFILE_BYTES, self._take_file
+        ).classes("oc-wide").mark("profile-file")
         text = (
             f"In use: {self.form.file_name}"
             if self.form.file_name
@@ -196,11 +201,9 @@ class EyePanel:
         self.form.correct_fully()
         self._changed()
 
-    async def _take_file(self, event: events.UploadEventArguments) -> None:
-        event.sender.reset()  # ready for another
-        content = await event.file.read()
+    async def _take_file(self, name: str, content: bytes) -> None:
         try:
-            age_years = self.form.take_file(event.file.name, content)
+            age_years = self.form.take_file(name, content)
         except ValueError as error:
             ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
             return

@@ -1,14 +1,15 @@
 """Who may open the page: whoever has the token that was printed with its address.
 
 An ASGI layer around the whole application, files and websockets alike.  The first
-visit with the token in the address gets a cookie and is sent on without the token.
+visit with the token in the address gets a cookie and is redirected to the address
+without the token.  Requests from other sites are refused even with the cookie.
 """
 
 from __future__ import annotations
 
 import hmac
-from collections.abc import Awaitable, Callable, Mapping
-from http.cookies import CookieError, SimpleCookie
+from collections.abc import Awaitable, Callable, Collection, Mapping
+from html import escape
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -16,99 +17,189 @@ Scope = Mapping[str, Any]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 Application = Callable[[Any, Any, Any], Awaitable[None]]
 
-FORBIDDEN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>ocufilter: no entry</title>
-<style>body{font:16px/1.5 system-ui,sans-serif;color:#1b2430;background:#f4f6f8;
-max-width:34rem;margin:15vh auto;padding:0 1.5rem}code{background:#e3e8ee;
-padding:.1em .35em;border-radius:4px}</style>
-<h1>This page wants its token</h1>
-<p>Open the whole address that <code>ocufilter web</code> printed when it started; it
-ends with <code>?token=...</code>.  After a restart the token is another one.</p>
+<title>ocufilter</title>
+<style>body{{font:16px/1.5 system-ui,sans-serif;color:#1b2430;background:#f4f6f8;
+max-width:34rem;margin:15vh auto;padding:0 1.5rem}}code{{background:#e3e8ee;
+padding:.1em .35em;border-radius:4px}}</style>
+<h1>{title}</h1>
+{text}
 """
+FORBIDDEN_PAGE = PAGE.format(
+    title="This page wants its token",
+    text="<p>Open the whole address that <code>ocufilter web</code> printed when it "
+    "started; it ends with <code>?token=...</code>.  After a restart the token is "
+    "another one.</p>",
+).encode()
+HEADERS = [
+    (b"content-security-policy", b"frame-ancestors 'none'"),
+    (b"x-frame-options", b"DENY"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"referrer-policy", b"no-referrer"),
+]
+"""Of every response: other pages can neither frame this one nor embed its files."""
+
 POLICY_VIOLATION = 1008
 """Code with which a websocket is closed that may not be opened."""
 
 
 class Guard:
-    """Lets through what brings the token, in the address or as a cookie.
+    """Pass on requests that have the token, in the address or as a cookie.
 
     Parameters
     ----------
     app : ASGI application
     token : str
     cookie : str
-        Name of the cookie; cookies know no ports, so that it should.
+        Name of the cookie; it should contain the port, as cookies do not know ports.
+    opening : str, optional
+        A token that works once.  It is for the command line of a browser, which other
+        users of the machine can read.
+    hosts : collection of str, optional
+        Host names that requests may be addressed to; any if not given.
     """
 
-    def __init__(self, app: Application, *, token: str, cookie: str) -> None:
+    def __init__(
+        self,
+        app: Application,
+        *,
+        token: str,
+        cookie: str,
+        opening: str | None = None,
+        hosts: Collection[str] | None = None,
+    ) -> None:
         self.app = app
         self._token, self._cookie = token, cookie
+        self._opening, self._hosts = opening, hosts
 
     async def __call__(self, scope: Any, receive: Any, send: Send) -> None:
         """Answer one connection."""
         kind = scope["type"]
         if kind not in ("http", "websocket"):  # the server's own start and end
             await self.app(scope, receive, send)
+        elif not self._is_addressed_to_us(scope):
+            await _refuse(kind, receive, send, 421, page_of("There is no such host"))
         elif kind == "http" and self._has_token(scope):
-            await self._welcome(scope, send)
+            await self._welcome(send)
         elif self._has_cookie(scope) and is_from_here(scope):
-            await self.app(scope, receive, send)
-        elif kind == "http":
-            await _answer(send, 403, FORBIDDEN_PAGE.encode())
+            await self.app(scope, receive, _with_headers(send))
         else:
-            await receive()  # its request to connect
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION})
+            await _refuse(kind, receive, send, 403, FORBIDDEN_PAGE)
+
+    def _is_addressed_to_us(self, scope: Scope) -> bool:
+        """Return whether the Host header names us.
+
+        Otherwise the browser may have found our address under a name of another site.
+        """
+        return self._hosts is None or host_name(header(scope, b"host")) in self._hosts
 
     def _has_token(self, scope: Scope) -> bool:
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])
-        return self._is_token(given[0])
+        query = scope["query_string"].decode("latin-1")
+        given = parse_qs(query).get("token", [""])[0]
+        if _is_same(given, self._token):
+            return True
+        if self._opening is None or not _is_same(given, self._opening):
+            return False
+        self._opening = None
+        return True
 
     def _has_cookie(self, scope: Scope) -> bool:
-        try:
-            jar = SimpleCookie(_header(scope, b"cookie"))
-        except CookieError:
-            return False
-        return self._cookie in jar and self._is_token(jar[self._cookie].value)
+        # Not with http.cookies: it takes 13 s for a header of 64 kB of backslashes, and
+        # nothing from a header in which another program's cookie is JSON.
+        pairs = (part.partition("=") for part in header(scope, b"cookie").split(";"))
+        return any(
+            name.strip() == self._cookie and _is_same(value.strip(), self._token)
+            for name, _, value in pairs
+        )
 
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
-
-    async def _welcome(self, scope: Scope, send: Send) -> None:
+    async def _welcome(self, send: Send) -> None:
         cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
         # the token stays neither in the address bar nor in the browser's history
         headers = [
             (b"set-cookie", cookie.encode("latin-1")),
             (b"location", b"/"),
         ]
-        await _answer(send, 303, b"", headers)
+        await answer(send, 303, b"", headers)
+
+
+def _is_same(given: str, token: str) -> bool:
+    return hmac.compare_digest(given.encode(), token.encode())
 
 
 def is_from_here(scope: Scope) -> bool:
     """Return whether a request comes from our own page, or from no page at all.
 
     A page of another port of this machine brings our cookie along; its origin tells.
+    Where a request has no origin, browsers say in `Sec-Fetch-Site` whose it is; another
+    site may only link to the page.
     """
-    origin = _header(scope, b"origin")
-    return not origin or urlsplit(origin).netloc == _header(scope, b"host")
+    if header(scope, b"sec-fetch-site") in ("same-site", "cross-site"):
+        mode = header(scope, b"sec-fetch-mode"), header(scope, b"sec-fetch-dest")
+        if mode != ("navigate", "document"):
+            return False
+    origin = header(scope, b"origin")
+    try:
+        return not origin or urlsplit(origin).netloc == header(scope, b"host")
+    except ValueError:  # no address at all
+        return False
 
 
-def _header(scope: Scope, name: bytes) -> str:
+def host_name(host: str) -> str | None:
+    """Return the name in a Host header, without the port; None where there is none."""
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None
+
+
+def header(scope: Scope, name: bytes) -> str:
+    """Return the value of a header; an empty text without one."""
     values = [value for key, value in scope["headers"] if key == name]
     return b"; ".join(values).decode("latin-1")
 
 
-async def _answer(
+def page_of(title: str) -> bytes:
+    """Return a page with one line of text."""
+    return PAGE.format(title=escape(title), text="").encode()
+
+
+def _with_headers(send: Send) -> Send:
+    async def send_more(message: Mapping[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            names = {name for name, _ in HEADERS}
+            given = [
+                pair for pair in message.get("headers", ()) if pair[0] not in names
+            ]
+            message = {**message, "headers": given + HEADERS}
+        await send(message)
+
+    return send_more
+
+
+async def _refuse(
+    kind: str, receive: Any, send: Send, status: int, page: bytes
+) -> None:
+    if kind == "http":  # what is left of its body is not read
+        await answer(send, status, page, [(b"connection", b"close")])
+    else:
+        await receive()  # its request to connect
+        await send({"type": "websocket.close", "code": POLICY_VIOLATION})
+
+
+async def answer(
     send: Send,
     status: int,
     body: bytes,
     headers: list[tuple[bytes, bytes]] | None = None,
 ) -> None:
+    """Answer a request with a page."""
     common = [
         (b"content-type", b"text/html; charset=utf-8"),
         (b"cache-control", b"no-store"),
-        (b"referrer-policy", b"no-referrer"),
         (b"content-length", str(len(body)).encode()),
+        *HEADERS,
     ]
     await send(
         {

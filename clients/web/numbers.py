@@ -65,6 +65,12 @@ class NumberField:
             raise ValueError(f"{shown:.20} is out of range; allowed: {self.allowed}")
         return value
 
+    def within(self, sent: object) -> float | None:
+        """Return what a browser sent, within the limits; None where it is no number."""
+        if not isinstance(sent, int | float) or math.isnan(sent):
+            return None
+        return float(min(max(sent, self.low), self.high))
+
     def problem(self, text: str) -> str | None:
         """Return what is wrong with a text, or None."""
         try:

@@ -213,11 +213,11 @@ class Page:
         ui.notify(f"{SIDES[other]}: as the {SIDES[side].lower()}", timeout=2000)
 
     async def _point(self, event: events.GenericEventArguments) -> None:
-        place = event.args
-        await self.figures.point(place["eye"], place["x"], place["y"])
+        if event.args["eye"] in SIDES:
+            await self.figures.point(event.args["eye"], *_share(event))
 
     def _look(self, event: events.GenericEventArguments) -> None:
-        self.state.look_at(event.args["x"], event.args["y"])
+        self.state.look_at(*_share(event))
         self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
         self.wish()
 
@@ -289,6 +289,12 @@ class Page:
         self.desk.seeing.forget(self.name)
         self.desk.studying.forget(self.name)
         self.desk.out.pop(self.name, None)
+
+
+def _share(event: events.GenericEventArguments) -> tuple[float, float]:
+    """Return a place in the picture, from 0, 0 to 1, 1, whatever was sent."""
+    x, y = (min(max(float(event.args[name]), 0.0), 1.0) for name in "xy")
+    return x, y
 
 
 def _sentence(note: str) -> str:

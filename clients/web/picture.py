@@ -23,6 +23,13 @@ SMALL_WIDTH_PX = 480
 
 LEAST_SIDE_PX = 16
 MAX_PHOTO_BYTES = 60_000_000
+MAX_PHOTO_PIXELS = 64_000_000
+"""A file of 200 kB may be a picture of any size."""
+
+PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+"""By content, whatever the name: others run programs (EPS) or have rare readers."""
+
+DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 FAR_DPT = 0.0
 DEPTH_HELP = ".npy or .exr in metres, 16-bit .png in millimetres, float .tif"
 
@@ -197,9 +204,8 @@ def _resized(
     """Return colour with fewer pixels: each the light around it."""
     if color.shape[:2] == (height_px, width_px):
         return color
-    light = linear_from_srgb8(color)
     planes = [
-        Image.fromarray(light[..., c]).resize(
+        Image.fromarray(linear_from_srgb8(color[..., c])).resize(
             (width_px, height_px), Image.Resampling.HAMMING
         )
         for c in range(3)
@@ -211,11 +217,18 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
     allowed = "allowed: a JPEG, PNG, WebP or TIFF picture of 8 bits"
     _check_size(name, content)
     try:
-        with Image.open(io.BytesIO(content)) as image:
-            upright = ImageOps.exif_transpose(image)
-            color = np.asarray(upright.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError):
+        with Image.open(io.BytesIO(content), formats=PHOTO_FORMATS) as image:
+            n_pixels = image.width * image.height
+            if n_pixels <= MAX_PHOTO_PIXELS:
+                upright = ImageOps.exif_transpose(image)
+                color = np.asarray(upright.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise ValueError(f"“{name:.60}” is no picture; {allowed}") from None
+    if n_pixels > MAX_PHOTO_PIXELS:
+        raise ValueError(
+            f"“{name:.60}” has {n_pixels / 1e6:.0f} million pixels; allowed: "
+            f"{MAX_PHOTO_PIXELS / 1e6:.0f} million"
+        )
     if min(color.shape[:2]) < LEAST_SIDE_PX:
         size = f"{color.shape[1]} × {color.shape[0]} px"
         raise ValueError(f"“{name:.60}” is {size}; allowed: {LEAST_SIDE_PX} or more")
@@ -226,8 +239,12 @@ def _photo_depth(
     name: str, content: bytes, *, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
     _check_size(name, content)
+    suffix = Path(name).suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        allowed = ", ".join(DEPTH_SUFFIXES)
+        raise ValueError(f"“{name:.60}” is no depth; allowed: {allowed}")
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
-        path = Path(folder) / f"depth{Path(name).suffix.lower()}"
+        path = Path(folder) / f"depth{suffix}"
         path.write_bytes(content)
         try:
             depth_m = read_depth(path, option="")

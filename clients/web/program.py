@@ -3,12 +3,14 @@
     ocufilter web
     ocufilter web --profile myopia --port 8080 --no-browser
 
-Serves this machine alone, with a token in the address that it prints.
+Serves this machine alone, with a token in the address that it prints; `--host` lets
+other machines in.
 """
 
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import json
 import secrets
 import signal
@@ -24,6 +26,10 @@ from clients.extra import WEB_INSTALL
 
 DEFAULT_PORT = 8765
 TOKEN_BYTES = 24
+EXPOSED = (
+    "web: other machines can reach this page over unencrypted HTTP; whoever reads the "
+    "traffic has the token"
+)
 
 
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -42,8 +48,16 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve; others than the default let other machines in, "
-        "unencrypted, with the token (default: 127.0.0.1)",
+        help="address to serve; 0.0.0.0 or an address of a network lets other machines "
+        "in, unencrypted, with the token (default: 127.0.0.1)",
+    )
+    parser.add_argument(
+        "--proxy-host",
+        action="append",
+        default=[],
+        metavar="HOST",
+        help="host name that a proxy on this machine leaves in requests; may be "
+        "repeated.  Without --host only localhost and these names are answered",
     )
     parser.add_argument(
         "--no-browser", action="store_true", help="print the address and open nothing"
@@ -88,6 +102,8 @@ def open_socket(host: str, port: int) -> socket.socket:
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port is {port}; allowed: 0 to 65535")
+    if not host:  # the system would take it for all addresses
+        raise ValueError("--host is empty; expected an address, as 127.0.0.1")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
@@ -107,29 +123,51 @@ def address_of(host: str, port: int, token: str) -> str:
     return f"http://{shown}:{port}/?token={token}"
 
 
+def hosts_of(listening: socket.socket, names: Sequence[str]) -> set[str] | None:
+    """Return the names that requests may be addressed to; None where any may be.
+
+    A page that only this machine reaches has few names.  One that others reach may have
+    any, and there the cookie alone keeps out the pages of other sites.
+    """
+    address = listening.getsockname()[0]
+    if not ipaddress.ip_address(address).is_loopback:
+        return None
+    return {"localhost", "127.0.0.1", "::1", address, *map(str.lower, names)}
+
+
 def serve(options: argparse.Namespace) -> int:
     """Serve until the end; return the exit code."""
     profile = read_profile(options.profile)
     listening = open_socket(options.host, options.port)
     port = listening.getsockname()[1]
-    token = secrets.token_urlsafe(TOKEN_BYTES)
+    hosts = hosts_of(listening, options.proxy_host)
+    if hosts is None:
+        print(EXPOSED, file=sys.stderr, flush=True)
+    token, opening = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
     from clients.web.server import make_server
 
-    address = address_of(options.host, port, token)
-    server = make_server(token, port, profile, on_ready=lambda: _tell(address, options))
+    addresses = [address_of(options.host, port, t) for t in (token, opening)]
+    server = make_server(
+        token,
+        port,
+        profile,
+        opening=None if options.no_browser else opening,
+        hosts=hosts,
+        on_ready=lambda: _tell(*addresses, options),
+    )
     # the server stops by itself, then hands the signal on: to an orderly end
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.run(sockets=[listening])
     return 0
 
 
-def _tell(address: str, options: argparse.Namespace) -> None:
+def _tell(address: str, opening: str, options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps({"address": address}), flush=True)
     else:
         print(f"Open {address}\nCtrl-C ends it.", flush=True)
     if not options.no_browser:  # may wait for the browser
-        threading.Thread(target=webbrowser.open, args=[address], daemon=True).start()
+        threading.Thread(target=webbrowser.open, args=[opening], daemon=True).start()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

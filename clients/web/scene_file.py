@@ -8,6 +8,8 @@ scene takes seconds in which the page should answer.
 
 from __future__ import annotations
 
+import json
+import struct
 import subprocess
 import sys
 import tempfile
@@ -24,6 +26,8 @@ from filter_service import RgbdView
 TIMEOUT_S = 300.0
 SIZE_PX = (960, 540)
 GLTF_SUFFIXES = (".glb", ".gltf")
+MAX_GLTF_BYTES = 200_000_000
+_GLB_HEADER = struct.Struct("<4sIIII")
 TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
 _CHECKOUT = Path(__file__).resolve().parents[2]
 # There `-m` finds our packages whatever the folder; installed ones are found anyway.
@@ -62,6 +66,7 @@ def gltf_picture(name: str, content: bytes) -> Picture:
             f"“{name:.60}” is no scene; allowed: {', '.join(GLTF_SUFFIXES)}, with its "
             "pictures and meshes inside"
         )
+    _check_is_self_contained(name, content)
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
         path = Path(folder) / f"scene{suffix}"
         path.write_bytes(content)
@@ -71,6 +76,38 @@ def gltf_picture(name: str, content: bytes) -> Picture:
             raise SceneNotRendered(
                 str(error).replace(str(path), Path(name).name)
             ) from None
+
+
+def _check_is_self_contained(name: str, content: bytes) -> None:
+    """Refuse a glTF file that names other files: they would be this machine's.
+
+    Whether the file is a right one is the reader's part.
+    """
+    text = content
+    if content.startswith(b"glTF") and len(content) >= _GLB_HEADER.size:
+        length = _GLB_HEADER.unpack_from(content)[3]
+        text = content[_GLB_HEADER.size :][:length]
+    try:
+        header = json.loads(text)
+        uris = _uris(header)
+    except (ValueError, RecursionError):
+        raise ValueError(f"“{name:.60}” is no glTF 2 file") from None
+    for uri in uris:
+        if not uri.startswith("data:"):
+            raise ValueError(
+                f"“{name:.60}” refers to another file, “{uri:.60}”; expected a .glb, "
+                "or a .gltf with its pictures and meshes inside"
+            )
+
+
+def _uris(part: object) -> list[str]:
+    """Return all addresses in the header of a glTF file, wherever they stand."""
+    if isinstance(part, list):
+        return [uri for each in part for uri in _uris(each)]
+    if not isinstance(part, dict):
+        return []
+    own = part.get("uri")
+    return [str(own)] * (own is not None) + _uris(list(part.values()))
 
 
 def _rendered(source: str, title: str, folder: Path) -> Picture:

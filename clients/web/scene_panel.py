@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -9,19 +10,33 @@ from nicegui import events, run, ui
 
 from clients.web.chart import chart_picture
 from clients.web.page_state import DISTANCE, PageState
-from clients.web.picture import DEPTH_HELP, Picture, photo_picture
+from clients.web.picture import (
+    DEPTH_HELP,
+    DEPTH_SUFFIXES,
+    MAX_PHOTO_BYTES,
+    Picture,
+    photo_picture,
+)
 from clients.web.scene_file import (
     GLTF_SUFFIXES,
+    MAX_GLTF_BYTES,
     TITLES,
     SceneNotRendered,
     gltf_picture,
     scene_picture,
 )
-from clients.web.upload_entry import upload_entry
+from clients.web.upload_entry import Taking, upload_entry
 
 KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
 FIRST = "courtyard"
+MAX_AT_ONCE = 2
+"""Pictures that are made at the same time; a photo of 64 Mpx takes 0.6 GB."""
+
+MAX_WAITING = 4
+"""Pictures of one page that are being made or wait for it, each with its file."""
+
+_turns = asyncio.Semaphore(MAX_AT_ONCE)
 
 
 class ScenePanel:
@@ -35,6 +50,7 @@ class ScenePanel:
     def __init__(self, state: PageState, on_picture: Callable[[Picture], None]) -> None:
         self._state, self._on_picture = state, on_picture
         self._kind = FIRST
+        self._n_waiting = 0
         self._photo: tuple[str, bytes] | None = None
         self._depth: tuple[str, bytes] | None = None
         self._width_deg = 35
@@ -52,11 +68,13 @@ class ScenePanel:
             return
         with ui.element("div").classes("oc-uploads"):
             if self._kind == "gltf":
-                self._upload("glTF 2 scene", ",".join(GLTF_SUFFIXES), self._take_gltf)
+                suffixes = ",".join(GLTF_SUFFIXES)
+                self._upload("glTF 2 scene", suffixes, MAX_GLTF_BYTES, self._take_gltf)
                 return
-            self._upload("Photo", "image/*", self._take_photo)
+            self._upload("Photo", "image/*", MAX_PHOTO_BYTES, self._take_photo)
+            suffixes = ",".join(DEPTH_SUFFIXES)
             self._upload(
-                "Its depth, if known", ".npy,.png,.tif,.tiff,.exr", self._take_depth
+                "Its depth, if known", suffixes, MAX_PHOTO_BYTES, self._take_depth
             )
             with ui.element("div").classes("oc-photo-width"):
                 ui.select(
@@ -71,8 +89,8 @@ class ScenePanel:
                 self._used = ui.label().classes("oc-note")
                 self._in_use()
 
-    def _upload(self, label: str, accept: str, take) -> None:
-        upload_entry(label, accept, take).mark(label)
+    def _upload(self, label: str, accept: str, most_bytes: int, take: Taking) -> None:
+        upload_entry(label, accept, most_bytes, take).mark(label)
 
     def _in_use(self) -> None:
         """Say which files the picture is of."""
@@ -93,16 +111,16 @@ class ScenePanel:
         elif self._kind == "photo":
             await self._show_photo()
 
-    async def _take_gltf(self, event: events.UploadEventArguments) -> None:
-        await self._make(gltf_picture, *await _sent(event))
+    async def _take_gltf(self, name: str, content: bytes) -> None:
+        await self._make(gltf_picture, name, content)
 
-    async def _take_photo(self, event: events.UploadEventArguments) -> None:
-        self._photo = await _sent(event)
+    async def _take_photo(self, name: str, content: bytes) -> None:
+        self._photo = name, content
         self._depth = None  # that of another photo
         await self._show_photo()
 
-    async def _take_depth(self, event: events.UploadEventArguments) -> None:
-        self._depth = await _sent(event)
+    async def _take_depth(self, name: str, content: bytes) -> None:
+        self._depth = name, content
         if self._photo is None:
             ui.notify("Now the photo that this is the depth of", type="info")
             return
@@ -127,21 +145,21 @@ class ScenePanel:
 
     async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
         """Show the picture that a function makes, or say why there is none."""
+        if self._n_waiting >= MAX_WAITING:
+            ui.notify("Still busy with the last pictures; try again", type="warning")
+            return False
         kind = self._kind
         self._busy.set_visibility(True)
+        self._n_waiting += 1
         try:
-            picture = await run.io_bound(make, *args, **options)
+            async with _turns:
+                picture = await run.io_bound(make, *args, **options)
         except (ValueError, SceneNotRendered) as error:
             ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
             return False
         finally:
-            self._busy.set_visibility(False)
+            self._n_waiting -= 1
+            self._busy.set_visibility(self._n_waiting > 0)
         if picture is not None and kind == self._kind:  # else another was chosen
             self._on_picture(picture)
         return True
-
-
-async def _sent(event: events.UploadEventArguments) -> tuple[str, bytes]:
-    """Return name and content of a file; the entry is ready for another."""
-    event.sender.reset()
-    return event.file.name, await event.file.read()

@@ -7,6 +7,7 @@ one once the hand has rested, and it is given up as soon as the hand moves on.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,9 @@ POLL_S = 0.002
 
 STALE_S = 0.5
 """A small picture that takes longer is not waited for where the wish is another."""
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -85,6 +89,12 @@ class _Page:
             self.show(seen)
         return seen is not None
 
+    def give_up(self, reason: str) -> None:
+        """Drop what is wanted, and say so."""
+        wish, self.newest, self.in_hand = self.in_hand, None, None
+        for side in wish.bodies if wish else ():
+            self.show(Seen("failed", side, wish.number, b"", {"error": reason}))
+
     def close(self) -> None:
         for eye in self.eyes.values():
             eye.close()
@@ -137,6 +147,11 @@ class Seeing:
 
     def _step_all(self) -> Iterator[float]:
         for page in list(self._pages.values()):
-            wait_s = page.step()
+            try:
+                wait_s = page.step()
+            except Exception as error:  # of one page; the others go on
+                _log.exception("A picture failed")
+                page.give_up(f"{type(error).__name__}: {error}")
+                continue
             if wait_s is not None:
                 yield wait_s

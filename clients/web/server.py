@@ -1,15 +1,18 @@
-"""The page's server: NiceGUI within a guard, and a websocket for pictures."""
+"""The page's server: NiceGUI behind a guard and limits, a websocket for pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, WebSocket
-from nicegui import ui
+from fastapi.exception_handlers import http_exception_handler
+from nicegui import app, ui
 
+from clients.web.bounds import MAX_MESSAGE_BYTES, MAX_PAGES, Bounds
+from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from clients.web.guard import POLICY_VIOLATION, Guard
 from clients.web.page import PICTURES_PATH, Desk, add_page
 
@@ -24,9 +27,16 @@ def make_server(
     port: int,
     profile: tuple[Mapping[str, Any], str] | None,
     *,
+    opening: str | None = None,
+    hosts: Collection[str] | None = None,
     on_ready: Callable[[], None],
 ) -> uvicorn.Server:
-    """Return the server; its sockets are given to its `run`."""
+    """Return the server; its sockets are given to its `run`.
+
+    Parameters
+    ----------
+    opening, hosts : as the guard has them
+    """
     desk: list[Desk] = []
 
     @asynccontextmanager
@@ -57,9 +67,24 @@ def make_server(
         message_history_length=MESSAGE_HISTORY,
         show_welcome_message=False,
     )
-    guarded = Guard(application, token=token, cookie=f"ocufilter-{port}")
+    # NiceGUI's own makes a page for each address that there is not
+    app.add_exception_handler(404, http_exception_handler)
+    bounded = Bounds(application, is_full=lambda: len(desk[0].out) >= MAX_PAGES)
+    guarded = Guard(
+        bounded,
+        token=token,
+        cookie=f"ocufilter-{port}",
+        opening=opening,
+        hosts=hosts,
+    )
     return uvicorn.Server(
         uvicorn.Config(
-            guarded, log_level="warning", timeout_graceful_shutdown=FAREWELL_S
+            guarded,
+            log_level="warning",
+            timeout_graceful_shutdown=FAREWELL_S,
+            http=BoundedConnection,
+            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            ws_max_size=MAX_MESSAGE_BYTES,
+            server_header=False,
         )
     )

@@ -50,10 +50,11 @@ class SliderRow:
                 throttle=THROTTLE_S,
             )
 
-    def _moved(self, value: float) -> None:
-        value = float(value)
-        self._told.text = self._words(value)
-        self._on_move(value)
+    def _moved(self, sent: object) -> None:
+        value = self.number.within(sent)
+        if value is not None:
+            self._told.text = self._words(value)
+            self._on_move(value)
 
     def show(self, value: float) -> None:
         """Show a value that came from elsewhere."""

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Awaitable, Callable
 
-from nicegui import ui
+from nicegui import events, ui
+
+from clients.web.file_names import plain_name
+
+Taking = Callable[[str, bytes], Awaitable[None]]
 
 
-def upload_entry(label: str, accept: str, take: Callable[[Any], Any]) -> ui.upload:
+def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.upload:
     """Return an entry for a file.
 
     Parameters
     ----------
     accept : as HTML has it: the browser itself refuses other files, and says nothing
-    take : called with each file
+    most_bytes : a larger file is refused before it is in memory
+    take : called with the name and the content of each file
     """
     allowed = "a picture" if accept == "image/*" else accept.replace(",", ", ")
+    allowed += f", up to {most_bytes / 1e6:g} MB"
 
     def refuse() -> None:
         ui.notify(f"{label}: not such a file; allowed: {allowed}", type="negative")
 
+    async def check(event: events.UploadEventArguments) -> None:
+        event.sender.reset()  # ready for another
+        if event.file.size() > most_bytes:  # the browser was to refuse it
+            refuse()
+        else:
+            await take(plain_name(event.file.name), await event.file.read())
+
     entry = ui.upload(
-        auto_upload=True, label=label, on_upload=take, on_rejected=refuse
+        auto_upload=True,
+        label=label,
+        max_file_size=most_bytes,
+        on_upload=check,
+        on_rejected=refuse,
     ).props(f'accept="{accept}" flat bordered')
     return entry.classes("oc-upload")

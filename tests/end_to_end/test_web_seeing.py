@@ -1,5 +1,6 @@
 """The thread behind the page: small picture, then full; the newest wish wins."""
 
+import dataclasses
 import io
 import json
 import queue
@@ -116,3 +117,17 @@ def test_what_cannot_be_seen_is_told_and_the_next_is_seen(seeing, screen):
     assert "pupil_diameter_mm: it is 40.0" in failed.facts["error"]
     seeing.wish("page", wish(2))
     screen.until("full", 2)
+
+
+def test_a_fault_of_one_page_does_not_end_the_others(seeing, screen):
+    other = Screen()
+    seeing.open("other", other.seen.put)
+    broken = dataclasses.replace(wish(1), gaze_deg=("far", 0.0))
+    seeing.wish("other", broken)
+    failed = other.until("failed", 1)[-1]
+    assert failed.facts["error"]
+    seeing.wish("page", wish(1))
+    screen.until("full", 1)
+    seeing.wish("other", wish(2))
+    other.until("full", 2)
+    seeing.forget("other")

@@ -143,7 +143,7 @@ def test_the_command_filters_in_a_hidden_window(started, tmp_path, display):
         told = outcome(program)
         complaints = program.complaints()
         assert program.exit_code() == 0
-    assert told["report"]["filtered"] == 30
+    assert told["filtered"] == 30
     assert complaints == []
 
 

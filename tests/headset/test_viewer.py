@@ -80,7 +80,7 @@ def test_frames_with_both_layers_are_taken_and_eyes_differ(started, tmp_path, ro
         complaints = viewer.complaints()
     (session,) = [line["session"] for line in lines if "session" in line]
     assert session["has_depth"]
-    (report,) = [line["report"] for line in lines if "report" in line]
+    (report,) = [line for line in lines if "filtered" in line]
     assert report["filtered"] == N_FRAMES
     assert report["repeated"] == 0
     frames = [line["frame"] for line in lines if "frame" in line]
@@ -190,8 +190,8 @@ def test_through_a_service_pictures_keep_their_poses(started, tmp_path, room, se
             monado, tmp_path, *arguments, "--service", endpoint, "--validate"
         ) as viewer:
             for line in viewer.lines():
-                if "report" in line:
-                    report = line["report"]
+                if "filtered" in line:
+                    report = line
                 if "frame" not in line:
                     continue
                 frame = line["frame"]

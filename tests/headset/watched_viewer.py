@@ -2,9 +2,10 @@
 
     python -m tests.headset.watched_viewer --scene room.glb --frames 300
 
-Its arguments are the command's.  Lines: ``{"session": ...}`` where one begins,
-``{"frame": ...}`` with the views that the runtime asked for and those that were shown,
-``{"report": ...}`` at the end.  What the command says goes to stderr.
+Its arguments are the command's, with `--json`.  Each line is a JSON object:
+``{"session": ...}`` when a session begins, ``{"frame": ...}`` with the views that the
+runtime requested and the views that the viewer showed, and at the end the report that
+`ocufilter headset --json` prints.  The command's messages go to stderr.
 """
 
 import json
@@ -45,9 +46,7 @@ def as_json(view):
 
 def main() -> int:
     openxr_runtime.OpenXrRuntime = WatchedRuntime
-    options = program.arguments_of(sys.argv[1:])
-    tell(report=program.run(options))
-    return 0
+    return program.main([*sys.argv[1:], "--json"])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Pictures to look at: photos, depth, the chart, and places in them."""
 
 import io
+import json
 import math
 
 import numpy as np
@@ -144,3 +145,67 @@ def test_the_small_picture_is_small_enough():
         np.zeros((50, 961, 3), np.uint8), np.ones((50, 961), np.float32), (-1, 1, 1, -1)
     )
     assert picture_of("x", view).small.width_px == 320
+
+
+def test_a_photo_is_known_by_its_content(color):
+    """Whatever its name; of other formats some readers start programs."""
+    for kind in ("eps", "pcx", "ppm", "ico"):
+        file = io.BytesIO()
+        Image.fromarray(color).save(file, kind)
+        with pytest.raises(ValueError, match=r"no picture; allowed: a JPEG"):
+            photo_picture("photo.png", file.getvalue(), **FLAT)
+
+
+def test_a_photo_of_few_bytes_and_many_pixels_is_not_read():
+    file = io.BytesIO()
+    Image.new("1", (10_000, 7_000)).save(file, "png")
+    assert len(file.getvalue()) < 20_000
+    with pytest.raises(ValueError, match=r"70 million pixels; allowed: 64 million"):
+        photo_picture("photo.png", file.getvalue(), **FLAT)
+
+
+@pytest.mark.parametrize("name", ["d.png\0.npy\0", "d." + 300 * "x", "d", "d./../x"])
+def test_a_depth_of_another_name_is_not_written(color, name):
+    with pytest.raises(ValueError, match=r"is no depth; allowed: \.npy, \.png"):
+        photo_picture("p.png", _png(color), depth=(name, b"1"), **FLAT)
+
+
+def _gltf(**header):
+    return json.dumps({"asset": {"version": "2.0"}, **header}).encode()
+
+
+def _glb(text):
+    text += b" " * (-len(text) % 4)
+    sizes = [n.to_bytes(4, "little") for n in (2, 20 + len(text), len(text))]
+    return b"glTF" + b"".join(sizes) + b"JSON" + text
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "file:///etc/passwd",
+        "/etc/passwd",
+        "../../../../etc/passwd",
+        "beside.bin",
+        "http://127.0.0.1/x",
+        "DATA:,x",
+        " data:,x",
+        "",
+    ],
+)
+@pytest.mark.parametrize("part", ["buffers", "images", "extensions"])
+def test_a_scene_does_not_read_other_files(uri, part):
+    place = {"uri": uri, "byteLength": 9}
+    text = _gltf(**{part: {"x": [place]} if part == "extensions" else [place]})
+    for name, content in (("s.gltf", text), ("s.glb", _glb(text)), ("s.glb", text)):
+        with pytest.raises(ValueError, match="refers to another file"):
+            gltf_picture(name, content)
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[" * 100_000, b'{"a":' * 100_000, b"\xff\xfe", b"glTF", b"{"]
+)
+def test_a_scene_that_is_none_is_refused_before_anything_is_started(text):
+    for name, content in (("s.gltf", text), ("s.glb", _glb(text))):
+        with pytest.raises(ValueError, match="is no glTF 2 file"):
+            gltf_picture(name, content)

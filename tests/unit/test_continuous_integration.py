@@ -1,0 +1,95 @@
+"""`.ci/run` runs every suite that the README names, and reports each outcome."""
+
+import os
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from tests.source_tree import ROOT
+
+MAKE = """#!/bin/sh
+echo "made $1"
+case " $BROKEN " in *" $1 "*) exit 2 ;; esac
+"""
+
+
+def _suites() -> list[str]:
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    return re.search(r"^SUITES=\((.*)\)$", script, re.MULTILINE)[1].split()
+
+
+def test_every_suite_of_the_readme_runs():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = re.findall(
+        r"^    make (check|test|test-[a-z-]+) ", readme, flags=re.MULTILINE
+    )
+    assert sorted(_suites()) == sorted(named)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return how to run a copy of the script with stand-ins for make and the set-up."""
+    programs = {"bin/make": MAKE, "tests/headset/setup_root.sh": "exit $HEADSET_STATUS"}
+    for name, text in programs.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True)
+        path.write_text(text, encoding="utf-8")
+        path.chmod(0o755)
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci/run", tmp_path / ".ci/run")
+
+    def run(*suites, broken="", headset_status=0):
+        environment = {
+            "PATH": f"{tmp_path}/bin:{os.environ['PATH']}",
+            "BROKEN": broken,
+            "HEADSET_STATUS": str(headset_status),
+            "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        }
+        return subprocess.run(
+            ["bash", str(tmp_path / ".ci/run"), *suites],
+            cwd=tmp_path,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+
+    return run
+
+
+def _summary(finished) -> dict[str, str]:
+    """Return the outcome of each suite, by the lines after the last heading."""
+    lines = finished.stdout.split("summary")[-1].splitlines()[1:]
+    return {line.split()[0]: line.split(" s  ", 1)[1] for line in lines}
+
+
+def test_all_suites_pass_one_after_another(run):
+    finished = run()
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    assert re.findall(r"^made (.*)$", finished.stdout, re.MULTILINE) == _suites()
+    assert _summary(finished) == dict.fromkeys(_suites(), "passed")
+
+
+def test_a_failed_suite_does_not_stop_the_others(run):
+    finished = run(broken="check test-web")
+    assert finished.returncode == 1
+    outcomes = _summary(finished)
+    assert list(outcomes) == _suites()
+    failed = [name for name, outcome in outcomes.items() if "FAILED" in outcome]
+    assert failed == ["check", "test-web"]
+
+
+def test_a_suite_that_cannot_run_here_is_skipped_and_reported(run):
+    finished = run(headset_status=77)
+    assert finished.returncode == 0
+    assert _summary(finished)["test-headset"].startswith("skipped")
+    assert "made test-headset" not in finished.stdout
+
+
+def test_a_headset_root_that_cannot_be_finished_is_a_failure(run):
+    finished = run("test-headset", headset_status=1)
+    assert finished.returncode == 1
+    assert "FAILED" in _summary(finished)["test-headset"]
