@@ -17,6 +17,7 @@ Importing this loads nothing but names: clients stay light.
     progress         how far long work is, said on stderr
     constants        numbers that Python and GLSL share
     image_files      pictures and depth in files
+    bounded_images   the decoders, within limits of memory
     gl_device        which device OpenGL works on, as a user names it
     threads          numba's thread layer
     one_blas_thread  numpy on one thread

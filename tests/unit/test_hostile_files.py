@@ -1,0 +1,285 @@
+"""Hostile files: refused by one exception, before they cost memory or time."""
+
+import pickle
+import struct
+import time
+import zlib
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from estimator.bounded_files import InvalidFile, loads_bounded, read_json, read_text
+from estimator.profiles.files import load_profile
+from filter_service.bounded_images import MAX_PIXELS
+from filter_service.commands.display_file import display_of_file
+from filter_service.image_files import read_color, read_depth
+
+
+def refused(read, path, said=None):
+    """Read a file that must be refused within a second; return the error."""
+    start_s = time.perf_counter()
+    with pytest.raises(InvalidFile, match=said) as caught:
+        read(path)
+    assert time.perf_counter() - start_s < 1.0
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def png(width, height, *, extra=b""):
+    """Return a PNG with a valid header and few pixels."""
+
+    def chunk(kind, data):
+        end = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + end
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = zlib.compress(bytes(100))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + extra
+        + chunk(b"IDAT", data)
+        + chunk(b"IEND", b"")
+    )
+
+
+# ----- pictures
+
+
+def test_a_png_of_169_megapixels_is_refused_by_its_header(tmp_path):
+    path = tmp_path / "large.png"
+    path.write_bytes(png(13000, 13000))
+    error = refused(read_color, path, "13000x13000 px")
+    assert f"{MAX_PIXELS:,}" in error.allowed
+    refused(lambda p: read_depth(p, depth_scale=1.0), path, "13000x13000 px")
+
+
+@pytest.mark.parametrize("sides", [(2**31 - 1, 2**31 - 1), (0, 5), (65536, 65536)])
+def test_sides_that_no_picture_has(tmp_path, sides):
+    path = tmp_path / "a.png"
+    path.write_bytes(png(*sides))
+    refused(read_color, path)
+
+
+def test_a_png_of_a_million_chunks(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(
+        png(8, 8, extra=(struct.pack(">I", 0) + b"abCd" + bytes(4)) * 10**6)
+    )
+    refused(read_color, path, "chunks")
+
+
+def test_a_text_chunk_that_unpacks_to_a_gigabyte(tmp_path):
+    data = b"Comment\0\0" + zlib.compress(bytes(2**30 // 16), 9)
+    chunk = struct.pack(">I", len(data)) + b"zTXt" + data
+    chunk += struct.pack(">I", zlib.crc32(b"zTXt" + data))
+    path = tmp_path / "a.png"
+    path.write_bytes(png(8, 8, extra=chunk))
+    refused(read_color, path, "cannot be read")
+
+
+def test_a_truncated_picture(tmp_path, rng):
+    whole = tmp_path / "whole.png"
+    Image.fromarray(rng.integers(0, 256, (64, 64, 3), np.uint8)).save(whole)
+    path = tmp_path / "cut.png"
+    path.write_bytes(whole.read_bytes()[:500])
+    refused(read_color, path, "cannot be read")
+
+
+def test_another_format_under_a_known_name(tmp_path):
+    path = tmp_path / "a.png"
+    Image.new("RGB", (8, 8)).save(path, "GIF")
+    refused(read_color, path, "no known kind of picture")
+
+
+def test_a_jpeg_of_many_scans(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (2048, 2048)).save(path, progressive=True)
+    content = path.read_bytes()
+    path.write_bytes(content[:-2] + content[content.rindex(b"\xff\xda") :] * 300)
+    refused(read_color, path, "scans")
+
+
+def test_a_tiff_tag_of_many_values(tmp_path):
+    path = tmp_path / "a.tif"
+    entry = struct.pack("<HHLL", 273, 4, 2**30, 8)
+    path.write_bytes(b"II*\0" + struct.pack("<LH", 8, 1) + entry + bytes(4))
+    refused(read_depth, path, "tag 273")
+
+
+def test_a_plain_pgm_that_would_take_a_minute(tmp_path):
+    path = tmp_path / "a.pgm"
+    path.write_bytes(b"P2 8000 8000 65535\n" + b"1 " * 1000)
+    refused(read_depth, path, "samples")
+
+
+# ----- .npy
+
+
+def npy(header, data=b"", version=b"\1\0"):
+    """Return a .npy file with a header as given."""
+    width = "<H" if version[0] == 1 else "<I"
+    head = header.encode()
+    return b"\x93NUMPY" + version + struct.pack(width, len(head)) + head + data
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (100000, 100000, 3), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (4294967296, 4294967296), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 4), }",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }",
+        "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (1,), }",
+        "{'descr': '<f99', 'fortran_order': False, 'shape': (1,), }",
+        "{'descr': '<f4', 'fortran_order': False, }",
+        "{'descr': '<f4', 'fortran_order': 1, 'shape': (1,), }",
+        "{" * 5000,
+        "(" * 9000,
+        "'",
+        "{'descr': '\x00",
+        "",
+    ],
+)
+@pytest.mark.parametrize("version", [b"\1\0", b"\2\0", b"\3\0"])
+def test_npy_headers_that_lie(tmp_path, header, version):
+    path = tmp_path / "a.npy"
+    path.write_bytes(npy(header, bytes(64), version))
+    refused(read_color, path)
+    refused(read_depth, path)
+
+
+def test_a_npy_file_whose_shape_is_more_than_it_holds(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.ones((40, 60), np.float32))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"(40, 60)", b"(41, 60)"))
+    refused(read_depth, path, r"shape \(41, 60\) of float32 in 9,600 bytes")
+
+
+def test_a_sparse_npy_file_beyond_the_limit(tmp_path):
+    path = tmp_path / "a.npy"
+    path.write_bytes(
+        npy("{'descr': '<f8', 'fortran_order': False, 'shape': (20000, 20000), }")
+    )
+    with path.open("r+b") as file:
+        file.truncate(20000 * 20000 * 8 + 200)
+    refused(read_depth, path, "3,200,000,000 bytes")
+
+
+@pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f2", "<u2", ">i4", "|u1", "<f8"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_npy_files_come_back_as_numpy_reads_them(tmp_path, dtype, order):
+    stored = np.arange(35).reshape(5, 7).astype(dtype, order=order)
+    np.save(tmp_path / "a.npy", stored)
+    expected = np.load(tmp_path / "a.npy") * np.float64(0.5)
+    found = read_depth(tmp_path / "a.npy", depth_scale=0.5)
+    np.testing.assert_array_equal(found, expected.astype(np.float32))
+
+
+# ----- OpenEXR
+
+
+@pytest.mark.parametrize("side", [20_000, 2**30])
+def test_an_exr_of_a_large_window_is_refused_by_its_header(tmp_path, side, capfd):
+    path = tmp_path / "a.exr"
+    with OpenEXR.File(
+        {"type": OpenEXR.scanlineimage}, {"Z": np.ones((8, 8), np.float32)}
+    ) as file:
+        file.write(str(path))
+    content = bytearray(path.read_bytes())
+    at = content.index(b"dataWindow\0box2i\0") + 21
+    content[at : at + 16] = struct.pack("<4i", 0, 0, side - 1, side - 1)
+    path.write_bytes(content)
+    refused(read_depth, path)
+    assert capfd.readouterr().err == ""
+
+
+# ----- profiles and other text
+
+
+DEEP = {
+    "eye.json": '{"a":' * 100_000,
+    "list.json": "[" * 1_000_000,
+    "closed.json": '{"kind": ' + "[" * 40 + "]" * 40 + "}",
+    "digits.json": '{"kind": "preset", "age_years": ' + "9" * 5000 + "}",
+    "bits.json": '{"kind": "preset", "age_years": 99999999999999999999999}',
+    "long.json": "[" + "1," * 1_500_000 + "1]",
+    "half.json": '{"kind": "\\ud800"}',
+    "five.json": "5",
+    "eye.abp": "Z[2,0] = 1\n" * 30_000,
+    "digits.abp": f"Z[{'9' * 5000},0] = 1\n",
+    "eye.csv": f"{'9' * 5000},0,1\n",
+    "sign.csv": "--2,0,1\n",
+    "null.csv": "2,0,1\0\n",
+    "huge.csv": "#" * 3_000_000,
+}
+
+
+@pytest.mark.parametrize("name", DEEP)
+def test_profile_files_that_are_none(tmp_path, name):
+    path = tmp_path / name
+    path.write_text(DEEP[name])
+    error = refused(load_profile, path)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_a_profile_with_a_wrong_field_names_file_and_field(tmp_path):
+    path = tmp_path / "eye.json"
+    path.write_text('{"kind": "preset", "name": "nobody"}')
+    error = refused(load_profile, path, "name")
+    assert error.field == "name" and "myopia" in error.allowed
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["1,2\n" * 50, "nan,1,2,3\nnan,1,2,3\n", "1e308,1,2,3\n2e308,1,2,3", "", "\0"],
+)
+def test_display_files_that_hold_no_spectra(tmp_path, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    refused(lambda p: display_of_file(str(p)), path)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\0", b"\n" * 300_000, b"a\0b"])
+def test_text_that_is_none(tmp_path, content):
+    path = tmp_path / "a.txt"
+    path.write_bytes(content)
+    refused(read_text, path)
+
+
+def test_what_is_no_regular_file(tmp_path):
+    path = tmp_path / "a.json"
+    path.mkdir()
+    refused(read_json, path, "not a regular file")
+    refused(read_json, tmp_path / "absent.json", "no such file")
+
+
+def test_json_bounds():
+    assert loads_bounded(b'\xef\xbb\xbf{"a": [1, 2.5]}', max_bytes=99) == {
+        "a": [1, 2.5]
+    }
+    for text, said in (
+        ('{"a": 1, "a": 2}', "twice"),
+        ("[" * 33 + "]" * 33, "deep"),
+        ("[1, 2, 3]", "3 values"),
+        ("[" + "9" * 4000 + "]", "bits"),
+        ("[" + "9" * 5000 + "]", "digits"),
+        ("[NaN]", "finite"),
+        ("[1e999]", "finite"),
+        ("9" * 100, "bytes"),
+        ('["\\udc00"]', "surrogate"),
+        ("\xff", "decode"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            loads_bounded(
+                text.encode("latin-1"),
+                max_bytes=8000 if "bytes" not in said else 99,
+                max_items=3 if "values" in said else 100,
+                finite=True,
+            )
+    assert loads_bounded(b"[" * 32 + b"]" * 32, max_bytes=99) is not None
+    assert loads_bounded(b'["\\ud83d\\ude00"]', max_bytes=99) == ["\U0001f600"]
