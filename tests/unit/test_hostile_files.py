@@ -10,11 +10,13 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from clients.headset.gltf_scene import load_gltf
 from estimator.bounded_files import InvalidFile, loads_bounded, read_json, read_text
 from estimator.profiles.files import load_profile
 from filter_service.bounded_images import MAX_PIXELS
 from filter_service.commands.display_file import display_of_file
 from filter_service.image_files import read_color, read_depth
+from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
 
 
 def refused(read, path, said=None):
@@ -283,3 +285,125 @@ def test_json_bounds():
             )
     assert loads_bounded(b"[" * 32 + b"]" * 32, max_bytes=99) is not None
     assert loads_bounded(b'["\\ud83d\\ude00"]', max_bytes=99) == ["\U0001f600"]
+
+
+# ----- glTF
+
+
+def textured(image):
+    """Return changes of a header that give its triangle an image."""
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}
+    texture = {"baseColorTexture": {"index": 0}}
+    return {
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": texture}],
+        "textures": [{"source": 0}],
+        "images": [image],
+    }
+
+
+def nested(count):
+    """Return nodes within each other."""
+    return [{"mesh": 0, "children": [k + 1]} for k in range(count)] + [{"mesh": 0}]
+
+
+def position(**fields):
+    """Return accessors of which the first has other fields."""
+    first, *rest = triangle_header()["accessors"]
+    return {"accessors": [first | fields, *rest]}
+
+
+GLTF = {
+    "nested nodes": ({"nodes": nested(5000)}, "more than 1000 deep"),
+    "a circle": ({"nodes": [{"children": [1]}, {"children": [0]}]}, "stands twice"),
+    "two parents": ({"nodes": [{"children": [1, 1]}, {}]}, "stands twice"),
+    "a child": ({"nodes": [{"children": [-1]}]}, "node -1"),
+    "many nodes": (
+        {"scenes": [{"nodes": list(range(40_000))}], "nodes": [{"mesh": 0}] * 40_000},
+        "40,000 parts",
+    ),
+    "a count": (position(count=2**31), "ends at byte 25,769,803,776"),
+    "an end": (position(count=4), "ends at byte 48"),
+    "an offset": (position(byteOffset=2**39), "ends at byte"),
+    "zeros": (
+        {"accessors": [{"componentType": 5126, "count": 2**33, "type": "VEC3"}] * 3},
+        "triangles",
+    ),
+    "a type": (position(type="MAT4"), "type is 'MAT4'"),
+    "a float": (position(count=3.0), "count is 3.0"),
+    "a view": (
+        {"bufferViews": [{"buffer": 0, "byteLength": 2**33}] * 3},
+        "ends at byte 8,589,934,592",
+    ),
+    "a buffer": ({"buffers": []}, "'buffers' 0"),
+    "a matrix": ({"nodes": [{"mesh": 0, "matrix": [1e308] * 16}]}, "no triangles"),
+    "a scale": (
+        {
+            "nodes": [
+                {"children": [1], "scale": [1e200] * 3},
+                {"mesh": 0, "scale": [1e200] * 3},
+            ]
+        },
+        "finite numbers",
+    ),
+    "no list": ({"meshes": {"0": 1}}, "not a list"),
+    "a huge image": (textured({"uri": "large.png"}), "13000x13000"),
+    "http": (textured({"uri": "http://a.example/b.png"}), "a file in its folder"),
+    "an absolute path": (textured({"uri": "/etc/passwd"}), "a file in its folder"),
+    "another folder": (textured({"uri": "../secret.png"}), "leads out of its folder"),
+    "coded": (textured({"uri": "%2e%2e/secret.png"}), "leads out of its folder"),
+    "a link": (textured({"uri": "link.png"}), "leads out of its folder"),
+    "absent": (textured({"uri": "absent.png"}), "no such file"),
+    "a null byte": (textured({"uri": "a\0.png"}), "leads out of its folder"),
+    "a URI": (textured({"uri": "data:image/png;base64,AAA"}), "not base64"),
+}
+
+
+@pytest.mark.parametrize("case", GLTF)
+def test_gltf_files_that_are_refused(tmp_path, case):
+    changes, said = GLTF[case]
+    (tmp_path / "secret.png").write_bytes(png(8, 8))
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "large.png").write_bytes(png(13000, 13000))
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    path = folder / "a.glb"
+    path.write_bytes(glb(triangle_header(**changes), triangle_bytes()))
+    refused(load_gltf, path, said)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b'{"asset": {"version": "2.0"}, "extras": ' + b'{"a":' * 100_000,
+        b"[" * 1_000_000,
+        b'{"asset": {"version": 2' + b"0" * 5000 + b"}}",
+        b'{"asset": {"version": NaN}}',
+        b"\xff",
+    ],
+)
+def test_gltf_headers_that_are_refused(tmp_path, header):
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb(header))
+    refused(load_gltf, path, "not a glTF file")
+
+
+def test_a_triangle_out_of_range_and_one_that_is_fine(tmp_path):
+    path = tmp_path / "a.glb"
+    data = bytearray(triangle_bytes())
+    path.write_bytes(glb(triangle_header(), bytes(data)))
+    scene = load_gltf(path)
+    assert scene.n_triangles == 1
+    np.testing.assert_array_equal(scene.batches[0].vertices_m[:, 2], -2.0)
+    data[60] = 7
+    path.write_bytes(glb(triangle_header(), bytes(data)))
+    refused(load_gltf, path, "vertex 7")
+
+
+def test_a_gltf_texture_beside_it_is_read(tmp_path):
+    (tmp_path / "a b.png").write_bytes(b"")
+    Image.new("RGB", (8, 8), (1, 2, 3)).save(tmp_path / "a b.png")
+    header = triangle_header(**textured({"uri": "a%20b.png"}))
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb(header, triangle_bytes()))
+    assert tuple(load_gltf(path).batches[0].texture[0, 0]) == (1, 2, 3)
