@@ -36,19 +36,20 @@ class InvalidProfileFile(InvalidFile, ProfileError):
     Attributes
     ----------
     field : str
-        The line, or the dotted path of the field at fault.
+        The line, or the dotted path of the field at fault; may be empty.
     """
 
     def __init__(
         self, path: str | Path, field: str, problem: str, allowed: str
     ) -> None:
-        InvalidFile.__init__(self, path, f"{field}: {problem}", allowed)
+        found = f"{field}: {problem}" if field else problem
+        InvalidFile.__init__(self, path, found, allowed)
         self.field = field
+        self._problem = problem
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle makes it from."""
-        problem = self.found.removeprefix(f"{self.field}: ")
-        return type(self), (self.path, self.field, problem, self.allowed)
+        return type(self), (self.path, self.field, self._problem, self.allowed)
 
 
 def load_profile(
@@ -86,10 +87,7 @@ def load_profile(
             raise
         problem = str(error).removeprefix(f"profile field '{error.field}': ")
         problem = problem.removesuffix(f"; allowed: {error.allowed}")
-        field = f"profile field '{error.field}'"
-        invalid = InvalidProfileFile(source, field, problem, error.allowed)
-        invalid.field = error.field
-        raise invalid from None
+        raise InvalidProfileFile(source, error.field, problem, error.allowed) from None
 
 
 def profile_body(
@@ -124,8 +122,7 @@ def profile_body(
     try:
         text = read_text(path, max_bytes=MAX_PROFILE_BYTES, max_lines=MAX_PROFILE_LINES)
     except InvalidFile as error:
-        field = path.name
-        raise InvalidProfileFile(path, field, error.found, error.allowed) from None
+        raise InvalidProfileFile(path, "", error.found, error.allowed) from None
     body = reader(text, path)
     if reader is _read_csv:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
@@ -138,10 +135,10 @@ def _read_json(text: str, path: Path) -> dict[str, Any]:
         body = loads_bounded(text.encode(), max_bytes=MAX_PROFILE_BYTES)
     except ValueError as error:
         problem = f"not JSON ({reason_of(error)})"
-        raise InvalidProfileFile(path, path.name, problem, "one JSON object") from None
+        raise InvalidProfileFile(path, "", problem, "one JSON object") from None
     if not isinstance(body, dict):
         problem = f"{body!r:.60} is not an object"
-        raise InvalidProfileFile(path, path.name, problem, "one JSON object")
+        raise InvalidProfileFile(path, "", problem, "one JSON object")
     return body
 
 

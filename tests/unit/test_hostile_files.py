@@ -10,12 +10,30 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from clients.arguments import read_object
+from clients.batch.layout_middlebury import read_calibration
+from clients.batch.layout_nyu import KinectCounts
+from clients.batch.layout_tum import tum_frames
+from clients.batch.manifest import Manifest, below, records_of
+from clients.batch.states import read_states
+from clients.batch.whole_files import write_whole
 from clients.headset.gltf_scene import load_gltf
 from estimator.bounded_files import InvalidFile, loads_bounded, read_json, read_text
+from estimator.eye.checked_fields import ProfileError
 from estimator.profiles.files import load_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
+from estimator.profiles.parse import parse_profile
 from filter_service.bounded_images import MAX_PIXELS
+from filter_service.building import from_profile
+from filter_service.building.jobs import BuildJob
+from filter_service.camera import Camera
 from filter_service.commands.display_file import display_of_file
+from filter_service.errors import BuildFailed, GridTooLarge
 from filter_service.image_files import read_color, read_depth
+from filter_service.planning.defocus_nodes import _spread
+from filter_service.planning.plan import plan_cache
+from filter_service.settings import FilterSettings
+from tests.grid_specs import grid_spec
 from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
 
 
@@ -407,3 +425,204 @@ def test_a_gltf_texture_beside_it_is_read(tmp_path):
     path = tmp_path / "a.glb"
     path.write_bytes(glb(header, triangle_bytes()))
     assert tuple(load_gltf(path).batches[0].texture[0, 0]) == (1, 2, 3)
+
+
+# ----- data sets
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("1.0 /etc/passwd", "leads out of the data set"),
+        ("1.0 rgb/../../secret.png", "leads out of the data set"),
+        ("nan rgb/a.png", "not a time"),
+        ("1e999 rgb/a.png", "not a time"),
+        ("1.0", "1 fields"),
+        ("1.0 a\0.png", "not a text file"),
+        ("\n" * 300_000, "lines"),
+    ],
+)
+def test_lists_of_frames_that_are_refused(tmp_path, line, said):
+    (tmp_path / "depth.txt").write_text("1.0 depth/a.png\n")
+    path = tmp_path / "rgb.txt"
+    path.write_text(line + "\n")
+    refused(lambda p: tum_frames(p.parent), path, said)
+
+
+def test_a_list_of_thousands_of_times_within_a_moment_is_read_at_once(tmp_path):
+    for name in ("rgb", "depth"):
+        lines = [f"{k * 1e-7:.7f} {name}/{k}.png" for k in range(3000)]
+        (tmp_path / f"{name}.txt").write_text("\n".join(lines))
+    start_s = time.perf_counter()
+    assert len(tum_frames(tmp_path)) == 3000
+    assert time.perf_counter() - start_s < 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "'cam0' is missing"),
+        ("cam0=[1.2.3 0 1; 0 1 1; 0 0 1]\ndoffs=0\nbaseline=1", "cam0 is"),
+        ("cam0=[1e300 0 1; 0 1 1; 0 0 1]\ndoffs=0\nbaseline=1", "cam0 is"),
+        ("cam0=[9 0 1; 0 9 1; 0 0 1]\ndoffs=nan\nbaseline=1", "no number"),
+        ("cam0=" + " 1" * 50_000, "bytes"),
+    ],
+)
+def test_calibrations_that_are_refused(tmp_path, text, said):
+    path = tmp_path / "calib.txt"
+    path.write_text(text)
+    refused(read_calibration, path, said)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "columns none"),
+        ("frame,pupil_mm\n" + "x" * 200_000 + ",4", "not CSV"),
+        ("frame,pupil_mm\na,nan", "pupil_mm 'nan'"),
+        ("pupil_mm,frame\n4", "no frame"),
+        ("frame,pupil_mm\n" + "9" * 5000 + ",400", "pupil_mm '400'"),
+        ("frame\n" + "a\n" * 300_000, "lines"),
+    ],
+)
+def test_lists_of_states_that_are_refused(tmp_path, text, said):
+    path = tmp_path / "states.csv"
+    path.write_text(text)
+    refused(lambda p: read_states(p, ["000001"]), path, said)
+
+
+def test_depth_that_a_kinect_does_not_count(tmp_path):
+    path = tmp_path / "d-1.0-1.pgm"
+    Image.fromarray(np.ones((48, 64), np.uint16)).save(path)
+    refused(KinectCounts().read, path, "64x48")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nfile:///etc/passwd\n",
+        b"ffconcat version 1.0\nfile /etc/passwd\n",
+        b"\x1a\x45\xdf\xa3" + b"\xff" * 100,
+        b"",
+    ],
+)
+def test_videos_that_are_none(tmp_path, content):
+    video_reading = pytest.importorskip("clients.batch.video_reading")
+    path = tmp_path / "a.mkv"
+    path.write_bytes(content)
+    refused(video_reading.frame_count, path, "cannot be read")
+
+
+def test_a_video_of_frames_that_are_too_large(tmp_path, monkeypatch):
+    video_reading = pytest.importorskip("clients.batch.video_reading")
+    from clients.batch.video_writing import VIDEO_KINDS, write_segment
+
+    path = tmp_path / "a.mkv"
+    frames = [(k, np.zeros((64, 64, 3), np.uint8)) for k in range(4)]
+    write_segment(path, iter(frames), kind=VIDEO_KINDS["ffv1"], rate_hz=30.0)
+    assert video_reading.frame_count(path) == 4
+    monkeypatch.setattr(video_reading, "MAX_VIDEO_FRAMES", 3)
+    refused(video_reading.frame_count, path, "more than 3 frames")
+    monkeypatch.setattr(video_reading, "MAX_VIDEO_PIXELS", 1000)
+    refused(video_reading.frame_count, path, "64x64 px")
+
+
+# ----- what is written, and told of it
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"kind": "frame"}',
+        b'{"kind": "frame", "profile": [], "frame": "a", "ok": true}',
+        b'{"kind": "frame", "profile": "p", "frame": "a", "ok": true, "file": 1}',
+        b"[" * 100_000,
+        b"5",
+    ],
+)
+def test_manifests_that_are_refused(tmp_path, line):
+    Manifest(tmp_path, {"made_by": "x"}).__exit__()
+    path = tmp_path / "manifest.jsonl"
+    path.write_bytes(path.read_bytes() + line + b"\n")
+    refused(lambda p: Manifest(p.parent, {"made_by": "x"}), path)
+    assert len(list(records_of(path))) <= 2
+
+
+def test_a_manifest_names_no_file_outside_of_its_folder(tmp_path):
+    out, secret = tmp_path / "out", tmp_path / "secret"
+    out.mkdir()
+    secret.mkdir()
+    (out / "link").symlink_to(secret)
+    for name in ("../secret/a", str(secret / "a"), "link/a", "a/../../b", "", 5, "\0"):
+        assert below(out, name) is None
+    assert below(out, "profile/a.png") == out / "profile/a.png"
+
+
+def test_links_are_not_followed_where_files_are_written(tmp_path, monkeypatch):
+    victim = tmp_path / "victim"
+    victim.write_text("kept")
+    (tmp_path / "manifest.jsonl").symlink_to(victim)
+    with pytest.raises(InvalidFile, match="cannot be opened"):
+        Manifest(tmp_path, {})
+    monkeypatch.setattr("secrets.token_hex", lambda n: "0")
+    (tmp_path / ".a.0.part.txt").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        write_whole(tmp_path / "a.txt", lambda path: path.write_text("lost"))
+    assert victim.read_text() == "kept"
+
+
+def test_an_object_on_the_command_line_is_bounded():
+    for text in ("[" * 100_000, '{"a":' * 100_000, '{"a": ' + "9" * 5000 + "}"):
+        with pytest.raises(ValueError, match="--settings"):
+            read_object("--settings", text)
+
+
+# ----- eyes that are none
+
+
+HOPELESS = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 2,
+    "wavelength_nm": 580.0,
+    "zernike_um": {"6,0": 100, "4,-4": 0.04},
+    "age_years": 3,
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("mode", ["on-axis", "dynamic"])
+def test_an_eye_that_is_out_of_focus_as_none_is(mode):
+    eye = MeasuredWavefront.from_profile(parse_profile(HOPELESS))
+    camera = Camera(640, 480, (-0.5, 0.5, 0.4, -0.4))
+    spec = grid_spec(camera, mode=mode, pupil_range_mm=(0.5, 0.5))
+    with pytest.raises(ProfileError, match="out of focus by") as caught:
+        plan_cache(eye, spec)
+    assert caught.value.field == "profile" and "1000 dpt" in caught.value.allowed
+
+
+def test_nodes_of_defocus_ascend_whatever_is_needed():
+    flat = np.zeros(49)
+    np.testing.assert_array_equal(_spread(1.0, 2.0, flat), [1.0, 2.0])
+    steep = np.linspace(0.0, 1e9, 49)
+    with pytest.raises(GridTooLarge) as caught:
+        _spread(1.0, 2.0, steep)
+    assert caught.value.field == "settings.object_range_dpt"
+    with pytest.raises(GridTooLarge):
+        _spread(1.0, 2.0, steep * np.nan)
+    close = _spread(5e21, 5e21 + 2e6, np.linspace(0.0, 3.0, 49))
+    assert (np.diff(close) > 0.0).all()
+
+
+def test_what_a_computation_says_reaches_a_client_with_a_field(monkeypatch):
+    def fail(*_):
+        raise ValueError("zero-size array to reduction operation minimum")
+
+    monkeypatch.setattr(from_profile, "plan_cache", fail)
+    job = BuildJob(
+        parse_profile({"kind": "preset", "name": "myopia"}),
+        FilterSettings(mode="on-axis", eye_model="wavefront"),
+        Camera(64, 48, (-0.5, 0.5, 0.4, -0.4)),
+    )
+    with pytest.raises(BuildFailed) as caught:
+        list(from_profile.build(job, progress=lambda *_: None, cancelled=lambda: False))
+    assert caught.value.field == "settings" and caught.value.allowed
