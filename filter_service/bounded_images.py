@@ -14,10 +14,17 @@ import math
 import os
 import re
 import struct
+import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import (
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+    suppress,
+)
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 
@@ -72,6 +79,9 @@ FORMATS = (
     WebPImagePlugin.WebPImageFile.format,
 )
 
+EXR_INCOMPLETE = "Exception raised reading pixel data"
+"""What the library prints where pixels are damaged, and nowhere else."""
+
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 NPY_MAGIC = b"\x93NUMPY"
 _NPY_FIELD = re.compile(
@@ -79,6 +89,7 @@ _NPY_FIELD = re.compile(
     r"""(?:['"]([<>|=][a-z]\d{1,2})['"]|(True|False)|\(([\d,\sL]*)\))\s*(?:,|(?=\}))"""
 )
 
+_KEPT_BYTES = 100_000
 _WARNINGS = threading.RLock()
 """Filters of warnings are the process's: two readers would restore each other's."""
 
@@ -164,7 +175,8 @@ def _opened_picture(source: Source, name: str, option: str) -> Iterator[Image.Im
                 file.seek(0)
                 with Image.open(file, formats=FORMATS) as image:
                     _check_picture(image, file)
-                    yield image
+                    with _quiet_library() if image.format == "TIFF" else nullcontext():
+                        yield image
         except InvalidFile:
             raise
         except _Refused as error:
@@ -177,6 +189,27 @@ def _opened_picture(source: Source, name: str, option: str) -> Iterator[Image.Im
         except Exception as error:  # Pillow's decoders raise nearly anything
             found = f"cannot be read ({_text_of(error)})"
             _refuse(named, found, "an intact picture", option)
+
+
+@contextmanager
+def _quiet_library() -> Iterator[list[str]]:
+    """Keep what a library prints, or writes to stderr; the list holds it afterwards.
+
+    Both streams are the process's: the lock of `_WARNINGS` is held meanwhile.
+    """
+    said: list[str] = []
+    printed = io.StringIO()
+    with tempfile.TemporaryFile() as kept, redirect_stdout(printed):
+        with ExitStack() as stack:
+            with suppress(OSError):  # there may be no stderr
+                own = os.dup(2)
+                stack.callback(os.close, own)
+                stack.callback(os.dup2, own, 2)
+                os.dup2(kept.fileno(), 2)
+            yield said
+        kept.seek(0)
+        said.append(kept.read(_KEPT_BYTES).decode("utf-8", "replace"))
+        said.append(printed.getvalue())
 
 
 def _text_of(error: BaseException) -> str:
@@ -436,12 +469,19 @@ def read_exr_channels(
         if size_bytes > MAX_FILE_BYTES:
             allowed = f"at most {MAX_FILE_BYTES:,} bytes"
             _refuse(path, f"{size_bytes:,} bytes", allowed, option)
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            _check_exr(file.parts)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            wanted = choose(set(channels))
-            return {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
+        with _WARNINGS, _quiet_library() as said:
+            how = {"separate_channels": True}
+            with OpenEXR.File(str(path), header_only=True, **how) as file:
+                _check_exr(file.parts)
+            with OpenEXR.File(str(path), **how) as file:
+                channels = file.channels()
+                wanted = choose(set(channels))
+                found = {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
+        text = "".join(said)
+        if EXR_INCOMPLETE in text:  # it goes on with what it has
+            reason = text[text.index(EXR_INCOMPLETE) :].split("\n")[0].split(" - ")[-1]
+            raise _Refused(f"cannot be read ({reason:.100})", "an intact OpenEXR file")
+        return found
     except InvalidFile:
         raise
     except _Refused as error:

@@ -26,6 +26,7 @@ from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+RESTART = "the same, another folder, or --overwrite"
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
 """Of a line: a job with states of 200,000 frames, as many as are read, takes half."""
@@ -34,7 +35,7 @@ SYNC_S = 2.0
 """So much work may a power cut undo."""
 
 
-class ManifestDiffers(ValueError):
+class ManifestDiffers(InvalidFile):
     """The folder holds the results of another job."""
 
 
@@ -88,7 +89,7 @@ class Manifest:
             while (line := file.readline(MAX_LINE_BYTES + 1)).endswith(b"\n"):
                 record = _parsed(line, self._path)
                 if end == 0:
-                    _check_same(record, job)
+                    _check_same(record, job, self._path)
                 elif record.get("kind") == "frame":
                     _check_frame(record, self._path)
                     self._places[record["profile"], record["frame"]] = end
@@ -217,18 +218,19 @@ def _check_frame(record: Record, path: Path) -> None:
         raise InvalidFile(path, found, "the lines of a batch, or --overwrite")
 
 
-def _check_same(found: Record, job: Mapping[str, Any]) -> None:
+def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
     if found.get("fingerprint") == fingerprint(job):
         return
     wanted = json.loads(json.dumps(job))  # lists for tuples, as in the file
     for name in sorted({*wanted, *found} - {"kind", "fingerprint"}):
         if found.get(name) != wanted.get(name):
             before, now = _first_difference(name, found.get(name), wanted.get(name))
-            raise ManifestDiffers(
+            found_text = (
                 f"{now[0]} is {_short(now[1])}, and was {_short(before[1])} when this "
-                "folder was begun; allowed: the same, another folder, or --overwrite"
+                "folder was begun"
             )
-    raise ManifestDiffers("the folder's manifest is of another job")
+            raise ManifestDiffers(path, found_text, RESTART)
+    raise ManifestDiffers(path, "the folder's manifest is of another job", RESTART)
 
 
 def _first_difference(name: str, before: Any, now: Any) -> tuple:

@@ -38,11 +38,11 @@ from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
 
 
 def refused(read, path, said=None):
-    """Read a file that must be refused within a second; return the error."""
-    start_s = time.perf_counter()
+    """Read a file that must be refused in a second of work; return the error."""
+    start_s = time.process_time()
     with pytest.raises(InvalidFile, match=said) as caught:
         read(path)
-    assert time.perf_counter() - start_s < 1.0
+    assert time.process_time() - start_s < 1.0
     assert path.name in str(caught.value)
     assert "\n" not in str(caught.value)
     return caught.value
@@ -215,7 +215,35 @@ def test_an_exr_of_a_large_window_is_refused_by_its_header(tmp_path, side, capfd
     content[at : at + 16] = struct.pack("<4i", 0, 0, side - 1, side - 1)
     path.write_bytes(content)
     refused(read_depth, path)
-    assert capfd.readouterr().err == ""
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("compression", ["ZIP", "RLE", "PIZ", "NO"])
+def test_an_exr_with_damaged_pixels_is_refused_without_a_word(
+    tmp_path, rng, capfd, compression
+):
+    path = tmp_path / "a.exr"
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": getattr(OpenEXR, f"{compression}_COMPRESSION"),
+    }
+    with OpenEXR.File(header, {"Z": rng.random((64, 64), np.float32)}) as file:
+        file.write(str(path))
+    content = path.read_bytes()
+    path.write_bytes(content[: 2 * len(content) // 3])
+    refused(read_depth, path, "cannot be read")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_tiff_with_damaged_pixels_is_refused_without_a_word(tmp_path, rng, capfd):
+    path = tmp_path / "a.tif"
+    metres = Image.fromarray(rng.random((64, 64), np.float32))
+    metres.save(path, compression="tiff_deflate")
+    content = bytearray(path.read_bytes())
+    content[8:40] = bytes(32)
+    path.write_bytes(content)
+    refused(read_depth, path, "cannot be read")
+    assert capfd.readouterr() == ("", "")
 
 
 # ----- profiles and other text
