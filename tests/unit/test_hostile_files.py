@@ -18,7 +18,13 @@ from clients.batch.manifest import Manifest, below, records_of
 from clients.batch.states import read_states
 from clients.batch.whole_files import write_whole
 from clients.headset.gltf_scene import load_gltf
-from estimator.bounded_files import InvalidFile, loads_bounded, read_json, read_text
+from estimator.bounded_files import (
+    InvalidFile,
+    loads_bounded,
+    read_json,
+    read_text,
+    read_toml,
+)
 from estimator.eye.checked_fields import ProfileError
 from estimator.profiles.files import load_profile
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -304,6 +310,15 @@ def test_what_is_no_regular_file(tmp_path):
     path.mkdir()
     refused(read_json, path, "not a regular file")
     refused(read_json, tmp_path / "absent.json", "no such file")
+
+
+@pytest.mark.parametrize("text", ["a = [" * 5000, "a = 1\na = 2", "=", "a = '\0'"])
+def test_toml_that_is_none(tmp_path, text):
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    refused(read_toml, path)
+    path.write_text("a = 1")
+    assert read_toml(path) == {"a": 1}
 
 
 def test_json_bounds():
