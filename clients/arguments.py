@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from estimator import profile_body
+from estimator import InvalidFile, profile_body
 from estimator.bounded_files import loads_bounded
 
 MAX_ARGUMENT_BYTES = 1_000_000
@@ -29,6 +29,9 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
         return {"kind": "preset", "name": text}
     try:
         body = profile_body(path)
+    except InvalidFile as error:
+        name = option.removeprefix("--")
+        raise InvalidFile(path, error.found, error.allowed, name) from None
     except (OSError, ValueError) as error:
         raise ValueError(f"{option} {path}: {error}") from None
     if not isinstance(body, dict):
