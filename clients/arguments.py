@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from estimator import profile_body
+from estimator import InvalidFile, profile_body
+from estimator.bounded_files import loads_bounded
+
+MAX_ARGUMENT_BYTES = 1_000_000
 
 
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
@@ -27,6 +29,9 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
         return {"kind": "preset", "name": text}
     try:
         body = profile_body(path)
+    except InvalidFile as error:
+        name = option.removeprefix("--")
+        raise InvalidFile(path, error.found, error.allowed, name) from None
     except (OSError, ValueError) as error:
         raise ValueError(f"{option} {path}: {error}") from None
     if not isinstance(body, dict):
@@ -37,11 +42,12 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
 def read_object(option: str, text: str) -> dict[str, Any]:
     """Return a JSON object from the command line."""
     try:
-        value = json.loads(text)
+        data = text.encode("utf-8", "surrogateescape")
+        value = loads_bounded(data, max_bytes=MAX_ARGUMENT_BYTES)
     except ValueError as error:
         raise ValueError(f"{option} is no JSON: {error}") from None
     if not isinstance(value, dict):
-        raise ValueError(f"{option} is {value!r}; allowed: a JSON object")
+        raise ValueError(f"{option} is {value!r:.60}; allowed: a JSON object")
     return value
 
 

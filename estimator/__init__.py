@@ -15,6 +15,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     periphery/     how people's wavefronts change off the axis, measured
     estimate/      from a measurement to the eye
     field/         an eye over its visual field
+    bounded_files  text and JSON of untrusted files within limits
     threads        how many threads this machine gives us
     machine_speed  how fast one of its cores is
 """

@@ -3,6 +3,7 @@ from .acuity.predict import predict_acuity as predict_acuity
 from .acuity.sensitivity import perfect_transfer as perfect_transfer
 from .acuity.transfer import Transfer as Transfer
 from .acuity.transfer import optical_transfer as optical_transfer
+from .bounded_files import InvalidFile as InvalidFile
 from .corrections.lenslets import Lenslets as Lenslets
 from .corrections.progressive import ProgressiveLens as ProgressiveLens
 from .corrections.rings import DiffractiveRings as DiffractiveRings

@@ -18,6 +18,7 @@ Importing this loads nothing but names: clients stay light.
     constants        numbers that Python and GLSL share
     image_files      pictures and depth in files
     whole_files      files that are written as a whole or not at all
+    bounded_images   the decoders, within limits of memory
     gl_device        which device OpenGL works on, as a user names it
     threads          numba's thread layer
     one_blas_thread  numpy on one thread

@@ -8,10 +8,19 @@ Pillow reads and writes the rest, 32-bit float TIFF and PFM included.
 
 import math
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from estimator.bounded_files import InvalidFile
+from filter_service.bounded_images import (
+    read_exr_channels,
+    read_npy,
+    read_picture_rgb,
+    read_picture_values,
+)
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".npy", ".exr")
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr", ".pfm", ".pgm")
@@ -21,7 +30,8 @@ LINEAR_SUFFIXES = (".npy", ".exr")
 METRES_PER_INTEGER_STEP = 0.001
 """Depth scale of integer files when none is given: millimetres, as depth cameras."""
 
-EXR_MAGIC = b"\x76\x2f\x31\x01"
+ROW_VALUES = 1 << 20
+"""Converted at a time: all of a large image in float64 would be held beside it."""
 
 
 def read_color(path: Path, *, option: str = "color") -> NDArray:
@@ -39,19 +49,17 @@ def read_color(path: Path, *, option: str = "color") -> NDArray:
 
     Raises
     ------
-    ValueError
-        The file is missing, not of a known kind, or its pixels are unfit.
+    InvalidFile
+        The file is missing, not of a known kind, damaged, too large, or its pixels are
+        unfit.
     """
     suffix = _known_suffix(option, path, COLOR_SUFFIXES)
     if suffix == ".exr":
-        pixels = _exr_color(_exr_channels(option, path), path, option)
+        pixels = _exr_color(path, option)
     elif suffix == ".npy":
-        pixels = _npy_array(option, path)
+        pixels = read_npy(path, option=option)
     else:
-        with _pillow_image(option, path) as image:
-            if image.mode.startswith(("I", "F")):
-                _refuse(option, path, f"mode {image.mode}", "8 bits per channel")
-            pixels = np.asarray(image.convert("RGB"))
+        pixels = read_picture_rgb(path, option=option)
     return _checked_color(pixels, path, option)
 
 
@@ -75,18 +83,19 @@ def read_depth(
 
     Raises
     ------
+    InvalidFile
+        The file is missing, not of a known kind, damaged, too large, not one channel,
+        or of 8 bits without a scale.
     ValueError
-        The file is missing, not of a known kind, not one channel, of 8 bits without
-        a scale, or the scale is not positive.
+        The scale is not positive.
     """
     suffix = _known_suffix(option, path, DEPTH_SUFFIXES)
     if suffix == ".exr":
-        stored = _exr_depth(_exr_channels(option, path), path, option)
+        stored = _exr_depth(path, option)
     elif suffix == ".npy":
-        stored = _npy_array(option, path)
+        stored = read_npy(path, option=option)
     else:
-        with _pillow_image(option, path) as image:
-            stored = np.asarray(image)
+        stored = read_picture_values(path, option=option)
     if stored.ndim == 3 and stored.shape[2] == 1:
         stored = stored[:, :, 0]
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "uif":
@@ -99,7 +108,21 @@ def read_depth(
         depth_scale = 1.0 if stored.dtype.kind == "f" else METRES_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
         raise ValueError(f"--depth-scale {depth_scale}: allowed is a positive number")
-    return (stored * np.float64(depth_scale)).astype(np.float32)
+    return _scaled(stored, depth_scale)
+
+
+def _scaled(stored: NDArray, depth_scale: float) -> NDArray[np.float32]:
+    """Return stored values times the scale, multiplied in float64, some rows at a time.
+
+    What float32 cannot hold is infinitely far.
+    """
+    depth_m = np.empty(stored.shape, np.float32)
+    step = max(1, ROW_VALUES // stored.shape[1])
+    with np.errstate(over="ignore", invalid="ignore"):
+        for top in range(0, len(stored), step):
+            rows = slice(top, top + step)
+            depth_m[rows] = stored[rows] * np.float64(depth_scale)
+    return depth_m
 
 
 def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> None:
@@ -148,12 +171,8 @@ def write_image(path: Path, image: NDArray, *, png_level: int = 6) -> None:
 # --- kinds of files ----------------------------------------------------------
 
 
-def _refuse(field: str, path: Path, found: str, allowed: str) -> None:
-    raise ValueError(f"{_named(field, path)}: {found}; allowed: {allowed}")
-
-
-def _named(field: str, path: Path) -> str:
-    return f"--{field} '{path}'" if field else f"'{path}'"
+def _refuse(field: str, path: Path, found: str, allowed: str) -> NoReturn:
+    raise InvalidFile(path, found, allowed, field)
 
 
 def _known_suffix(field: str, path: Path, suffixes: tuple[str, ...]) -> str:
@@ -161,56 +180,41 @@ def _known_suffix(field: str, path: Path, suffixes: tuple[str, ...]) -> str:
     if suffix not in suffixes:
         found = f"'{path.suffix}' is not a kind it reads"
         _refuse(field, path, found, ", ".join(suffixes))
-    if not path.is_file():
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError):  # a null byte, or a name that is too long
+        is_file = False
+    if not is_file:
         _refuse(field, path, "no such file", "a file that exists")
     return suffix
 
 
-def _pillow_image(field: str, path: Path) -> Image.Image:
-    try:
-        image = Image.open(path)
-        image.load()
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{_named(field, path)}: cannot be read ({error})") from None
-    return image
+def _exr_color(path: Path, option: str) -> NDArray[np.float32]:
+    def choose(names: set[str]) -> tuple[str, ...]:
+        if not set("RGB") <= names:
+            found = f"channels {', '.join(sorted(names))}"
+            _refuse(option, path, found[:200], "channels R, G and B")
+        return tuple("RGB")
+
+    channels = read_exr_channels(path, choose, option=option)
+    shapes = {channel.shape for channel in channels.values()}
+    if len(shapes) > 1:
+        _refuse(option, path, "channels of different sizes", "R, G and B alike")
+    rgb = np.empty((*shapes.pop(), 3), np.float32)
+    for k, name in enumerate("RGB"):
+        rgb[:, :, k] = channels.pop(name)
+    return rgb
 
 
-def _npy_array(field: str, path: Path) -> NDArray:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{_named(field, path)}: cannot be read ({error})") from None
+def _exr_depth(path: Path, option: str) -> NDArray[np.float32]:
+    def choose(names: set[str]) -> tuple[str, ...]:
+        for name in ("Z", "Y", "R"):
+            if name in names:
+                return (name,)
+        found = f"channels {', '.join(sorted(names))}"
+        _refuse(option, path, found[:200], "a channel Z, Y or R")
 
-
-def _exr_channels(field: str, path: Path) -> dict[str, NDArray]:
-    """Channels of the first part, ``R`` and not ``RGB``, as float32."""
-    import OpenEXR
-
-    with path.open("rb") as file:
-        # asked here, because the library itself writes to stderr about it
-        if file.read(4) != EXR_MAGIC:
-            _refuse(field, path, "not an OpenEXR file", "OpenEXR")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            return {k: np.asarray(v.pixels, np.float32) for k, v in channels.items()}
-    except RuntimeError as error:
-        raise ValueError(f"{_named(field, path)}: cannot be read ({error})") from None
-
-
-def _exr_color(channels: dict[str, NDArray], path: Path, option: str) -> NDArray:
-    if not {"R", "G", "B"} <= channels.keys():
-        found = f"channels {', '.join(sorted(channels))}"
-        _refuse(option, path, found, "channels R, G and B")
-    return np.dstack([channels[name] for name in "RGB"])
-
-
-def _exr_depth(channels: dict[str, NDArray], path: Path, option: str) -> NDArray:
-    for name in ("Z", "Y", "R"):
-        if name in channels:
-            return channels[name]
-    found = f"channels {', '.join(sorted(channels))}"
-    _refuse(option, path, found, "a channel Z, Y or R")
+    return read_exr_channels(path, choose, option=option).popitem()[1]
 
 
 def _write_exr(path: Path, linear_rgb: NDArray) -> None:
@@ -236,4 +240,4 @@ def _checked_color(pixels: NDArray, path: Path, option: str) -> NDArray:
     if pixels.dtype == np.float16:
         return pixels
     with np.errstate(over="ignore"):  # infinity is dealt with as such
-        return pixels.astype(np.float32)
+        return pixels.astype(np.float32, copy=False)

@@ -20,6 +20,10 @@ from filter_service.settings import DEPTH_KINDS, DepthKind
 ColorImage = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
 """(height, width, 3): 8-bit sRGB, or linear light."""
 
+LEAST_DEPTH_M = 1e-6
+"""Depth that is less is missing: a micrometre is nearer than any surface can be, and
+the reciprocals of much smaller numbers are beyond float32."""
+
 COLOR_DTYPES = (np.uint8, np.float32, np.float16)
 
 
@@ -32,7 +36,7 @@ class RgbdView:
     color : (height, width, 3)
         uint8 sRGB; or float32 or float16 linear light, above 1 and below 0 too.
     depth_m : (height, width), float32
-        +inf is infinity; 0, negative and NaN are missing.
+        +inf is infinity; NaN and less than `LEAST_DEPTH_M` are missing.
     tangents : (left, right, up, down)
         Of the angles to the image edges, left < right and down < up.
     depth_kind : "planar" or "radial"

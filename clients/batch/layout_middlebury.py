@@ -14,13 +14,18 @@ truth.
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 from clients.batch.source import Disparity, Pinhole, SourceFrame
+from estimator.bounded_files import InvalidFile, read_text
 
 M_PER_MM = 1e-3
+FIELDS = ("cam0", "doffs", "baseline")
 FILES = ("im0.png", "disp0.pfm", "calib.txt")
+MAX_CALIBRATION_BYTES = 65_536
+LARGEST_NUMBER = 1e9
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
 
@@ -34,7 +39,7 @@ def middlebury_frames(source: Path) -> list[SourceFrame]:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         A calibration that cannot be read; names the file and what it lacks.
     """
     frames = []
@@ -60,30 +65,40 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
 
     Raises
     ------
-    ValueError
+    InvalidFile
     """
-    text = path.read_text(encoding="utf-8")
-    fields = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", text, re.MULTILINE))
-    for name in ("cam0", "doffs", "baseline"):
+    text = read_text(path, max_bytes=MAX_CALIBRATION_BYTES)
+    fields = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*)$", text, re.MULTILINE))
+    for name in FIELDS:
         if name not in fields:
-            raise ValueError(f"'{path}': '{name}' is missing")
-    matrix = [float(number) for number in re.findall(_NUMBER, fields["cam0"])]
-    if len(matrix) != 9 or matrix[0] <= 0.0 or matrix[4] <= 0.0:
-        raise ValueError(
-            f"'{path}': cam0 is {fields['cam0']}; allowed: [f 0 cx; 0 f cy; 0 0 1]"
-        )
-    try:
-        offset_px, baseline_mm = float(fields["doffs"]), float(fields["baseline"])
-    except ValueError:
-        raise ValueError(f"'{path}': doffs or baseline is no number") from None
+            raise InvalidFile(path, f"'{name}' is missing", ", ".join(FIELDS))
+    numbers = re.findall(_NUMBER, fields["cam0"])
+    matrix = [_number(number) for number in numbers]
+    usable = len(matrix) == 9 and all(map(math.isfinite, matrix))
+    if not usable or matrix[0] <= 0.0 or matrix[4] <= 0.0:
+        found = f"cam0 is {fields['cam0'].strip():.60}"
+        raise InvalidFile(path, found, "[f 0 cx; 0 f cy; 0 0 1]")
+    offset_px, baseline_mm = _number(fields["doffs"]), _number(fields["baseline"])
+    if not (math.isfinite(offset_px) and math.isfinite(baseline_mm)):
+        found = "doffs or baseline is no number"
+        raise InvalidFile(path, found, f"up to {LARGEST_NUMBER:g} px or mm")
     return (
         Pinhole(matrix[0], matrix[4], matrix[2], matrix[5], _size_px(fields)),
         Disparity(matrix[0], M_PER_MM * baseline_mm, offset_px),
     )
 
 
+def _number(text: str) -> float:
+    """Return a number; NaN for other text and what no camera has."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if abs(value) <= LARGEST_NUMBER else math.nan
+
+
 def _size_px(fields: dict[str, str]) -> tuple[int, int] | None:
     sides = fields.get("width", ""), fields.get("height", "")
-    if not all(side.isdecimal() for side in sides):
+    if not all(side.strip().isdecimal() and len(side) < 10 for side in sides):
         return None
     return int(sides[0]), int(sides[1])

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from clients.batch.layout_pairs import pair_frames
 from clients.batch.source import Pinhole, Scaled, SourceFrame
+from estimator import InvalidFile
 from filter_service.image_files import read_depth
 
 COLOR_CAMERA = Pinhole(
@@ -56,6 +57,7 @@ SHIFT_M = np.array(
 )
 COUNT_SCALE_M, COUNT_AT_INFINITY = 351.3, 1092.5
 MAX_DEPTH_M = 10.0
+MAX_COUNT = 65535
 _RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?:ppm|pgm)$")
 _EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
 
@@ -66,8 +68,14 @@ class KinectCounts:
 
     def read(self, path: Path) -> NDArray[np.float32]:
         """Return the depth that the colour camera sees, m; 0 where it is unknown."""
-        stored = read_depth(path, depth_scale=1.0, option="").astype(np.uint16)
-        return self.of_integers(stored)
+        stored = read_depth(path, depth_scale=1.0, option="")
+        width_px, height_px = COLOR_CAMERA.size_px or (0, 0)
+        if stored.shape != (height_px, width_px):
+            found = f"{stored.shape[1]}x{stored.shape[0]} px"
+            raise InvalidFile(path, found, f"{width_px}x{height_px}, as the Kinect's")
+        if not ((stored >= 0.0) & (stored <= MAX_COUNT)).all():
+            raise InvalidFile(path, "numbers that are no counts", f"0 to {MAX_COUNT}")
+        return self.of_integers(stored.astype(np.uint16))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return it for the numbers of a file as they are read, bytes still swapped."""

@@ -15,13 +15,19 @@ Sturm et al. 2012, A benchmark for the evaluation of RGB-D SLAM systems.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from pathlib import Path
 
 from clients.batch.source import Pinhole, Scaled, SourceFrame
+from estimator.bounded_files import InvalidFile, numbered_lines, read_text
 
 DEPTH_SCALE_M = 1.0 / 5000.0
 CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
 MAX_APART_S = 0.02
+MAX_NEAR = 50
+"""Images of depth that are compared to each side: a camera of 30 Hz has one."""
+
 ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
 
 
@@ -37,7 +43,7 @@ def tum_frames(source: Path) -> list[SourceFrame]:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         A list that cannot be read; names its line.
     """
     lists = next((source / n for n in ASSOCIATIONS if (source / n).is_file()), None)
@@ -60,10 +66,8 @@ def _listed(path: Path) -> list[tuple[str, str]]:
     for number, fields in _lines(path, 4):
         first, second = fields[1], fields[3]
         if first.startswith("depth/") == second.startswith("depth/"):
-            raise ValueError(
-                f"'{path}', line {number}: '{first}' and '{second}'; allowed: one of "
-                "them in depth/"
-            )
+            found = f"line {number}: '{first:.60}' and '{second:.60}'"
+            raise InvalidFile(path, found, "one of them in depth/")
         is_depth_first = first.startswith("depth/")
         pairs.append((second, first) if is_depth_first else (first, second))
     return pairs
@@ -71,10 +75,11 @@ def _listed(path: Path) -> list[tuple[str, str]]:
 
 def _associated(source: Path) -> list[tuple[str, str]]:
     colors, depths = (_times(source / name) for name in ("rgb.txt", "depth.txt"))
+    depths_s = sorted(depths)
     candidates = sorted(
         (abs(color_s - depth_s), color_s, depth_s)
         for color_s in colors
-        for depth_s in _near(depths, color_s)
+        for depth_s in _near(depths_s, color_s)
     )
     free_colors, free_depths = dict(colors), dict(depths)
     pairs = []
@@ -84,29 +89,41 @@ def _associated(source: Path) -> list[tuple[str, str]]:
     return [(color, depth) for _, color, depth in sorted(pairs)]
 
 
-def _near(times: dict[float, str], at_s: float) -> list[float]:
-    return [time_s for time_s in times if abs(time_s - at_s) < MAX_APART_S]
+def _near(times_s: list[float], at_s: float) -> list[float]:
+    """Return those of ascending times that are near; of a crowd the nearest ones."""
+    first = bisect_left(times_s, at_s - MAX_APART_S)
+    end = bisect_right(times_s, at_s + MAX_APART_S)
+    middle = bisect_left(times_s, at_s)
+    some = times_s[max(first, middle - MAX_NEAR) : min(end, middle + MAX_NEAR)]
+    return [time_s for time_s in some if abs(time_s - at_s) < MAX_APART_S]
 
 
 def _times(path: Path) -> dict[float, str]:
     found = {}
     for number, (time, name) in _lines(path, 2):
         try:
-            found[float(time)] = name
+            time_s = float(time)
         except ValueError:
-            raise ValueError(
-                f"'{path}', line {number}: '{time}' is no time in s"
-            ) from None
+            time_s = math.nan
+        if not math.isfinite(time_s):
+            found_text = f"line {number}: '{time:.60}' is not a time"
+            raise InvalidFile(path, found_text, "seconds")
+        found[time_s] = name
     return found
 
 
 def _lines(path: Path, count: int) -> list[tuple[int, list[str]]]:
     lines = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in numbered_lines(read_text(path)):
         fields = line.replace(",", " ").split()
         if not fields or line.lstrip().startswith("#"):
             continue
         if len(fields) < count:
-            raise ValueError(f"'{path}', line {number}: '{line}' has no {count} fields")
+            found = f"line {number}: '{line:.60}' has {len(fields)} fields"
+            raise InvalidFile(path, found, f"{count} or more")
+        for name in fields[1:count:2]:
+            if Path(name).is_absolute() or ".." in Path(name).parts:
+                found = f"line {number}: '{name:.60}' leads out of the data set"
+                raise InvalidFile(path, found, "a path below its folder")
         lines.append((number, fields[:count]))
     return lines

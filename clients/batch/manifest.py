@@ -22,14 +22,20 @@ from typing import Any, Self
 from clients.batch.job import fingerprint
 from clients.batch.whole_files import is_unchanged, write_whole
 from clients.batch.work import Record
+from estimator import InvalidFile
+from estimator.bounded_files import loads_bounded
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+RESTART = "the same, another folder, or --overwrite"
 _NUMBER = re.compile(r"\d+(\.\d+)?")
+MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
+"""Of a line: a job with states of 200,000 frames, as many as are read, takes half."""
+
 SYNC_S = 2.0
 """So much work may a power cut undo."""
 
 
-class ManifestDiffers(ValueError):
+class ManifestDiffers(InvalidFile):
     """The folder holds the results of another job."""
 
 
@@ -56,7 +62,12 @@ class Manifest:
         self._path = out / LINES
         self._places: dict[tuple[str, str], int] = {}  # of lines, in bytes
         self._synced_s = time.monotonic()
-        self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK
+        try:
+            self._file = os.open(self._path, flags, 0o644)
+        except OSError as error:
+            found = f"cannot be opened ({error.strerror})"
+            raise InvalidFile(self._path, found, "a plain file or none") from None
         try:
             self._read(job)
         except BaseException:
@@ -75,15 +86,17 @@ class Manifest:
     def _read(self, job: Mapping[str, Any]) -> None:
         end = 0
         with self._path.open("rb") as file:
-            for line in file:
-                if not line.endswith(b"\n"):
-                    break
+            while (line := file.readline(MAX_LINE_BYTES + 1)).endswith(b"\n"):
                 record = _parsed(line, self._path)
                 if end == 0:
-                    _check_same(record, job)
+                    _check_same(record, job, self._path)
                 elif record.get("kind") == "frame":
+                    _check_frame(record, self._path)
                     self._places[record["profile"], record["frame"]] = end
                 end += len(line)
+        if len(line) > MAX_LINE_BYTES:
+            found = f"a line of more than {MAX_LINE_BYTES:,} bytes"
+            raise InvalidFile(self._path, found, "at most that many")
         os.ftruncate(self._file, end)
         if end == 0:
             self._write({"kind": "job", "fingerprint": fingerprint(job), **job})
@@ -129,8 +142,8 @@ class Manifest:
         record = self.record(profile, frame)
         if record is None or not record["ok"]:
             return False
-        path = self._out / record["file"]
-        if not path.is_file() or path.stat().st_size != record["bytes"]:
+        path = below(self._out, record["file"])
+        if path is None or not path.is_file() or path.stat().st_size != record["bytes"]:
             return False
         return len(files) == len(record["inputs"]) and all(
             is_unchanged(path, told)
@@ -138,28 +151,86 @@ class Manifest:
         )
 
 
+def records_of(path: Path) -> Iterator[Record]:
+    """Yield the lines of a manifest that can be read."""
+    with path.open("rb") as file:
+        while line := file.readline(MAX_LINE_BYTES + 1):
+            try:
+                yield _parsed(line, path)
+            except InvalidFile:
+                continue
+
+
+def below(folder: Path, name: object) -> Path | None:
+    """Return a file of a folder by a name that a manifest tells; None outside of it."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        return None
+    inner = Path(name)
+    if inner.is_absolute() or ".." in inner.parts:
+        return None
+    path = folder / inner
+    is_inside = path.parent.resolve().is_relative_to(folder.resolve())
+    return path if is_inside else None
+
+
 def _parsed(line: bytes, path: Path) -> Record:
     try:
-        record = json.loads(line)
+        record = loads_bounded(line, max_bytes=MAX_LINE_BYTES, max_items=MAX_LINE_ITEMS)
     except ValueError:
         record = None
     if not isinstance(record, dict):
-        raise ValueError(f"'{path}': a line is no JSON object: {line[:60]!r}")
+        found = f"a line is no JSON object: {line[:60]!r}"
+        raise InvalidFile(path, found, "the lines of a batch")
     return record
 
 
-def _check_same(found: Record, job: Mapping[str, Any]) -> None:
+_FRAME_FIELDS: dict[str, type | tuple[type, ...]] = {
+    "profile": str,
+    "frame": str,
+    "ok": bool,
+}
+_DONE_FIELDS: dict[str, type | tuple[type, ...]] = {
+    "file": str,
+    "bytes": int,
+    "inputs": list,
+    "notes": list,
+    "missing_depth_count": int,
+    "clamped_depth_count": int,
+    "overflow_count": int,
+}
+_INPUT_FIELDS = {"bytes": int, "mtime_ns": int, "sha256": str}
+
+
+def _check_frame(record: Record, path: Path) -> None:
+    """Refuse a line of a frame that lacks what is read of it."""
+    wanted = _FRAME_FIELDS | (_DONE_FIELDS if record.get("ok") else {"error": str})
+    wrong = [k for k, kind in wanted.items() if not isinstance(record.get(k), kind)]
+    if not wrong and record["ok"]:
+        if not all(isinstance(note, str) for note in record["notes"]):
+            wrong.append("notes")
+        for told in record["inputs"]:
+            if not isinstance(told, dict) or not all(
+                isinstance(told.get(k), kind) for k, kind in _INPUT_FIELDS.items()
+            ):
+                wrong.append("inputs")
+    if wrong:
+        found = f"a frame's line with a wrong '{wrong[0]}'"
+        raise InvalidFile(path, found, "the lines of a batch, or --overwrite")
+
+
+def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
     if found.get("fingerprint") == fingerprint(job):
         return
     wanted = json.loads(json.dumps(job))  # lists for tuples, as in the file
     for name in sorted({*wanted, *found} - {"kind", "fingerprint"}):
         if found.get(name) != wanted.get(name):
             before, now = _first_difference(name, found.get(name), wanted.get(name))
-            raise ManifestDiffers(
+            found_text = (
                 f"{now[0]} is {_short(now[1])}, and was {_short(before[1])} when this "
-                "folder was begun; allowed: the same, another folder, or --overwrite"
+                "folder was begun"
             )
-    raise ManifestDiffers("the folder's manifest is of another job")
+            raise ManifestDiffers(path, found_text, RESTART)
+    raise ManifestDiffers(path, "the folder's manifest is of another job", RESTART)
 
 
 def _first_difference(name: str, before: Any, now: Any) -> tuple:

@@ -20,7 +20,7 @@ from clients.batch.layouts import LAYOUTS, Told, list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import SourceFrame
 from clients.batch.states import CENTER, States, read_states
-from estimator import parse_profile, profile_body, thread_count
+from estimator import InvalidFile, load_profile, profile_body, thread_count
 from filter_service.settings import (
     MAX_PUPIL_MM,
     MAX_RENDER_TOLERANCE,
@@ -53,6 +53,7 @@ each frame, OUT/manifest.json the whole.  Exit codes: 0 done, 1 some frames fail
 2 bad input.
 """
 
+FPS_LIMITS_HZ = (0.1, 1000.0)
 _NAME = re.compile(r"[^\w.+-]+")
 
 
@@ -225,7 +226,7 @@ def _check(options: argparse.Namespace) -> None:
         "pupil_mm": (MIN_PUPIL_MM, MAX_PUPIL_MM),
         "render_tolerance": (0.0, MAX_RENDER_TOLERANCE),
         "limit": (1, float("inf")),
-        "fps": (0.1, 1000.0),
+        "fps": FPS_LIMITS_HZ,
         "workers": (1, 1024),
         "threads": (1, 256),
         "price_per_core_hour": (0.0, float("inf")),
@@ -278,7 +279,7 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     for text in texts:
         name, _, what = text.rpartition("=")
         body = profile_body(what)
-        parse_profile(body)
+        load_profile(what)  # checks its fields, and names the file
         name = name or (what if body.get("kind") == "preset" else Path(what).stem)
         name = _NAME.sub("_", name).lstrip(".")
         if not name or name in found:
@@ -297,4 +298,9 @@ def _rate_hz(options: argparse.Namespace, frames: Sequence[SourceFrame]) -> floa
         return 30.0
     from clients.batch.video_reading import frames_per_second
 
-    return frames_per_second(frames[0].color)
+    rate_hz = frames_per_second(frames[0].color)
+    low_hz, high_hz = FPS_LIMITS_HZ
+    if not low_hz <= rate_hz <= high_hz:
+        allowed = f"{low_hz:g} to {high_hz:g}, or --fps"
+        raise InvalidFile(frames[0].color, f"{rate_hz:g} frames a second", allowed)
+    return rate_hz

@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         return 1
     except ValueError as error:
-        print(f"batch: {error}", file=sys.stderr)
+        print(f"batch: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except (EngineUnusable, FilterError, OSError) as error:
         print(f"batch: {error}", file=sys.stderr)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,12 +17,15 @@ from clients.batch.manifest import (
     LINES,
     SUMMARY,
     Manifest,
+    below,
+    records_of,
     summary_of,
     write_summary,
 )
 from clients.batch.source import SourceFrame
 from clients.batch.whole_files import content_of, remove_parts, write_whole
 from clients.batch.work import Record, Unit
+from estimator import InvalidFile
 
 UNIT_FRAMES = 16
 """That a worker is given at once: few enough for all to end together, and enough that
@@ -32,6 +35,7 @@ SEGMENT_FRAMES = 48
 """Of a video; it decides its bytes, so it does not go by the number of workers."""
 
 SEGMENTS = ".segments"
+VIDEO_SUFFIXES = (".mkv", ".mp4")
 LOCK = ".lock"
 
 
@@ -108,16 +112,15 @@ def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
 
 def _remove_results(batch: Batch) -> None:
     """Remove what an earlier batch made, by its manifest."""
-    for line in (batch.out / LINES).read_bytes().splitlines():
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if record.get("file"):
-            (batch.out / record["file"]).unlink(missing_ok=True)
-        for name in record.get("profiles", ()):
-            for suffix in (".mkv", ".mp4"):
-                (batch.out / f"{name}{suffix}").unlink(missing_ok=True)
+    for record in records_of(batch.out / LINES):
+        names = [record.get("file")]
+        profiles = record.get("profiles", ())
+        if isinstance(profiles, dict | list):
+            names += [f"{k}{suffix}" for k in profiles for suffix in VIDEO_SUFFIXES]
+        for name in names:
+            path = below(batch.out, name)
+            if path is not None and not path.is_dir():
+                path.unlink(missing_ok=True)
     shutil.rmtree(batch.out / SEGMENTS, ignore_errors=True)
     for name in (SUMMARY, LINES):
         (batch.out / name).unlink(missing_ok=True)
@@ -132,7 +135,13 @@ def only_one(out: Path) -> Iterator[None]:
     ValueError
         There is one at work.
     """
-    with (out / LOCK).open("w") as file:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+    try:
+        descriptor = os.open(out / LOCK, flags, 0o644)
+    except OSError as error:
+        found = f"cannot be opened ({error.strerror})"
+        raise InvalidFile(out / LOCK, found, "a plain file or none") from None
+    with os.fdopen(descriptor, "w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

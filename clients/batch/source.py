@@ -95,7 +95,8 @@ class Scaled:
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a frame of a video, m."""
         scale_m = self.depth_scale_m or METRES_PER_INTEGER_STEP
-        return (stored * np.float64(scale_m)).astype(np.float32)
+        with np.errstate(over="ignore"):
+            return (stored * np.float64(scale_m)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,9 @@ class Disparity:
         apart_px = disparity_px.astype(np.float64) + self.offset_px
         known = np.isfinite(apart_px) & (apart_px > 0.0)
         depth_m = np.zeros(disparity_px.shape)
-        depth_m[known] = self.focal_px * self.baseline_m / apart_px[known]
-        return depth_m.astype(np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinitely far
+            depth_m[known] = self.focal_px * self.baseline_m / apart_px[known]
+            return depth_m.astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.source import center_depth_m
+from estimator.bounded_files import InvalidFile, read_text
 from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
 
 CENTER = "center"
@@ -45,7 +47,8 @@ class States:
             focus_dpt = self.focus_dpt
         if focus_dpt is None:
             low_dpt, high_dpt = CENTER_RANGE_DPT
-            focus_dpt = min(max(1.0 / center_depth_m(depth_m), low_dpt), high_dpt)
+            nearest_m = 1.0 / high_dpt  # so that no depth is too small to divide by
+            focus_dpt = max(1.0 / max(center_depth_m(depth_m), nearest_m), low_dpt)
         return self.pupil_mm if pupil_mm is None else pupil_mm, focus_dpt
 
     @property
@@ -98,42 +101,56 @@ def read_states(
 
     Raises
     ------
-    ValueError
+    InvalidFile
         Names the line, the value and what is allowed.
     """
-    by_number = {int(name): name for name in names if name.isdecimal()}
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.DictReader(file, skipinitialspace=True)
-        columns = rows.fieldnames or []
-        if "frame" not in columns or not set(columns) <= set(COLUMNS):
-            raise ValueError(
-                f"--states '{path}': columns {', '.join(columns) or 'none'}; allowed: "
-                f"{', '.join(COLUMNS)}"
-            )
-        found = {}
-        for row in rows:
-            name = row["frame"]
-            if name not in names and name.isdecimal():
-                name = by_number.get(int(name), name)
-            where = f"--states '{path}', line {rows.line_num}"
-            found[name] = (
-                _number(row, "pupil_mm", (MIN_PUPIL_MM, MAX_PUPIL_MM), where),
-                _number(row, "focus_dpt", (0.0, MAX_VERGENCE_DPT), where),
-            )
+    text = read_text(path, option="states")
+    try:
+        return _states_of(text, path, names)
+    except csv.Error as error:
+        raise InvalidFile(path, f"not CSV ({error})", "CSV", "states") from None
+
+
+def _states_of(
+    text: str, path: Path, names: Sequence[str]
+) -> dict[str, tuple[float | None, float | None]]:
+    known = set(names)
+    by_number = {int(name): name for name in names if _is_number(name)}
+    rows = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
+    columns = rows.fieldnames or []
+    if "frame" not in columns or not set(columns) <= set(COLUMNS):
+        found_text = f"columns {', '.join(columns) or 'none':.100}"
+        raise InvalidFile(path, found_text, ", ".join(COLUMNS), "states")
+    found = {}
+    for row in rows:
+        where = f"line {rows.line_num}"
+        name = row["frame"]
+        if name is None:
+            raise InvalidFile(path, f"{where}: no frame", "its name", "states")
+        if name not in known and _is_number(name):
+            name = by_number.get(int(name), name)
+        state = []
+        for column, low, high in (
+            ("pupil_mm", MIN_PUPIL_MM, MAX_PUPIL_MM),
+            ("focus_dpt", 0.0, MAX_VERGENCE_DPT),
+        ):
+            value = _number(row.get(column)) if column in row else None
+            if value is not None and not low <= value <= high:
+                found_text = f"{where}: {column} '{row[column]!s:.40}'"
+                allowed = f"{low:g} to {high:g}"
+                raise InvalidFile(path, found_text, allowed, "states")
+            state.append(value)
+        found[name] = (state[0], state[1])
     return found
 
 
-def _number(
-    row: dict[str, str | None], column: str, limits: tuple[float, float], where: str
-) -> float | None:
-    text = row.get(column)
-    if text is None and column not in row:
-        return None
-    low, high = limits
+def _is_number(name: str) -> bool:
+    return name.isdecimal() and len(name) < 20
+
+
+def _number(text: str | None) -> float:
+    """Return a number; NaN for other text."""
     try:
-        value = float(text or "")
+        return float(text or "")
     except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{where}: {column} '{text}'; allowed: {low:g} to {high:g}")
-    return value
+        return float("nan")

@@ -6,13 +6,30 @@ decoding; then the decoder goes to the key frame before it and on from there.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.bounded_files import InvalidFile, reason_of
+
 GREY = ("gray16le", "gray16be")
+
+MAX_VIDEO_PIXELS = 1 << 25
+"""Of a frame, as 8K is: a decoder holds up to 17 of them, and one as sRGB beside."""
+
+MAX_VIDEO_FRAMES = 1_000_000
+"""Nine hours at 30 Hz; the times of all are held, 40 bytes each."""
+
+MAX_PACKETS_AHEAD = 10_000
+"""Without a picture of those that were asked for: a key frame is some hundred back."""
+
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
+"""What may be in a file, whatever its name: no playlists, which name other files."""
+
+OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
 
 
 def frame_count(path: Path) -> int:
@@ -20,7 +37,7 @@ def frame_count(path: Path) -> int:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         It cannot be read, or has no pictures.
     """
     with VideoReader(path) as reader:
@@ -32,7 +49,7 @@ def frames_per_second(path: Path) -> float:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         It cannot be read.
     """
     with VideoReader(path) as reader:
@@ -44,23 +61,25 @@ class VideoReader:
 
     Raises
     ------
-    ValueError
-        It cannot be read, or has no pictures.
+    InvalidFile
+        It cannot be read, has no pictures, too many, or too large ones.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._container = av.open(str(path))
-        except (av.FFmpegError, OSError) as error:
-            raise ValueError(f"'{path}': cannot be read ({error})") from None
-        if not self._container.streams.video:
-            raise ValueError(f"'{path}': no pictures in it")
-        self._stream = self._container.streams.video[0]
-        # One thread: the machine's cores have frames of their own.
-        self._stream.codec_context.thread_count = 1
-        self._times = self._packet_times()
-        self._decoded = iter(())
+            self._container = av.open(
+                str(path), options=OPTIONS, metadata_errors="replace"
+            )
+        except Exception as error:  # the bindings raise nearly anything
+            raise self._unreadable("cannot be read", error) from None
+        try:
+            self._stream = self._opened_stream()
+            self._times = self._packet_times()
+        except BaseException:
+            self.close()
+            raise
+        self._decoded: Iterator[av.VideoFrame] = iter(())
         self._next = -1  # number of the frame that is decoded next
 
     def __enter__(self) -> VideoReader:
@@ -83,55 +102,120 @@ class VideoReader:
     @property
     def rate_hz(self) -> float:
         """Return the mean rate, or 30 where the file does not tell."""
-        return float(self._stream.average_rate or 30)
+        try:
+            return float(self._stream.average_rate or 30)
+        except (ZeroDivisionError, OverflowError):
+            return 30.0
 
     def color(self, index: int) -> NDArray[np.uint8]:
         """Return a frame in sRGB, (height, width, 3).
 
         Raises
         ------
-        ValueError
+        InvalidFile
         """
-        return self._frame(index).to_ndarray(format="rgb24")
+        return self._array(self._frame(index), format="rgb24")
 
     def integers(self, index: int) -> NDArray[np.uint16]:
         """Return a frame of 16-bit grey as it is stored, (height, width).
 
         Raises
         ------
-        ValueError
+        InvalidFile
             The video is of another kind.
         """
         frame = self._frame(index)
         if frame.format.name not in GREY:
-            raise ValueError(
-                f"'{self._path}': pixels are {frame.format.name}; allowed for depth: "
-                "16-bit grey without loss, as `ffmpeg -pix_fmt gray16le -c:v ffv1`"
+            raise InvalidFile(
+                self._path,
+                f"pixels are {frame.format.name}",
+                "16-bit grey without loss, as `ffmpeg -pix_fmt gray16le -c:v ffv1`",
             )
-        return frame.to_ndarray().astype(np.uint16)
+        return self._array(frame).astype(np.uint16)
+
+    def _unreadable(self, what: str, error: Exception) -> InvalidFile:
+        found = f"{what} ({reason_of(error)})"
+        return InvalidFile(self._path, found, "an intact video")
+
+    def _opened_stream(self) -> av.VideoStream:
+        if not self._container.streams.video:
+            raise InvalidFile(self._path, "no pictures in it", "a video")
+        stream = self._container.streams.video[0]
+        context = stream.codec_context
+        if context is None:
+            raise InvalidFile(self._path, "no decoder for it", "a known codec")
+        # One thread: the machine's cores have frames of their own.
+        context.thread_count = 1
+        # Frames of another size may follow: the decoder itself refuses larger ones.
+        context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+        if context.width * context.height > MAX_VIDEO_PIXELS:
+            found = f"frames of {context.width}x{context.height} px"
+            raise InvalidFile(self._path, found, f"at most {MAX_VIDEO_PIXELS:,} pixels")
+        return stream
 
     def _packet_times(self) -> list[int]:
-        times = [packet.pts for packet in self._container.demux(self._stream)]
-        known = sorted(time for time in times if time is not None)
+        known: list[int] = []
+        try:
+            for packet in self._container.demux(self._stream):
+                if packet.pts is not None:
+                    known.append(packet.pts)
+                if len(known) > MAX_VIDEO_FRAMES:
+                    found = f"more than {MAX_VIDEO_FRAMES:,} frames"
+                    raise InvalidFile(
+                        self._path, found, f"at most {MAX_VIDEO_FRAMES:,}"
+                    )
+        except InvalidFile:
+            raise
+        except Exception as error:  # the bindings raise nearly anything
+            raise self._unreadable("cannot be read", error) from None
         if not known or len(set(known)) < len(known):
-            raise ValueError(f"'{self._path}': its frames have no times of their own")
+            found = "its frames have no times of their own"
+            raise InvalidFile(self._path, found, "a time for each")
+        known.sort()
         return known
 
     def _frame(self, index: int) -> av.VideoFrame:
         if not 0 <= index < self.count:
-            raise ValueError(f"'{self._path}': frame {index} of {self.count}")
+            found = f"frame {index} of {self.count}"
+            raise InvalidFile(self._path, found, "one that there is")
+        wanted = self._times[index]
         try:
             if index != self._next:
-                self._container.seek(self._times[index], stream=self._stream)
-                self._decoded = self._container.decode(self._stream)
+                self._container.seek(wanted, stream=self._stream)
+                self._decoded = self._decoded_frames()
             self._next = index + 1
             for frame in self._decoded:
-                if frame.pts == self._times[index]:
+                if frame.pts == wanted:
                     return frame
-        except av.FFmpegError as error:
+                if frame.pts is not None and frame.pts > wanted:
+                    break  # frames come in the order of their times
+        except Exception as error:  # the bindings raise nearly anything
             self._next = -1
-            raise ValueError(
-                f"'{self._path}': frame {index} cannot be read ({error})"
-            ) from None
+            if isinstance(error, InvalidFile):
+                raise
+            raise self._unreadable(f"frame {index} cannot be read", error) from None
         self._next = -1
-        raise ValueError(f"'{self._path}': frame {index} cannot be read")
+        raise InvalidFile(
+            self._path, f"frame {index} cannot be read", "an intact video"
+        )
+
+    def _decoded_frames(self) -> Iterator[av.VideoFrame]:
+        """Yield frames from here on, as long as packets lead to some."""
+        n_without = 0
+        for packet in self._container.demux(self._stream):
+            for frame in packet.decode():
+                n_without = 0
+                yield frame
+            n_without += 1
+            if n_without > MAX_PACKETS_AHEAD:
+                found = f"{n_without:,} packets without a picture"
+                raise InvalidFile(self._path, found, "an intact video")
+
+    def _array(self, frame: av.VideoFrame, **how: str) -> NDArray:
+        if frame.width * frame.height > MAX_VIDEO_PIXELS:
+            found = f"a frame of {frame.width}x{frame.height} px"
+            raise InvalidFile(self._path, found, f"at most {MAX_VIDEO_PIXELS:,} pixels")
+        try:
+            return frame.to_ndarray(**how)
+        except Exception as error:  # the bindings raise nearly anything
+            raise self._unreadable("pixels cannot be read", error) from None

@@ -10,6 +10,10 @@ from pathlib import Path
 from typing import Any
 
 PART = ".part"
+MAX_STEM = 180
+"""Of a name, so that with what is added it is one that a file system takes."""
+
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _BLOCK_BYTES = 1 << 20
 
 
@@ -25,8 +29,9 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
         bytes and sha256 of the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    random = secrets.token_hex(4)
-    part = path.with_name(f".{path.stem}.{random}{PART}{path.suffix}")
+    random = secrets.token_hex(8)
+    part = path.with_name(f".{path.stem[:MAX_STEM]}.{random}{PART}{path.suffix}")
+    os.close(os.open(part, _NEW_FILE, 0o666))  # no link that is there is followed
     try:
         write(part)
         with part.open("rb") as file:

@@ -22,7 +22,10 @@ scene_view         a scene's colour and depth in an OpenGL context
 scene_buffers      what that keeps there
 projection         its matrices
 built_scene        our own scenes, built in a process apart
-gltf_file          any glTF file, in parts
+gltf_container     a glTF file's header and buffers
+gltf_arrays        its arrays
+gltf_nodes         where its meshes stand
+gltf_file          all of it, in parts
 gltf_scene         as a scene
 viewpoint          where a viewer stands in it
 

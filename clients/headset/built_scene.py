@@ -9,6 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from clients.batch.whole_files import write_whole
 from clients.extra import what_to_install
 from clients.scenes.paths import PATHS
 from clients.scenes.scene import Scene
@@ -64,9 +65,8 @@ def main(name: str, file: str) -> None:
         from clients.scenes.catalogue import build_scene
     except ModuleNotFoundError as error:
         sys.exit(what_to_install(error))
-    unfinished = Path(f"{file}.part")
-    unfinished.write_bytes(pickle.dumps(build_scene(name)))
-    unfinished.rename(file)
+    content = pickle.dumps(build_scene(name))
+    write_whole(Path(file), lambda part: part.write_bytes(content))
 
 
 if __name__ == "__main__":

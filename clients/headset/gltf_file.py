@@ -1,32 +1,47 @@
-"""Read a glTF file into triangles with the look that each part of it has."""
+"""Read a glTF file into triangles with the look that each part of it has.
 
-import io
-import json
-import struct
+What a file places is counted before anything is copied: it may place one mesh a
+thousand times, and name one image of a gigabyte.
+"""
+
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
+from clients.headset.gltf_arrays import accessor_array, accessor_count
+from clients.headset.gltf_container import Container
+from clients.headset.gltf_nodes import placed_meshes
 from clients.scenes.geometry import Array
+from filter_service.bounded_images import check_picture, read_picture_rgb
 
-MAX_FILE_MB = 1000.0
-MAX_TRIANGLES = 5_000_000
+MAX_TRIANGLES = 2_000_000
+MAX_VERTICES = 6_000_000
+"""Placed ones, three for each triangle without normals: 32 bytes of each stay, and two
+million triangles take 3 to 5 s."""
+
+MAX_DRAWS = 15_000
+"""Parts placed by nodes: 0.25 ms each."""
+
+MAX_TEXTURE_PIXELS = 1 << 26
+"""In all textures: three bytes of each stay."""
+
 LEAST_VOLUME_RATIO = 1e-30
 """A node that shrinks volumes to less has no inverse."""
 
 LEAST_WEIGHT_RATIO = 0.5
 """What is blended with less is left out."""
 
-_MAGIC = b"glTF"
-_JSON_CHUNK = b"JSON"
-_HEADER = struct.Struct("<4sII")
-_CHUNK = struct.Struct("<I4s")
+_TRIANGLES, _STRIP = 4, 5
 _KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
 """How the names of those begin without which a file is shown all the same."""
+
+_PICTURES = ("", "image/png", "image/jpeg", "image/webp")
 
 
 @dataclass(frozen=True)
@@ -36,7 +51,7 @@ class Part:
     Attributes
     ----------
     world_from_part : (4, 4)
-    vertices_m : (n, 3)
+    vertices_m : (n, 3), as they are stored, and so are normals
     faces : (m, 3)
     normals : (n, 3), or None where the file has none
     uv : (n, 2), v up, or None
@@ -46,21 +61,21 @@ class Part:
     """
 
     world_from_part: Array
-    vertices_m: Array
+    vertices_m: NDArray[np.float32]
     faces: NDArray[np.int64]
-    normals: Array | None
-    uv: Array | None
+    normals: NDArray[np.float32] | None
+    uv: NDArray[np.float32] | None
     reflectance_ratio: Array
     texture: NDArray[np.uint8] | None
     is_unlit: bool
 
 
-def read_parts(path: Path) -> list[Part]:
-    """Return all triangles of a .glb or .gltf file.
+def read_parts(path: Path) -> Iterator[Part]:
+    """Yield all triangles of a .glb or .gltf file, part by part.
 
     Raises
     ------
-    ValueError
+    InvalidFile
         No such file, no glTF 2, one that needs extensions not known here, damaged,
         without triangles, or too large.
 
@@ -69,133 +84,229 @@ def read_parts(path: Path) -> list[Part]:
     Nothing is transparent: what the file blends with less than `LEAST_WEIGHT_RATIO`
     is left out, all else is opaque.  Skins, shape keys and animations rest.
     """
-    header, data, kind = _numbered(path, _content(path))
-    try:
-        scene = trimesh.load_scene(
-            io.BytesIO(data),
-            file_type=kind,
-            resolver=trimesh.resolvers.FilePathResolver(str(path)),
-        )
-    except Exception as error:  # whatever a damaged file leads a reader to
-        raise ValueError(f"{path}: damaged, or files beside it are missing") from error
-    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    meshes = [(matrix, scene.geometry[name]) for matrix, name in placed]
-    # Lines and points are no triangles; what a node squeezes flat has no inside.
-    meshes = [
-        (matrix, mesh)
-        for matrix, mesh in meshes
-        if isinstance(mesh, trimesh.Trimesh)
-        and len(mesh.faces)
-        and abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO
+    file = Container(path)
+    required = file.header.get("extensionsRequired", [])
+    for name in required if isinstance(required, list) else [required]:
+        if not isinstance(name, str) or not name.startswith(_KNOWN_EXTENSIONS):
+            file.refuse(f"needs the extension {name!s:.60}, not known here")
+    placed = [
+        (matrix, primitive)
+        for matrix, mesh in placed_meshes(file)
+        if abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO
+        for primitive in _primitives(file, mesh)
     ]
-    # Counted before any is copied: a file may place one mesh a thousand times.
-    count = sum(len(mesh.faces) for _, mesh in meshes)
-    if count > MAX_TRIANGLES:
-        raise ValueError(f"{path}: {count} triangles; at most {MAX_TRIANGLES}")
-    parts = list(_parts(meshes, header))
-    if not parts:
-        raise ValueError(f"{path}: no triangles to show")
-    return parts
-
-
-def _content(path: Path) -> bytes:
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    size_mb = path.stat().st_size / 1e6
-    if size_mb > MAX_FILE_MB:
-        raise ValueError(f"{path}: {size_mb:.0f} MB; at most {MAX_FILE_MB:.0f}")
-    return path.read_bytes()
-
-
-def _numbered(path: Path, content: bytes) -> tuple[dict, bytes, str]:
-    """Return a file's header, the file with materials numbered, and its kind.
-
-    trimesh rounds the colours of materials, and forgets which is unlit.  So each
-    primitive gets a material of its own, whose name says where it stands in the header.
-    """
-    kind = "glb" if content.startswith(_MAGIC) else "gltf"
-    try:
-        text, rest = _split(content) if kind == "glb" else (content, b"")
-        header = json.loads(text)
-        version = header["asset"]["version"]
-        numbered = json.dumps(_with_own_materials(header)).encode()
-    except (ValueError, TypeError, LookupError, AttributeError, struct.error) as error:
-        raise ValueError(f"{path}: not a glTF file") from error
-    if not str(version).startswith("2."):
-        raise ValueError(f"{path}: glTF {version}; needs glTF 2")
-    for name in header.get("extensionsRequired", ()):
-        if not name.startswith(_KNOWN_EXTENSIONS):
-            raise ValueError(f"{path}: needs the extension {name}, not known here")
-    return header, _joined(numbered, rest) if kind == "glb" else numbered, kind
-
-
-def _split(content: bytes) -> tuple[bytes, bytes]:
-    """Return the header's text and the chunks behind it of a binary file."""
-    length, name = _CHUNK.unpack_from(content, _HEADER.size)
-    start = _HEADER.size + _CHUNK.size
-    if name != _JSON_CHUNK or start + length > len(content):
-        raise ValueError("no header")
-    return content[start : start + length], content[start + length :]
-
-
-def _joined(text: bytes, rest: bytes) -> bytes:
-    text += b" " * (-len(text) % 4)
-    total = _HEADER.size + _CHUNK.size + len(text) + len(rest)
-    start = _HEADER.pack(_MAGIC, 2, total) + _CHUNK.pack(len(text), _JSON_CHUNK)
-    return start + text + rest
-
-
-def _with_own_materials(header: dict) -> dict:
-    """Return the header with one material for each primitive, named by its place."""
-    materials, meshes = [], []
-    for i, mesh in enumerate(header.get("meshes", [])):
-        primitives = []
-        for k, primitive in enumerate(mesh["primitives"]):
-            primitives.append(primitive | {"material": len(materials)})
-            materials.append(_material(header, primitive) | {"name": f"{i} {k}"})
-        meshes.append(mesh | {"primitives": primitives})
-    return header | {"materials": materials, "meshes": meshes}
-
-
-def _material(header: dict, primitive: dict) -> dict:
-    index = primitive.get("material")
-    return {} if index is None else header["materials"][index]
-
-
-def _parts(placed, header: dict) -> Iterator[Part]:
-    """Yield what is visible of placed meshes [(matrix, mesh), ...]."""
-    textures: dict[int, NDArray[np.uint8]] = {}
-    for world_from_part, mesh in placed:
-        i, k = map(int, mesh.visual.material.name.split())
-        primitive = header["meshes"][i]["primitives"][k]
-        material = _material(header, primitive)
-        surface = material.get("pbrMetallicRoughness", {})
-        factor = np.array(surface.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), float)
-        if material.get("alphaMode") == "BLEND" and factor[3] < LEAST_WEIGHT_RATIO:
+    _check_counts(file, [primitive for _, primitive in placed])
+    textures = _Textures(file)
+    materials = [_material(file, primitive) for _, primitive in placed]
+    textures.check(materials)
+    n_parts = 0
+    for (matrix, primitive), material in zip(placed, materials, strict=True):
+        if not _is_shown(file, material):
             continue
-        has_normals = "NORMAL" in primitive["attributes"]
-        uv, image = mesh.visual.uv, mesh.visual.material.baseColorTexture
-        texture = None
-        if uv is not None and image is not None:
-            if id(image) not in textures:
-                textures[id(image)] = np.asarray(image.convert("RGB"))
-            texture = textures[id(image)]
-        yield Part(
-            world_from_part=world_from_part,
-            vertices_m=np.asarray(mesh.vertices, float),
-            faces=np.asarray(mesh.faces),
-            normals=np.asarray(mesh.vertex_normals, float) if has_normals else None,
-            uv=uv,
-            reflectance_ratio=factor[:3] * _vertex_colors(mesh),
-            texture=texture,
-            is_unlit="KHR_materials_unlit" in material.get("extensions", {}),
-        )
+        n_parts += 1
+        yield _part(file, matrix, primitive, material, textures)
+    if not n_parts:
+        file.refuse("no triangles to show")
 
 
-def _vertex_colors(mesh) -> Array:
-    """Return the linear factor (n, 3) on each vertex; integers are shares of all."""
-    colors = mesh.visual.vertex_attributes.get("color")
-    if colors is None:
-        return np.ones((len(mesh.vertices), 3))
+def _primitives(file: Container, mesh: int) -> list[dict[str, Any]]:
+    """Return the primitives of a mesh that are triangles: no lines, no points."""
+    primitives = file.entry("meshes", mesh).get("primitives")
+    if not isinstance(primitives, list):
+        file.refuse(f"damaged: meshes[{mesh}].primitives is not a list")
+    for primitive in primitives:
+        attributes = primitive.get("attributes") if isinstance(primitive, dict) else 0
+        if not isinstance(attributes, dict):
+            file.refuse(f"damaged: a primitive of meshes[{mesh}] has no attributes")
+    return [
+        primitive
+        for primitive in primitives
+        if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP)
+        and _triangle_count(file, primitive) > 0
+    ]
+
+
+def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
+    corners = primitive.get("indices", primitive["attributes"].get("POSITION"))
+    count = accessor_count(file, corners)
+    return count - 2 if primitive.get("mode", _TRIANGLES) == _STRIP else count // 3
+
+
+def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
+    """Refuse too many of anything; a primitive counts each time that it is placed."""
+    if len(primitives) > MAX_DRAWS:
+        file.refuse(f"{len(primitives):,} parts", f"at most {MAX_DRAWS:,}")
+    counts = {id(p): _triangle_count(file, p) for p in primitives}
+    n_triangles = sum(counts[id(p)] for p in primitives)
+    if n_triangles > MAX_TRIANGLES:
+        file.refuse(f"{n_triangles:,} triangles", f"at most {MAX_TRIANGLES:,}")
+    counts = {
+        id(p): accessor_count(file, p["attributes"].get("POSITION"))
+        if "NORMAL" in p["attributes"]
+        else 3 * counts[id(p)]
+        for p in primitives
+    }
+    n_vertices = sum(counts[id(p)] for p in primitives)
+    if n_vertices > MAX_VERTICES:
+        file.refuse(f"{n_vertices:,} vertices", f"at most {MAX_VERTICES:,}")
+
+
+def _material(file: Container, primitive: dict[str, Any]) -> dict[str, Any]:
+    index = primitive.get("material")
+    return {} if index is None else file.entry("materials", index)
+
+
+def _object(file: Container, entry: dict[str, Any], field: str) -> dict[str, Any]:
+    found = entry.get(field, {})
+    if not isinstance(found, dict):
+        file.refuse(f"damaged: '{field}' is not an object")
+    return found
+
+
+def _factor(file: Container, material: dict[str, Any]) -> Array:
+    surface = _object(file, material, "pbrMetallicRoughness")
+    given = surface.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
+    is_four = isinstance(given, list) and len(given) == 4
+    if not is_four or not all(type(v) in (int, float) for v in given):
+        file.refuse("damaged: a baseColorFactor", "four numbers")
+    return np.array(given, float)
+
+
+def _is_shown(file: Container, material: dict[str, Any]) -> bool:
+    weight = _factor(file, material)[3]
+    return material.get("alphaMode") != "BLEND" or weight >= LEAST_WEIGHT_RATIO
+
+
+def _part(
+    file: Container,
+    matrix: Array,
+    primitive: dict[str, Any],
+    material: dict[str, Any],
+    textures: _Textures,
+) -> Part:
+    attributes = primitive["attributes"]
+    vertices_m = _columns(file, attributes, "POSITION", 3, kinds="f")
+    n = len(vertices_m)
+    normals = uv = None
+    if "NORMAL" in attributes:
+        normals = _columns(file, attributes, "NORMAL", 3, kinds="f", count=n)
+        if not np.ptp(normals) > 0.0:
+            normals = None
+    if "TEXCOORD_0" in attributes:
+        uv = _columns(file, attributes, "TEXCOORD_0", 2, kinds="fu", count=n)
+        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
+    return Part(
+        world_from_part=matrix,
+        vertices_m=vertices_m,
+        faces=_faces(file, primitive, n),
+        normals=normals,
+        uv=uv,
+        reflectance_ratio=_reflectance(file, material, attributes, n),
+        texture=None if uv is None else textures.of(material),
+        is_unlit="KHR_materials_unlit" in _object(file, material, "extensions"),
+    )
+
+
+def _columns(
+    file: Container,
+    attributes: dict[str, Any],
+    name: str,
+    columns: int,
+    *,
+    kinds: str,
+    count: int | None = None,
+) -> NDArray:
+    """Return a vertex attribute; integers as shares of their largest value."""
+    array = accessor_array(file, attributes.get(name), kinds=kinds)
+    if array.shape[1] < columns or count not in (None, len(array)):
+        found = f"damaged: {name} has {len(array):,} entries of {array.shape[1]}"
+        file.refuse(found, f"{count or len(array):,} of {columns}")
+    if array.dtype.kind == "u":
+        return array / np.float32(np.iinfo(array.dtype).max)
+    return array
+
+
+def _reflectance(
+    file: Container, material: dict[str, Any], attributes: dict[str, Any], n: int
+) -> Array:
+    """Return the linear factor (n, 3) on each vertex."""
+    factor = _factor(file, material)[:3]
+    if "COLOR_0" not in attributes:
+        return np.broadcast_to(factor, (n, 3))
+    colors = accessor_array(file, attributes["COLOR_0"], kinds="fu")
+    if len(colors) != n or colors.shape[1] < 3:
+        return np.broadcast_to(factor, (n, 3))
     top = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
-    return np.asarray(colors, float)[:, :3] / top
+    return factor * (np.asarray(colors, float)[:, :3] / top)
+
+
+def _faces(
+    file: Container, primitive: dict[str, Any], n_vertices: int
+) -> NDArray[np.int64]:
+    corners = np.arange(n_vertices)
+    if "indices" in primitive:
+        stored = accessor_array(file, primitive["indices"], kinds="u")
+        corners = stored[:, 0].astype(np.int64)
+        if len(corners) and int(corners.max()) >= n_vertices:
+            found = f"damaged: a triangle of vertex {int(corners.max()):,}"
+            file.refuse(found, f"0 to {n_vertices - 1:,}")
+    if primitive.get("mode", _TRIANGLES) == _STRIP:
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, ::-1]  # so that all face the same way
+        return faces
+    if len(corners) % 3:
+        file.refuse(f"damaged: {len(corners):,} corners of triangles", "three of each")
+    return corners.reshape(-1, 3)
+
+
+class _Textures:
+    """The pictures of a file: their headers are checked; a part has its own decoded."""
+
+    def __init__(self, file: Container) -> None:
+        self._file = file
+        self._decoded: dict[int, NDArray[np.uint8]] = {}
+
+    def check(self, materials: list[dict[str, Any]]) -> None:
+        """Refuse more pixels than are allowed, by the headers of the pictures."""
+        distinct = {id(m): m for m in materials}.values()
+        images = sorted({i for m in distinct if (i := self._image_of(m)) is not None})
+        n_pixels = 0
+        for index in images:
+            n_pixels += check_picture(self._content(index), name=self._name(index))
+            if n_pixels > MAX_TEXTURE_PIXELS:
+                found = f"textures of {n_pixels:,} pixels or more"
+                self._file.refuse(found, f"at most {MAX_TEXTURE_PIXELS:,}")
+
+    def of(self, material: dict[str, Any]) -> NDArray[np.uint8] | None:
+        """Return the texture of a material, if it has one."""
+        index = self._image_of(material)
+        if index is None:
+            return None
+        if index not in self._decoded:
+            content, name = self._content(index), self._name(index)
+            self._decoded[index] = read_picture_rgb(content, name=name)
+        return self._decoded[index]
+
+    def _image_of(self, material: dict[str, Any]) -> int | None:
+        """Return the number of a material's image; None without one that is read."""
+        surface = _object(self._file, material, "pbrMetallicRoughness")
+        if "baseColorTexture" not in surface:
+            return None
+        reference = _object(self._file, surface, "baseColorTexture")
+        texture = self._file.entry("textures", reference.get("index"))
+        extensions = _object(self._file, texture, "extensions")
+        webp = _object(self._file, extensions, "EXT_texture_webp")
+        index = webp.get("source", texture.get("source"))
+        if index is None:
+            return None
+        kind = self._file.entry("images", index).get("mimeType", "")
+        return index if kind in _PICTURES else None
+
+    def _content(self, index: int) -> bytes:
+        image = self._file.entry("images", index)
+        if "bufferView" in image:
+            return bytes(self._file.view(image["bufferView"]))
+        return self._file.uri_bytes(image.get("uri"))
+
+    def _name(self, index: int) -> str:
+        return f"{self._file.path}, image {index}"

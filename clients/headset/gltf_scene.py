@@ -1,21 +1,21 @@
 """Any glTF file as a scene: its light is simple, fixed, and baked into its vertices."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.headset.gltf_file import Part, read_parts
-from clients.scenes.geometry import (
-    Array,
-    Mesh,
-    by_texture,
-    transformed,
-    vertex_normals,
-)
-from clients.scenes.scene import Scene, finished
+from clients.scenes.geometry import Array, Mesh, transformed
+from clients.scenes.scene import Batch, Scene, finished
+from estimator import InvalidFile
 
 MAX_EXTENT_M = 10_000.0
 """What is larger is in other units than metres, as glTF has them, or a landscape."""
+
+PIECE_TRIANGLES = 250_000
+"""Of a part at once: each takes 0.4 kB on its way."""
 
 NEAR_M = 0.05
 LEAST_FAR_M = 10.0
@@ -33,22 +33,28 @@ def load_gltf(path: str | Path) -> Scene:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         What is wrong with the file, which it names: see `read_parts`; or a place that
         is no number, or more than `MAX_EXTENT_M` across.
     """
     path = Path(path)
-    parts = read_parts(path)
-    textures = {str(id(p.texture)): p.texture for p in parts if p.texture is not None}
-    meshes = by_texture([_mesh(part) for part in parts])
-    extent_m = _extent_m(meshes)
+    batches, corners_m = [], []
+    with np.errstate(over="ignore", invalid="ignore"):  # places that are no numbers
+        for part in read_parts(path):  # one at a time: a batch takes a sixth of it
+            for mesh in _meshes(part):
+                low_m, high_m = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+                corners_m += [low_m, high_m]
+                textures = {} if part.texture is None else {mesh.texture: part.texture}
+                batches.append(finished(mesh, light_on(mesh.normals), textures))
+        extent_m = float(np.linalg.norm(np.ptp(corners_m, axis=0)))
     if not extent_m <= MAX_EXTENT_M:
-        raise ValueError(f"{path}: {extent_m:.3g} m across; at most {MAX_EXTENT_M:g}")
+        allowed = f"at most {MAX_EXTENT_M:g} m"
+        raise InvalidFile(path, f"{extent_m:.3g} m across", allowed)
     # Twice that: the viewer may stand outside, see `viewpoint`, and walk.
     far_m = max(LEAST_FAR_M, 4.0 * extent_m)
     return Scene(
         name=path.name,
-        batches=tuple(finished(m, light_on(m.normals), textures) for m in meshes),
+        batches=tuple(_by_texture(batches)),
         background_srgb=BACKGROUND_SRGB,
         near_m=NEAR_M,
         far_m=far_m,
@@ -70,31 +76,65 @@ def light_on(normals: Array) -> Array:
     return around + _SUN * np.maximum(normals @ _TO_SUN, 0.0)[:, None]
 
 
-def _extent_m(meshes: list[Mesh]) -> float:
-    """Return the diagonal of the box around all; NaN where a place is none."""
-    low_m = np.min([mesh.vertices_m.min(axis=0) for mesh in meshes], axis=0)
-    high_m = np.max([mesh.vertices_m.max(axis=0) for mesh in meshes], axis=0)
-    return float(np.linalg.norm(high_m - low_m))
+def _by_texture(batches: list[Batch]) -> list[Batch]:
+    """Merge batches into one per texture, so that a frame takes few draw calls."""
+    groups: dict[int, list[Batch]] = {}
+    while batches:  # each is let go as soon as it is in its group's arrays
+        batch = batches.pop(0)
+        groups.setdefault(id(batch.texture), []).append(batch)
+    return [_merged(group) for group in groups.values()]
 
 
-def _mesh(part: Part) -> Mesh:
-    """Return a part in the world's frame, its normals as glTF wants them."""
-    columns = {"vertices_m": part.vertices_m, "albedo": part.reflectance_ratio}
-    columns["uv"] = np.zeros((len(part.vertices_m), 2)) if part.uv is None else part.uv
-    faces, normals = part.faces, part.normals
-    if normals is None:  # each face is flat, and has its corners for itself
-        columns = {name: values[faces.ravel()] for name, values in columns.items()}
-        faces = np.arange(faces.size).reshape(-1, 3)
-        normals = vertex_normals(columns["vertices_m"], faces)
-    dark = np.zeros_like(columns["albedo"])
-    light = {"emission": dark}
-    if part.is_unlit:
-        light = {"emission": columns["albedo"], "albedo": dark}
+def _merged(batches: list[Batch]) -> Batch:
+    counts = [len(batch.vertices_m) for batch in batches]
+    starts = np.cumsum([0, *counts[:-1]], dtype=np.int64).astype(np.uint32)
+    return Batch(
+        vertices_m=np.concatenate([b.vertices_m for b in batches]),
+        faces=np.concatenate(
+            [b.faces + start for b, start in zip(batches, starts, strict=True)]
+        ),
+        uv=np.concatenate([b.uv for b in batches]),
+        srgb=np.concatenate([b.srgb for b in batches]),
+        texture=batches[0].texture,
+    )
+
+
+def _meshes(part: Part) -> Iterator[Mesh]:
+    """Yield a part in the world's frame, its normals as glTF wants them, in pieces."""
+    for start in range(0, len(part.faces), PIECE_TRIANGLES):
+        faces = part.faces[start : start + PIECE_TRIANGLES]
+        is_whole = len(faces) == len(part.faces)
+        used = np.arange(len(part.vertices_m))
+        if part.normals is None:  # each face is flat, and has its corners for itself
+            used, faces = faces.ravel(), np.arange(faces.size).reshape(-1, 3)
+        elif not is_whole:
+            is_used = np.zeros(len(used), bool)
+            is_used[faces] = True
+            used, faces = np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces]
+        yield _mesh(part, used, faces)
+
+
+def _mesh(part: Part, used: NDArray[np.int64], faces: NDArray[np.int64]) -> Mesh:
+    """Return triangles of the vertices of a part that they use."""
+    vertices_m = part.vertices_m[used].astype(float)
+    albedo = part.reflectance_ratio[used]
+    uv = np.zeros((len(used), 2)) if part.uv is None else part.uv[used].astype(float)
+    if part.normals is None:
+        a, b, c = (vertices_m[k::3] for k in range(3))
+        normals = np.cross(b - a, c - a)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.repeat(normals / np.maximum(length, 1e-12), 3, axis=0)
+    else:
+        normals = part.normals[used].astype(float)
+    dark = np.zeros_like(albedo)
     mesh = Mesh(
+        vertices_m=vertices_m,
         normals=normals,
         faces=faces,
+        albedo=dark if part.is_unlit else albedo,
+        emission=albedo if part.is_unlit else dark,
         translucency=np.zeros(len(normals)),
+        uv=uv,
         texture="" if part.texture is None else str(id(part.texture)),
-        **(columns | light),
     )
     return transformed(mesh, part.world_from_part)

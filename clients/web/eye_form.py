@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clients.web.worn_form import PRESCRIPTION, WornForm, read_numbers
-from estimator import parse_profile, preset_names, profile_body
+from estimator import (
+    InvalidFile,
+    load_profile,
+    parse_profile,
+    preset_names,
+    profile_body,
+)
 
 EyeSide = Literal["OD", "OS"]
 Source = Literal["prescription", "preset", "file"]
@@ -133,27 +139,24 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         Another kind of file, too large, or not a profile: says what is allowed.
     """
     suffix, shown = Path(name).suffix.lower(), Path(name).name[:60]
     if suffix not in PROFILE_SUFFIXES:
         allowed = ", ".join(PROFILE_SUFFIXES)
-        raise ValueError(f"“{shown}” is no profile; allowed: {allowed}")
+        raise InvalidFile(shown, "not a profile", allowed)
     if len(content) > MAX_PROFILE_BYTES:
-        raise ValueError(
-            f"{len(content) / 1e6:.1f} MB is too much for a profile; allowed: "
-            f"{MAX_PROFILE_BYTES / 1e6:g} MB"
-        )
+        found = f"{len(content) / 1e6:.1f} MB"
+        raise InvalidFile(shown, found, f"{MAX_PROFILE_BYTES / 1e6:g} MB")
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
         path = Path(folder) / f"profile{suffix}"
         path.write_bytes(content)
         try:
-            body = dict(profile_body(path))
-            parse_profile(body)
-        except ValueError as error:
-            text = str(error).replace(str(path), path.name)
-            raise ValueError(text.replace(path.name, shown)) from None
+            body = profile_body(path)
+            load_profile(path)  # checks its fields
+        except InvalidFile as error:
+            raise InvalidFile(shown, error.found, error.allowed) from None
     if body.get("name") == path.name:  # coefficients are called as their file is
         body["name"] = shown
     return body

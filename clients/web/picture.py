@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
 from dataclasses import dataclass, replace
@@ -10,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 
+from estimator import InvalidFile
 from filter_service import Camera, RgbdView
+from filter_service.bounded_images import read_picture_rgb
 from filter_service.image_files import read_depth
 
 MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
@@ -177,7 +178,7 @@ def photo_picture(
 
     Raises
     ------
-    ValueError
+    InvalidFile
         A file that is no picture, or a depth of another shape: says what is allowed.
     """
     color = _photo_color(name, content)
@@ -214,24 +215,17 @@ def _resized(
 
 
 def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
-    allowed = "allowed: a JPEG, PNG, WebP or TIFF picture of 8 bits"
+    allowed = "a JPEG, PNG, WebP or TIFF picture of 8 bits"
     _check_size(name, content)
     try:
-        with Image.open(io.BytesIO(content), formats=PHOTO_FORMATS) as image:
-            n_pixels = image.width * image.height
-            if n_pixels <= MAX_PHOTO_PIXELS:
-                upright = ImageOps.exif_transpose(image)
-                color = np.asarray(upright.convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise ValueError(f"“{name:.60}” is no picture; {allowed}") from None
-    if n_pixels > MAX_PHOTO_PIXELS:
-        raise ValueError(
-            f"“{name:.60}” has {n_pixels / 1e6:.0f} million pixels; allowed: "
-            f"{MAX_PHOTO_PIXELS / 1e6:.0f} million"
-        )
+        color = read_picture_rgb(content, name=name[:60], upright=True)
+    except InvalidFile as error:
+        if error.found.startswith("cannot be read"):
+            raise InvalidFile(name[:60], "not a picture", allowed) from None
+        raise
     if min(color.shape[:2]) < LEAST_SIDE_PX:
         size = f"{color.shape[1]} × {color.shape[0]} px"
-        raise ValueError(f"“{name:.60}” is {size}; allowed: {LEAST_SIDE_PX} or more")
+        raise InvalidFile(name[:60], size, f"{LEAST_SIDE_PX} or more")
     return color
 
 
@@ -248,23 +242,20 @@ def _photo_depth(
         path.write_bytes(content)
         try:
             depth_m = read_depth(path, option="")
-        except ValueError as error:
-            text = str(error).replace(str(path), Path(name).name)
-            raise ValueError(text) from None
+        except InvalidFile as error:
+            shown = Path(name).name[:60]
+            raise InvalidFile(shown, error.found, error.allowed) from None
     if depth_m.shape != shape:
         found, wanted = (f"{w} × {h} px" for h, w in (depth_m.shape, shape))
-        raise ValueError(
-            f"“{name:.60}” is {found}; allowed: the size of the photo, {wanted}"
-        )
+        allowed = f"the size of the photo, {wanted}"
+        raise InvalidFile(name[:60], found, allowed)
     return depth_m
 
 
 def _check_size(name: str, content: bytes) -> None:
     if len(content) > MAX_PHOTO_BYTES:
-        raise ValueError(
-            f"“{name:.60}” has {len(content) / 1e6:.0f} MB; allowed: "
-            f"{MAX_PHOTO_BYTES / 1e6:.0f} MB"
-        )
+        found = f"{len(content) / 1e6:.0f} MB"
+        raise InvalidFile(name[:60], found, f"{MAX_PHOTO_BYTES / 1e6:.0f} MB")
 
 
 def camera_of(width_deg: float, *, width_px: int, height_px: int) -> Camera:

@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from clients.arguments import read_size_px
+from clients.batch.whole_files import write_whole
 from clients.extra import what_to_install
 from clients.web.picture import Picture, picture_of
+from estimator import InvalidFile
 from filter_service import RgbdView
 
 TIMEOUT_S = 300.0
@@ -55,17 +57,15 @@ def gltf_picture(name: str, content: bytes) -> Picture:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         Not a file of that kind.
     SceneNotRendered
         Damaged, or not to be rendered here.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in GLTF_SUFFIXES:
-        raise ValueError(
-            f"“{name:.60}” is no scene; allowed: {', '.join(GLTF_SUFFIXES)}, with its "
-            "pictures and meshes inside"
-        )
+        allowed = f"{', '.join(GLTF_SUFFIXES)}, with its pictures and meshes inside"
+        raise InvalidFile(name[:60], "not a scene", allowed)
     _check_is_self_contained(name, content)
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
         path = Path(folder) / f"scene{suffix}"
@@ -167,17 +167,15 @@ def main(source: str, file: str, size: str) -> int:
         state = (moment.pupil_diameter_mm, moment.focus_dpt)
     with SceneRenderer(scene, read_size_px(size)) as renderer:
         seen, hidden = renderer.render_layers(viewpoint(scene))
-        unfinished = Path(file).with_suffix(".part.npz")
-        np.savez(
-            unfinished,
-            color=seen[0],
-            depth_m=seen[1],
-            hidden_color=hidden[0],
-            hidden_depth_m=hidden[1],
-            tangents=renderer.tangents,
-            state=state,
-        )
-    unfinished.rename(file)
+        arrays = {
+            "color": seen[0],
+            "depth_m": seen[1],
+            "hidden_color": hidden[0],
+            "hidden_depth_m": hidden[1],
+            "tangents": renderer.tangents,
+            "state": state,
+        }
+    write_whole(Path(file), lambda part: np.savez(part, **arrays))
     return 0
 
 

@@ -1,10 +1,16 @@
 """Profile files: JSON, the ``.abp`` of the paper's framework, CSV of coefficients."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
+from estimator.bounded_files import (
+    InvalidFile,
+    loads_bounded,
+    numbered_lines,
+    read_text,
+    reason_of,
+)
 from estimator.profiles.parse import (
     EyeProfile,
     ProfileError,
@@ -12,9 +18,38 @@ from estimator.profiles.parse import (
     preset_names,
 )
 
+MAX_PROFILE_BYTES = 2_000_000
+"""Of a profile file: 28 coefficients at 400 field directions take 0.3 MB as JSON."""
+
+MAX_PROFILE_LINES = 20_000
+"""Of an .abp or .csv file, which has a line for each of at most 28 coefficients."""
+
 _ABP_SETTING = re.compile(r"(Ap|Wa)\s*=\s*(\S+)")
 _ABP_TERM = re.compile(r"Z\s*\[\s*(-?\d+)\s*,\s*(-?\d+)\s*\]\s*=\s*(\S+)")
+_WHOLE = re.compile(r"-?[0-9]{1,4}")
 _CSV_SETTING = re.compile(r"#\s*(pupil_diameter_mm|wavelength_nm)\s*[:=]\s*(\S+)")
+
+
+class InvalidProfileFile(InvalidFile, ProfileError):
+    """A profile file with a wrong line or field.
+
+    Attributes
+    ----------
+    field : str
+        The line, or the dotted path of the field at fault; may be empty.
+    """
+
+    def __init__(
+        self, path: str | Path, field: str, problem: str, allowed: str
+    ) -> None:
+        found = f"{field}: {problem}" if field else problem
+        InvalidFile.__init__(self, path, found, allowed)
+        self.field = field
+        self._problem = problem
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickle makes it from."""
+        return type(self), (self.path, self.field, self._problem, self.allowed)
 
 
 def load_profile(
@@ -35,13 +70,24 @@ def load_profile(
     Raises
     ------
     ProfileError
-        Unknown name or file kind, or the field at fault in the file.
+        Unknown name or file kind.
+    InvalidFile
+        The file, with the line or field at fault; both a `ProfileError`, too, where it
+        could be read.
     """
-    return parse_profile(
-        profile_body(
-            source, pupil_diameter_mm=pupil_diameter_mm, wavelength_nm=wavelength_nm
-        )
+    body = profile_body(
+        source, pupil_diameter_mm=pupil_diameter_mm, wavelength_nm=wavelength_nm
     )
+    try:
+        return parse_profile(body)
+    except InvalidFile:
+        raise
+    except ProfileError as error:
+        if body == {"kind": "preset", "name": str(source)}:
+            raise
+        problem = str(error).removeprefix(f"profile field '{error.field}': ")
+        problem = problem.removesuffix(f"; allowed: {error.allowed}")
+        raise InvalidProfileFile(source, error.field, problem, error.allowed) from None
 
 
 def profile_body(
@@ -50,7 +96,15 @@ def profile_body(
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
 ) -> dict[str, Any]:
-    """Return the profile as the plain object that also travels over the wire."""
+    """Return the profile as the plain object that also travels over the wire.
+
+    Raises
+    ------
+    ProfileError
+        Unknown name or file kind.
+    InvalidFile
+        A file that cannot be read as such; its fields are not checked here.
+    """
     if str(source) in preset_names():
         return {"kind": "preset", "name": str(source)}
     path = Path(source)
@@ -59,51 +113,54 @@ def profile_body(
     allowed = f"a preset ({', '.join(preset_names())}) or a .json, .abp or .csv file"
     if reader is None:
         raise ProfileError("profile", f"'{source}' is not known", allowed)
-    if not path.is_file():
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError):  # a null byte, or a name that is too long
+        is_file = False
+    if not is_file:
         raise ProfileError("profile", f"file '{source}' does not exist", allowed)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ProfileError(path.name, "is not a text file", "UTF-8 text") from None
-    body = reader(text, path.name)
+        text = read_text(path, max_bytes=MAX_PROFILE_BYTES, max_lines=MAX_PROFILE_LINES)
+    except InvalidFile as error:
+        raise InvalidProfileFile(path, "", error.found, error.allowed) from None
+    body = reader(text, path)
     if reader is _read_csv:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
         body.update({k: v for k, v in given.items() if v is not None})
     return body
 
 
-def _read_json(text: str, name: str) -> dict[str, Any]:
+def _read_json(text: str, path: Path) -> dict[str, Any]:
     try:
-        body: dict[str, Any] = json.loads(text, object_pairs_hook=_without_repeats)
-    except json.JSONDecodeError as error:
-        raise ProfileError(name, f"not JSON ({error})", "one JSON object") from None
+        body = loads_bounded(text.encode(), max_bytes=MAX_PROFILE_BYTES)
+    except ValueError as error:
+        problem = f"not JSON ({reason_of(error)})"
+        raise InvalidProfileFile(path, "", problem, "one JSON object") from None
+    if not isinstance(body, dict):
+        problem = f"{body!r:.60} is not an object"
+        raise InvalidProfileFile(path, "", problem, "one JSON object")
     return body
 
 
-def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, Any]:
-    body: dict[str, Any] = {}
-    for key, value in pairs:
-        _set_once(body, key, value, where=key)
-    return body
-
-
-def _set_once(body: dict[str, Any], key: str, value: object, *, where: str) -> None:
+def _set_once(
+    body: dict[str, Any], key: str, value: object, *, path: Path, where: str
+) -> None:
     """Set a field that must not be there yet: of two values neither can be trusted."""
     if key in body:
-        raise ProfileError(where, f"'{key}' is given twice", "each field once")
+        problem = f"'{key}' is given twice"
+        raise InvalidProfileFile(path, where, problem, "each field once")
     body[key] = value
 
 
-def _value(text: str, where: str) -> float:
+def _value(text: str, *, path: Path, where: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ProfileError(
-            where, f"'{text}' is not a number", "a number, as -0.25"
-        ) from None
+        problem = f"'{text:.60}' is not a number"
+        raise InvalidProfileFile(path, where, problem, "a number, as -0.25") from None
 
 
-def _read_abp(text: str, name: str) -> dict[str, Any]:
+def _read_abp(text: str, path: Path) -> dict[str, Any]:
     """Lines ``Ap = 5.0`` (mm), ``Wa = 587.56`` (nm), ``Z[n, m] = um``, ``#`` comments.
 
     Missing terms are zero; a missing Ap or Wa is an error here (the framework falls
@@ -111,42 +168,55 @@ def _read_abp(text: str, name: str) -> dict[str, Any]:
     """
     body: dict[str, Any] = {
         "kind": "zernike",
-        "name": name,
+        "name": path.name,
         "frame": "eye",
         "zernike_um": {},
     }
     keys = {"Ap": "pupil_diameter_mm", "Wa": "wavelength_nm"}
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in numbered_lines(text):
         content = line.split("#", 1)[0].strip()
-        where = f"{name}, line {number}"
+        at: dict[str, Any] = {"path": path, "where": f"line {number}"}
         if setting := _ABP_SETTING.fullmatch(content):
-            _set_once(body, keys[setting[1]], _value(setting[2], where), where=where)
+            _set_once(body, keys[setting[1]], _value(setting[2], **at), **at)
         elif term := _ABP_TERM.fullmatch(content):
-            key = f"{int(term[1])},{int(term[2])}"
-            _set_once(body["zernike_um"], key, _value(term[3], where), where=where)
+            key = _index_key(term[1], term[2], **at)
+            _set_once(body["zernike_um"], key, _value(term[3], **at), **at)
         elif content:
             allowed = "'Ap = mm', 'Wa = nm', 'Z[n, m] = um' or a # comment"
-            raise ProfileError(where, f"cannot read '{content}'", allowed)
+            problem = f"cannot read '{content:.60}'"
+            raise InvalidProfileFile(
+                problem=problem, field=at["where"], path=path, allowed=allowed
+            )
     return body
 
 
-def _read_csv(text: str, name: str) -> dict[str, Any]:
+def _read_csv(text: str, path: Path) -> dict[str, Any]:
     body: dict[str, Any] = {
         "kind": "zernike",
-        "name": name,
+        "name": path.name,
         "frame": "eye",
         "zernike_um": {},
     }
-    for number, line in enumerate(text.splitlines(), start=1):
-        content, where = line.strip(), f"{name}, line {number}"
+    for number, line in numbered_lines(text):
+        content = line.strip()
+        at: dict[str, Any] = {"path": path, "where": f"line {number}"}
         if setting := _CSV_SETTING.fullmatch(content):
-            _set_once(body, setting[1], _value(setting[2], where), where=where)
+            _set_once(body, setting[1], _value(setting[2], **at), **at)
         elif content and not content.startswith("#"):
             parts = [part.strip() for part in content.split(",")]
             if parts == ["n", "m", "um"]:
                 continue
-            if len(parts) != 3 or not all(p.lstrip("-").isdigit() for p in parts[:2]):
-                raise ProfileError(where, f"cannot read '{content}'", "n,m,um")
-            key = f"{int(parts[0])},{int(parts[1])}"
-            _set_once(body["zernike_um"], key, _value(parts[2], where), where=where)
+            if len(parts) != 3:
+                problem = f"cannot read '{content:.60}'"
+                raise InvalidProfileFile(path, at["where"], problem, "n,m,um")
+            key = _index_key(parts[0], parts[1], **at)
+            _set_once(body["zernike_um"], key, _value(parts[2], **at), **at)
     return body
+
+
+def _index_key(n: str, m: str, *, path: Path, where: str) -> str:
+    """Return the key of a term; its order and frequency have few digits."""
+    if not (_WHOLE.fullmatch(n) and _WHOLE.fullmatch(m)):
+        problem = f"'{n:.30},{m:.30}' is not a term"
+        raise InvalidProfileFile(path, where, problem, "n,m as whole numbers")
+    return f"{int(n)},{int(m)}"

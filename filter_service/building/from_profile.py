@@ -85,9 +85,16 @@ def build(
     except ProfileError as error:  # light does not pass a given eye
         raise unknown_profile(error) from error
     except ValueError as error:  # the settings do not suit this eye or camera
-        named = {name: getattr(error, name, None) for name in ("field", "allowed")}
+        field = getattr(error, "field", None)
+        if field is None:  # of a computation, which knows nothing of fields
+            raise BuildFailed(
+                f"no PSFs can be computed for this eye ({error})",
+                field="settings",
+                allowed="ranges, and a camera, that this eye can be seen through",
+            ) from error
         text = getattr(error, "message", str(error))
-        raise BuildFailed(text, **named) from error
+        allowed = getattr(error, "allowed", None)
+        raise BuildFailed(text, field=field, allowed=allowed) from error
 
 
 def _known_eye(

@@ -1,10 +1,18 @@
 """Measured spectra of a display in a file, to what stands for them."""
 
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
+from estimator.bounded_files import InvalidFile, read_text
 from filter_service.displays import primaries_of_spectra
+
+MAX_DISPLAY_BYTES = 1_000_000
+"""Of a file of spectra: 0.1 nm from 300 to 1100 nm take 0.4 MB."""
+
+MAX_VALUE = 1e30
+"""Of a number in it, so that sums and products stay within float64."""
 
 
 def display_of_file(name: str) -> str:
@@ -14,13 +22,11 @@ def display_of_file(name: str) -> str:
 
     Raises
     ------
-    ValueError
+    InvalidFile
         Names the file and what is wrong with it.
     """
-    path = Path(name)
-    if not path.exists():
-        raise ValueError(f"--display {name}: there is no such file")
-    lines = path.read_text(encoding="utf-8").split("\n")
+    text = read_text(Path(name), max_bytes=MAX_DISPLAY_BYTES, option="display")
+    lines = text.split("\n")
     try:
         table = np.array(
             [
@@ -30,17 +36,25 @@ def display_of_file(name: str) -> str:
             ]
         )
         columns = table[:, 0], table[:, 1:]
-        steps_nm = np.diff(columns[0])
     except (ValueError, IndexError):
-        raise ValueError(
-            f"--display {name}: every line must hold four numbers: nm, red, green, blue"
-        ) from None
+        _refuse(name, "a line without four numbers", "nm, red, green, blue")
+    if not np.abs(table).max() <= MAX_VALUE:
+        _refuse(name, "a number out of range", f"at most {MAX_VALUE:g}")
+    steps_nm = np.diff(columns[0])
     if not (steps_nm.size and np.allclose(steps_nm, steps_nm[0]) and steps_nm[0] > 0):
-        raise ValueError(f"--display {name}: nm must rise in even steps")
+        _refuse(name, "nm do not rise in even steps", "even steps")
+    try:
+        with np.errstate(all="ignore"):  # spectra of zeros: refused there by name
+            primaries = primaries_of_spectra(*columns)
+    except ValueError as error:
+        _refuse(name, str(error), "measured spectra of three primaries")
     return ",".join(
-        f"{nm:.1f}:{width_nm:.1f}"
-        for nm, width_nm in zip(*primaries_of_spectra(*columns), strict=True)
+        f"{nm:.1f}:{width_nm:.1f}" for nm, width_nm in zip(*primaries, strict=True)
     )
+
+
+def _refuse(name: str, found: str, allowed: str) -> NoReturn:
+    raise InvalidFile(name, found, allowed, "display") from None
 
 
 def _is_words(line: str) -> bool:

@@ -47,6 +47,7 @@ class Bench(StrEnum):
     HEADSET = "headset"
     HOST = "host"
     ABUSE = "abuse"
+    FILES = "files"
     OVERLOAD = "overload"
     DEVICES = "devices"
     RESTART = "restart"
@@ -81,6 +82,7 @@ BENCH_MODULES = {
     Bench.HEADSET: "tests.benchmarks.bench_headset",
     Bench.HOST: "tests.benchmarks.bench_host",
     Bench.ABUSE: "tests.benchmarks.bench_abuse",
+    Bench.FILES: "tests.benchmarks.bench_files",
     Bench.OVERLOAD: "tests.benchmarks.bench_overload",
     Bench.DEVICES: "tests.benchmarks.bench_devices",
     Bench.RESTART: "tests.benchmarks.bench_restart",

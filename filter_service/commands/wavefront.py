@@ -1,6 +1,5 @@
 """`ocufilter wavefront`: the aberrations of one eye at one field, ray-traced."""
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -126,14 +125,16 @@ def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt
 
 def explicit_body(source: str) -> dict | None:
     """Content of a JSON file that gives surfaces; None for any other source."""
+    from estimator.bounded_files import InvalidFile, read_json
     from estimator.eye.explicit import is_explicit_eye
+    from estimator.profiles.files import MAX_PROFILE_BYTES
 
     path = Path(source)
     if path.suffix.lower() != ".json" or not path.is_file():
         return None
     try:
-        body = json.loads(path.read_text(encoding="utf-8-sig"))
-    except ValueError:
+        body = read_json(path, max_bytes=MAX_PROFILE_BYTES)
+    except InvalidFile:
         return None  # the reader of profiles says what is wrong with it
     return body if is_explicit_eye(body) else None
 

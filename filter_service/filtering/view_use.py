@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from filter_service.building.jobs import LookAt
 from filter_service.building.used_ranges import Range
 from filter_service.filtering.stream_use import FrameUse
-from filter_service.rgbd_view import RgbdView
+from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
 from filter_service.settings import MAX_PLANES, MAX_VERGENCE_DPT, PLANE_ROOM_DPT
 
 STEP_PX = 8
@@ -79,7 +79,7 @@ def _plane_steps(depths_m: NDArray[np.float32]) -> list[float]:
 
 def _valid_depths_m(view: RgbdView, *, step_px: int) -> NDArray[np.float32]:
     depths_m = [d[::step_px, ::step_px] for d in view.surface_depths_m]
-    return np.concatenate([d[d > 0.0] for d in depths_m])
+    return np.concatenate([d[d >= LEAST_DEPTH_M] for d in depths_m])
 
 
 def _object_range_dpt(view: RgbdView) -> Range:

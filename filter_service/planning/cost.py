@@ -81,7 +81,8 @@ def kernel_radius_px(
 ) -> NDArray[np.int64]:
     """Radii (P,) that hold all but a share of the light that a cache may drop."""
     if not spec.settings.diffraction:
-        return np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX).astype(np.int64)
+        radius_px = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX)
+        return np.minimum(radius_px, LARGEST_RADIUS_PX).astype(np.int64)
     return needed_radius_px(
         survey,
         lost_energy_ratio=share * (1.0 - spec.kept_energy_ratio),
@@ -106,6 +107,9 @@ def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
         reach_px[:, 1] + reach_px[:, 3] + 1.0
     )
 
+
+LARGEST_RADIUS_PX = 1e9
+"""Far more than any plan allows, and within what integers hold."""
 
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
 """Processor time of what `cost_terms` counts, on an AMD EPYC (another machine's is

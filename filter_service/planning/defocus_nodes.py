@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.constants import RGB
+from filter_service.errors import GridTooLarge
 from filter_service.planning.error_law import (
     allowed_difference_px,
     half_way_error,
@@ -44,6 +45,9 @@ EXACT_DPT = 1e-9
 
 DEEP_DPT = 6.0
 """From here on, the shift saves a range too little to be tried."""
+
+MAX_GROUP_NODES = 100_000
+"""Of defocus at one place.  The largest blur, 255 px, takes 1,000 steps of 0.25 px."""
 
 Ranges = list[NDArray[np.float64]]
 
@@ -297,6 +301,16 @@ def _spread(
     """Nodes from end to end of a range, as many as its ladder asks for."""
     if high_dpt - low_dpt < EXACT_DPT:
         return np.array([low_dpt])
+    if not needed[-1] <= MAX_GROUP_NODES:  # NaN is none either
+        raise GridTooLarge(
+            f"defocus from {low_dpt:.4g} to {high_dpt:.4g} dpt needs {needed[-1]:.3g} "
+            "PSFs at one place in the image",
+            field="settings.object_range_dpt",
+            allowed=f"ranges and an eye that need at most {MAX_GROUP_NODES:,}",
+        )
+    if not needed[-1] > 0.0:  # PSFs are so wide that no difference shows
+        return np.array([low_dpt, high_dpt])
     count = 1 + max(1, math.ceil(needed[-1] - 1e-9))
     ladder = np.linspace(low_dpt, high_dpt, _LADDER)
-    return np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
+    nodes = np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
+    return np.unique(nodes)  # ends that differ by a rounding error are one

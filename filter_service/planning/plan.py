@@ -37,6 +37,7 @@ from filter_service.planning.nodes import (
 from filter_service.planning.paper_grid import paper_axes, paper_defocus
 from filter_service.planning.readable import (
     PlanAxes,
+    check_central_defocus,
     joined_ranges,
     readable_defocus,
     usable_pupils_mm,
@@ -89,6 +90,10 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
 
     Raises
     ------
+    ProfileError
+        The eye is out of focus as no eye is.
+    GridTooLarge
+        One place, pupil and accommodation alone would need too many PSFs.
     PlanTooLarge
         The kernels would exceed ``spec.memory_budget_mb``; the message proposes what
         to change.
@@ -112,6 +117,7 @@ def unchecked_plan(
     allowed_error = target_error(spec)
     if target_db is not None:
         allowed_error = 10.0 ** (-target_db / 10.0)
+    check_central_defocus(eye, spec)
     use = sample_use(eye, spec, USE_SAMPLES)
     if spec.settings.grid == "paper":
         axes = PlanAxes(*paper_axes(eye, spec))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.eye.checked_fields import ProfileError
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GREEN, GridSpec
 
@@ -13,6 +14,10 @@ MAX_FIELD_STEP_DPT = 1.5
 eye hardly sees, as at the edge of a cataract, is it more; there the nodes' own ranges
 end the blend at equal blur, and far objects are read a little nearer."""
 
+
+MAX_DEFOCUS_DPT = 1000.0
+"""Of an eye that looks at infinity.  More is no eye but a mistake in its profile, and
+the nodes of such a range would fill any memory."""
 
 GAP_ROOM_DPT = 0.25
 """Into the gap between two planes: as far as a frame's layers lie beside a plane."""
@@ -67,6 +72,37 @@ class ReadableDefocus:
         return _hull(self.ranges_dpt - self.shift_dpt[:, None, :, None])
 
 
+def check_central_defocus(eye: EyeOptics, spec: GridSpec) -> None:
+    """Refuse an eye that is no eye on its axis, before anything is planned for it.
+
+    Raises
+    ------
+    ProfileError
+    """
+    defocus_dpt = eye.total_defocus_dpt(
+        pupil_diameter_mm=np.array(usable_pupils_mm(eye, spec))[:, None, None],
+        accommodation_dpt=np.array(used_accommodations_dpt(eye, spec))[:, None],
+        wavelength_nm=spec.channel_wavelengths_nm,
+    )
+    check_defocus(defocus_dpt)
+
+
+def check_defocus(defocus_dpt: NDArray[np.float64]) -> None:
+    """Refuse defocus that no eye has.
+
+    Raises
+    ------
+    ProfileError
+    """
+    largest_dpt = float(np.abs(defocus_dpt).max(initial=0.0))
+    if not largest_dpt <= MAX_DEFOCUS_DPT:  # NaN is none either
+        raise ProfileError(
+            "profile",
+            f"its eye is out of focus by {largest_dpt:.3g} dpt",
+            f"up to {MAX_DEFOCUS_DPT:g} dpt through the pupils asked for",
+        )
+
+
 def _hull(ranges_dpt: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(
         [ranges_dpt[..., 0].min(axis=-1), ranges_dpt[..., 1].max(axis=-1)], axis=-1
@@ -91,6 +127,7 @@ def readable_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> Readable
         accommodation_dpt=used_dpt[:, None],
         wavelength_nm=spec.channel_wavelengths_nm,
     )
+    check_defocus(at_infinity_dpt)
     at_nodes_dpt = at_infinity_dpt[:, :, own_pupil][:, :, :, own_used]
     lows = _over(at_infinity_dpt, 3, of_used, np.min)
     highs = _over(at_infinity_dpt, 3, of_used, np.max)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def kept_eyes(folder: Path) -> list[KeptEye]:
     """
     found: dict[str, KeptEye] = {}
     for path in _stores(folder):
-        status = path.stat()
+        status = path.lstat()
         name = path.name.split(BETWEEN)[0]
         before = found.get(name, KeptEye(name, 0, 0, 0.0))
         found[name] = KeptEye(
@@ -63,4 +64,12 @@ def erase_eyes(folder: Path, name: str = "") -> int:
 def _stores(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder")
-    return [path for path in folder.iterdir() if path.suffix == SUFFIX]
+    return [path for path in folder.iterdir() if _is_store(path)]
+
+
+def _is_store(path: Path) -> bool:
+    """Tell our files from folders and links under such names."""
+    try:
+        return path.suffix == SUFFIX and stat.S_ISREG(path.lstat().st_mode)
+    except FileNotFoundError:  # a service has removed it
+        return False

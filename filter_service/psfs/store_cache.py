@@ -12,6 +12,7 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable
@@ -96,6 +97,26 @@ def eye_name(profile: EyeProfile) -> str:
     return digest.hexdigest()
 
 
+_logged: set[tuple[Path, str]] = set()
+
+
+def _log_once(path: Path, text: str) -> None:
+    """Log what is wrong with an entry the first time; later builds say nothing."""
+    if (path, text) not in _logged:
+        _logged.add((path, text))
+        log.warning("%s %s", path, text)
+
+
+def _remove(path: Path, reason: Exception) -> None:
+    """Remove an entry that is damaged; a folder under its name stays."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:  # a folder, or one of a folder that is not ours to change
+        _log_once(path, f"is passed over: {reason}")
+    else:
+        log.warning("%s is removed: %s", path, reason)
+
+
 class StoreCache:
     """A folder of stores.
 
@@ -114,6 +135,8 @@ class StoreCache:
     def load(self, key: str, *, go_on: Callable[[], None]) -> Stored | None:
         """Return what is kept under a key; a damaged file is removed.
 
+        What cannot be read or removed is passed over, and logged once.
+
         Parameters
         ----------
         go_on : callable
@@ -124,14 +147,15 @@ class StoreCache:
         path = self._path(key)
         try:
             stored = read_file(path, go_on=go_on)
+            if not isinstance(stored, Stored):
+                raise DamagedFile(f"it holds a {type(stored).__name__}")
         except FileNotFoundError:
             return None
         except DamagedFile as error:
-            log.warning("%s is removed: %s", path, error)
-            path.unlink(missing_ok=True)
+            _remove(path, error)
             return None
         except OSError as error:
-            log.warning("%s cannot be read: %s", path, error)
+            _log_once(path, f"cannot be read: {error}")
             return None
         with suppress(OSError):  # another service has removed it meanwhile
             os.utime(path)
@@ -148,7 +172,8 @@ class StoreCache:
             n_bytes = write_file(self._path(key), stored)
             self._evict()
         except (OSError, NotStorable) as error:
-            log.warning("a store cannot be kept in %s: %s", self._folder, error)
+            reason = getattr(error, "strerror", None) or error
+            _log_once(self._path(key), f"cannot be kept: {reason}")
             return
         log.info(
             "a store of %.0f MB is kept for the next time, written in %.1f s",
@@ -182,9 +207,11 @@ class StoreCache:
         found = []
         for path in self._folder.iterdir():
             try:
-                status = path.stat()
+                status = path.lstat()
             except FileNotFoundError:
                 continue  # another service has removed it
+            if not stat.S_ISREG(status.st_mode):
+                continue  # a folder, or a link: none of ours
             if path.suffix == SUFFIX:
                 found.append((status.st_mtime, status.st_size, path))
             elif path.suffix == UNFINISHED:

@@ -31,6 +31,12 @@ ALIGNMENT_BYTES = 64
 BLOCK_BYTES = 2**24
 """Read or written between two looks at cancellation: 5 to 20 ms."""
 
+_MALFORMED = (
+    *(ValueError, LookupError, TypeError, AttributeError, ImportError),
+    *(OverflowError, RecursionError, MemoryError),
+)
+"""What a header that is not one of ours may lead to."""
+
 Look = Callable[[], None]
 
 
@@ -122,13 +128,13 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
         content = json.loads(header)
         arrays = {key: _array(data, p) for key, p in content["arrays"].items()}
         return unpack(content["tree"], arrays)
-    except (ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
-        raise DamagedFile(f"it is of another version: {error}") from error
+    except _MALFORMED as error:
+        raise DamagedFile(f"it is of another version: {error!r:.200}") from error
 
 
 def _open_plain_file(path: str, flags: int) -> int:
     """Open a file, and nothing that could keep its reader waiting, as a FIFO does."""
-    descriptor = os.open(path, flags | os.O_NONBLOCK)
+    descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise DamagedFile("it is no plain file")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import TILE_SIZE_PX
-from filter_service.rgbd_view import RgbdView
+from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
 
 IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 
@@ -16,10 +16,11 @@ def fill_missing_depth(
 ) -> tuple[NDArray[np.float32], int]:
     """Give missing pixels the depth of the nearest valid pixel, and count them.
 
+    Missing is what is not a number from `LEAST_DEPTH_M` on.
     Nearest by Euclidean distance in the image; if no pixel is valid, all are at
     infinity.
     """
-    missing = ~(depth_m > 0.0)
+    missing = ~(depth_m >= LEAST_DEPTH_M)
     count = int(np.count_nonzero(missing))
     if count == 0:
         return depth_m, 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import resource
 
+import estimator.bounded_files  # noqa: F401  read now: later no file may be opened
 from filter_service.service.child import begin
 from filter_service.service.door import Door
 from filter_service.service.metrics import NoMetrics

@@ -176,8 +176,8 @@ def test_a_file_that_cannot_be_shown_is_named_with_the_reason(tmp_path, monkeypa
     refused("m across", "huge.glb")
     monkeypatch.setattr("clients.headset.gltf_file.MAX_TRIANGLES", 1)
     refused("2 triangles", "good.glb")
-    monkeypatch.setattr("clients.headset.gltf_file.MAX_FILE_MB", 1e-5)
-    refused("MB; at most", "good.glb")
+    monkeypatch.setattr("clients.headset.gltf_container.MAX_FILE_MB", 1e-5)
+    refused("at most 1e-05 MB", "good.glb")
 
 
 # ----- places

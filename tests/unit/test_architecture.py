@@ -37,6 +37,8 @@ MAY_IMPORT = {
         "filter_service.slots",  # memory shared with the service
         "filter_service.settings",
         "filter_service.image_files",  # pictures and depth in files
+        "filter_service.bounded_images",  # and those that were sent
+        "estimator.bounded_files",  # text and JSON of files
         "estimator.profile_body",  # a profile as plain values
         "estimator.parse_profile",  # and whether it is one
         "estimator.thread_count",
@@ -164,9 +166,10 @@ HOME = {
         "estimator/field/plot.py",  # `ocufilter field --plot`
         "training/learning_curve.py",
     ),
-    "OpenEXR": ("filter_service/image_files.py",),
+    "OpenEXR": ("filter_service/bounded_images.py", "filter_service/image_files.py"),
     "PIL": (
-        "filter_service/image_files.py",
+        "filter_service/bounded_images.py",  # reads
+        "filter_service/image_files.py",  # writes
         "filter_service/psfs/picture.py",
         "clients/*",  # captions, textures, contact sheet
     ),

@@ -308,13 +308,16 @@ def test_parts_are_dropped_in_slices_up_to_the_end_of_the_message(drop):
 @pytest.mark.parametrize(
     ("body", "text"),
     [
-        (json.dumps({"a": [[]] * 20_000}).encode(), f"more than {MAX_ITEMS} items"),
-        (json.dumps({"a": [1] * 20_000}).encode(), f"more than {MAX_ITEMS} items"),
+        (json.dumps({"a": [[]] * 20_000}).encode(), "more than 16,384 values"),
+        (json.dumps({"a": [1] * 20_000}).encode(), "more than 16,384 values"),
         (msgpack.packb({"a": [[[]] * 4000] * 5}), f"more than {MAX_ITEMS} items"),
         (msgpack.packb({"a": [[0] * 4000] * 5}), f"more than {MAX_ITEMS} items"),
-        (b'{"a": ' + b"1" * 900_000 + b"}", "an integer has 900000 digits"),
+        (b'{"a": ' + b"1" * 900_000 + b"}", "an integer of 900000 digits"),
         (b'{"a": ' + b"[" * 5000 + b"]" * 5000 + b"}", "cannot be read as JSON"),
-        (b'{"a": ' + b"[" * 40 + b"]" * 40 + b"}", "deep in each other"),
+        (
+            b'{"a": ' + b"[" * 40 + b"]" * 40 + b"}",
+            "arrays more than 32 deep",
+        ),
         (json.dumps({"a": {"b": "x" * 5000}}).encode(), "5000 characters"),
     ],
 )

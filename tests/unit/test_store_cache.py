@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+import zlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.psfs import store_cache, store_codec, store_file
 from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.kept_eyes import erase_eyes, kept_eyes
 from filter_service.psfs.store_cache import StoreCache, Stored, eye_name, store_key
 from tests.grid_specs import grid_spec
 
@@ -378,3 +380,57 @@ def test_nothing_is_kept_where_others_may_look(tmp_path, stored, caplog):
     StoreCache(str(folder), max_mb=1000).save(key_of(1), stored)
     assert not list(folder.iterdir())
     assert f"chmod 700 {folder}" in caplog.text
+
+
+def test_a_folder_under_an_entrys_name_is_passed_over_and_logged_once(
+    cache, path, stored, caplog
+):
+    path.unlink()
+    path.mkdir()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            assert cache.load(key_of(1), go_on=nothing) is None
+            cache.save(key_of(1), stored)
+    told = [record for record in caplog.records if str(path) in record.getMessage()]
+    assert len(told) == 2, caplog.text  # one of reading, one of writing
+    assert path.is_dir()
+    assert kept_eyes(path.parent) == []
+    assert erase_eyes(path.parent) == 0
+
+
+def test_a_link_is_not_followed(cache, path, tmp_path):
+    moved = tmp_path / "moved"
+    path.rename(moved)
+    path.symlink_to(moved)
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert moved.is_file()
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        None,
+        5,
+        [],
+        {"array": "none"},
+        {"object": []},
+        {"object": ["estimator.nothing:A", {}]},
+        {"object": ["filter_service.psfs.store_cache:Stored", {"store": {"tuple": 5}}]},
+        {"object": ["filter_service.camera:Camera", {}]},
+    ],
+)
+def test_an_entry_with_another_content_is_removed(cache, path, monkeypatch, tree):
+    monkeypatch.setattr(store_file, "pack", lambda value: (tree, {}))
+    store_file.write_file(path, None)
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert not path.exists()
+
+
+def test_an_entry_nested_too_deep_is_removed(cache, path):
+    header = b'{"arrays": {}, "tree": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+    start = store_file.PREAMBLE.size + len(header)
+    sums = zlib.crc32(header), zlib.crc32(b"")
+    preamble = (store_file.MAGIC, len(header), start, 0, *sums)
+    path.write_bytes(store_file.PREAMBLE.pack(*preamble) + header)
+    assert cache.load(key_of(1), go_on=nothing) is None
+    assert not path.exists()

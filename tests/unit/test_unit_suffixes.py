@@ -24,6 +24,7 @@ DIMENSIONLESS = {
     "maps": "pixels per pixel",
     "node_from_cell": "pixels per pixel",
     "tangents": "of the angles to the image edges",
+    "normals": "unit vectors",
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",

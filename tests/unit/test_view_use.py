@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from filter_service.building.jobs import LookAt
-from filter_service.filtering.one_image import image_spec
+from filter_service.filtering.one_image import image_spec, object_range_dpt
 from filter_service.filtering.view_use import frame_use, planes_of_view_dpt
-from filter_service.rgbd_view import RgbdView
+from filter_service.rendering.frame import fill_missing_depth
+from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
 from filter_service.settings import PLANE_ROOM_DPT
 
 TANGENTS = (-0.6, 0.6, 0.4, -0.4)
@@ -92,3 +93,25 @@ def test_views_of_a_frame_share_their_planes_and_ranges():
     assert frame_use([view(planes(0.5)), scene], look_at, at_s=1.0).planes_dpt == ()
     nothing = frame_use([view(planes(0.0))], look_at, at_s=1.0)
     assert nothing.object_dpt == (0.0, 0.0) and nothing.planes_dpt == ()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("depth_kind", ["planar", "radial"])
+def test_depth_too_small_to_have_a_reciprocal_is_missing(depth_kind):
+    denormal_m = np.finfo(np.float32).smallest_subnormal
+    plain = planes(0.5)
+    depth_m = plain.copy()
+    depth_m[:4] = denormal_m
+    depth_m[4:8] = 0.99 * LEAST_DEPTH_M
+    hidden_m = np.full_like(depth_m, denormal_m)
+    seen = view(depth_m, depth_kind, hidden_depth_m=hidden_m.astype(np.float32))
+    filled_m, count = fill_missing_depth(seen.depth_m)
+    assert count == 8 * 120 and (filled_m == 0.5).all()
+    assert planes_of_view_dpt(seen) == planes_of_view_dpt(view(plain, depth_kind))
+    look_at = LookAt(4.0, 0.0)
+    ranges = [
+        frame_use((v,), look_at, at_s=0.0).object_dpt
+        for v in (seen, view(plain, depth_kind))
+    ]
+    assert ranges[0] == ranges[1]
+    assert np.isfinite(object_range_dpt(seen)).all()

@@ -155,12 +155,16 @@ def test_a_file_is_taken_as_what_it_is():
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("p.exe", b"", r"“p.exe” is no profile; allowed: .json, .csv, .abp"),
+        ("p.exe", b"", r"'p.exe': not a profile; allowed: .json, .csv, .abp"),
         ("p.json", b"{", r"not JSON.*allowed: one JSON object"),
-        ("p.json", b'{"kind": "cat"}', r"'kind'.*'cat' is unknown.*prescription"),
+        (
+            "p.json",
+            b'{"kind": "cat"}',
+            r"'p.json': kind: 'cat' is unknown.*prescription",
+        ),
         ("p.csv", b"\xff\xfe\x00", r"is not a text file"),
-        ("my eye.csv", b"n;m;um", r"'my eye.csv, line 1'.*allowed: n,m,um"),
-        ("o.abp", b"Ap = 6,0", r"'o.abp, line 1': '6,0' is not.*as -0.25"),
+        ("my eye.csv", b"n;m;um", r"'my eye.csv': line 1.*allowed: n,m,um"),
+        ("o.abp", b"Ap = 6,0", r"'o.abp': line 1: '6,0' is not.*as -0.25"),
     ],
 )
 def test_a_file_that_is_no_profile_changes_nothing(name, content, said):

@@ -60,13 +60,13 @@ def test_a_photo_with_depth_keeps_it(color):
 @pytest.mark.parametrize(
     ("photo", "depth", "said"),
     [
-        (("p.png", b"no picture"), None, "“p.png” is no picture; allowed: a JPEG"),
+        (("p.png", b"no picture"), None, "'p.png': not a picture; allowed: a JPEG"),
         (None, ("d.npy", b"junk"), "d.npy"),
         (None, ("d.txt", b"1"), r"allowed.*\.npy"),
         (
             None,
             ("d.npy", "small"),
-            "“d.npy” is 8 × 8 px; allowed: the size of the photo",
+            "'d.npy': 8 × 8 px; allowed: the size of the photo",
         ),
     ],
 )
@@ -136,7 +136,7 @@ def test_the_chart_is_as_large_at_every_distance():
 
 
 def test_a_scene_of_another_kind_is_refused():
-    with pytest.raises(ValueError, match=r"“s.obj” is no scene; allowed: .glb, .gltf"):
+    with pytest.raises(ValueError, match=r"'s.obj': not a scene; allowed: .glb, .gltf"):
         gltf_picture("s.obj", b"")
 
 

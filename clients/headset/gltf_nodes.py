@@ -1,0 +1,100 @@
+"""Where a glTF file places its meshes: its tree of nodes, walked without recursion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from clients.headset.gltf_container import Container
+from clients.scenes.geometry import Array
+
+MAX_NODE_DEPTH = 1000
+"""Of nodes within each other.  A skeleton has 20, a chain of links some 100."""
+
+_SIZES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
+
+
+def placed_meshes(file: Container) -> list[tuple[Array, int]]:
+    """Return [(world_from_mesh (4, 4), number of the mesh), ...] of the file's scene.
+
+    Raises
+    ------
+    InvalidFile
+        Nodes that are no tree, too deep, or placed by what are not numbers.
+    """
+    if not file.list_of("scenes"):
+        return []
+    scene = file.entry("scenes", file.header.get("scene", 0))
+    nodes = file.list_of("nodes")
+    found: list[tuple[Array, int]] = []
+    seen: set[int] = set()
+    waiting = [(k, np.eye(4), 1) for k in reversed(_numbers(file, scene, "nodes"))]
+    while waiting:
+        k, world_from_parent, depth = waiting.pop()
+        if not 0 <= k < len(nodes):
+            file.refuse(f"damaged: node {k}", f"0 to {len(nodes) - 1}")
+        if k in seen:
+            file.refuse(f"damaged: node {k} stands twice in the tree", "once")
+        if depth > MAX_NODE_DEPTH:
+            found_text = f"nodes more than {MAX_NODE_DEPTH} deep"
+            file.refuse(found_text, f"at most {MAX_NODE_DEPTH}")
+        seen.add(k)
+        node = nodes[k]
+        with np.errstate(all="ignore"):
+            world_from_node = world_from_parent @ _local(file, node, k)
+        if not np.isfinite(world_from_node).all():
+            file.refuse(f"damaged: node {k} is placed by {np.inf}", "finite numbers")
+        if "mesh" in node:
+            file.entry("meshes", node["mesh"])
+            found.append((world_from_node, node["mesh"]))
+        children = _numbers(file, node, "children")
+        waiting += [(c, world_from_node, depth + 1) for c in reversed(children)]
+    return found
+
+
+def _numbers(file: Container, entry: dict[str, Any], field: str) -> list[int]:
+    found = entry.get(field, [])
+    if not isinstance(found, list) or not all(type(k) is int for k in found):
+        file.refuse(f"damaged: '{field}' is not a list of whole numbers")
+    return found
+
+
+def _local(file: Container, node: dict[str, Any], k: int) -> Array:
+    """Return the matrix (4, 4) from a node's frame to its parent's."""
+    values: dict[str, Array] = {}
+    for name, size in _SIZES.items():
+        given = node.get(name)
+        if given is None:
+            continue
+        is_list = isinstance(given, list) and len(given) == size
+        if not is_list or not all(type(v) in (int, float) for v in given):
+            file.refuse(f"damaged: nodes[{k}].{name}", f"{size} numbers")
+        values[name] = np.array(given, float)
+    matrix = np.eye(4)
+    if "matrix" in values:
+        matrix = values["matrix"].reshape(4, 4).T
+    if "translation" in values:
+        moved = np.eye(4)
+        moved[:3, 3] = values["translation"]
+        matrix = matrix @ moved
+    if "rotation" in values:
+        matrix = matrix @ _turned(values["rotation"])
+    if "scale" in values:
+        matrix = matrix @ np.diag([*values["scale"], 1.0])
+    return matrix
+
+
+def _turned(quaternion: Array) -> Array:
+    """Return the rotation (4, 4) by a quaternion x, y, z, w of any length but zero."""
+    length = np.linalg.norm(quaternion)
+    if not length > np.finfo(float).tiny:
+        return np.eye(4)
+    x, y, z, w = quaternion / length
+    turned = np.eye(4)
+    turned[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return turned

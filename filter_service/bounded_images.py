@@ -1,0 +1,512 @@
+"""Image files in memory, with their decoded size checked before anything is decoded.
+
+Pillow decodes PNG, JPEG, PPM, PGM, PFM, TIFF and WebP, the OpenEXR library its own
+format; ``.npy`` files are read here, as NumPy's reader evaluates the header's text.
+The limits keep the peak memory of any file below 1 GB
+(`ocufilter bench files`).  Whatever a decoder raises becomes `InvalidFile`.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import os
+import re
+import struct
+import tempfile
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import (
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+    suppress,
+)
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import (
+    Image,
+    ImageOps,
+    JpegImagePlugin,
+    PngImagePlugin,
+    PpmImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
+
+from estimator.bounded_files import InvalidFile, reason_of
+
+MAX_PIXELS = 1 << 26
+"""8192 x 8192, four times what the service takes as a view by default.  Pillow holds
+four bytes of each, and the array beside them takes three: 0.47 GB."""
+
+MAX_DECODED_BYTES = 4096 * 4096 * 3 * 8
+"""403 MB: the service's largest default view in float64, or 100 megapixels of float32.
+Beside it stands the array in float32 that is made of it."""
+
+MAX_FILE_BYTES = 1 << 29
+"""More than any format needs for so many bytes: metadata may take the rest."""
+
+MAX_SCANNED_PIXELS = 1 << 30
+"""Of a JPEG: its pixels times its scans, each of which visits all of them.  A
+progressive camera picture has 10 scans."""
+
+MAX_PNG_CHUNKS = 200_000
+"""Pillow takes some microseconds for each; encoders make one for 8 kB."""
+
+MAX_TIFF_VALUES = 1_000_000
+"""Of one numeric tag: they become Python numbers, 36 bytes each."""
+
+MAX_SLOW_SAMPLES = 1 << 21
+"""Of a PPM or PGM in plain text or of unusual depth, which Pillow decodes in Python:
+about a microsecond each."""
+
+MAX_NPY_HEADER_BYTES = 10_000
+MAX_WEBP_PIXELS = 1 << 25
+"""libwebp holds two canvases beside the picture."""
+
+FORMATS = (
+    PngImagePlugin.PngImageFile.format,
+    JpegImagePlugin.JpegImageFile.format,  # of phones, too, which Pillow calls MPO
+    PpmImagePlugin.PpmImageFile.format,
+    TiffImagePlugin.TiffImageFile.format,
+    WebPImagePlugin.WebPImageFile.format,
+)
+
+EXR_INCOMPLETE = "Exception raised reading pixel data"
+"""What the library prints where pixels are damaged, and nowhere else."""
+
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+NPY_MAGIC = b"\x93NUMPY"
+_NPY_FIELD = re.compile(
+    r"""\s*['"](descr|fortran_order|shape)['"]\s*:\s*"""
+    r"""(?:['"]([<>|=][a-z]\d{1,2})['"]|(True|False)|\(([\d,\sL]*)\))\s*(?:,|(?=\}))"""
+)
+
+_KEPT_BYTES = 100_000
+_WARNINGS = threading.RLock()
+"""Filters of warnings are the process's: two readers would restore each other's."""
+
+_PIXEL_LIMIT = f"at most {MAX_PIXELS:,} pixels, as 8192x8192"
+
+# Otherwise Python writes its records to stderr, beside the one line of the error.
+logging.getLogger("PIL").addHandler(logging.NullHandler())
+
+Source = Path | bytes
+
+
+def read_picture_rgb(
+    source: Source, *, name: str = "", option: str = "", upright: bool = False
+) -> NDArray[np.uint8]:
+    """Return a picture of 8 bits per channel as sRGB (height, width, 3).
+
+    Parameters
+    ----------
+    source : Path or bytes
+        The file, or its content.
+    name : str
+        How errors name it; its path where there is none.
+    option : str
+        What asked for it, for the texts of errors.
+    upright : bool
+        Whether to turn it as its EXIF data say.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with _opened_picture(source, name, option) as image:
+        if image.mode.startswith(("I", "F")):
+            raise _Refused(f"mode {image.mode}", "8 bits per channel")
+        image.load()
+        picture = ImageOps.exif_transpose(image) if upright else image
+        return _rows_as_rgb(picture)
+
+
+def read_picture_values(source: Source, *, name: str = "", option: str = "") -> NDArray:
+    """Return the stored values of a picture, as depth files have them.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with _opened_picture(source, name, option) as image:
+        image.load()
+        return np.asarray(image)
+
+
+def check_picture(source: Source, *, name: str = "", option: str = "") -> int:
+    """Check a picture's kind and size without decoding it; return its pixels.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with _opened_picture(source, name, option) as image:
+        return image.width * image.height
+
+
+class _Refused(Exception):
+    """What was found and what is allowed."""
+
+    def __init__(self, found: str, allowed: str) -> None:
+        super().__init__(found, allowed)
+        self.found, self.allowed = found, allowed
+
+
+@contextmanager
+def _opened_picture(source: Source, name: str, option: str) -> Iterator[Image.Image]:
+    """Open a picture that is within the limits; turn all errors into `InvalidFile`."""
+    named = name or str(source if isinstance(source, Path) else "picture")
+    with _WARNINGS, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of sizes, which are checked here
+        try:
+            file = (
+                io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")
+            )
+            with file:
+                _check_container(file)
+                file.seek(0)
+                with Image.open(file, formats=FORMATS) as image:
+                    _check_picture(image, file)
+                    with _quiet_library() if image.format == "TIFF" else nullcontext():
+                        yield image
+        except InvalidFile:
+            raise
+        except _Refused as error:
+            raise InvalidFile(named, error.found, error.allowed, option) from None
+        except FileNotFoundError:
+            _refuse(named, "no such file", "a file that exists", option)
+        except Image.UnidentifiedImageError:
+            found = "cannot be read (no known kind of picture)"
+            _refuse(named, found, "PNG, JPEG, PPM, TIFF or WebP", option)
+        except Exception as error:  # Pillow's decoders raise nearly anything
+            found = f"cannot be read ({_text_of(error)})"
+            _refuse(named, found, "an intact picture", option)
+
+
+@contextmanager
+def _quiet_library() -> Iterator[list[str]]:
+    """Keep what a library prints, or writes to stderr; the list holds it afterwards.
+
+    Both streams are the process's: the lock of `_WARNINGS` is held meanwhile.
+    """
+    said: list[str] = []
+    printed = io.StringIO()
+    with tempfile.TemporaryFile() as kept, redirect_stdout(printed):
+        with ExitStack() as stack:
+            with suppress(OSError):  # there may be no stderr
+                own = os.dup(2)
+                stack.callback(os.close, own)
+                stack.callback(os.dup2, own, 2)
+                os.dup2(kept.fileno(), 2)
+            yield said
+        kept.seek(0)
+        said.append(kept.read(_KEPT_BYTES).decode("utf-8", "replace"))
+        said.append(printed.getvalue())
+
+
+def _text_of(error: BaseException) -> str:
+    """Return what a decoder says, without addresses of Python objects."""
+    return re.sub(r"<[^>]* at 0x[0-9a-f]+>", "it", reason_of(error))
+
+
+def _refuse(named: str | Path, found: str, allowed: str, option: str) -> NoReturn:
+    raise InvalidFile(named, found, allowed, option) from None
+
+
+def _rows_as_rgb(image: Image.Image) -> NDArray[np.uint8]:
+    """Convert some rows at a time: the whole in RGB would be held three times."""
+    width, height = image.size
+    rgb = np.empty((height, width, 3), np.uint8)
+    step = max(1, (1 << 22) // max(1, width))
+    for top in range(0, height, step):
+        rows = image.crop((0, top, width, min(top + step, height)))
+        rgb[top : top + step] = np.asarray(rows.convert("RGB"))
+    return rgb
+
+
+# --- pictures: what is checked before Pillow sees them ------------------------
+
+
+def _check_container(file: BinaryIO) -> None:
+    size_bytes = _size_of(file)
+    if size_bytes > MAX_FILE_BYTES:
+        raise _Refused(f"{size_bytes:,} bytes", f"at most {MAX_FILE_BYTES:,} bytes")
+    head = file.read(64)
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        _check_png(file, size_bytes)
+    elif head.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
+        _check_tiff(file, head)
+    elif head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        # Here, as Pillow makes the canvases when it opens the file.
+        width, height = _webp_size(head)
+        if width * height > MAX_WEBP_PIXELS:
+            allowed = f"at most {MAX_WEBP_PIXELS:,} pixels of a WebP"
+            raise _Refused(f"{width}x{height} px", allowed)
+
+
+def _size_of(file: BinaryIO) -> int:
+    size_bytes = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    return size_bytes
+
+
+def _check_png(file: BinaryIO, size_bytes: int) -> None:
+    """Count the chunks by their heads alone."""
+    at, count = 8, 0
+    while at < size_bytes:
+        file.seek(at)
+        head = file.read(4)
+        if len(head) < 4:
+            return  # cut off: the decoder says so
+        count += 1
+        if count > MAX_PNG_CHUNKS:
+            raise _Refused(f"more than {count - 1:,} chunks", f"{MAX_PNG_CHUNKS:,}")
+        at += 12 + int.from_bytes(head, "big")
+
+
+_TIFF_NUMERIC = {3, 4, 5, 6, 8, 9, 10, 11, 12, 13, 16, 17, 18}
+
+
+def _check_tiff(file: BinaryIO, head: bytes) -> None:
+    """Bound the numbers in each tag of the first image."""
+    order = "<" if head[:1] == b"I" else ">"
+    is_big = b"+" in head[2:4]
+    offset_at, offset, count, entry = (
+        (8, "Q", "Q", "HHQ8x") if is_big else (4, "L", "H", "HHL4x")
+    )
+    try:
+        (start,) = struct.unpack_from(order + offset, head, offset_at)
+        file.seek(start)
+        counted = struct.Struct(order + count)
+        (n_tags,) = counted.unpack(file.read(counted.size))
+        tags = struct.Struct(order + entry)
+        if n_tags > 4096:
+            raise _Refused(f"{n_tags} tags", "at most 4096")
+        content = file.read(n_tags * tags.size)
+        entries = list(
+            tags.iter_unpack(content[: len(content) // tags.size * tags.size])
+        )
+    except (struct.error, OverflowError):
+        return  # cut off: the decoder says so
+    for tag, kind, n_values in entries:
+        if kind in _TIFF_NUMERIC and n_values > MAX_TIFF_VALUES:
+            found = f"tag {tag} with {n_values:,} values"
+            raise _Refused(found, f"at most {MAX_TIFF_VALUES:,}")
+
+
+def _webp_size(head: bytes) -> tuple[int, int]:
+    """Return the canvas of a WebP, 0, 0 where the decoder will refuse it."""
+    kind, data = head[12:16], head[20:30]
+    if len(data) < 10:
+        return 0, 0
+    if kind == b"VP8X":
+        sides = data[4:7], data[7:10]
+        width, height = (int.from_bytes(side, "little") + 1 for side in sides)
+    elif kind == b"VP8L":
+        bits = int.from_bytes(data[1:5], "little")
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        sides = data[6:8], data[8:10]
+        width, height = (int.from_bytes(side, "little") & 0x3FFF for side in sides)
+    return width, height
+
+
+def _check_picture(image: Image.Image, file: BinaryIO) -> None:
+    """Refuse a picture that is too large, by its header."""
+    width, height = image.size
+    n_pixels = width * height
+    if n_pixels > MAX_PIXELS:
+        raise _Refused(f"{width}x{height} px", _PIXEL_LIMIT)
+    if image.format in ("JPEG", "MPO"):
+        n_scans = _count(file, b"\xff\xda")
+        if n_scans * n_pixels > MAX_SCANNED_PIXELS:
+            allowed = f"at most {MAX_SCANNED_PIXELS:,} pixels in all scans"
+            raise _Refused(f"{width}x{height} px in {n_scans} scans", allowed)
+    elif image.format == "TIFF":
+        _check_tiles(image)
+    elif image.format == "PPM" and image.tile:
+        is_slow = image.tile[0][0] in ("ppm", "ppm_plain")
+        n_samples = n_pixels * len(image.getbands())
+        if is_slow and n_samples > MAX_SLOW_SAMPLES:
+            allowed = (
+                f"at most {MAX_SLOW_SAMPLES:,} samples in plain text or of another "
+                "maximum than 255 or 65535"
+            )
+            raise _Refused(f"{n_samples:,} samples", allowed)
+
+
+def _check_tiles(image: Image.Image) -> None:
+    """Refuse tiles that are much larger than the picture: they are decoded whole."""
+    tags = image.tag_v2  # type: ignore[attr-defined]
+    tile_width, tile_height = (int(tags.get(tag, 0)) for tag in (322, 323))
+    if tile_width * tile_height > MAX_PIXELS:
+        raise _Refused(f"tiles of {tile_width}x{tile_height} px", _PIXEL_LIMIT)
+
+
+def _count(file: BinaryIO, marker: bytes) -> int:
+    """Count a marker of two bytes in a file, and leave the file where it is."""
+    before = file.tell()
+    file.seek(0)
+    count, last = 0, b""
+    while block := file.read(1 << 20):
+        count += (last + block).count(marker)
+        last = block[-1:]
+    file.seek(before)
+    return count
+
+
+# --- .npy ---------------------------------------------------------------------
+
+
+def read_npy(path: Path, *, option: str = "") -> NDArray:
+    """Return the array of a ``.npy`` file of bool, integers or floats.
+
+    The shape that its header claims is compared with the file's size and the limits
+    before any memory is taken.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    try:
+        with open(path, "rb") as file:
+            return _npy_array(file, _size_of(file))
+    except _Refused as error:
+        raise InvalidFile(path, error.found, error.allowed, option) from None
+    except (OSError, ValueError, MemoryError) as error:
+        found = f"cannot be read ({reason_of(error)})"
+        raise InvalidFile(path, found, "an intact .npy file", option) from None
+
+
+def _npy_array(file: BinaryIO, size_bytes: int) -> NDArray:
+    dtype, shape, is_fortran = _npy_header(file)
+    n_values = math.prod(shape)
+    n_bytes = n_values * dtype.itemsize
+    claimed = f"shape {shape} of {dtype}"
+    n_there = size_bytes - file.tell()
+    if n_bytes > n_there:
+        found = f"cannot be read ({claimed} in {n_there:,} bytes)"
+        raise _Refused(found, f"a file with all of its {n_bytes:,} bytes")
+    if n_bytes > MAX_DECODED_BYTES:
+        allowed = f"at most {MAX_DECODED_BYTES:,} bytes"
+        raise _Refused(f"{claimed}, {n_bytes:,} bytes", allowed)
+    array = np.fromfile(file, dtype, n_values)
+    return array.reshape(shape, order="F" if is_fortran else "C")
+
+
+def _npy_header(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...], bool]:
+    """Return the dtype, shape and order of a header, without evaluating it."""
+    intact = "a .npy file of bool, integers or floats"
+    magic = file.read(8)
+    if magic[:6] != NPY_MAGIC or magic[6:7] not in (b"\1", b"\2", b"\3"):
+        raise _Refused("cannot be read (not a .npy file)", intact)
+    width = 2 if magic[6] == 1 else 4
+    n_header = int.from_bytes(file.read(width), "little")
+    if n_header > MAX_NPY_HEADER_BYTES:
+        found = f"a header of {n_header:,} bytes"
+        raise _Refused(found, f"at most {MAX_NPY_HEADER_BYTES:,} bytes")
+    header = file.read(n_header)
+    text = header.decode("latin-1" if magic[6] < 3 else "utf-8").strip()
+    fields: dict[str, tuple[str, ...]] = {}
+    at = 1
+    while text[:1] == "{" and (match := _NPY_FIELD.match(text, at)):
+        fields[match[1]] = match.groups()[1:]
+        at = match.end()
+    is_whole = len(header) == n_header and text[at:].strip() == "}"
+    if not is_whole or set(fields) != {"descr", "fortran_order", "shape"}:
+        raise _Refused("cannot be read (another header than a plain array's)", intact)
+    descr, order, shape = (
+        fields[name][k] for k, name in enumerate(("descr", "fortran_order", "shape"))
+    )
+    if descr is None or order is None or shape is None:
+        raise _Refused("cannot be read (another header than a plain array's)", intact)
+    try:
+        dtype = np.dtype(descr)
+        sides = tuple(
+            int(side.rstrip("L")) for side in shape.split(",") if side.strip()
+        )
+    except (TypeError, ValueError):
+        raise _Refused(
+            f"cannot be read ({descr} of shape ({shape:.40}))", intact
+        ) from None
+    if dtype.kind not in "buif" or len(sides) > 8:
+        raise _Refused(f"cannot be read ({dtype} of shape {sides})", intact)
+    return dtype, sides, order == "True"
+
+
+# --- OpenEXR ------------------------------------------------------------------
+
+
+def read_exr_channels(
+    path: Path, choose: Callable[[set[str]], tuple[str, ...]], *, option: str = ""
+) -> dict[str, NDArray]:
+    """Return channels of the first part of an OpenEXR file, as float32.
+
+    Parameters
+    ----------
+    choose : callable
+        Returns which of the channels are wanted, or raises.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    import OpenEXR
+
+    try:
+        with open(path, "rb") as stream:
+            size_bytes = _size_of(stream)
+            if stream.read(4) != EXR_MAGIC:  # the library would write to stderr
+                _refuse(path, "not an OpenEXR file", "OpenEXR", option)
+        if size_bytes > MAX_FILE_BYTES:
+            allowed = f"at most {MAX_FILE_BYTES:,} bytes"
+            _refuse(path, f"{size_bytes:,} bytes", allowed, option)
+        with _WARNINGS, _quiet_library() as said:
+            how = {"separate_channels": True}
+            with OpenEXR.File(str(path), header_only=True, **how) as file:
+                _check_exr(file.parts)
+            with OpenEXR.File(str(path), **how) as file:
+                channels = file.channels()
+                wanted = choose(set(channels))
+                found = {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
+        text = "".join(said)
+        if EXR_INCOMPLETE in text:  # it goes on with what it has
+            reason = text[text.index(EXR_INCOMPLETE) :].split("\n")[0].split(" - ")[-1]
+            raise _Refused(f"cannot be read ({reason:.100})", "an intact OpenEXR file")
+        return found
+    except InvalidFile:
+        raise
+    except _Refused as error:
+        raise InvalidFile(path, error.found, error.allowed, option) from None
+    except Exception as error:  # bindings raise nearly anything of damaged files
+        found = f"cannot be read ({_text_of(error)})"
+        raise InvalidFile(path, found, "an intact OpenEXR file", option) from None
+
+
+def _check_exr(parts: list) -> None:
+    """Refuse what would take too much memory, by the headers of all parts."""
+    n_bytes = 0
+    if not parts:
+        raise _Refused("no parts", "a part with pixels")
+    for part in parts:
+        low, high = part.header["dataWindow"]
+        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        if width < 1 or height < 1:
+            raise _Refused(f"{width}x{height} px", "1x1 px or more")
+        if width * height > MAX_PIXELS:
+            raise _Refused(f"{width}x{height} px", _PIXEL_LIMIT)
+        if "deep" in str(part.header.get("type", "")):
+            raise _Refused("deep pixels", "one value of each channel for a pixel")
+        # 4 bytes of each: half floats become float32
+        n_bytes += 4 * width * height * len(part.header["channels"])
+    if n_bytes > MAX_DECODED_BYTES:
+        allowed = f"at most {MAX_DECODED_BYTES:,} bytes as float32"
+        raise _Refused(f"{n_bytes:,} bytes in all channels", allowed)

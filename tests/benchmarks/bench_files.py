@@ -1,0 +1,313 @@
+"""Hostile files: what reading them costs, and what is said of them.
+
+    python -m tests.benchmarks.bench_files [--quick] [--json]
+
+Valid files of all kinds that are read - pictures, depth, arrays, OpenEXR, profiles,
+spectra, lists, calibrations, states, manifests, videos, glTF, stored eyes - are
+changed: bytes flipped, cut, removed and repeated, sizes that claim much, numbers and
+words replaced, brackets nested.  100,000 of them are read by processes of their own,
+and 500 given to `ocufilter` as a program.  Errors: of readers, what is raised beside
+`InvalidFile` and what libraries write to stderr; of the program, an exit code that is
+neither 2 with one line on stderr nor 0; of all, processes that die, the longest read
+in s and the most memory in MB.  Writes results/files.json.
+"""
+
+import argparse
+import json
+import logging
+import os
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from tests.benchmarks.file_mutants import Kind, kinds, mutated
+from tests.benchmarks.harness import ROOT, Row, publish
+
+N_READS, N_COMMANDS = 100_000, 500
+QUICK_READS, QUICK_COMMANDS = 1_500, 6
+N_PROCESSES = 2
+COMMAND_S = 60.0
+MAX_READ_S, MAX_MEMORY_MB = 5.0, 1000.0
+"""What a file may cost."""
+
+ADDRESS_SPACE_BYTES = 6 << 30
+"""Of a reading process, so that a file that asks for more is found and not the machine
+brought down; memory itself is measured."""
+
+TEMPORARY = "/dev/shm" if os.path.isdir("/dev/shm") else None
+REFERENCE = f"at most {MAX_READ_S:g} s, {MAX_MEMORY_MB:g} MB"
+
+
+def mutant(kind: Kind, number: int) -> tuple[str, bytes]:
+    """Return name and content of a changed file; the same for the same number."""
+    chance = random.Random(f"{kind.name} {number}")
+    name = chance.choice(sorted(kind.files))
+    return name, mutated(kind.files[name], chance)
+
+
+# --- reads ----------------------------------------------------------------------
+
+
+def read_some(name: str, first: int, count: int, folder: Path) -> None:
+    """Read changed files of one kind; print a line for each, as a process of its own.
+
+    A line: number, s, what was raised, bytes that were written to stdout or stderr, MB.
+    """
+    from estimator import InvalidFile
+
+    logging.getLogger("ocufilter").addHandler(logging.NullHandler())
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE_BYTES, ADDRESS_SPACE_BYTES))
+    kind = next(k for k in kinds(folder) if k.name == name)
+    said = os.open(folder / "stderr", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+    out = os.fdopen(os.dup(1), "w")
+    for stream in (1, 2):  # libraries may write to either
+        os.dup2(said, stream)
+    place = folder / "read"
+    place.mkdir()
+    for number in range(first, first + count):
+        file_name, content = mutant(kind, number)
+        path = place / file_name
+        path.write_bytes(content)
+        print(f"{number} began", file=out, flush=True)
+        start_s, raised, before = time.perf_counter(), "", os.fstat(said).st_size
+        try:
+            kind.read(path)
+            raised = "valid"
+        except InvalidFile as error:
+            raised = "InvalidFile"
+            if "\n" in str(error):
+                raised = "InvalidFile of several lines"
+        except BaseException as error:
+            raised = f"{type(error).__name__}: {str(error)[:100]!r}"
+        took_s = time.perf_counter() - start_s
+        sys.stdout.flush()
+        path.unlink(missing_ok=True)
+        written = os.fstat(said).st_size - before
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        result = [number, took_s, raised, written, peak_mb]
+        print(json.dumps(result), file=out, flush=True)
+
+
+class Reads:
+    """What came of the reads of one kind."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind = kind
+        self.times_s: list[float] = []
+        self.raised: Counter[str] = Counter()
+        self.wrong: list[str] = []
+        self.peak_mb = 0.0
+
+    def run(self, count: int) -> None:
+        """Read so many; a process that dies is counted, and another goes on."""
+        first = 0
+        while first < count:
+            with tempfile.TemporaryDirectory(dir=TEMPORARY) as folder:
+                first = self._run_process(first, count - first, folder)
+
+    def _run_process(self, first: int, count: int, folder: str) -> int:
+        command = [
+            *(sys.executable, "-m", "tests.benchmarks.bench_files", "--read"),
+            *(self.kind.name, str(first), str(count), folder),
+        ]
+        done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        last = first - 1
+        for line in done.stdout.splitlines():
+            if line.endswith("began"):
+                last = int(line.split()[0])
+                continue
+            number, took_s, raised, written, peak_mb = json.loads(line)
+            self.times_s.append(took_s)
+            self.raised[raised.split(":")[0]] += 1
+            self.peak_mb = max(self.peak_mb, peak_mb)
+            if raised not in ("valid", "InvalidFile"):
+                self.wrong.append(f"{number}: {raised}")
+            if written:
+                self.wrong.append(f"{number}: {written} bytes on stdout or stderr")
+            if took_s > MAX_READ_S:
+                self.wrong.append(f"{number}: {took_s:.1f} s")
+        if done.returncode != 0 and last < first:
+            said = Path(folder, "stderr")
+            reason = said.read_text("utf-8", "replace")[-500:] if said.exists() else ""
+            raise RuntimeError(f"{self.kind.name}: no process reads: {reason}")
+        if done.returncode != 0:
+            self.wrong.append(f"{last}: process ended with {done.returncode}")
+        return last + 1 if done.returncode != 0 else first + count
+
+    def rows(self) -> list[Row]:
+        """Return them as rows."""
+        refused = self.raised["InvalidFile"]
+        setting = f"{refused} refused, {self.raised['valid']} valid"
+        values = (
+            ("wrong answers", len(self.wrong)),
+            ("longest read, s", max(self.times_s, default=0.0)),
+            ("peak memory, MB", self.peak_mb),
+        )
+        times_ms = 1e3 * np.array(self.times_s or [0.0])
+        return [
+            _row("reads", self.kind.name, setting, times_ms, self.peak_mb, *value)
+            for value in values
+        ]
+
+
+# --- commands --------------------------------------------------------------------
+
+
+def run_commands(kinds_: list[Kind], count: int, folder: Path) -> list[Row]:
+    """Give changed files to `ocufilter`; most are ones that readers refuse."""
+    from estimator import InvalidFile
+
+    able = [kind for kind in kinds_ if kind.command is not None]
+    chosen: list[tuple[Kind, int]] = []
+    number = 1_000_000  # other files than those of the reads
+    place = folder / "chosen"
+    place.mkdir()
+    while len(chosen) < count:
+        kind = able[number % len(able)]
+        number += 1
+        name, content = mutant(kind, number)
+        path = place / name
+        path.write_bytes(content)
+        try:
+            kind.read(path)
+        except InvalidFile:
+            chosen.append((kind, number))
+        else:  # valid: some only, where the program then does little
+            if len(chosen) % 10 == 0 and kind.name not in ("glTF", "states"):
+                chosen.append((kind, number))
+        path.unlink()
+
+    def run(one: tuple[Kind, int]) -> tuple[float, float, str]:
+        kind, number = one
+        own = folder / f"{number}"
+        own.mkdir()
+        name, content = mutant(kind, number)
+        (own / name).write_bytes(content)
+        arguments = kind.command(own / name, folder)
+        return _run_command(f"{kind.name} {number}", arguments)
+
+    with ThreadPoolExecutor(N_PROCESSES) as pool:
+        ran = list(pool.map(run, chosen))
+    times_ms = 1e3 * np.array([took_s for took_s, _, _ in ran])
+    peak_mb = max(mb for _, mb, _ in ran)
+    wrong = [text for _, _, text in ran if text not in ("0", "2")]
+    for text in wrong:
+        print(f"ocufilter: {text}", file=sys.stderr)
+    codes = Counter(text for _, _, text in ran)
+    setting = f"{codes['2']} refused, {codes['0']} done"
+    return [
+        _row("ocufilter", "a process each", setting, times_ms, peak_mb, *value)
+        for value in (("wrong answers", len(wrong)), ("peak memory, MB", peak_mb))
+    ]
+
+
+def _run_command(label: str, arguments: list[str]) -> tuple[float, float, str]:
+    """Return s, MB and the exit code, or what is wrong with it."""
+    start_s = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "filter_service", *arguments],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    timer = _killed_after(process, COMMAND_S)
+    said = process.stderr.read().decode("utf-8", "replace")
+    process.stderr.close()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = code = os.waitstatus_to_exitcode(status)
+    timer.cancel()
+    took_s, peak_mb = time.perf_counter() - start_s, usage.ru_maxrss / 1024.0
+    is_fine = code == 0 or (code == 2 and said.count("\n") == 1)
+    if not is_fine or "Traceback" in said:
+        return took_s, peak_mb, f"{label}: code {code}, stderr {said[-500:]!r}"
+    return took_s, peak_mb, str(code)
+
+
+def _killed_after(process: subprocess.Popen, limit_s: float):
+    from threading import Timer
+
+    timer = Timer(limit_s, process.kill)
+    timer.start()
+    return timer
+
+
+# --- rows ------------------------------------------------------------------------
+
+
+def _row(
+    method: str,
+    case: str,
+    setting: str,
+    times_ms: np.ndarray,
+    memory_mb: float,
+    error_name: str,
+    error: float,
+) -> Row:
+    return Row(
+        bench="files",
+        method=method,
+        case=case,
+        setting=setting,
+        n=len(times_ms),
+        median_ms=float(np.median(times_ms)),
+        p95_ms=float(np.percentile(times_ms, 95)),
+        memory_mb=float(memory_mb),
+        error_name=error_name,
+        error=float(error),
+        reference=REFERENCE,
+    )
+
+
+def measure(n_reads: int, n_commands: int) -> list[Row]:
+    """Return the rows of all kinds, of all together, and of the program."""
+    with tempfile.TemporaryDirectory(dir=TEMPORARY) as name:
+        folder = Path(name)
+        every = kinds(folder)
+        reads = [Reads(kind) for kind in every]
+        count = -(-n_reads // len(reads))
+        with ThreadPoolExecutor(N_PROCESSES) as pool:
+            list(pool.map(lambda one: one.run(count), reads))
+        for one in reads:
+            for text in one.wrong[:20]:
+                print(f"{one.kind.name} {text}", file=sys.stderr)
+        rows = [row for one in reads for row in one.rows()]
+        times_ms = 1e3 * np.array([t for one in reads for t in one.times_s])
+        peak_mb = max(one.peak_mb for one in reads)
+        rows += [
+            _row("reads", "all", f"{len(reads)} kinds", times_ms, peak_mb, *value)
+            for value in (
+                ("wrong answers", sum(len(one.wrong) for one in reads)),
+                ("longest read, s", times_ms.max() / 1e3),
+                ("peak memory, MB", peak_mb),
+            )
+        ]
+        return rows + run_commands(every, n_commands, folder)
+
+
+def main() -> None:
+    """Run, print, and write results/files.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="1,500 reads")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--read", nargs=4, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.read:
+        name, first, count, folder = options.read
+        read_some(name, int(first), int(count), Path(folder))
+        return
+    counts = (QUICK_READS, QUICK_COMMANDS) if options.quick else (N_READS, N_COMMANDS)
+    rows = measure(*counts)
+    publish("files", rows, as_json=options.json, is_whole=not options.quick)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,462 @@
+"""Valid files of each kind that is read, what reads them, and how they are changed."""
+
+import base64
+import json
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from PIL import Image
+
+from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
+
+SIDES = (48, 64)
+SIZES = (0, 1, 2**15, 2**16 - 1, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
+NUMBERS = (b"0", b"-1", b"65536", b"2147483647", b"99999999999999999999", b"1e999")
+WORDS = (b"NaN", b"null", b"[]", b"{}", b'"x"', b"\\ud800", b"\xff\xfe", b"\0")
+LONGEST_BYTES = 4_000_000
+
+PROFILE = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 5.0,
+    "wavelength_nm": 555.0,
+    "zernike_um": {"2,0": 1.5, "3,-1": 0.2, "4,0": 0.1},
+}
+EYE = {
+    "kind": "prescription",
+    "sphere_dpt": -2.0,
+    "cylinder_dpt": -1.0,
+    "axis_deg": 20,
+    "correction": {"sphere_dpt": -2.0, "vertex_mm": 12},
+}
+ABP = "# an eye\nAp = 5\nWa = 587.56\nZ[2, 0] = 1.4\nZ[3,-1]=0.1\n"
+CSV = "# pupil_diameter_mm: 5\n# wavelength_nm: 555\nn,m,um\n2,0,1.5\n3,-1,-0.25\n"
+DISPLAY = "nm,r,g,b\n" + "".join(
+    f"{nm},{np.exp(-(((nm - 610) / 20) ** 2)):.4f},"
+    f"{np.exp(-(((nm - 540) / 20) ** 2)):.4f},"
+    f"{np.exp(-(((nm - 455) / 20) ** 2)):.4f}\n"
+    for nm in range(400, 701, 5)
+)
+CALIBRATION = (
+    "cam0=[3997.684 0 1176.728; 0 3997.684 1011.728; 0 0 1]\n"
+    "doffs=131.111\nbaseline=193.001\nwidth=2964\nheight=1988\nndisp=280\n"
+)
+STATES = "frame,pupil_mm,focus_dpt\n" + "".join(
+    f"{k:06d},{3 + k / 10},{k / 5}\n" for k in range(5)
+)
+LISTED = "".join(f"{k}.5 rgb/{k}.png {k}.51 depth/{k}.png\n" for k in range(5))
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes
+    ----------
+    name : str
+        Of the kind, as rows of results have it.
+    files : dict
+        Contents of valid files by the name that each has.
+    read : callable
+        What reads a file by its path.
+    command : callable, optional
+        Returns the arguments of `ocufilter` that have a file read, for its path and a
+        folder with valid files beside.
+    """
+
+    name: str
+    files: dict[str, bytes]
+    read: Callable[[Path], object]
+    command: Callable[[Path, Path], list[str]] | None = None
+
+
+def kinds(folder: Path) -> list[Kind]:
+    """Return all kinds; valid files are written to a folder, and read from there."""
+    from clients.batch.layout_middlebury import read_calibration
+    from clients.batch.layout_tum import tum_frames
+    from clients.batch.manifest import Manifest
+    from clients.batch.states import read_states
+    from clients.batch.video_reading import VideoReader
+    from clients.headset.gltf_scene import load_gltf
+    from clients.web.eye_form import read_profile_file
+    from clients.web.picture import photo_picture
+    from estimator.profiles.files import load_profile
+    from filter_service.commands.display_file import display_of_file
+    from filter_service.commands.wavefront import explicit_body
+    from filter_service.image_files import read_color, read_depth
+    from filter_service.psfs.store_cache import StoreCache
+
+    pictures = _pictures(folder)
+    write_beside(folder, pictures)
+
+    def depth(path: Path) -> object:
+        return read_depth(path, depth_scale=0.001)
+
+    def photo(path: Path) -> object:
+        content = path.read_bytes()
+        return photo_picture(path.name, content, width_deg=40.0, distance_dpt=1.0)
+
+    def profile(path: Path) -> object:
+        explicit_body(str(path))
+        read_profile_file(path.name, path.read_bytes())
+        return load_profile(path)
+
+    def tum(path: Path) -> object:
+        return tum_frames(path.parent)
+
+    def manifest(path: Path) -> object:
+        with Manifest(path.parent, JOB):
+            return None
+
+    def video(path: Path) -> object:
+        with VideoReader(path) as reader:
+            return [reader.color(k) for k in (0, reader.count - 1)]
+
+    def store(path: Path) -> object:
+        cache = StoreCache(str(path.parent), max_mb=100)
+        return cache.load(path.stem, go_on=lambda: None)
+
+    def of(*endings: str) -> dict[str, bytes]:
+        return {k: v for k, v in pictures.items() if k.endswith(endings)}
+
+    as_color = ("filter", "--fov-deg", "50", "--plan", "--profile")
+    return [
+        Kind("color", of(".png", ".jpg", ".ppm"), read_color, _color_command),
+        Kind("depth", of("g16.png", ".tif", ".pfm", ".pgm"), depth, _depth_command),
+        Kind("npy", of(".npy"), _either(read_color, depth), _color_command),
+        Kind("OpenEXR", of(".exr"), _either(read_color, depth), _color_command),
+        Kind("photo", of("c.png", ".jpg", ".webp", ".tif"), photo),
+        Kind(
+            "profile",
+            {
+                "p.json": json.dumps(PROFILE).encode(),
+                "e.json": json.dumps(EYE).encode(),
+                "p.abp": ABP.encode(),
+                "p.csv": CSV.encode(),
+            },
+            profile,
+            lambda path, beside: [*as_color, str(path), *_images(beside)],
+        ),
+        Kind(
+            "display",
+            {"d.csv": DISPLAY.encode()},
+            lambda path: display_of_file(str(path)),
+            lambda path, beside: [
+                *(*as_color, "myopia", *_images(beside), "--display", str(path)),
+            ],
+        ),
+        Kind("TUM list", {"associations.txt": LISTED.encode()}, tum),
+        Kind("calibration", {"calib.txt": CALIBRATION.encode()}, read_calibration),
+        Kind(
+            "states",
+            {"s.csv": STATES.encode()},
+            lambda path: read_states(path, [f"{k:06d}" for k in range(5)]),
+            _states_command,
+        ),
+        Kind("manifest", {"manifest.jsonl": _manifest(folder)}, manifest),
+        Kind("video", _videos(folder), video),
+        Kind("glTF", _scenes(pictures), load_gltf, _scene_command),
+        Kind("stored eye", {"ab-cd.psfs": _store(folder)}, store),
+    ]
+
+
+JOB = {"made_by": "x", "profiles": {"p": {"kind": "preset", "name": "myopia"}}}
+
+
+def _either(first: Callable, second: Callable) -> Callable[[Path], object]:
+    def read(path: Path) -> object:
+        return (first if path.name.startswith("c") else second)(path)
+
+    return read
+
+
+def _images(beside: Path) -> list[str]:
+    color, depth = beside / "c.png", beside / "g16.png"
+    return ["--color", str(color), "--depth", str(depth), "-o", str(beside / "o.png")]
+
+
+def _filtered(color: Path, depth: Path, beside: Path) -> list[str]:
+    return [
+        *("filter", "--fov-deg", "50", "--plan", "--profile", "myopia"),
+        *("--color", str(color), "--depth", str(depth), "-o", str(beside / "o.png")),
+    ]
+
+
+def _color_command(path: Path, beside: Path) -> list[str]:
+    if not path.name.startswith("c"):
+        return _depth_command(path, beside)
+    return _filtered(path, beside / "g16.png", beside)
+
+
+def _depth_command(path: Path, beside: Path) -> list[str]:
+    return _filtered(beside / "c.png", path, beside)
+
+
+def _states_command(path: Path, beside: Path) -> list[str]:
+    return [
+        *("batch", str(beside / "set"), "-p", "myopia", "-o", str(beside / "out")),
+        *("--fov-deg", "50", "--states", str(path), "--dry-run"),
+    ]
+
+
+def _scene_command(path: Path, beside: Path) -> list[str]:
+    return ["headset", "--simulated", "--frames", "1", "--scene", str(path)]
+
+
+def write_beside(folder: Path, pictures: dict[str, bytes]) -> None:
+    """Write valid files that commands need beside the changed one."""
+    for name in ("c.png", "g16.png"):
+        (folder / name).write_bytes(pictures[name])
+    for k in range(5):
+        for name, made in (("color", "c.png"), ("depth", "g16.png")):
+            (folder / "set" / name).mkdir(parents=True, exist_ok=True)
+            (folder / "set" / name / f"{k:06d}.png").write_bytes(pictures[made])
+
+
+# --- valid files ---------------------------------------------------------------
+
+
+def _pictures(folder: Path) -> dict[str, bytes]:
+    rng = np.random.default_rng(0)
+    height, width = SIDES
+    color = rng.integers(0, 256, (height, width, 3), np.uint8)
+    image, small = Image.fromarray(color), Image.fromarray(color[:20, :20])
+    depth = Image.fromarray(rng.integers(500, 3000, SIDES).astype(np.uint16))
+    metres = rng.random(SIDES, np.float32)
+    made: dict[str, tuple[Image.Image, dict]] = {
+        "c.png": (image, {"pnginfo": None}),
+        "c_p.png": (image.quantize(16), {"transparency": 3}),
+        "c_la.png": (image.convert("LA"), {"icc_profile": bytes(2000)}),
+        "c.jpg": (image, {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0"}),
+        "c_progressive.jpg": (image, {"progressive": True}),
+        "c.ppm": (image, {}),
+        "c.webp": (small, {}),
+        "c_lossless.webp": (small, {"lossless": True}),
+        "g16.png": (depth, {}),
+        "g16.pgm": (depth, {}),
+        "g16.tif": (depth, {}),
+        "f.tif": (Image.fromarray(metres), {}),
+        "f_deflate.tif": (Image.fromarray(metres), {"compression": "tiff_deflate"}),
+        "f_lzw.tif": (Image.fromarray(metres), {"compression": "tiff_lzw"}),
+        "f.pfm": (Image.fromarray(metres), {}),
+    }
+    files = {}
+    for name, (picture, how) in made.items():
+        picture.save(folder / name, **how)
+        files[name] = (folder / name).read_bytes()
+    files["plain.pgm"] = b"P2\n# c\n8 4 65535\n" + b"1200 " * 32
+    for name, array in {
+        "c.npy": color,
+        "c_float.npy": color / np.float64(255.0),
+        "c_fortran.npy": np.asfortranarray(color.astype(np.float32)),
+        "d.npy": metres,
+        "d_integers.npy": np.asarray(depth),
+    }.items():
+        np.save(folder / name, array)
+        files[name] = (folder / name).read_bytes()
+    linear = color.astype(np.float32)
+    for name, compression, type_, channels in (
+        ("c.exr", OpenEXR.ZIP_COMPRESSION, OpenEXR.scanlineimage, {"RGB": linear}),
+        ("c_half.exr", OpenEXR.PIZ_COMPRESSION, OpenEXR.scanlineimage, {"RGB": "half"}),
+        ("c_dwa.exr", OpenEXR.DWAA_COMPRESSION, OpenEXR.scanlineimage, {"RGB": linear}),
+        ("c_b44.exr", OpenEXR.B44_COMPRESSION, OpenEXR.scanlineimage, {"RGB": "half"}),
+        ("d_rle.exr", OpenEXR.RLE_COMPRESSION, OpenEXR.scanlineimage, {"Z": metres}),
+        ("d.exr", OpenEXR.NO_COMPRESSION, OpenEXR.scanlineimage, {"Z": metres}),
+        ("d_tiled.exr", OpenEXR.PXR24_COMPRESSION, OpenEXR.tiledimage, {"Z": metres}),
+    ):
+        header = {"type": type_, "compression": compression}
+        if type_ == OpenEXR.tiledimage:
+            header["tiles"] = OpenEXR.TileDescription()
+        arrays = {
+            k: linear.astype(np.float16) if isinstance(v, str) else v
+            for k, v in channels.items()
+        }
+        with OpenEXR.File(header, arrays) as file:
+            file.write(str(folder / name))
+        files[name] = (folder / name).read_bytes()
+    return files
+
+
+def _manifest(folder: Path) -> bytes:
+    from clients.batch.manifest import Manifest
+
+    out = folder / "out_manifest"
+    out.mkdir(exist_ok=True)
+    told = {"name": "a.png", "mtime_ns": 1, "bytes": 5, "sha256": "0" * 64}
+    counts = {f"{k}_count": 0 for k in ("missing_depth", "clamped_depth", "overflow")}
+    with Manifest(out, JOB) as manifest:
+        for k in range(3):
+            frame = {"kind": "frame", "profile": "p", "frame": f"{k}", "ok": True}
+            done = {"file": f"p/{k}.png", "bytes": 9, "inputs": [told], "notes": ["n"]}
+            manifest.append({**frame, **done, **counts})
+    content = (out / "manifest.jsonl").read_bytes()
+    (out / "manifest.jsonl").unlink()
+    return content
+
+
+def _videos(folder: Path) -> dict[str, bytes]:
+    from clients.batch.video_writing import VIDEO_KINDS, join_segments, write_segment
+
+    frames = np.random.default_rng(1).integers(0, 256, (4, *SIDES, 3), np.uint8)
+    files = {}
+    for kind, name in (("ffv1", "v.mkv"), ("h264", "v.mp4")):
+        how = {"kind": VIDEO_KINDS[kind], "rate_hz": 30.0}
+        segment = folder / f"{kind}.mkv"
+        write_segment(segment, enumerate(frames), **how)
+        join_segments(folder / name, [(0, segment)], **how)
+        files[name] = (folder / name).read_bytes()
+        segment.unlink()
+    return files
+
+
+def _scenes(pictures: dict[str, bytes]) -> dict[str, bytes]:
+    primitive = {
+        "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
+        "indices": 2,
+        "material": 0,
+    }
+    image = base64.b64encode(pictures["c.png"]).decode()
+    nodes = [
+        {"children": [1], "scale": [1, 2, 3]},
+        {"mesh": 0, "rotation": [0, 0, 0, 1]},
+    ]
+    header = triangle_header(
+        nodes=nodes,
+        meshes=[{"primitives": [primitive]}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        textures=[{"source": 0}],
+        images=[{"uri": f"data:image/png;base64,{image}"}],
+    )
+    data = base64.b64encode(triangle_bytes()).decode()
+    inside = header | {
+        "buffers": [{"byteLength": 68, "uri": f"data:a/b;base64,{data}"}]
+    }
+    plain = triangle_header()
+    return {
+        "plain.glb": glb(plain, triangle_bytes()),
+        "picture.glb": glb(header, triangle_bytes()),
+        "inside.gltf": json.dumps(inside).encode(),
+    }
+
+
+def _store(folder: Path) -> bytes:
+    from filter_service.camera import Camera
+    from filter_service.psfs.store_cache import Stored
+    from filter_service.psfs.store_file import write_file
+
+    arrays = {"a": np.arange(1000.0), "b": Camera(8, 8, (-1.0, 1.0, 1.0, -1.0))}
+    write_file(folder / "store", Stored(arrays, ("a note",)))
+    return (folder / "store").read_bytes()
+
+
+# --- changes --------------------------------------------------------------------
+
+
+def mutated(content: bytes, chance: random.Random) -> bytes:
+    """Return a file with one to three changes."""
+    changed = bytearray(content)
+    for _ in range(chance.choice((1, 1, 1, 2, 3))):
+        changes = TEXT_CHANGES if _is_text(content) else CHANGES
+        changed = chance.choice(changes)(changed, chance)
+        if len(changed) > LONGEST_BYTES:
+            changed = changed[:LONGEST_BYTES]
+    return bytes(changed)
+
+
+def _is_text(content: bytes) -> bool:
+    return b"\0" not in content and all(b < 128 for b in content[:2000])
+
+
+def _place(data: bytearray, chance: random.Random) -> int:
+    """Return a place; half of them near the beginning, where headers are."""
+    end = len(data) if chance.random() < 0.5 else min(len(data), 400)
+    return chance.randrange(max(1, end))
+
+
+def _flip(data: bytearray, chance: random.Random) -> bytearray:
+    for _ in range(chance.choice((1, 2, 8, 40))):
+        if data:
+            data[_place(data, chance)] = chance.randrange(256)
+    return data
+
+
+def _cut(data: bytearray, chance: random.Random) -> bytearray:
+    return data[: _place(data, chance)]
+
+
+def _remove(data: bytearray, chance: random.Random) -> bytearray:
+    at = _place(data, chance)
+    del data[at : at + chance.choice((1, 4, 100))]
+    return data
+
+
+def _repeat(data: bytearray, chance: random.Random) -> bytearray:
+    at = _place(data, chance)
+    piece = data[at : at + chance.choice((1, 12, 100, 1000))]
+    count = chance.choice((1, 2, 50, 5000))
+    return data[:at] + piece * count + data[at:]
+
+
+def _size(data: bytearray, chance: random.Random) -> bytearray:
+    """Put a number that claims much where a size may stand."""
+    how, limit = chance.choice((("<I", 4), (">I", 4), ("<H", 2), (">H", 2), ("<Q", 8)))
+    at, value = _place(data, chance), chance.choice(SIZES)
+    data[at : at + limit] = struct.pack(how, value % (1 << (8 * limit)))
+    return data
+
+
+def _window(data: bytearray, chance: random.Random) -> bytearray:
+    """Claim a large picture in the header of a format that has one."""
+    width, height = chance.choice(SIZES), chance.choice((1, 48, *SIZES))
+    if data[1:4] == b"PNG" and len(data) > 33:
+        data[16:24] = struct.pack(">II", width, height)
+        data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+        return data
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        at = data.find(name)
+        if at >= 0:
+            at += len(name) + 4
+            sides = (0, 0, min(width, 2**31 - 1), min(height, 2**31 - 1))
+            data[at : at + 16] = struct.pack("<4i", *sides)
+    at = data.find(b"\xff\xc0")
+    if data[:2] == b"\xff\xd8" and at > 0:
+        data[at + 5 : at + 9] = struct.pack(">HH", height % 65536, width % 65536)
+    if data[:6] == b"\x93NUMPY":
+        side = str(width).encode()
+        return bytearray(re.sub(rb"\d+(?=[,)])", side, bytes(data), count=1))
+    return _size(data, chance)
+
+
+def _number(data: bytearray, chance: random.Random) -> bytearray:
+    """Replace one of the numbers or words of a text."""
+    found = list(re.finditer(rb"-?\d[\d.]*|\"[^\"]*\"", bytes(data[:200_000])))
+    if not found:
+        return _flip(data, chance)
+    first, last = chance.choice(found).span()
+    long = b"9" * chance.choice((20, 400, 5000))
+    data[first:last] = chance.choice((*NUMBERS, *WORDS, long))
+    return data
+
+
+def _nest(data: bytearray, chance: random.Random) -> bytearray:
+    at, count = _place(data, chance), chance.choice((10, 40, 1200, 100_000))
+    opening = chance.choice((b"[", b'{"a":', b"(", b"Z["))
+    closing = chance.choice((b"", b"]" * count, b"}" * count))
+    return data[:at] + opening * count + closing + data[at:]
+
+
+def _lines(data: bytearray, chance: random.Random) -> bytearray:
+    lines = bytes(data).split(b"\n")
+    line = chance.choice(lines)
+    count = min(chance.choice((1, 50, 30_000)), LONGEST_BYTES // (len(line) + 1))
+    return bytearray(b"\n".join(lines + [line] * count))
+
+
+CHANGES = (_flip, _flip, _cut, _remove, _repeat, _size, _size, _window, _number)
+TEXT_CHANGES = (_flip, _cut, _remove, _repeat, _number, _number, _nest, _lines)
