@@ -102,7 +102,12 @@ Source = Path | bytes
 
 
 def read_picture_rgb(
-    source: Source, *, name: str = "", option: str = "", upright: bool = False
+    source: Source,
+    *,
+    name: str = "",
+    option: str = "",
+    upright: bool = False,
+    formats: Sequence[str] = FORMATS,
 ) -> NDArray[np.uint8]:
     """Return a picture of 8 bits per channel as sRGB (height, width, 3).
 
@@ -116,12 +121,14 @@ def read_picture_rgb(
         What asked for it, for the texts of errors.
     upright : bool
         Whether to turn it as its EXIF data say.
+    formats : sequence of str
+        Pillow's names of those to read, whatever the file's name.
 
     Raises
     ------
     InvalidFile
     """
-    with _opened_picture(source, name, option) as image:
+    with _opened_picture(source, name, option, formats) as image:
         if image.mode.startswith(("I", "F")):
             raise _Refused(f"mode {image.mode}", "8 bits per channel")
         image.load()
@@ -161,7 +168,9 @@ class _Refused(Exception):
 
 
 @contextmanager
-def _opened_picture(source: Source, name: str, option: str) -> Iterator[Image.Image]:
+def _opened_picture(
+    source: Source, name: str, option: str, formats: Sequence[str] = FORMATS
+) -> Iterator[Image.Image]:
     """Open a picture that is within the limits; turn all errors into `InvalidFile`."""
     named = name or str(source if isinstance(source, Path) else "picture")
     with _WARNINGS, warnings.catch_warnings():
@@ -173,7 +182,7 @@ def _opened_picture(source: Source, name: str, option: str) -> Iterator[Image.Im
             with file:
                 _check_container(file)
                 file.seek(0)
-                with Image.open(file, formats=FORMATS) as image:
+                with Image.open(file, formats=formats) as image:
                     _check_picture(image, file)
                     with _quiet_library() if image.format == "TIFF" else nullcontext():
                         yield image

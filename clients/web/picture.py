@@ -24,9 +24,6 @@ SMALL_WIDTH_PX = 480
 
 LEAST_SIDE_PX = 16
 MAX_PHOTO_BYTES = 60_000_000
-MAX_PHOTO_PIXELS = 64_000_000
-"""A file of 200 kB may be a picture of any size."""
-
 PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 """By content, whatever the name: others run programs (EPS) or have rare readers."""
 
@@ -218,7 +215,9 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
     allowed = "a JPEG, PNG, WebP or TIFF picture of 8 bits"
     _check_size(name, content)
     try:
-        color = read_picture_rgb(content, name=name[:60], upright=True)
+        color = read_picture_rgb(
+            content, name=name[:60], upright=True, formats=PHOTO_FORMATS
+        )
     except InvalidFile as error:
         if error.found.startswith("cannot be read"):
             raise InvalidFile(name[:60], "not a picture", allowed) from None

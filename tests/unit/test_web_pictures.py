@@ -152,7 +152,7 @@ def test_a_photo_is_known_by_its_content(color):
     for kind in ("eps", "pcx", "ppm", "ico"):
         file = io.BytesIO()
         Image.fromarray(color).save(file, kind)
-        with pytest.raises(ValueError, match=r"no picture; allowed: a JPEG"):
+        with pytest.raises(ValueError, match=r"not a picture; allowed: a JPEG"):
             photo_picture("photo.png", file.getvalue(), **FLAT)
 
 
@@ -160,7 +160,9 @@ def test_a_photo_of_few_bytes_and_many_pixels_is_not_read():
     file = io.BytesIO()
     Image.new("1", (10_000, 7_000)).save(file, "png")
     assert len(file.getvalue()) < 20_000
-    with pytest.raises(ValueError, match=r"70 million pixels; allowed: 64 million"):
+    with pytest.raises(
+        ValueError, match=r"10000x7000 px; allowed: at most 67,108,864 pixels"
+    ):
         photo_picture("photo.png", file.getvalue(), **FLAT)
 
 
