@@ -160,9 +160,7 @@ def test_a_photo_of_few_bytes_and_many_pixels_is_not_read():
     file = io.BytesIO()
     Image.new("1", (10_000, 7_000)).save(file, "png")
     assert len(file.getvalue()) < 20_000
-    with pytest.raises(
-        ValueError, match=r"10000x7000 px; allowed: at most 67,108,864 pixels"
-    ):
+    with pytest.raises(ValueError, match="10000x7000 px; allowed: at most"):
         photo_picture("photo.png", file.getvalue(), **FLAT)
 
 
