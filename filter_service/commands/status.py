@@ -35,8 +35,11 @@ def status(
     if json_output:
         print_json(found)
         return
-    print(f"{endpoint} is {'ready' if found['is_ready'] else 'alive, not ready'}")
-    for name in ("n_sessions", "n_rendered", "n_dropped", "memory_mb"):
+    state = "ready" if found["is_ready"] else "alive, not ready"
+    if found["is_degraded"]:
+        state += ", degraded: a process does not stay up, see the service's log"
+    print(f"{endpoint} is {state}")
+    for name in ("n_connections", "n_sessions", "n_rendered", "n_dropped", "memory_mb"):
         print(f"  {name:<16} {found[name]:g}")
     for name in ("is_filtering", "is_building"):
         print(f"  {name:<16} {'yes' if found[name] else 'no'}")
