@@ -213,7 +213,7 @@ class Door:
         soon_s = self._devices.wait_s(now_s)
         if soon_s is not None:
             return soon_s
-        due_s = min(self._reception.next_alive_s, self._next_trim_s)
+        due_s = min(self._reception.due_s, self._next_trim_s)
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
     def _close(self) -> None:

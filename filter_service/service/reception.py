@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -33,6 +34,10 @@ from filter_service.service.sharing import Sharing
 
 MAX_GREETINGS = 256
 """Clients that wait for the answer to hello while a device is started."""
+
+PROFILE_PAUSE_S = 0.05
+"""Between two profiles of an eye: the process that filters needs some milliseconds to
+read one and to begin with it.  Of those that come meanwhile the newest counts."""
 
 log = logging.getLogger("ocufilter")
 
@@ -75,11 +80,12 @@ class Reception:
         self._send, self._record = send, record
         self._greetings: list[tuple[Peer, Hello]] = []  # until devices are known
         self._next_alive_s = time.monotonic() + config.alive_interval_s
+        self._next_profile_s = math.inf
 
     @property
-    def next_alive_s(self) -> float:
-        """When clients get a sign of life next, on the monotonic clock."""
-        return self._next_alive_s
+    def due_s(self) -> float:
+        """When `tidy` has something to do next, on the monotonic clock."""
+        return min(self._next_alive_s, self._next_profile_s)
 
     # Coming
 
@@ -220,14 +226,28 @@ class Reception:
             )
             reply = ErrorReply.from_exception(error, profile_id=replaced.profile_id)
             self._send(session.peer, reply)
-        if eye.asked_profile is None:
-            self._ask_next_profile(session, eye)
+        self._ask_next_profile(session, eye)
 
     def _ask_next_profile(self, session: Session, eye: EyeProfiles) -> None:
-        request, eye.next_profile = eye.next_profile, None
-        if request is not None:
-            eye.asked_profile = request
-            self._devices.of(session).render.tell("profile", session.key, request)
+        """Hand the newest profile over, unless one is on its way or was just now."""
+        now_s = time.monotonic()
+        if eye.next_profile is None or eye.asked_profile is not None:
+            return
+        if now_s < eye.next_ask_s:
+            self._next_profile_s = min(self._next_profile_s, eye.next_ask_s)
+            return
+        eye.next_ask_s = now_s + PROFILE_PAUSE_S
+        eye.asked_profile, eye.next_profile = eye.next_profile, None
+        render = self._devices.of(session).render
+        render.tell("profile", session.key, eye.asked_profile)
+
+    def _ask_due_profiles(self, now_s: float) -> None:
+        if now_s < self._next_profile_s:
+            return
+        self._next_profile_s = math.inf
+        for session in self._guests:
+            for eye in session.eyes.values():
+                self._ask_next_profile(session, eye)
 
     def pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
         """Tell a session what the render loop says of the profile of an eye."""
@@ -253,6 +273,7 @@ class Reception:
         """Find out who is gone, and forget who did not come back."""
         self._probe_clients()
         now_s = time.monotonic()
+        self._ask_due_profiles(now_s)
         for session in self._guests.away:
             if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
                 self._forget(session, "its client did not come back")

@@ -44,6 +44,7 @@ class EyeProfiles:
     next_profile: ProfileRequest | None = None  # waits for the one on its way
     profile_id: int | None = None
     generation: int = 0
+    next_ask_s: float = 0.0  # no sooner is another one asked for
 
     def record(self) -> EyeProfiles:
         """Return the accepted profile alone, without its body where that is large."""

@@ -231,6 +231,27 @@ def profiles(endpoint: str, duration_s: float, rate_hz: float = 20.0) -> dict:
     return counts
 
 
+def valid_profiles(endpoint: str, duration_s: float) -> dict:
+    """Profiles that are right, 150 a second for each of three eyes."""
+    context, client = dealer(endpoint)
+    client.send_multipart(encode(Hello("profiles")))
+    camera = small_frame(1).views[0].camera
+    counts, end_s, n = Counter(), time.monotonic() + duration_s, 0
+    while time.monotonic() < end_s:
+        body = {"kind": "double", "mark": n % 250}
+        for eye in ("both", "left", "right"):
+            request = ProfileRequest(n, body, views=(camera,), eye=eye)
+            with suppress(zmq.Again):
+                client.send_multipart(encode(request))
+            n += 1
+        _read(client, counts)
+        time.sleep(1 / 150)
+    counts["sent"] = n
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
 def _read(client, counts: Counter) -> None:
     while client.poll(0):
         reply = decode_reply(client.recv_multipart())
@@ -401,7 +422,7 @@ ATTACKS = {
     function.__name__: function
     for function in (
         *(bare, one_byte, half_greeted, silent_dealers, chosen_ids),
-        *(profiles, pings, unread, parts, parts_in_session, hoard),
+        *(profiles, valid_profiles, pings, unread, parts, parts_in_session, hoard),
         *(raw_sockets, mutated_messages),
     )
 }

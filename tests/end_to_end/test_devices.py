@@ -255,6 +255,14 @@ def test_a_device_that_does_not_come_again_is_given_up(
     fresh = raw_client(service)
     fresh.begin(mark=9)
     assert fresh.ask(small_frame(1)).colors[0][0, 0, 0] == 9
+    # And it is used again once it can be started.
+    gone.unlink()
+    wait_until(lambda: "the render 1 process is there again" in service.log, 20.0)
+    wait_until(lambda: [d["is_lost"] for d in devices_of(service)] == [False, False])
+    other = raw_client(service)
+    other.begin(mark=8)
+    assert other.ask(small_frame(1)).colors[0][0, 0, 0] == 8
+    assert sessions_on(service) == [1, 1]
 
 
 def test_a_device_that_never_comes_ends_the_start(start_service, monkeypatch, tmp_path):
