@@ -25,6 +25,9 @@ from estimator.bounded_files import InvalidFile, numbered_lines, read_text
 DEPTH_SCALE_M = 1.0 / 5000.0
 CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
 MAX_APART_S = 0.02
+MAX_LINES = 100_000
+"""Of a list: an hour at 30 Hz.  20 us each."""
+
 MAX_NEAR = 50
 """Images of depth that are compared to each side: a camera of 30 Hz has one."""
 
@@ -62,14 +65,19 @@ def tum_frames(source: Path) -> list[SourceFrame]:
 
 def _listed(path: Path) -> list[tuple[str, str]]:
     """Colour and depth of each line, whichever of them comes first."""
-    pairs = []
+    pairs: list[tuple[str, str]] = []
+    seen: set[str] = set()
     for number, fields in _lines(path, 4):
         first, second = fields[1], fields[3]
         if first.startswith("depth/") == second.startswith("depth/"):
             found = f"line {number}: '{first:.60}' and '{second:.60}'"
             raise InvalidFile(path, found, "one of them in depth/")
-        is_depth_first = first.startswith("depth/")
-        pairs.append((second, first) if is_depth_first else (first, second))
+        color, depth = (second, first) if first.startswith("depth/") else fields[1::2]
+        if color in seen:
+            found = f"line {number}: '{color:.60}' again"
+            raise InvalidFile(path, found, "each image of colour once")
+        seen.add(color)
+        pairs.append((color, depth))
     return pairs
 
 
@@ -114,7 +122,7 @@ def _times(path: Path) -> dict[float, str]:
 
 def _lines(path: Path, count: int) -> list[tuple[int, list[str]]]:
     lines = []
-    for number, line in numbered_lines(read_text(path)):
+    for number, line in numbered_lines(read_text(path, max_lines=MAX_LINES)):
         fields = line.replace(",", " ").split()
         if not fields or line.lstrip().startswith("#"):
             continue
@@ -122,7 +130,7 @@ def _lines(path: Path, count: int) -> list[tuple[int, list[str]]]:
             found = f"line {number}: '{line:.60}' has {len(fields)} fields"
             raise InvalidFile(path, found, f"{count} or more")
         for name in fields[1:count:2]:
-            if Path(name).is_absolute() or ".." in Path(name).parts:
+            if name.startswith("/") or ".." in name.split("/"):
                 found = f"line {number}: '{name:.60}' leads out of the data set"
                 raise InvalidFile(path, found, "a path below its folder")
         lines.append((number, fields[:count]))

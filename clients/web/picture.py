@@ -23,6 +23,9 @@ SMALL_WIDTH_PX = 480
 """A preview is no wider."""
 
 LEAST_SIDE_PX = 16
+MAX_SIDE_RATIO = 100
+"""Of one side to the other: of more, nothing is left in a preview."""
+
 MAX_PHOTO_BYTES = 60_000_000
 PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 """By content, whatever the name: others run programs (EPS) or have rare readers."""
@@ -222,9 +225,11 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
         if error.found.startswith("cannot be read"):
             raise InvalidFile(name[:60], "not a picture", allowed) from None
         raise
-    if min(color.shape[:2]) < LEAST_SIDE_PX:
+    shorter, longer = sorted(color.shape[:2])
+    if shorter < LEAST_SIDE_PX or longer > MAX_SIDE_RATIO * shorter:
         size = f"{color.shape[1]} × {color.shape[0]} px"
-        raise InvalidFile(name[:60], size, f"{LEAST_SIDE_PX} or more")
+        allowed = f"{LEAST_SIDE_PX} or more, and at most {MAX_SIDE_RATIO} to 1"
+        raise InvalidFile(name[:60], size, allowed)
     return color
 
 

@@ -9,7 +9,7 @@ words replaced, brackets nested.  100,000 of them are read by processes of their
 and 500 given to `ocufilter` as a program.  Errors: of readers, what is raised beside
 `InvalidFile` and what libraries write to stderr; of the program, an exit code that is
 neither 2 with one line on stderr nor 0; of all, processes that die, the longest read
-in s and the most memory in MB.  Writes results/files.json.
+in s of the processor and the most memory in MB.  Writes results/files.json.
 """
 
 import argparse
@@ -36,7 +36,10 @@ QUICK_READS, QUICK_COMMANDS = 1_500, 6
 N_PROCESSES = 2
 COMMAND_S = 60.0
 MAX_READ_S, MAX_MEMORY_MB = 5.0, 1000.0
-"""What a file may cost."""
+"""What a file may cost: processor time, as other work shares the machine."""
+
+WAITING_S = 60.0
+"""A read that takes so long in all is one that hangs."""
 
 ADDRESS_SPACE_BYTES = 6 << 30
 """Of a reading process, so that a file that asks for more is found and not the machine
@@ -59,7 +62,8 @@ def mutant(kind: Kind, number: int) -> tuple[str, bytes]:
 def read_some(name: str, first: int, count: int, folder: Path) -> None:
     """Read changed files of one kind; print a line for each, as a process of its own.
 
-    A line: number, s, what was raised, bytes that were written to stdout or stderr, MB.
+    A line: number, s, s of the processor, what was raised, bytes that were written to
+    stdout or stderr, MB.
     """
     from estimator import InvalidFile
 
@@ -77,7 +81,8 @@ def read_some(name: str, first: int, count: int, folder: Path) -> None:
         path = place / file_name
         path.write_bytes(content)
         print(f"{number} began", file=out, flush=True)
-        start_s, raised, before = time.perf_counter(), "", os.fstat(said).st_size
+        raised, before = "", os.fstat(said).st_size
+        start_s, start_cpu_s = time.perf_counter(), time.process_time()
         try:
             kind.read(path)
             raised = "valid"
@@ -88,11 +93,12 @@ def read_some(name: str, first: int, count: int, folder: Path) -> None:
         except BaseException as error:
             raised = f"{type(error).__name__}: {str(error)[:100]!r}"
         took_s = time.perf_counter() - start_s
+        cpu_s = time.process_time() - start_cpu_s
         sys.stdout.flush()
         path.unlink(missing_ok=True)
         written = os.fstat(said).st_size - before
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        result = [number, took_s, raised, written, peak_mb]
+        result = [number, took_s, cpu_s, raised, written, peak_mb]
         print(json.dumps(result), file=out, flush=True)
 
 
@@ -104,7 +110,7 @@ class Reads:
         self.times_s: list[float] = []
         self.raised: Counter[str] = Counter()
         self.wrong: list[str] = []
-        self.peak_mb = 0.0
+        self.longest_s = self.peak_mb = 0.0
 
     def run(self, count: int) -> None:
         """Read so many; a process that dies is counted, and another goes on."""
@@ -124,7 +130,7 @@ class Reads:
             if line.endswith("began"):
                 last = int(line.split()[0])
                 continue
-            number, took_s, raised, written, peak_mb = json.loads(line)
+            number, took_s, cpu_s, raised, written, peak_mb = json.loads(line)
             self.times_s.append(took_s)
             self.raised[raised.split(":")[0]] += 1
             self.peak_mb = max(self.peak_mb, peak_mb)
@@ -132,8 +138,9 @@ class Reads:
                 self.wrong.append(f"{number}: {raised}")
             if written:
                 self.wrong.append(f"{number}: {written} bytes on stdout or stderr")
-            if took_s > MAX_READ_S:
-                self.wrong.append(f"{number}: {took_s:.1f} s")
+            self.longest_s = max(self.longest_s, cpu_s)
+            if cpu_s > MAX_READ_S or took_s > WAITING_S:
+                self.wrong.append(f"{number}: {cpu_s:.1f} s of {took_s:.1f} s")
         if done.returncode != 0 and last < first:
             said = Path(folder, "stderr")
             reason = said.read_text("utf-8", "replace")[-500:] if said.exists() else ""
@@ -148,7 +155,7 @@ class Reads:
         setting = f"{refused} refused, {self.raised['valid']} valid"
         values = (
             ("wrong answers", len(self.wrong)),
-            ("longest read, s", max(self.times_s, default=0.0)),
+            ("longest read, s", self.longest_s),
             ("peak memory, MB", self.peak_mb),
         )
         times_ms = 1e3 * np.array(self.times_s or [0.0])
@@ -286,7 +293,7 @@ def measure(n_reads: int, n_commands: int) -> list[Row]:
             _row("reads", "all", f"{len(reads)} kinds", times_ms, peak_mb, *value)
             for value in (
                 ("wrong answers", sum(len(one.wrong) for one in reads)),
-                ("longest read, s", times_ms.max() / 1e3),
+                ("longest read, s", max(one.longest_s for one in reads)),
                 ("peak memory, MB", peak_mb),
             )
         ]

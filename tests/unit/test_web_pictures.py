@@ -34,6 +34,9 @@ def _npy(values):
     return file.getvalue()
 
 
+NARROW = _png(np.zeros((3200, 16, 3), np.uint8))
+
+
 @pytest.fixture
 def color():
     return np.random.default_rng(3).integers(0, 256, (40, 64, 3), np.uint8)
@@ -60,6 +63,7 @@ def test_a_photo_with_depth_keeps_it(color):
 @pytest.mark.parametrize(
     ("photo", "depth", "said"),
     [
+        (("n.png", NARROW), None, "'n.png': 16 × 3200 px; allowed: 16 or more"),
         (("p.png", b"no picture"), None, "'p.png': not a picture; allowed: a JPEG"),
         (None, ("d.npy", b"junk"), "d.npy"),
         (None, ("d.txt", b"1"), r"allowed.*\.npy"),
