@@ -185,11 +185,25 @@ class Keeper:
         try:
             for name in (*self._devices, DOOR):  # the last takes least
                 self._start(name)
-            self._join(DOOR)
             while not self._is_stopping:
-                self._turn()
+                try:
+                    self._turn()
+                except OSError as error:
+                    self._bear(error)
         finally:
             self._end_all()
+
+    def _bear(self, error: OSError) -> None:
+        """Go on after the system has refused something, once all had been ready.
+
+        Raises
+        ------
+        ServiceFailed
+        """
+        if not self._was_ready:
+            raise ServiceFailed(str(error)) from None
+        log.error("the system refused something (%s)", error)
+        time.sleep(CHECK_INTERVAL_S)
 
     def _turn(self) -> None:
         with selectors.DefaultSelector() as selector:
@@ -212,7 +226,6 @@ class Keeper:
             if restarts.due_s is not None and time.monotonic() >= restarts.due_s:
                 restarts.due_s = None
                 self._start(name)
-                self._join(name)
         if self._config.standby:
             for name in list(self._devices):
                 self._keep_standby(name)
@@ -233,9 +246,11 @@ class Keeper:
         standby = self._standbys.pop(name, None)
         try:
             self._children[name] = standby or self._spawned(name)
+            self._join(name)
         except OSError as error:  # no memory, processes or descriptors for it now
             if not self._was_ready:
                 raise ServiceFailed(f"its {name} process: {error}") from None
+            self._children[name].end()
             self._note_death(name, time.monotonic(), f"cannot be started ({error})")
 
     def _spawned(self, name: str) -> _Child:
@@ -299,6 +314,8 @@ class Keeper:
 
     def _join(self, new: str) -> None:
         """Give the door, and each render process that it lacks, the ends of a link."""
+        if self._children[DOOR].link is None:
+            return
         for name, index in self._devices.items():
             if new in (DOOR, name) and self._children[name].link is not None:
                 ours, theirs = socket.socketpair()
@@ -346,8 +363,9 @@ class Keeper:
         if not self._is_announced and all(
             child.is_ready for child in self._children.values()
         ):
-            self._is_announced = self._was_ready = True
+            self._is_announced = True
             self._when_ready(self._endpoint)
+            self._was_ready = True
 
     def _tell_degraded(self) -> None:
         """Have the door say so while a process is down for longer than a restart."""
