@@ -26,7 +26,7 @@ from contextlib import (
     suppress,
 )
 from pathlib import Path
-from typing import BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,17 @@ FORMATS = (
     TiffImagePlugin.TiffImageFile.format,
     WebPImagePlugin.WebPImageFile.format,
 )
+
+MAX_EXR_CHUNK_BYTES = 1 << 26
+"""Rows that are decoded at once: DWA holds them four times beside the picture."""
+
+EXR_CHUNK_ROWS = {
+    **dict.fromkeys(("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION"), 1),
+    **dict.fromkeys(("ZIP_COMPRESSION", "PXR24_COMPRESSION"), 16),
+    **dict.fromkeys(("PIZ_COMPRESSION", "B44_COMPRESSION", "B44A_COMPRESSION"), 32),
+    **dict.fromkeys(("DWAA_COMPRESSION", "HTJ2K32_COMPRESSION"), 32),
+}
+"""By compression; 256 of others."""
 
 EXR_INCOMPLETE = "Exception raised reading pixel data"
 """What the library prints where pixels are damaged, and nowhere else."""
@@ -500,6 +511,15 @@ def read_exr_channels(
         raise InvalidFile(path, found, "an intact OpenEXR file", option) from None
 
 
+def _exr_chunk_rows(header: dict[str, Any]) -> int:
+    """Return how many rows are decoded at once, at most; those of a tile its own."""
+    tiles = header.get("tiles")
+    if tiles is not None:
+        return max(1, int(tiles.ySize))
+    name = str(header.get("compression", "")).rpartition(".")[2]
+    return EXR_CHUNK_ROWS.get(name.partition(":")[0].strip("> "), 256)
+
+
 def _check_exr(parts: list) -> None:
     """Refuse what would take too much memory, by the headers of all parts."""
     n_bytes = 0
@@ -515,7 +535,12 @@ def _check_exr(parts: list) -> None:
         if "deep" in str(part.header.get("type", "")):
             raise _Refused("deep pixels", "one value of each channel for a pixel")
         # 4 bytes of each: half floats become float32
-        n_bytes += 4 * width * height * len(part.header["channels"])
+        row_bytes = 4 * width * len(part.header["channels"])
+        n_bytes += row_bytes * height
+        chunk_bytes = row_bytes * min(height, _exr_chunk_rows(part.header))
+        if chunk_bytes > MAX_EXR_CHUNK_BYTES:
+            found = f"{chunk_bytes:,} bytes in a chunk"
+            raise _Refused(found, f"at most {MAX_EXR_CHUNK_BYTES:,} bytes")
     if n_bytes > MAX_DECODED_BYTES:
         allowed = f"at most {MAX_DECODED_BYTES:,} bytes as float32"
         raise _Refused(f"{n_bytes:,} bytes in all channels", allowed)

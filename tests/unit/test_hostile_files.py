@@ -209,6 +209,19 @@ def test_npy_files_come_back_as_numpy_reads_them(tmp_path, dtype, order):
 # ----- OpenEXR
 
 
+def test_an_exr_of_rows_too_long_to_unpack_is_refused_by_its_header(tmp_path):
+    path = tmp_path / "a.exr"
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.DWAA_COMPRESSION}
+    with OpenEXR.File(header, {"RGB": np.ones((8, 8, 3), np.float32)}) as file:
+        file.write(str(path))
+    read_color(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"dataWindow\0box2i\0") + 21
+    content[at : at + 16] = struct.pack("<4i", 0, 0, 2**24 - 1, 0)
+    path.write_bytes(content)
+    refused(read_color, path, "201,326,592 bytes in a chunk")
+
+
 @pytest.mark.parametrize("side", [20_000, 2**30])
 def test_an_exr_of_a_large_window_is_refused_by_its_header(tmp_path, side, capfd):
     path = tmp_path / "a.exr"
