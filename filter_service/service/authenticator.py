@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import zmq
 from zmq.utils import z85
@@ -26,6 +27,9 @@ class Authenticator:
         Of the socket to guard, which must be bound after this is made.
     keys : KeyRing, optional
         Without it every connection is let in.
+    before_numbering : callable
+        Called when a connection has asked and has no number yet: what the socket's
+        monitor has reported by then includes that it was accepted.
 
     Attributes
     ----------
@@ -34,9 +38,12 @@ class Authenticator:
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], keys: KeyRing | None
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        keys: KeyRing | None,
+        before_numbering: Callable[[], None],
     ) -> None:
-        self._keys = keys
+        self._keys, self._before_numbering = keys, before_numbering
         self.next_number = 1
         self.socket = context.socket(zmq.REP)
         self.socket.linger = 0
@@ -58,6 +65,7 @@ class Authenticator:
                 request = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
+            self._before_numbering()
             self.socket.send_multipart(self._reply(request))
 
     def lets_in(self, key: str) -> bool:

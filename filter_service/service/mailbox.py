@@ -125,7 +125,7 @@ class Mailbox:
         self._ended: list[int] = []
         _seed_random()
         self._context = zmq.Context()
-        self._authenticator = Authenticator(self._context, keys)
+        self._authenticator = Authenticator(self._context, keys, self._read_monitor)
         self._socket = self._context.socket(zmq.ROUTER)
         socket = self._socket
         socket.linger = 0
@@ -195,7 +195,6 @@ class Mailbox:
         self._poller.poll(max(0, math.ceil(1000 * timeout_s)))
         if pause_s > 0.0:
             self._poller.modify(self._monitor, zmq.POLLIN)
-        # In this order: a connection is known before it is given a number.
         self._read_monitor()
         self._authenticator.answer()
         self._connections.check_unread(time.monotonic())

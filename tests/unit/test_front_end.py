@@ -16,6 +16,7 @@ from filter_service.service.connections import Connections
 from filter_service.service.descriptors import BASE, DescriptorLimit
 from filter_service.service.dropped_parts import drop_parts, drop_parts_in_python
 from filter_service.service.keeper import _Restarts
+from filter_service.service.mailbox import Mailbox, Outcome
 from filter_service.service.rate_limit import (
     MAX_IGNORED,
     MAX_REFUSALS,
@@ -354,3 +355,82 @@ def test_pauses_before_restarts_grow_to_a_minute_and_end_with_a_stable_process()
     pauses_s = [restarts.note_death(float(i), float(i)) for i in range(11)]
     assert pauses_s == [0, 0, 1, 2, 4, 8, 16, 32, 60, 60, 60]
     assert restarts.note_death(100.0, 161.0) == 0.0
+
+
+# The socket
+
+
+@pytest.fixture
+def mailbox():
+    connections = Connections(9, set())
+    box = Mailbox("tcp://127.0.0.1:*", 10**6, 4, connections=connections)
+    yield box
+    box.close()
+
+
+def received_within(mailbox, limit_s=5.0):
+    end_s = time.monotonic() + limit_s
+    while time.monotonic() < end_s:
+        mailbox.wait(0.05)
+        message = mailbox.receive()
+        if message is not None:
+            return message
+    raise AssertionError("nothing was received")
+
+
+def test_a_connection_that_comes_between_is_known_before_it_has_a_number(
+    mailbox, monkeypatch
+):
+    """It was not, on a busy machine: its client was never answered."""
+    context = zmq.Context()
+    dealer = context.socket(zmq.DEALER)
+    answer = mailbox._authenticator.answer
+    calls = []
+
+    def late():
+        if not calls:  # after the monitor was read, and before requests are answered
+            dealer.connect(mailbox.endpoint)
+            dealer.send(b"hello")
+            time.sleep(0.2)
+        calls.append(1)
+        answer()
+
+    monkeypatch.setattr(mailbox._authenticator, "answer", late)
+    try:
+        message = received_within(mailbox)
+        assert bytes(message.parts[0]) == b"hello"
+        assert message.connection is not None
+        outcome, _ = mailbox.send(message.peer, [b"welcome"])
+        assert (outcome, dealer.recv()) == (Outcome.SENT, b"welcome")
+    finally:
+        dealer.close(linger=0)
+        context.term()
+
+
+def test_a_reply_to_a_connection_that_has_ended_is_not_sent(mailbox):
+    context = zmq.Context()
+    dealer = context.socket(zmq.DEALER)
+    dealer.setsockopt(zmq.IDENTITY, b"camera")
+    dealer.connect(mailbox.endpoint)
+    dealer.send(b"hello")
+    peer = received_within(mailbox).peer
+    dealer.close(linger=0)
+    thief = context.socket(zmq.DEALER)
+    try:
+        end_s = time.monotonic() + 5.0
+        while not mailbox.take_ended():
+            assert time.monotonic() < end_s
+            mailbox.wait(0.05)
+        thief.setsockopt(zmq.IDENTITY, b"camera")
+        thief.connect(mailbox.endpoint)
+        thief.send(b"mine")
+        other = received_within(mailbox).peer
+        assert other.routing_id == peer.routing_id
+        assert other.connection != peer.connection
+        assert mailbox.send(peer, [b"secret"])[0] is Outcome.GONE
+        assert mailbox.send(other, [b"hello"])[0] is Outcome.SENT
+        thief.rcvtimeo = 5000
+        assert thief.recv() == b"hello"
+    finally:
+        thief.close(linger=0)
+        context.term()
