@@ -265,23 +265,23 @@ def _said(upload, pattern):
 @pytest.mark.parametrize(
     ("name", "shown"),
     [
-        (b"../../../etc/passwd", "“passwd”"),
-        (b"..\\..\\boot.ini", "“boot.ini”"),
-        (b"a\x00b.png", "“ab.png”"),
-        (500 * b"long" + b".png", "“longlong"),
-        (b"<img src=x onerror=alert(1)>.png", "“<img"),
-        (b"\xff\xfe\xed\xa0\x80.gif", "is no picture"),
+        (b"../../../etc/passwd", "'passwd'"),
+        (b"..\\..\\boot.ini", "'boot.ini'"),
+        (b"a\x00b.png", "'ab.png'"),
+        (500 * b"long" + b".png", "'longlong"),
+        (b"<img src=x onerror=alert(1)>.png", "'<img"),
+        (b"\xff\xfe\xed\xa0\x80.gif", "not a picture"),
     ],
 )
 def test_a_hostile_name_is_only_shown(upload, name, shown):
     assert upload(name, b"GIF89a no picture") == 200
     text = _said(upload, re.escape(shown))
-    assert "is no picture" in text and len(text) < 300
+    assert "not a picture" in text and len(text) < 300
 
 
 def test_a_bomb_is_refused(upload):
-    assert upload(b"bomb.png", _png(8000, 8001)) == 200
-    assert "allowed: 64 million" in _said(upload, "bomb.png.*million")
+    assert upload(b"bomb.png", _png(9000, 8001)) == 200
+    assert "allowed: at most" in _said(upload, "bomb.png.*pixels")
 
 
 def test_uploads_that_are_none_are_refused(upload):
