@@ -16,6 +16,7 @@ import sys
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 
 from filter_service.log_lines import ONCE_A_SECOND
 from filter_service.service.rate_limit import RateLimit
@@ -80,7 +81,6 @@ class Connection:
     first_number: int
     number: int | None = None
     is_ended: bool = False
-    has_greeted: bool = False
     has_had_session: bool = False
     counted_bytes: int | None = None  # received, when its last message was complete
     rates: RateLimit = field(default_factory=RateLimit)
@@ -119,8 +119,10 @@ class Connections:
         self._with_session = with_session
         self._open: dict[int, Connection] = {}  # by descriptor, oldest first
         self._numbered: dict[int, Connection] = {}
-        # By address, those that may be closed for others, in the order to do so.
-        self._candidates: dict[str, dict[int, Connection]] = {}
+        # By address and descriptor, oldest first: those that have not been seen to have
+        # sent a greeting, and the others.
+        self._silent: dict[str, dict[int, Connection]] = {}
+        self._greeted: dict[str, dict[int, Connection]] = {}
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
         self._n_ending = 0  # shut down, and not reported as ended yet
@@ -145,7 +147,7 @@ class Connections:
         self.remove(descriptor)
         connection = Connection(descriptor, inode, address, next_number)
         self._open[descriptor] = connection
-        self._candidates.setdefault(address, {})[descriptor] = connection
+        self._silent.setdefault(address, {})[descriptor] = connection
 
     def remove(self, descriptor: int) -> int | None:
         """Note that a connection has ended; return its number if it has one."""
@@ -159,11 +161,11 @@ class Connections:
         return connection.number
 
     def _forget_candidate(self, connection: Connection) -> None:
-        candidates = self._candidates.get(connection.address)
-        if candidates is not None:
-            candidates.pop(connection.descriptor, None)
-            if not candidates:
-                del self._candidates[connection.address]
+        for groups in (self._silent, self._greeted):
+            group = groups.get(connection.address, {})
+            group.pop(connection.descriptor, None)
+            if not group:
+                groups.pop(connection.address, None)
 
     def of_message(self, number: int, descriptor: int) -> Connection | None:
         """Return the connection of a message; None where it has ended meanwhile.
@@ -208,10 +210,8 @@ class Connections:
         if n_surplus <= 0:
             return
         for _ in range(n_surplus):
-            candidates = max(self._candidates.values(), key=len, default=None)
-            if not candidates:
-                return
-            self._evict_one(candidates)
+            if not (self._evict_silent() or self._evict_greeted()):
+                break
             self.n_evicted += 1
         log.warning(
             "%d connections are open, of %d; the oldest without a session are closed",
@@ -219,23 +219,27 @@ class Connections:
             extra=ONCE_A_SECOND,
         )
 
-    def _evict_one(self, candidates: dict[int, Connection]) -> None:
-        """Close the oldest connection without a greeting, else the oldest.
+    def _evict_silent(self) -> bool:
+        """Close the oldest one without a greeting; return whether there was one."""
+        while self._silent:
+            address = max(self._silent, key=lambda a: len(self._silent[a]))
+            connection = next(iter(self._silent[address].values()))
+            has_session = connection.number in self._with_session
+            if not has_session and self._bytes_received(connection) < GREETING_BYTES:
+                self._shut_down(connection)
+                return True
+            self._forget_candidate(connection)
+            self._greeted.setdefault(address, {})[connection.descriptor] = connection
+        return False
 
-        A handshake takes longer than a flood of connections needs to come round.
-        """
-        for _ in range(len(candidates)):
-            connection = next(iter(candidates.values()))
-            if connection.number in self._with_session:
-                del candidates[connection.descriptor]
-                continue
-            n_bytes = 0 if connection.has_greeted else self._bytes_received(connection)
-            if connection.has_greeted or n_bytes < GREETING_BYTES:
-                break
-            connection.has_greeted = True  # it is the last to go
-            candidates[connection.descriptor] = candidates.pop(connection.descriptor)
-        if candidates:
-            self._shut_down(next(iter(candidates.values())))
+    def _evict_greeted(self) -> bool:
+        """Close the oldest one with a greeting, and without a session; likewise."""
+        by_size = sorted(self._greeted.values(), key=len, reverse=True)
+        for connection in chain.from_iterable(group.values() for group in by_size):
+            if connection.number not in self._with_session:
+                self._shut_down(connection)
+                return True
+        return False
 
     def check_unread(self, now_s: float) -> None:
         """Close connections that fill libzmq's memory before they say hello."""

@@ -65,6 +65,7 @@ from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep others waiting
+MAX_PARTS_LEFT_OUT = 1000  # a message with more of them was never meant to be one
 IDLE_WAIT_S = 1.0
 TRIM_INTERVAL_S = 10.0
 CLOSING_LINGER_MS = 200
@@ -338,7 +339,8 @@ class Door:
         peer, parts = received.peer, received.parts
         try:
             if received.n_left_out:
-                if received.connection is not None:
+                is_many = received.n_left_out > MAX_PARTS_LEFT_OUT
+                if received.connection is not None and is_many:
                     received.connection.rates.end_patience()
                 raise BadMessage(
                     f"{len(parts) + received.n_left_out - 1} parts follow the header",
