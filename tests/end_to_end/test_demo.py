@@ -249,10 +249,10 @@ def test_profile_is_a_preset_json_or_a_file(tmp_path):
         (
             "eye.json",
             "[1, 2]",
-            r"--left .*eye.json is \[1, 2\]; allowed: a JSON object",
+            r"--left .*eye.json': \[1, 2\] is not an object; allowed: one JSON",
         ),
         ("eye.json", "{", "--left .*not JSON"),
-        ("eye.abp", "Q = 1", "--left .*line 1': cannot read 'Q = 1'"),
+        ("eye.abp", "Q = 1", "--left .*eye.abp': line 1: cannot read 'Q = 1'; allowed"),
         ("eye.txt", "{}", "--left .*eye.txt.* allowed: a preset"),
     ],
 )
