@@ -1,250 +1,260 @@
-"""Plans that follow a stream, against all that its settings allow.
+"""Streams whose pupil and focus change in every frame: how many frames are whole.
 
     python -m tests.benchmarks.bench_follow [--quick] [--json]
 
-Two streams of ten seconds go through `EyeFilter` in real time: the demo's walk, and one
-whose pupil and focus sweep from 2 to 7 mm and from 0 to 6 dpt.  A row says how many
-PSFs the largest store has and all of them together, when the first picture and the
-first whole eye were there, the slowest frame, and how many frames were seen through
-less than the whole.  Errors: of a frame in the middle of the walk against the dense
-reference, for both ways; and of what changes in a frame when one store takes the place
-of another, as encoded for a screen, beside what a pupil 0.1 mm wider changes in the
-same frames: less than a breath does.  Writes results/follow.json.
+A frame is whole when it shows the state that it asks for and is delivered within two
+frame intervals of its submission; dropped frames count against it.  Walks: the demo's,
+and a panned photograph (`stream_walks`), at 480x270 and 30 frames a second, and at
+1280x720 and 8 a second or 0.6 of the eye's own frame rate, in this process and through
+the service; half way the eye changes.  Then, with calls that wait: the slowest frame of
+the walk against the median, and how long the first frame after a step takes (pupil 3 to
+6 mm and focus 0 to 2.5 dpt at once).  Error: the share of frames that are not whole.
+Writes results/follow.json.
 """
 
 import argparse
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimator.profiles.parse import parse_profile
-from filter_service.building.from_profile import build
-from filter_service.building.jobs import BuildJob
+from filter_service import Camera, EyeFilter
 from filter_service.building.limits import BuildLimits
-from filter_service.building.used_ranges import UsedRanges
 from filter_service.building.worker_handle import WorkerHandle
-from filter_service.filtering.accepted_profile import PreparedStore
-from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import EyeReady
 from filter_service.filtering.workshop import Workshop
-from filter_service.rendering.native.renderer import NativeRenderer
-from filter_service.settings import FilterSettings
+from filter_service.rendering.native.lanes import NativeLanes
 from tests.benchmarks.harness import Row, memory_mb, publish
-from tests.benchmarks.live_walk import Judge, Walk
+from tests.benchmarks.published_figures import CONDITIONS
+from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk
 
-EYES = ("emmetropia", "myopia", "keratoconus")
-CASES = (((480, 270), EYES), ((1280, 720), EYES[:1]))
-STREAM_S, FRAMES_PER_S = 10.0, 12.0
-COUNT = 48
-PUPIL_STEP_MM = 0.1
-REFERENCE = "dense reference; the store before"
+EYES = CONDITIONS
+STREAM_S = 6.0
+SIZES = (((480, 270), 30.0), ((1280, 720), 8.0))
+OF_OWN_RATE = 0.6
 LIMITS = BuildLimits(psf_engine="cpu")
-
-State = dict[str, float]
-
-
-def sweeping(share: float) -> State:
-    """State of a stream that asks for everything in turn."""
-    return {"pupil_diameter_mm": 2.0 + 5.0 * share, "focus_dpt": 6.0 * share}
+STEP = ((3.0, 0.0), (6.0, 2.5))
+WAIT_S = 120.0
 
 
-def walking(walk: Walk) -> Callable[[float], State]:
-    """State of the demo's walk at a share of its way."""
-    return lambda share: walk.states[int(share * len(walk.states))]
+def preset(name: str) -> dict[str, str]:
+    """Return a preset's profile."""
+    return {"kind": "preset", "name": name}
 
 
 @dataclass
 class Seen:
     """What came of one stream."""
 
-    first_s: float = 0.0
-    whole_s: float = 0.0
-    psf_counts: list[int] = field(default_factory=list)
-    switches: list[tuple[float, UsedRanges | None]] = field(default_factory=list)
+    n_frames: int = 0
+    n_whole: int = 0
+    n_dropped: int = 0
     times_ms: list[float] = field(default_factory=list)
-    incomplete_count: int = 0
-
-
-def _psf_count(prepared: PreparedStore) -> int:
-    return int(prepared.store.store.psf_count)  # type: ignore[attr-defined]
-
-
-def streamed(
-    eye: str, walk: Walk, state_at: Callable[[float], State], prepare: str
-) -> Seen:
-    """Send a stream through an eye in real time; nothing is known of it before."""
-    seen, ready = Seen(), []
-    started_s = time.monotonic()
-
-    def note(event) -> None:
-        if isinstance(event, EyeReady):
-            ready.append((time.monotonic() - started_s, event.is_complete))
-
-    renderer = NativeRenderer()
-    workshop = Workshop(WorkerHandle(), renderer, LIMITS, engine_name="native")
-    settings, camera = FilterSettings(prepare=prepare), walk.views[0].camera
-    try:
-        with EyeFilter(
-            {"kind": "preset", "name": eye},
-            camera,
-            settings,
-            on_event=note,
-            workshop=workshop,
-        ) as eye_filter:
-            first = walk.views[0]
-            eye_filter.filter(first, **state_at(0.0))
-            seen.first_s = time.monotonic() - started_s
-            eye_filter.wait()
-            seen.whole_s = ready[-1][0]
-            _send(eye_filter, walk, state_at, seen)
-    finally:
-        workshop.close()
-    return seen
-
-
-def _send(eye_filter: EyeFilter, walk: Walk, state_at, seen: Seen) -> None:
-    last, started_s = None, time.monotonic()
-    count = int(STREAM_S * FRAMES_PER_S)
-    for number in range(count):
-        while time.monotonic() < started_s + number / FRAMES_PER_S:
-            eye_filter.advance()
-            time.sleep(0.001)
-        eye_filter.advance()  # a stream that is late has no time to wait
-        share = number / count
-        view = walk.views[int(share * len(walk.views))]
-        before_s = time.perf_counter()
-        frame = eye_filter.try_filter([view], **state_at(share))
-        assert frame is not None  # the eye is whole: it never waits
-        seen.times_ms.append(1e3 * (time.perf_counter() - before_s))
-        seen.incomplete_count += not frame.is_complete
-        prepared = eye_filter.prepared_stores[-1]
-        if prepared is not last:
-            last = prepared
-            seen.psf_counts.append(_psf_count(prepared))
-            if prepared.is_complete:
-                seen.switches.append((share, prepared.ranges))
-
-
-@dataclass
-class Steps:
-    """Changes of frames, PSNR of the encoded picture, one for each change of store."""
-
-    store_db: list[float] = field(default_factory=list)
-    pupil_db: list[float] = field(default_factory=list)
-    p99_codes: list[float] = field(default_factory=list)
+    new_eye_s: float = math.inf
+    psf_count: int = 0
+    kernels_mb: float = 0.0
+    tables_mb: float = 0.0
 
     @property
     def words(self) -> str:
-        """Say which change 1 % of the pixels exceed at worst."""
-        if not self.p99_codes:
-            return ""
-        return f"; 99 % change by {max(self.p99_codes):.0f} of 255"
-
-    def worst_db(self, name: str) -> float:
-        """Return the largest change; not a number where there is none."""
-        return min(getattr(self, name), default=float("nan"))
+        """Return the counts in words."""
+        return (
+            f"{self.n_dropped} of {self.n_frames} dropped, new eye after "
+            f"{self.new_eye_s:.2f} s, {self.psf_count} PSFs, kernels "
+            f"{self.kernels_mb:.0f} MB, tables {self.tables_mb:.0f} MB"
+        )
 
 
-def steps_of(eye: str, walk: Walk, state_at, seen: Seen) -> Steps:
-    """Compare the pictures of two stores where one takes the place of the other."""
-    renderer, steps = NativeRenderer(), Steps()
-    whole = renderer.load(_built(eye, walk, None))
-    for (_, before), (share, after) in zip(
-        seen.switches, seen.switches[1:], strict=False
+class Following:
+    """An `EyeFilter` with an engine and a worker of its own."""
+
+    def __init__(self, eye: str, camera: Camera) -> None:
+        self.workshop = Workshop(WorkerHandle(), NativeLanes(), LIMITS)
+        self.ready_s: list[float] = []
+        self.filter = EyeFilter(
+            preset(eye), camera, on_event=self._note, workshop=self.workshop
+        )
+        self.filter.wait(WAIT_S)
+
+    def _note(self, event: object) -> None:
+        if isinstance(event, EyeReady) and event.is_complete:
+            self.ready_s.append(time.monotonic())
+
+    def __enter__(self) -> "Following":
+        """Return it."""
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """End the engine and the worker."""
+        self.filter.close()
+        self.workshop.close()
+        self.workshop.engine.close()
+
+    def waited(self, moment: Moment) -> float:
+        """Filter a frame however long it takes; ms."""
+        begin_s = time.perf_counter()
+        self.filter.filter(
+            moment.view,
+            pupil_diameter_mm=moment.pupil_diameter_mm,
+            focus_dpt=moment.focus_dpt,
+        )
+        return 1e3 * (time.perf_counter() - begin_s)
+
+    def stream(
+        self, moments: Sequence[Moment], rate_hz: float, new_eye: str | None
+    ) -> Seen:
+        """Send frames in real time; those due while one is filtered are dropped."""
+        seen = Seen()
+        started_s, changed_s, half = time.monotonic(), math.inf, len(moments) // 2
+        for number, moment in enumerate(moments):
+            due_s = started_s + number / rate_hz
+            if number == half and new_eye is not None:
+                self.filter.set_profile(preset(new_eye))
+                changed_s = time.monotonic()
+            seen.n_frames += 1
+            if time.monotonic() > due_s + 1.0 / rate_hz:
+                seen.n_dropped += 1
+                continue
+            while time.monotonic() < due_s:
+                self.filter.advance()
+                time.sleep(0.0005)
+            begin_s = time.perf_counter()
+            shown = self.filter.try_filter(
+                [moment.view],
+                pupil_diameter_mm=moment.pupil_diameter_mm,
+                focus_dpt=moment.focus_dpt,
+            )
+            seen.times_ms.append(1e3 * (time.perf_counter() - begin_s))
+            end_s = time.monotonic()
+            is_whole = shown is not None and shown.is_complete
+            seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
+            if is_whole and shown.generation > 1:
+                seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)
+            self.filter.advance()
+        for prepared in self.filter.prepared_stores:
+            store: Any = prepared.store.store
+            seen.psf_count += getattr(store, "computed_count", store.psf_count)
+            seen.kernels_mb += store.memory_mb
+            seen.tables_mb += getattr(store, "tables_mb", 0.0)
+        return seen
+
+
+def served(
+    eye: str, moments: Sequence[Moment], rate_hz: float, new_eye: str | None
+) -> Seen:
+    """Send the same frames through the service, on this machine."""
+    from clients.filter_client import FilterClient, FilteredFrame
+    from clients.service_process import ServiceProcess
+
+    seen, sent_s = Seen(), {}
+    with (
+        ServiceProcess({"engine": "native"}, start_timeout_s=WAIT_S) as service,
+        FilterClient(service.endpoint, timeout_s=WAIT_S, max_in_flight=2) as client,
     ):
-        state, view = state_at(share), walk.views[int(share * len(walk.views))]
-        now = UsedRanges(
-            (state["pupil_diameter_mm"],) * 2, (state["focus_dpt"],) * 2, (0.0, 0.0)
-        )
-        if before is None or not replace(before, object_dpt=(0.0, 20.0)).holds(now):
-            continue  # what came before was not for this state: the preview bridged it
-        wider = state | {
-            "pupil_diameter_mm": state["pupil_diameter_mm"] + PUPIL_STEP_MM
-        }
-        first, second = (renderer.load(_built(eye, walk, r)) for r in (before, after))
-        old, new, narrow, wide = (
-            renderer.render(view, handle, **own, output="srgb8").color / 255.0
-            for handle, own in (
-                *((first, state), (second, state)),
-                *((whole, state), (whole, wider)),
+        client.set_profile(preset(eye), views=[moments[0].view])
+        started_s, changed_s, half = time.monotonic(), math.inf, len(moments) // 2
+
+        def take(events: Sequence[Any]) -> None:
+            now_s = time.monotonic()
+            for event in events:
+                if not isinstance(event, FilteredFrame):
+                    continue
+                took_s = now_s - sent_s[event.header.frame_id]
+                seen.times_ms.append(1e3 * took_s)
+                is_whole = event.header.is_complete
+                seen.n_whole += is_whole and took_s <= 2.0 / rate_hz
+                if is_whole and event.header.generation > 1:
+                    seen.new_eye_s = min(seen.new_eye_s, now_s - changed_s)
+
+        for number, moment in enumerate(moments):
+            due_s = started_s + number / rate_hz
+            while (left_s := due_s - time.monotonic()) > 0.0:
+                take(client.poll(min(left_s, 0.002)))
+            if number == half and new_eye is not None:
+                client.request_profile(preset(new_eye), views=[moment.view])
+                changed_s = time.monotonic()
+            seen.n_frames += 1
+            if client.n_unanswered >= 2:
+                seen.n_dropped += 1
+                continue
+            frame_id = client.submit(
+                moment.view,
+                pupil_diameter_mm=moment.pupil_diameter_mm,
+                focus_dpt=moment.focus_dpt,
             )
-        )
-        steps.store_db.append(_psnr_db(new - old))
-        steps.pupil_db.append(_psnr_db(wide - narrow))
-        steps.p99_codes.append(float(np.percentile(255.0 * np.abs(new - old), 99)))
-    return steps
+            sent_s[frame_id] = due_s
+        end_s = time.monotonic() + 2.0
+        while client.n_unanswered and time.monotonic() < end_s:
+            take(client.poll(0.01))
+        seen.kernels_mb = service.memory_mb
+    return seen
 
 
-def _psnr_db(difference: NDArray[np.float64]) -> float:
-    return -10.0 * math.log10(max(float(np.mean(difference**2)), 1e-12))
-
-
-def _built(eye: str, walk: Walk, ranges: UsedRanges | None):
-    job = BuildJob(
-        profile=parse_profile({"kind": "preset", "name": eye}),
-        settings=FilterSettings(prepare="stream" if ranges else "ranges"),
-        camera=walk.views[0].camera,
-        ranges=ranges,
-        with_preview=False,
+def _row(method: str, case: str, setting: str, times_ms, name: str, value) -> Row:
+    median_ms, p95_ms = (
+        (float(np.median(times_ms)), float(np.percentile(times_ms, 95)))
+        if len(times_ms)
+        else (math.nan, math.nan)
     )
-    *_, built = build(job, progress=lambda *_: None, cancelled=lambda: False)
-    return built.store
+    return Row(
+        *("follow", method, case, setting, len(times_ms), median_ms, p95_ms),
+        *(memory_mb(), name, float(value), "all submitted frames"),
+    )
 
 
-def error_db(eye: str, walk: Walk, ranges: UsedRanges | None) -> float:
-    """PSNR, linear, of the walk's judged frame against the dense reference."""
-    judge = Judge.of(walk, eye, compute=True)
-    renderer = NativeRenderer()
-    handle = renderer.load(_built(eye, walk, ranges))
-    return judge.error_db(renderer, handle, 1.0)
-
-
-def _rows(eye: str, size_px, walk: Walk, *, judged: bool) -> list[Row]:
-    rows, case = [], f"{eye} {size_px[0]}"
-    for name, state_at in (("walk", walking(walk)), ("sweep", sweeping)):
-        for prepare in ("ranges", "stream"):
-            seen = streamed(eye, walk, state_at, prepare)
-            setting = (
-                f"{max(seen.psf_counts)} PSFs at most, {sum(seen.psf_counts)} in all; "
-                f"first picture {seen.first_s:.2f} s, whole {seen.whole_s:.2f} s; "
-                f"slowest {max(seen.times_ms):.0f} ms; {seen.incomplete_count} of "
-                f"{len(seen.times_ms)} frames not whole"
-            )
-            p95_ms = float(np.percentile(seen.times_ms, 95))
-            median_ms = float(np.median(seen.times_ms))
-            steps = Steps()
-            if prepare == "stream":
-                steps = steps_of(eye, walk, state_at, seen)
+def eye_rows(
+    eye: str, size_px: tuple[int, int], rate_hz: float, stream_s: float
+) -> list[Row]:
+    """Rows of one eye and size."""
+    rows: list[Row] = []
+    case = f"{eye} {size_px[0]}"
+    new_eye = EYES[(EYES.index(eye) + 1) % len(EYES)]
+    few = photograph_walk(size_px, 12, rate_hz)
+    camera = few[0].view.camera
+    with Following(eye, camera) as following:
+        own_ms = float(np.median([following.waited(moment) for moment in few]))
+        rate_hz = (
+            min(rate_hz, OF_OWN_RATE * 1e3 / own_ms) if size_px[0] > 480 else rate_hz
+        )
+    count = int(stream_s * rate_hz)
+    setting = f"{rate_hz:.1f} a second"
+    for name, walk_of in (("photograph", photograph_walk), ("demo", demo_walk)):
+        moments = walk_of(size_px, count, rate_hz)
+        with Following(eye, moments[0].view.camera) as following:
+            seen = following.stream(moments, rate_hz, new_eye)
+        found = [("in process", seen)]
+        found.append(("service", served(eye, moments, rate_hz, new_eye)))
+        for where, seen in found:
             rows.append(
-                Row(
-                    *("follow", f"{name}, {prepare}", case, setting + steps.words),
-                    *(len(seen.psf_counts), median_ms, p95_ms, memory_mb()),
-                    *("change of store, dB", steps.worst_db("store_db"), REFERENCE),
+                _row(
+                    *(f"{name}, {where}", case, f"{setting}; {seen.words}"),
+                    *(seen.times_ms, "whole frames, %"),
+                    100.0 * seen.n_whole / seen.n_frames,
                 )
             )
-            if steps.store_db:
-                rows.append(
-                    replace(
-                        rows[-1],
-                        error_name="pupil 0.1 mm wider, dB",
-                        error=steps.worst_db("pupil_db"),
-                    )
-                )
-            if judged and name == "walk":
-                middle = next(
-                    (r for share, r in reversed(seen.switches) if share <= 0.5), None
-                )
-                rows.append(
-                    replace(
-                        rows[-1],
-                        error_name="middle frame, dB",
-                        error=error_db(eye, walk, middle),
-                    )
-                )
+        with Following(eye, moments[0].view.camera) as following:
+            times_ms = [following.waited(moment) for moment in moments][1:]
+        rows.append(
+            _row(
+                *(f"{name}, waiting", case, setting, times_ms),
+                *("slowest / median", max(times_ms) / np.median(times_ms)),
+            )
+        )
+    with Following(eye, camera) as following:
+        for state in STEP:
+            took_ms = following.waited(Moment(few[0].view, *state))
+    rows.append(
+        _row("step", case, "", [took_ms], "first whole frame, s", took_ms / 1e3)
+    )
+    for row in rows[-7:]:
+        print(
+            f"{row.method:22} {row.case:18} {row.error_name:22} {row.error:8.3f}  "
+            f"median {row.median_ms:.1f} p95 {row.p95_ms:.1f} ms  {row.setting}",
+            flush=True,
+        )
     return rows
 
 
@@ -252,14 +262,17 @@ def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one eye, one size")
+    parser.add_argument("--eyes", nargs="+", default=EYES, choices=EYES)
     parser.add_argument("--json", action="store_true", help="print the report alone")
     options = parser.parse_args()
-    rows = []
-    cases = ((CASES[0][0], EYES[:1]),) if options.quick else CASES
-    for size_px, eyes in cases:
-        walk = Walk.of(size_px, COUNT)
-        for eye in eyes:
-            rows += _rows(eye, size_px, walk, judged=size_px == CASES[0][0])
+    sizes, eyes = (SIZES[:1], EYES[:1]) if options.quick else (SIZES, options.eyes)
+    stream_s = 3.0 if options.quick else STREAM_S
+    rows = [
+        row
+        for size_px, rate_hz in sizes
+        for eye in eyes
+        for row in eye_rows(eye, size_px, rate_hz, stream_s)
+    ]
     publish("follow", rows, as_json=options.json, is_whole=not options.quick)
 
 
