@@ -7,8 +7,6 @@ are rendered 63 mm apart; here by shifting cards by hand, in a headset by its re
 Look at the pair with crossed eyes: the brain mostly takes the sharper one.
 """
 
-import time
-
 import numpy as np
 from common import font, save_pictures
 from PIL import Image, ImageDraw
@@ -59,15 +57,9 @@ states = [ViewState(side) for side in sides]
 filters = {side: EyeFilter(PROFILES[side], camera) for side in sides}
 for eye_filter in filters.values():
     eye_filter.wait()
-is_complete = False
-while not is_complete:  # previews come first; "preparing": there is not even one
-    time.sleep(0.05)
-    planned = plan_views(
-        filters.get, views, states, pupil_diameter_mm=4.5, focus_dpt=0.5
-    )
-    if planned != "preparing":
-        found = planned.render()
-        is_complete, seen = found.is_complete, found.views
+planned = plan_views(filters.get, views, states, pupil_diameter_mm=4.5, focus_dpt=0.5)
+assert planned is not None  # both eyes are ready
+seen = planned.render().views
 for eye_filter in filters.values():
     eye_filter.close()
 

@@ -155,6 +155,10 @@ class WorkerCrashed(SessionError):
     code = "worker_crashed"
 
 
+class NotPrepared(Exception):
+    """PSFs that a frame needs were not computed within its time; never sent."""
+
+
 class RenderError(FilterError):
     """A frame could not be filtered."""
 

@@ -82,8 +82,8 @@ class FilterSettings(Record):
     prepare: Annotated[
         Prepare,
         _doc(
-            "stream: PSFs for what the frames of a stream use and are about to use, "
-            "within the ranges; ranges: all of them at once."
+            "stream: PSFs are computed when frames need them, and a little ahead; "
+            "ranges: all of them before the first frame."
         ),
     ] = "stream"
     pupil_range_mm: Annotated[
@@ -180,10 +180,25 @@ class FilterSettings(Record):
         """Return whether PSFs differ over the visual field."""
         return self.mode != "on-axis"
 
-    @property
-    def follows_stream(self) -> bool:
-        """Return whether only what a stream uses is prepared."""
-        return self.prepare == "stream" and self.grid == "planned"
+    def covering(
+        self,
+        *,
+        pupils_mm: tuple[float, ...] = (),
+        foci_dpt: tuple[float, ...] = (),
+        objects_dpt: tuple[float, ...] = (),
+    ) -> FilterSettings:
+        """Return settings whose ranges hold these values, too."""
+
+        def widened(
+            span: tuple[float, float], values: tuple[float, ...]
+        ) -> tuple[float, float]:
+            return min((span[0], *values)), max((span[1], *values))
+
+        return self.changed(
+            pupil_range_mm=widened(self.pupil_range_mm, pupils_mm),
+            focus_range_dpt=widened(self.focus_range_dpt, foci_dpt),
+            object_range_dpt=widened(self.object_range_dpt, objects_dpt),
+        )
 
     def changed(self, **changes: Any) -> FilterSettings:
         """Return settings of which some are others."""

@@ -79,8 +79,7 @@ class Engine:
             from filter_service.rendering import image_cells
 
             per_pixel = texel_count / pixel_count
-            limits = dict.fromkeys(image_cells.TEXELS_PER_PIXEL, (per_pixel,) * 2)
-            monkeypatch.setattr(image_cells, "TEXELS_PER_PIXEL", limits)
+            monkeypatch.setattr(image_cells, "TEXELS_PER_PIXEL", per_pixel)
         else:
             from filter_service.rendering.gl import kernel_passes
 

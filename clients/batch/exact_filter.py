@@ -1,10 +1,4 @@
-"""Pictures that depend on their frame, eye and settings, and on nothing before them.
-
-`EyeFilter` is made for streams: a first preview, PSFs that grow with what is asked, and
-states that are kept from frame to frame, as the width of the field's cells, which grows
-where kernels are many.  Here each eye and camera is prepared whole before its first
-frame, and what frames leave is forgotten.
-"""
+"""Pictures that depend on their frame, eye and settings, and on nothing before them."""
 
 from __future__ import annotations
 
@@ -64,16 +58,13 @@ class ExactFilter:
             self._prepare(profile, view.camera)
         if self._failure is not None or self._filter is None:
             raise self._failure or RuntimeError("the filter is closed")
-        self._filter.forget()
-        seen = self._filter.filter(
+        return self._filter.filter(
             view,
             pupil_diameter_mm=pupil_mm,
             focus_dpt=focus_dpt,
             output=self._job.output,
             render_tolerance=self._job.render_tolerance,
         )
-        assert seen.is_complete  # `wait` has seen to it
-        return seen
 
     def _prepare(self, profile: str, camera: Camera) -> None:
         try:

@@ -77,37 +77,32 @@ class Job:
 
 
 def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
-    """Return the settings of a batch: all PSFs are prepared before the first frame.
+    """Return the settings of a batch.
 
     Parameters
     ----------
     given : mapping
-        Fields of `FilterSettings`; ranges that lack are those of the states.
+        Fields of `FilterSettings`; the usual ranges that lack are widened to hold the
+        states.
 
     Raises
     ------
     ValueError
-        A setting that is none, or with which pictures would depend on what was before.
+        An unknown setting, or one with which pictures would depend on the machine.
     """
-    fixed = {"prepare": "ranges"}
-    usual = {
-        "pupil_range_mm": states.pupil_range_mm,
-        "focus_range_dpt": states.focus_range_dpt,
-    }
-    for name, value in fixed.items():
-        if given.get(name, value) != value:
-            raise ValueError(
-                f"--settings: {name} is {given[name]!r}; allowed in a batch: {value!r}"
-            )
     if given.get("accuracy") == "balanced":
         raise ValueError(
             "--settings: accuracy is 'balanced', which goes by the speed of the "
             "machine; allowed in a batch: 'exact' or 'fast'"
         )
     try:
-        return FilterSettings(**{**usual, **given, **fixed})
+        settings = FilterSettings(**given)
     except TypeError as error:
         raise ValueError(f"--settings: {error}") from None
+    return settings.covering(
+        pupils_mm=() if "pupil_range_mm" in given else states.pupil_range_mm,
+        foci_dpt=() if "focus_range_dpt" in given else states.focus_range_dpt,
+    )
 
 
 def code_version() -> dict[str, str | None]:

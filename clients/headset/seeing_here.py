@@ -90,7 +90,7 @@ class SeeingHere:
             pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
             focus_dpt=frame.eyes[0].state.focus_dpt,
         )
-        if isinstance(planned, str):
+        if planned is None:
             return None
         seen = planned.render()
         stages_ms = seen.stage_times_ms

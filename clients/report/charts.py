@@ -66,7 +66,6 @@ def _settings(pupil_mm: float, distances_m: Sequence[float]) -> FilterSettings:
     at_dpt = tuple(sorted(1.0 / d for d in distances_m))
     return FilterSettings(
         mode="on-axis",  # a chart lies within 4 deg
-        prepare="ranges",
         pupil_range_mm=(pupil_mm, pupil_mm),
         focus_range_dpt=(at_dpt[0], at_dpt[-1]),
         object_planes_dpt=at_dpt,

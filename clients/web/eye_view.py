@@ -19,8 +19,10 @@ from clients.web.worn_form import turns_with_gaze
 from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, RgbdView
 
 MS_PER_S = 1e3
-FOCUS_RANGE_DPT = (0.0, 8.0)
-FULL = FilterSettings(focus_range_dpt=FOCUS_RANGE_DPT)
+PSF_SLICE_S = 0.05
+"""Computing PSFs goes on for so long before newer entries are looked at."""
+
+FULL = FilterSettings()
 QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")
 LEAST_WIDTH_PX = 200
 """Pictures whose blur is too wide for the filter are shown with fewer pixels, until
@@ -33,42 +35,29 @@ class _Through:
 
     filter: EyeFilter
     given: Any = None
-    generation: int = 0
 
     def give(self, body: Mapping[str, Any], settings: FilterSettings, view) -> None:
         """Change the eye, if it is another."""
         given = (body, settings, view.camera)
         if given != self.given:
             self.given = given
-            accepted = self.filter.set_profile(
-                body, settings=settings, cameras=[view.camera]
-            )
-            self.generation = accepted.generation
+            self.filter.set_profile(body, settings=settings, cameras=[view.camera])
 
     def see(self, view: RgbdView, wish: Wish, *, gaze_deg) -> Filtered | None:
-        """Return the picture through the newest eye as it is wanted, else None."""
+        """Return the picture through the newest eye; None while it is prepared."""
         state = {
             "pupil_diameter_mm": wish.pupil_diameter_mm,
             "focus_dpt": wish.focus_dpt,
         }
-        if not self._is_whole():  # it is told the state, and nothing is rendered
-            self.filter.plan([view], **state)
-            self.filter.advance()
-            return None
         seen = self.filter.try_filter(
-            [view], **state, gaze_deg=gaze_deg, prepared_only=True
+            [view],
+            **state,
+            gaze_deg=gaze_deg,
+            newest_only=True,
+            until_s=time.monotonic() + PSF_SLICE_S,
         )
         self.filter.advance()  # by now it knows what this frame asks for
-        is_it = seen is not None and seen.is_complete
-        return seen if is_it and seen.generation == self.generation else None
-
-    def _is_whole(self) -> bool:
-        ready = self.filter.ready
-        return (
-            ready is not None
-            and ready.is_complete
-            and ready.eye.generation == self.generation
-        )
+        return seen
 
 
 class EyeView:
@@ -91,16 +80,18 @@ class EyeView:
         self._stop_other(wish)
         if self._quick is None:
             self._quick = _Through(EyeFilter())
-        settings = QUICK
+        settings = QUICK.covering(foci_dpt=(wish.focus_dpt,))
         if turns_with_gaze(wish.bodies[self.side]):
-            settings = QUICK.changed(gaze_deg=wish.gaze_deg)
+            settings = settings.changed(gaze_deg=wish.gaze_deg)
         return self._look(self._quick, "preview", wish, settings, wish.picture.small)
 
     def full(self, wish: Wish) -> Seen | None:
         """Return the full picture; None while its eye is being prepared."""
         if self._full is None:
             self._full = _Through(EyeFilter())
-        settings = FULL.changed(gaze_deg=wish.gaze_deg)
+        settings = FULL.covering(foci_dpt=(wish.focus_dpt,)).changed(
+            gaze_deg=wish.gaze_deg
+        )
         view = wish.picture.view
         if self._merged > 1:
             view = coarser(view, self._merged)

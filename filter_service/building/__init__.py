@@ -1,14 +1,12 @@
-"""The worker process: from a profile to its PSF stores.
+"""The worker process: from a profile to an eye and the nodes of its PSFs.
 
 jobs            what is asked for and what comes back
 limits          what every build keeps to
-used_ranges     the part of an eye that frames use
 read_profile    a profile's body, checked
 from_profile    the work itself
-preview         what to build first
 worker          the process
 worker_handle   the service's end of it
-shared_buffers  large arrays between the two
+inline_worker   a worker without a process
 head_start      work begun before it is asked for
 compile_builds  every loop compiled before the first build
 helper_process  another program beside, while it is needed

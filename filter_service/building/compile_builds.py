@@ -7,11 +7,11 @@ one core, then 0.5 s to read them.  Both are done while the worker is idle.
 from dataclasses import replace
 
 from estimator.profiles.parse import parse_profile
-from filter_service.building.from_profile import build, grid_spec
+from filter_service.building.from_profile import build
 from filter_service.building.helper_process import HelperProcess
 from filter_service.building.jobs import BuildJob
 from filter_service.camera import Camera
-from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import PsfStore
 from filter_service.settings import FilterSettings
 
 FEW_PSFS = BuildJob(
@@ -33,9 +33,14 @@ HELP_AFTER_S = 1.0
 
 
 def build_a_few() -> None:
-    """Build some 200 PSFs, which takes every compiled loop of a build; 0.2 s."""
-    for _ in build(FEW_PSFS, progress=lambda *_: None, cancelled=lambda: False):
-        pass
+    """Estimate an eye and compute some 200 PSFs, with every compiled loop; 0.2 s."""
+    _built(FEW_PSFS).fill()
+
+
+def _built(job: BuildJob) -> PsfStore:
+    found = build(job, progress=lambda *_: None, cancelled=lambda: False).store
+    assert isinstance(found, PsfStore)
+    return found
 
 
 def build_a_few_with_help() -> None:
@@ -48,13 +53,12 @@ def build_a_few_with_help() -> None:
 
 
 def trace_an_eye() -> None:
-    """Estimate and trace one eye, for the first half of the loops."""
-    eye_for_spec(FEW_PSFS.profile, grid_spec(FEW_PSFS))
+    """Estimate, trace and plan for one eye, for the first half of the loops."""
+    _built(FEW_PSFS)
 
 
 def build_without_tracing() -> None:
     """Build PSFs of a given wavefront, for the other half."""
     settings = replace(FEW_PSFS.settings, eye_model="wavefront", mode="on-axis")
     job = replace(FEW_PSFS, settings=settings)
-    for _ in build(job, progress=lambda *_: None, cancelled=lambda: False):
-        pass
+    _built(job).fill()

@@ -1,36 +1,29 @@
-"""The worker process: computes PSF stores and hands them to the service.
+"""The worker process: estimates eyes and plans the nodes of their PSFs.
 
-A process, not a thread: OpenGL calls hold the interpreter lock of the render loop.
+A process, not a thread: estimating holds the interpreter lock for tenths of a second,
+which frames would wait for.
 
 Parent to worker: ``("build", ticket, job)``, ``("cancel", ticket)``.  Worker to parent:
-``("ready",)``, ``("progress", ticket, fraction, stage)``; for each store that a build
-yields ``("result", ticket, head, sizes)`` and then the descriptor of a file in memory
-with the arrays; at the end ``("finished", ticket)`` or ``("failed", ticket, code,
-message, field, allowed)``.  The render loop maps the file: over the pipe 100 MB would
-take it 0.2 s.  The pipe joins two processes of ours, so it may carry pickles; nothing
-from outside does.
+``("ready",)``, ``("progress", ticket, fraction, stage)``; at the end ``("result",
+ticket, built)`` or ``("failed", ticket, code, message, field, allowed)``.  A result has
+2 to 4 MB.  The pipe joins two processes of ours, so it may carry pickles; nothing from
+outside does.
 """
 
 from __future__ import annotations
 
 import importlib
 import logging
-import os
-import pickle
 import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import send_handle
 from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.building.head_start import HeadStart
-from filter_service.building.jobs import Build, BuildJob, BuiltStore
-from filter_service.building.shared_buffers import write_shared
+from filter_service.building.jobs import Build, BuildJob
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
 from filter_service.log_lines import start_log
 
@@ -46,14 +39,12 @@ class ParentGone(Exception):
 
 
 def main() -> None:
-    """Run as ``python -m``: DESCRIPTOR BUILD NICENESS WARM_UP; the entry point."""
-    descriptor, build_name, niceness, warm_up_name = sys.argv[1:]
-    serve_builds(Connection(int(descriptor)), build_name, int(niceness), warm_up_name)
+    """Run as ``python -m``: DESCRIPTOR BUILD WARM_UP; the entry point."""
+    descriptor, build_name, warm_up_name = sys.argv[1:]
+    serve_builds(Connection(int(descriptor)), build_name, warm_up_name)
 
 
-def serve_builds(
-    pipe: Connection, build_name: str, niceness: int, warm_up_name: str = ""
-) -> None:
+def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> None:
     """Build what is asked for until the pipe closes."""
     # Ctrl-C goes to the whole group; the service ends the worker in its own time.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -69,7 +60,7 @@ def serve_builds(
             message = pipe.recv()
             if message[0] == "build":
                 ticket, job = message[1:]
-                _build_one(pipe, build, niceness, head_start, ticket=ticket, job=job)
+                _build_one(pipe, build, head_start, ticket=ticket, job=job)
     except (EOFError, OSError, ParentGone):
         return
 
@@ -83,7 +74,6 @@ def _named(name: str) -> Callable[..., Any]:
 def _build_one(
     pipe: Connection,
     build: Build,
-    niceness: int,
     head_start: HeadStart | None,
     *,
     ticket: int,
@@ -97,34 +87,13 @@ def _build_one(
     if head_start is not None:
         progress = head_start.before(progress, cancelled)
     try:
-        stores = build(job, progress=progress, cancelled=cancelled)
-        # Somebody waits for the first; what follows makes room for the frames.
-        _send_result(pipe, ticket, next(stores))
-        _run_nicely(niceness, lambda: _send_all(pipe, ticket, stores))
+        built = build(job, progress=progress, cancelled=cancelled)
     except ParentGone:
         raise
     except Exception as error:
         _send_failure(pipe, ticket, error)
         return
-    pipe.send(("finished", ticket))
-
-
-def _run_nicely(niceness: int, work: Callable[[], None]) -> None:
-    """Run something in a thread with a niceness of its own, as Linux has it.
-
-    Threads that it starts have it too.  For the process it could not be taken back.
-    """
-
-    def yield_to_others() -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-
-    with ThreadPoolExecutor(1, initializer=yield_to_others) as pool:
-        pool.submit(work).result()
-
-
-def _send_all(pipe: Connection, ticket: int, stores: Iterator[BuiltStore]) -> None:
-    for built in stores:
-        _send_result(pipe, ticket, built)
+    pipe.send(("result", ticket, built))
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
@@ -160,18 +129,6 @@ def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:
     if not isinstance(error, BuildCancelled):
         log.info("build %d failed: %s", ticket, error)
     pipe.send(("failed", ticket, error.code, error.message, error.field, error.allowed))
-
-
-def _send_result(pipe: Connection, ticket: int, built: BuiltStore) -> None:
-    buffers: list[pickle.PickleBuffer] = []
-    head = pickle.dumps(built, protocol=5, buffer_callback=buffers.append)
-    arrays = [buffer.raw() for buffer in buffers]
-    descriptor = write_shared(arrays)
-    try:
-        pipe.send(("result", ticket, head, [array.nbytes for array in arrays]))
-        send_handle(pipe, descriptor, os.getppid())
-    finally:
-        os.close(descriptor)
 
 
 if __name__ == "__main__":

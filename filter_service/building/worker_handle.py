@@ -12,7 +12,6 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle
 from typing import Any
 
 from filter_service.building.helper_process import (
@@ -22,7 +21,6 @@ from filter_service.building.helper_process import (
     is_stopped,
 )
 from filter_service.building.jobs import BuildJob, BuiltStore
-from filter_service.building.shared_buffers import map_shared
 from filter_service.errors import (
     BuildCancelled,
     FilterError,
@@ -54,7 +52,7 @@ class BuildProgress:
 
 @dataclass(frozen=True)
 class BuildDone:
-    """What a build made; more may follow, as ``built`` says."""
+    """What a build made."""
 
     ticket: int
     built: BuiltStore
@@ -72,27 +70,6 @@ BuildEvent = BuildProgress | BuildDone | BuildError
 
 
 @dataclass(frozen=True)
-class _Incoming:
-    """A result of which the arrays are still to come."""
-
-    ticket: int
-    head: bytes
-    sizes: list[int]
-
-    def received(self, pipe: Connection) -> BuildDone:
-        """Take the descriptor of the arrays' file, which waits in the pipe."""
-        try:
-            descriptor = recv_handle(pipe)
-        except RuntimeError as error:  # what it says of a pipe that ends
-            raise EOFError from error
-        try:
-            buffers = map_shared(descriptor, self.sizes)
-        finally:
-            os.close(descriptor)
-        return BuildDone(self.ticket, pickle.loads(self.head, buffers=buffers))
-
-
-@dataclass(frozen=True)
 class _Worker:
     """A process and the pipe to it: there are both or neither."""
 
@@ -107,11 +84,9 @@ class WorkerHandle:
     Parameters
     ----------
     build : str
-        ``module:function`` of ``build(job, *, progress, cancelled)``, which yields what
-        it has built, a preview maybe before the whole.  A name, because to import the
-        function here would keep the new process waiting.
-    niceness : int
-        Of what a build does after the first store that it yields.
+        ``module:function`` of ``build(job, *, progress, cancelled)``, which returns a
+        `BuiltStore`.  A name, because to import the function here would keep the new
+        process waiting.
     cancel_grace_s : float
         A cancelled build that goes on longer is ended with its process.
     build_limit_s : float
@@ -121,7 +96,6 @@ class WorkerHandle:
     """
 
     build: str = BUILD
-    niceness: int = 5
     cancel_grace_s: float = 3.0
     build_limit_s: float = 600.0
     warm_up: str = WARM_UP
@@ -133,7 +107,6 @@ class WorkerHandle:
     _start_at_s: float = 0.0
     _is_ready: bool = False
     _worker: _Worker | None = None
-    _incoming: _Incoming | None = None
     _began_s: float = 0.0
     _next_watch_s: float = 0.0
     _stopped_since_s: float | None = None
@@ -149,7 +122,7 @@ class WorkerHandle:
         process = subprocess.Popen(
             [
                 *(sys.executable, "-P", "-m", "filter_service.building.worker"),
-                *(str(theirs.fileno()), self.build, str(self.niceness), self.warm_up),
+                *(str(theirs.fileno()), self.build, self.warm_up),
             ],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
@@ -237,10 +210,6 @@ class WorkerHandle:
             worker.process.kill()
 
     def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
-        if self._incoming is not None:
-            incoming, self._incoming = self._incoming, None
-            events.append(incoming.received(pipe))
-            return
         message = pipe.recv()
         kind = message[0]
         if kind == "ready":
@@ -253,9 +222,8 @@ class WorkerHandle:
             self._end_running()
             events.append(BuildError(ticket, error))
         elif kind == "result":
-            self._incoming = _Incoming(*message[1:])
-        elif kind == "finished":
             self._end_running()
+            events.append(BuildDone(*message[1:]))
 
     def _end_running(self) -> None:
         self._running = None
@@ -284,7 +252,7 @@ class WorkerHandle:
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]
         worker.pipe.close()
-        self._worker = self._incoming = None
+        self._worker = None
         self._is_ready = False
         self._end_running()
         self.n_restarts += 1

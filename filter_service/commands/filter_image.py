@@ -1,5 +1,9 @@
 """`ocufilter filter`: one RGB-D image through one eye, without a server."""
 
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +17,7 @@ from filter_service.commands.console import (
     progress_bar,
     say,
 )
-from filter_service.commands.plan_text import plan_summary, say_plan
+from filter_service.commands.plan_text import say_plan
 from filter_service.commands.setting_options import with_setting_options
 from filter_service.settings import (
     MAX_PUPIL_MM,
@@ -30,15 +34,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from estimator.profiles.parse import EyeProfile
-    from filter_service.filtering.one_image import FilteredImage
+    from filter_service.filtering.filtered import EyeEvent, Filtered
+    from filter_service.planning.nodes import CachePlan
     from filter_service.rgbd_view import RgbdView
+    from filter_service.settings import FilterSettings
 
 PUPIL_LIMITS_MM = (MIN_PUPIL_MM, MAX_PUPIL_MM)
 FOCUS_LIMITS_DPT = (0.0, MAX_VERGENCE_DPT)
 FOV_LIMITS_DEG = (1.0, 150.0)
+TIMEOUT_S = 600.0
 
 
-@with_setting_options(mode="on-axis", eye_model="wavefront")
+@with_setting_options()
 def filter_image(
     color: Annotated[
         Path,
@@ -134,7 +141,8 @@ def filter_image(
 
     from estimator.profiles.files import load_profile
     from filter_service import image_files
-    from filter_service.filtering import one_image
+    from filter_service.rendering.frame import object_range_dpt
+    from filter_service.settings import FilterSettings
 
     image_files.check_output(out)
     output = _output(out, half=half)
@@ -147,30 +155,96 @@ def filter_image(
         depth_scale=depth_scale,
         hidden_paths=(hidden_color, hidden_depth),
     )
-    spec = one_image.image_spec(
-        view, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt, settings=settings
+    object_dpt = object_range_dpt(view)
+    whole = FilterSettings(**settings).covering(
+        pupils_mm=(pupil_mm,), foci_dpt=(focus_dpt,), objects_dpt=object_dpt
     )
     if plan:
-        say_plan(one_image.plan_one_image(spec, eye), json_output=json_output)
+        say_plan(_planned(eye, view, whole), json_output=json_output)
         return
-    with progress_bar("PSFs", quiet=json_output) as progress:
-        filtered = one_image.filter_one_image(
-            view,
-            eye,
-            spec,
+    started_s = time.perf_counter()
+    with (
+        progress_bar("eye", quiet=json_output) as progress,
+        ExitStack() as closing,
+    ):
+        filtered = _filtered(
+            closing,
+            *(eye, view, whole, engine, progress),
+            pupil_diameter_mm=pupil_mm,
+            focus_dpt=focus_dpt,
             accumulation=accumulation,
             merge=not no_merge,
             render_tolerance=render_tolerance,
-            engine=engine,
             output=output,
-            progress=progress,
         )
-    image_files.write_image(out, filtered.rendered.color)
-    summary = _summary(filtered, out=out, eye=eye)
+    image_files.write_image(out, filtered.seen.color)
+    whole_ms = 1e3 * (time.perf_counter() - started_s)
+    summary = _summary(
+        filtered, whole, out=out, eye=eye, object_dpt=object_dpt, whole_ms=whole_ms
+    )
     if json_output:
         print_json(summary)
     else:
         _report(summary)
+
+
+def _planned(
+    eye: "EyeProfile", view: "RgbdView", settings: "FilterSettings"
+) -> "CachePlan":
+    from filter_service.planning.grid import GridSpec
+    from filter_service.planning.plan import unchecked_plan
+    from filter_service.psfs.eye_for_spec import eye_for_spec
+
+    spec = GridSpec(view.camera, settings)
+    return unchecked_plan(eye_for_spec(eye, spec)[0], spec)
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """A filtered image and how it came about."""
+
+    seen: "Filtered"
+    eye_notes: tuple[str, ...]
+    engine: str
+    renderer: str
+    start_ms: float
+    psf_count: int
+
+
+def _filtered(
+    closing: ExitStack,
+    eye: "EyeProfile",
+    view: "RgbdView",
+    settings: "FilterSettings",
+    engine: Engine,
+    progress: Callable[[float, str], None],
+    **options: Any,
+) -> _Filtered:
+    """Filter one view as any stream does, with the eye estimated in this process."""
+    from filter_service.filtering.eye_filter import EyeFilter
+    from filter_service.filtering.filtered import BuildingEye
+    from filter_service.filtering.shared_workshop import open_inline_workshop
+
+    def report(event: "EyeEvent") -> None:
+        if isinstance(event, BuildingEye):
+            progress(event.fraction, event.stage)
+
+    begin_s = time.perf_counter()
+    workshop = open_inline_workshop(closing, engine=engine)
+    start_ms = 1e3 * (time.perf_counter() - begin_s)
+    eye_filter = closing.enter_context(
+        EyeFilter(eye, view.camera, settings, on_event=report, workshop=workshop)
+    )
+    seen = eye_filter.filter(view, whole=True, timeout_s=TIMEOUT_S, **options)
+    store = eye_filter.prepared_stores[-1].store
+    return _Filtered(
+        seen,
+        eye_filter.prepared_stores[-1].notes,
+        workshop.engine_name,
+        workshop.engine.name,
+        start_ms,
+        store.computed_count,
+    )
 
 
 def _output(out: Path, *, half: bool) -> Output:
@@ -248,29 +322,39 @@ def _check_size(option: str, path: Path, image: "NDArray", color: "NDArray") -> 
         )
 
 
-def _summary(filtered: "FilteredImage", *, out: Path, eye: "EyeProfile") -> dict:
-    rendered = filtered.rendered
-    height_px, width_px = rendered.color.shape[:2]
+def _summary(
+    filtered: _Filtered,
+    settings: "FilterSettings",
+    *,
+    out: Path,
+    eye: "EyeProfile",
+    object_dpt: tuple[float, float],
+    whole_ms: float,
+) -> dict:
+    seen = filtered.seen
+    height_px, width_px = seen.color.shape[:2]
+    render_ms = sum(seen.stage_times_ms.values())
     return {
         "out": str(out),
         "width_px": width_px,
         "height_px": height_px,
         "profile": eye.name,
-        "pupil_diameter_mm": rendered.pupil_diameter_mm,
-        "focus_dpt": rendered.focus_dpt,
-        "object_range_dpt": list(filtered.spec.object_range_dpt),
-        "missing_depth_count": int(rendered.missing_depth_count),
-        "clamped_depth_count": int(rendered.clamped_depth_count),
-        "bad_color_count": int(rendered.bad_color_count),
-        "overflow_count": int(rendered.overflow_count),
-        "build_ms": filtered.build_ms,
+        "pupil_diameter_mm": seen.pupil_diameter_mm,
+        "focus_dpt": seen.focus_dpt,
+        "missing_depth_count": seen.missing_depth_count,
+        "clamped_depth_count": seen.clamped_depth_count,
+        "bad_color_count": seen.bad_color_count,
+        "overflow_count": seen.overflow_count,
         "start_ms": filtered.start_ms,
-        "render_ms": filtered.render_ms,
-        "stage_times_ms": dict(rendered.stage_times_ms),
+        "build_ms": whole_ms - filtered.start_ms - render_ms,
+        "render_ms": render_ms,
+        "stage_times_ms": dict(seen.stage_times_ms),
+        "psf_count": filtered.psf_count,
+        "object_range_dpt": list(object_dpt),
         "engine": filtered.engine,
         "renderer": filtered.renderer,
-        "plan": plan_summary(filtered.plan),
-        "notes": [*filtered.eye_notes, *rendered.notes],
+        "settings": vars(settings),
+        "notes": [*filtered.eye_notes, *seen.notes],
     }
 
 
@@ -280,10 +364,23 @@ def _report(summary: dict) -> None:
     for kind in ("missing", "clamped"):
         if count := summary[f"{kind}_depth_count"]:
             say(f"note: {count} pixels with {kind} depth")
+    settings = summary["settings"]
+    ranges = ", ".join(
+        f"{name} {settings[key][0]:g} to {settings[key][1]:.3g} {unit}"
+        for name, key, unit in (
+            ("pupil", "pupil_range_mm", "mm"),
+            ("focus", "focus_range_dpt", "dpt"),
+            ("objects", "object_range_dpt", "dpt"),
+        )
+    )
+    say(
+        f"mode {settings['mode']}, grid {settings['grid']}, tolerance "
+        f"{settings['tolerance']}, eye model {settings['eye_model']}; {ranges}"
+    )
     say(
         f"{summary['out']}: {summary['width_px']}x{summary['height_px']} through "
         f"{summary['profile']}, pupil {summary['pupil_diameter_mm']:g} mm, "
         f"focus {round(summary['focus_dpt'], 3) + 0.0:.3g} dpt; "
-        f"PSFs {summary['build_ms']:.0f} ms, start {summary['start_ms']:.0f} ms, "
-        f"frame {summary['render_ms']:.0f} ms on {summary['renderer']}"
+        f"eye {summary['build_ms']:.0f} ms, frame with {summary['psf_count']} PSFs "
+        f"{summary['render_ms']:.0f} ms on {summary['renderer']}"
     )

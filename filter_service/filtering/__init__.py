@@ -1,21 +1,17 @@
 """Streams of frames through eyes that may change on the way.
 
-eye_filter        `EyeFilter`: one stream; the public face
-planned_frame     a frame whose eye is prepared
+eye_filter        `EyeFilter`: one stream; the public API
+planned_frame     a frame whose eye is known
 several_eyes      a frame whose views have eyes of their own
 filtered          a filtered frame, and events on the way
 accepted_profile  one profile and the stores of it
-stream_eyes       which eye serves, and what is to be built
-store_memory      what all stores may take together
-stream_use        what frames used and are about to use
-view_use          what one frame uses
+stream_eyes       which eye serves, and what is to be estimated
+warm_up           the states that the next frames of a stream will have
 workshop          one worker and one engine for all streams
 shared_workshop   the one that a process shares
 choose_engine     which one filters here, and why
-upload            a store on its way to the engine
 compile_loops     every compiled loop, made ahead on all cores
 load_ahead        what frames need, loaded while nobody asks
-one_image         a single picture, planned for itself
 """
 
 import lazy_loader

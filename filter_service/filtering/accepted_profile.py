@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.building.used_ranges import UsedRanges
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError
 from filter_service.rendering.engine import LoadedStore
@@ -16,40 +15,28 @@ from filter_service.settings import FilterSettings
 
 @dataclass(eq=False)
 class PreparedStore:
-    """A loaded store and the camera it was built for.
+    """A loaded store and the camera that it was made for.
 
-    ``is_complete`` is false for a preview, which a complete store will replace.
-    ``ranges`` are those of a stream that it was built for, of a preview its one state,
-    None for all that the settings allow; ``failed`` are such that could not be built,
-    with the reason.
-    ``behind`` is the complete store that a preview of more stands before.
-    ``used_s`` is when a frame last went through it, or when it was put in place.
+    Attributes
+    ----------
+    camera : Camera
+    store : LoadedStore
+    started_s : float
+        When its profile was accepted, or a frame first asked for the camera.
+    notes : tuple of str
+        About the eye, in sentences.
+    is_ready : bool
+        The PSFs of a first frame are computed; from then on it serves.
+    used_s : float
+        When a frame last went through it, or when it was loaded.
     """
 
     camera: Camera
     store: LoadedStore
-    is_complete: bool = True
-    ranges: UsedRanges | None = None
-    build_s: float = 0.0
-    failed: dict[UsedRanges, str] = field(default_factory=dict)
-    behind: PreparedStore | None = None
-    memory_mb: float = 0.0
+    started_s: float
+    notes: tuple[str, ...] = ()
+    is_ready: bool = False
     used_s: float = field(default_factory=time.monotonic)
-
-    @property
-    def has_complete(self) -> bool:
-        """Return whether there is more than a preview."""
-        return self.is_complete or self.behind is not None
-
-    @property
-    def whole_mb(self) -> float:
-        """Return what it takes, with what is behind it."""
-        return self.memory_mb + (self.behind.whole_mb if self.behind else 0.0)
-
-    @property
-    def loaded(self) -> list[LoadedStore]:
-        """Return what is to be freed with it."""
-        return [self.store, *(self.behind.loaded if self.behind else ())]
 
 
 @dataclass(eq=False)
@@ -64,10 +51,11 @@ class AcceptedProfile:
     profile_id: int
     profile: EyeProfile
     settings: FilterSettings
-    wanted: tuple[Camera, ...] = ()
+    wanted: tuple[Camera, ...] = ()  # cameras whose first frame would wait
     stores: list[PreparedStore] = field(default_factory=list)
-    was_complete: bool = False  # for some camera, whatever has become of it
+    was_ready: bool = False  # for some camera, whatever has become of it
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
+    accepted_s: float = field(default_factory=time.monotonic)
 
     def is_same(self, first: Camera, second: Camera) -> bool:
         """Return whether one store of this eye serves both cameras."""
@@ -85,7 +73,7 @@ class AcceptedProfile:
         self.stores.sort(key=lambda prepared: self.is_same(prepared.camera, camera))
 
     def failure_for(self, camera: Camera) -> FilterError | None:
-        """Return why the build for a camera failed."""
+        """Return why no store could be made for a camera."""
         return next((e for c, e in self.failures if self.is_same(c, camera)), None)
 
     def want(self, cameras: Iterable[Camera]) -> None:

@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import EyeProfile, parse_profile
-from filter_service.building.jobs import LookAt
 from filter_service.camera import Camera
 from filter_service.checked import checked
-from filter_service.errors import BadMessage, ServiceTimeout
+from filter_service.errors import BadMessage, NotPrepared, ServiceTimeout
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
 from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.shared_workshop import shared
 from filter_service.filtering.stream_eyes import StreamEyes
-from filter_service.filtering.view_use import frame_use
 from filter_service.filtering.workshop import Workshop
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
@@ -76,8 +74,9 @@ def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
 class EyeFilter:
     """One stream of frames through one person's eye, which may change on the way.
 
-    A change of profile never stops the stream: frames go through the old eye until the
-    new one is ready, first through a small preview of it, then through the whole.  All
+    Every frame shows the state that it asks for: PSFs that it lacks are computed before
+    it is rendered, and kept.  A change of profile does not stop the stream: frames go
+    through the old eye until a first frame through the new one would not wait.  All
     filters of a process share a worker and an engine unless told otherwise: one thread
     at a time may use them.
 
@@ -136,7 +135,7 @@ class EyeFilter:
         self._workshop.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
-        self.is_extending = False  # whether the last frame waits for its state alone
+        self.is_extending = False  # whether only PSFs of the last frame are missing
         self.ready: EyeReady | None = None
         if first is not None:
             try:
@@ -177,7 +176,7 @@ class EyeFilter:
 
     @property
     def prepared_stores(self) -> tuple[PreparedStore, ...]:
-        """Return what is prepared of the newest eye, the store used last at the end."""
+        """Return the stores of the newest eye, the one used last at the end."""
         return tuple(self._newest.stores) if self._newest is not None else ()
 
     # The eye
@@ -217,25 +216,16 @@ class EyeFilter:
         return self._newest
 
     def keep_going(self) -> None:
-        """Let builds go on where the workshop has no owner who does that."""
+        """Let new eyes be prepared where the workshop has no owner who does that."""
         if self._shared is not None:
-            self.workshop.advance()
+            self.workshop.advance(ahead=False)
 
     def advance(self) -> None:
-        """Let builds go on where no frames come, or where the workshop is another's."""
+        """Let new eyes be prepared between frames, and compute PSFs ahead."""
         self.workshop.advance()
 
-    def forget(self) -> None:
-        """Have the next frame filtered as if it were the first.
-
-        Frames leave what saves time in those that follow.  These differ by it where
-        kernels were so many that cells of the field had to be made wider.  With this
-        and ``prepare="ranges"`` a picture does not depend on the frames before it.
-        """
-        self.workshop.engine.forget()
-
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
-        """Return when the newest eye is complete for all cameras it was asked for.
+        """Return when the newest eye is ready for all cameras it was asked for.
 
         Raises
         ------
@@ -280,7 +270,7 @@ class EyeFilter:
             raise ServiceTimeout(f"waited in vain for {what}")
         descriptor = self.workshop.worker.file_descriptor
         watched = [] if descriptor is None else [descriptor]
-        if not self.workshop.is_loading:
+        if not self.workshop.is_warming:
             wait(watched, min(remaining_s, WAIT_SLICE_S))  # select ends at 1024
 
     # Frames
@@ -300,7 +290,7 @@ class EyeFilter:
         whole: bool = False,
         timeout_s: float = 120.0,
     ) -> Filtered:
-        """Filter one frame; waits where its camera or its state is not prepared yet.
+        """Filter one frame; computes the PSFs that it lacks.
 
         Parameters
         ----------
@@ -325,10 +315,10 @@ class EyeFilter:
             Errors of rendering against the usual, which leaves no visible difference;
             0 is exact, more is faster.
         whole : bool
-            Wait for the newest eye and for all its PSFs, as a single picture may: a
-            stream would rather see the eye before, or a preview (`is_complete`).
+            Wait for the newest eye, as a single picture may: a stream would rather see
+            the eye before until then.
         timeout_s : float
-            For the eye to be prepared.
+            For the eye to be estimated and for its PSFs.
 
         Returns
         -------
@@ -356,10 +346,10 @@ class EyeFilter:
                 accumulation=accumulation,
                 merge=merge,
                 render_tolerance=render_tolerance,
-                prepared_only=True,
-                whole_only=whole,
+                newest_only=whole,
+                until_s=deadline_s,
             )
-            self.workshop.advance()  # by now it knows what this frame asks for
+            self.workshop.advance(ahead=False)  # it knows what this frame asks for
             if seen is not None:
                 return seen
             self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
@@ -375,19 +365,20 @@ class EyeFilter:
         accumulation: Accumulation = "coverage",
         merge: bool = True,
         render_tolerance: float = 1.0,
-        prepared_only: bool = False,
-        whole_only: bool = False,
+        newest_only: bool = False,
+        until_s: float | None = None,
         out: Sequence[NDArray[Any] | None] | None = None,
     ) -> Filtered | None:
         """Filter one frame like `filter`; None while its eye is being prepared.
 
         Parameters
         ----------
-        prepared_only : bool
-            None as well, and `is_extending`, while only the state of this frame is not
-            prepared; else it is seen through the nearest that is.
-        whole_only : bool
-            None, and `is_extending`, while there is an older eye or a preview to show.
+        newest_only : bool
+            None, and `is_extending`, while there is an older eye to show.
+        until_s : float, optional
+            Time of `time.monotonic` after which no more PSFs are computed: None, and
+            `is_extending`, where some are left.  Those that were computed are kept, so
+            that the next frame goes on from there.
         out : sequence of arrays, optional
             Memory for the pictures, which may be used; what is returned counts.
 
@@ -401,25 +392,30 @@ class EyeFilter:
             The engine failed.
         """
         self.keep_going()
+        if gaze_deg is not None:
+            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         planned = self.plan(
             views,
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,
-            prepared_only=prepared_only,
-            whole_only=whole_only,
+            gaze_deg=gaze_deg,
+            newest_only=newest_only,
         )
-        if gaze_deg is not None:
-            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         if planned is None:
             return None
-        return planned.render(
-            gazes_deg=[gaze_deg] * len(views),
-            output=output,
-            accumulation=accumulation,
-            merge=merge,
-            render_tolerance=render_tolerance,
-            out=out,
-        )
+        try:
+            return planned.render(
+                gazes_deg=[gaze_deg] * len(views),
+                output=output,
+                accumulation=accumulation,
+                merge=merge,
+                render_tolerance=render_tolerance,
+                out=out,
+                until_s=until_s,
+            )
+        except NotPrepared:
+            self.is_extending = True
+            return None
 
     def plan(
         self,
@@ -427,8 +423,8 @@ class EyeFilter:
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
-        prepared_only: bool = False,
-        whole_only: bool = False,
+        gaze_deg: tuple[float, float] | None = None,
+        newest_only: bool = False,
     ) -> PlannedFrame | None:
         """Return a frame ready to be rendered, before anything else is asked for.
 
@@ -438,15 +434,21 @@ class EyeFilter:
         """
         pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
         focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
-        look_at = LookAt(pupil_diameter_mm, focus_dpt)
-        self._eyes.use.note(frame_use(views, look_at, at_s=time.monotonic()))
+        self._eyes.use.note(
+            views,
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            gaze_deg=gaze_deg,
+            at_s=time.monotonic(),
+        )
         workshop = self.workshop
-        plan = self._eyes.plan([view.camera for view in views], look_at)
+        plan = self._eyes.plan([view.camera for view in views])
         workshop.free_retired(self._eyes)
-        self.is_extending = plan is not None and (
-            (prepared_only and not plan.is_prepared)
-            or (whole_only and not self._eyes.is_final(plan))
+        self.is_extending = (
+            plan is not None and newest_only and not self._eyes.is_newest(plan)
         )
         if plan is None or self.is_extending:
             return None
-        return PlannedFrame(workshop, plan, tuple(views), pupil_diameter_mm, focus_dpt)
+        return PlannedFrame(
+            workshop, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
+        )

@@ -25,14 +25,14 @@ class Filtered:
     generation : int
         Counts the profiles that the filter was given.
     is_complete : bool
-        False where it was seen through a preview, which the whole will replace.
+        True: every frame shows the state that it asks for.
     pupil_diameter_mm, focus_dpt
         As used: a profile may cap the pupil, and an eye can only add power.
     gazes_deg : tuple of (h, v)
         As used, one for each view.
-    missing_depth_count, clamped_depth_count, overflow_count : int
-        Pixels whose depth was filled in or lay outside of the prepared distances;
-        shares of light that found no room.
+    missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
+        Pixels whose depth was filled in, or lay outside of the prepared distances, or
+        whose color is not finite; shares of light that found no room.
     notes : tuple of str
         What the user should know, in sentences.
     stage_times_ms : dict
@@ -48,6 +48,7 @@ class Filtered:
     gazes_deg: tuple[tuple[float, float], ...]
     missing_depth_count: int
     clamped_depth_count: int
+    bad_color_count: int
     overflow_count: int
     notes: tuple[str, ...]
     stage_times_ms: dict[str, float]
@@ -74,19 +75,20 @@ class BuildingEye:
 
 @dataclass(frozen=True)
 class EyeReady:
-    """The PSFs of a profile are in place for a camera, or a preview of them.
+    """A first frame through a profile would not wait for PSFs of a camera.
 
     Attributes
     ----------
     build_ms : float
-        From the start of the build to here.
+        From the profile's acceptance to here.
     psf_count : int
+        PSFs that are computed.
     memory_mb : float
-        What the PSFs take, in 10^6 bytes.
+        What they take, in 10^6 bytes.
     notes : tuple of str
         What the user should know, in sentences.
     is_complete : bool
-        False for a preview.
+        True.
     """
 
     eye: AcceptedProfile

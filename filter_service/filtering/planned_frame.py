@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from filter_service.filtering.filtered import Filtered
-from filter_service.filtering.stream_eyes import RenderPlan
+from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
 from filter_service.rendering.filtered_view import FilteredView
@@ -27,6 +27,7 @@ class PlannedFrame:
     """Views that one eye sees, in one state of it, and what is prepared for them."""
 
     workshop: Workshop  # a service may close the filter in the middle
+    stream: StreamEyes
     plan: RenderPlan
     views: tuple[RgbdView, ...]
     pupil_diameter_mm: float
@@ -41,6 +42,7 @@ class PlannedFrame:
         merge: bool = True,
         render_tolerance: float = 1.0,
         out: Sequence[NDArray[Any] | None] | None = None,
+        until_s: float | None = None,
     ) -> Filtered:
         """Filter the frame; `EyeFilter.filter` explains the arguments.
 
@@ -49,9 +51,13 @@ class PlannedFrame:
         gazes_deg : one (h, v) for each view, or None
         out : sequence of arrays, optional
             Memory for the pictures, which may be used; what is returned counts.
+        until_s : float, optional
+            Time of `time.monotonic` after which no more PSFs are computed.
 
         Raises
         ------
+        NotPrepared
+            PSFs that the frame needs were not computed by ``until_s``.
         RenderError
             The engine failed.
         """
@@ -62,6 +68,7 @@ class PlannedFrame:
             merge=merge,
             render_tolerance=render_tolerance,
             out=out,
+            until_s=until_s,
         )()
 
     def begin(
@@ -102,6 +109,7 @@ class PlannedFrame:
     ) -> Filtered:
         rendered = [finish() for finish in begun]
         self.workshop.frame_s = time.monotonic() - started_s
+        self.workshop.note_served(self.stream, self.plan)
         return _filtered(self.plan, rendered)
 
 
@@ -115,7 +123,7 @@ def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:
         colors=tuple(view.color for view in rendered),
         profile_id=plan.eye.profile_id,
         generation=plan.eye.generation,
-        is_complete=plan.is_complete,
+        is_complete=True,
         pupil_diameter_mm=float(first.pupil_diameter_mm),
         focus_dpt=float(first.focus_dpt),
         gazes_deg=tuple(
@@ -124,11 +132,8 @@ def _filtered(plan: RenderPlan, rendered: Sequence[Rendered]) -> Filtered:
         ),
         missing_depth_count=sum(int(v.missing_depth_count) for v in rendered),
         clamped_depth_count=sum(int(v.clamped_depth_count) for v in rendered),
+        bad_color_count=sum(int(v.bad_color_count) for v in rendered),
         overflow_count=sum(int(v.overflow_count) for v in rendered),
-        notes=tuple(
-            dict.fromkeys(
-                [*plan.notes, *(note for view in rendered for note in view.notes)]
-            )
-        ),
+        notes=tuple(dict.fromkeys(note for view in rendered for note in view.notes)),
         stage_times_ms=stages_ms,
     )

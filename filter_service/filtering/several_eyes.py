@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -22,8 +22,6 @@ from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, GazeDeg, Output
 from filter_service.view_state import EyeName, ViewState, check_states
-
-Wait = Literal["preparing", "extending"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class SeenViews:
 
     @property
     def is_complete(self) -> bool:
-        """Return whether nothing was seen through a preview."""
+        """Return True: every frame shows the state that it asks for."""
         return all(seen.is_complete for seen in self.by_eye.values())
 
     @property
@@ -86,10 +84,16 @@ class PlannedViews:
         merge: bool = True,
         render_tolerance: float = 1.0,
         out: Sequence[NDArray[Any] | None] | None = None,
+        until_s: float | None = None,
     ) -> SeenViews:
         """Filter the frame, all eyes begun before one is finished.
 
         See `EyeFilter.filter`.
+
+        Raises
+        ------
+        NotPrepared
+            PSFs that the frame needs were not computed by ``until_s``.
         """
         found: dict[EyeName, Filtered] = {}
         views: dict[int, SeenView] = {}
@@ -101,6 +105,7 @@ class PlannedViews:
                 merge=merge,
                 render_tolerance=render_tolerance,
                 out=None if out is None else [out[i] for i in self.indices[eye]],
+                until_s=until_s,
             )
             for eye, planned in self.by_eye.items()
         }
@@ -122,9 +127,8 @@ def plan_views(
     pupil_diameter_mm: float,
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
-    prepared_only: bool = False,
-) -> PlannedViews | Wait:
-    """Plan a frame through the eyes that its views name, or say what it waits for.
+) -> PlannedViews | None:
+    """Plan a frame through the eyes that its views name; None while one is estimated.
 
     Every eye is told of the frame, so that all of them are being prepared.
 
@@ -135,13 +139,8 @@ def plan_views(
     views : sequence of RgbdView
     states : sequence of ViewState, one for each view
         Where a value is None there, that of the frame counts.
-    pupil_diameter_mm, focus_dpt, gaze_deg, prepared_only
+    pupil_diameter_mm, focus_dpt, gaze_deg
         Of the frame, as of `EyeFilter.try_filter`.
-
-    Returns
-    -------
-    PlannedViews, "preparing" or "extending"
-        An eye is being prepared; or all are, only not for their state in this frame.
 
     Raises
     ------
@@ -166,7 +165,7 @@ def plan_views(
             raise _of_eye(NoProfile("there is no filter"), eye, own[0])
         found.keep_going()
     planned: dict[EyeName, PlannedFrame] = {}
-    waits: list[Wait] = []
+    gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
     failure: SessionError | None = None
     for eye, own in indices.items():
         state = states[own[0]]
@@ -177,20 +176,17 @@ def plan_views(
                 [views[i] for i in own],
                 pupil_diameter_mm=_first(state.pupil_diameter_mm, pupil_diameter_mm),
                 focus_dpt=_first(state.focus_dpt, focus_dpt),
-                prepared_only=prepared_only,
+                gaze_deg=gazes_deg[own[0]],
             )
         except SessionError as error:
             failure = failure or _of_eye(error, eye, own[0])
             continue
         if frame is not None:
             planned[eye] = frame
-        else:
-            waits.append("extending" if eye_filter.is_extending else "preparing")
-    gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
     if failure is not None:
         raise failure.with_traceback(None)
-    if waits:
-        return "preparing" if "preparing" in waits else "extending"
+    if len(planned) < len(indices):
+        return None
     return PlannedViews(planned, indices, gazes_deg)
 
 

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 
+from filter_service.building.inline_worker import InlineWorker
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.workshop import Workshop
@@ -14,7 +15,7 @@ from filter_service.psfs.cache_folder import default_cache_dir
 
 
 def open_workshop(
-    worker: WorkerHandle,
+    worker: WorkerHandle | InlineWorker,
     limits: BuildLimits,
     closing: ExitStack,
     *,
@@ -45,6 +46,19 @@ def open_workshop(
     workshop = Workshop(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(workshop.close)
     return workshop
+
+
+def open_inline_workshop(closing: ExitStack, *, engine: str = "auto") -> Workshop:
+    """Open a workshop that estimates eyes in the caller's thread.
+
+    For a program that filters one picture: to start a process takes longer.
+
+    Raises
+    ------
+    RenderError
+        No engine works on this machine; names what to install.
+    """
+    return open_workshop(InlineWorker(), BuildLimits(), closing, engine=engine)
 
 
 class _Shared:

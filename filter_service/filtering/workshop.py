@@ -1,7 +1,7 @@
-"""Where eyes are made: one worker and one engine for all streams of a process.
+"""One worker that estimates eyes and one engine, for all streams of a process.
 
-Profiles of all streams go through the worker to the engine; what happens to them the
-streams are told as events.
+Profiles of all streams go through the worker to the engine; the streams get events
+about them.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.building.jobs import BuildJob, BuiltStore
+from filter_service.building.inline_worker import InlineWorker
+from filter_service.building.jobs import BuildJob
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import (
     BuildDone,
@@ -24,35 +24,40 @@ from filter_service.building.worker_handle import (
     WorkerHandle,
 )
 from filter_service.camera import Camera
-from filter_service.errors import BuildCancelled, FilterError, OutOfMemory, RenderFailed
+from filter_service.errors import (
+    BuildCancelled,
+    FilterError,
+    NotPrepared,
+    RenderFailed,
+)
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
-from filter_service.filtering.store_memory import held_mb, make_room
-from filter_service.filtering.stream_eyes import StreamEyes, Wanted
-from filter_service.filtering.upload import Upload
-from filter_service.rendering.engine import FrameEngine, LoadedStore
+from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes, Wanted
+from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.frame_use import first_frame
 from filter_service.settings import FilterSettings
 
 MS_PER_S = 1e3
 
-LOAD_RANGE_S = (0.004, 0.03)  # for copying a new store to the engine between two frames
-LOAD_SHARE = 0.5  # of a frame's time: the stream is never late by a whole frame
+EYE_SHARE = 0.3
+"""Progress at which the eye is estimated and its nodes are known."""
+
+KEPT_SHARE = 0.8
+"""Of the memory that an eye may keep: room for what comes next."""
+
+WARM_RANGE_S = (0.004, 0.03)
+WARM_SHARE = 0.5
+"""Time between two frames for PSFs ahead: this share of a frame's time, within the
+range, so that a stream is never late by a whole frame."""
+
+WARM_BATCH = 64
+"""PSFs computed between two looks at the time."""
 
 log = logging.getLogger("ocufilter")
 
 
-@dataclass(frozen=True, eq=False)
-class _Loading:
-    """A store that is built and not yet with the engine."""
-
-    stream: StreamEyes
-    wanted: Wanted
-    built: BuiltStore
-    upload: Upload
-
-
 class Workshop:
-    """Has the stores of profiles built and loaded, and tells their streams.
+    """Has the eyes of profiles estimated, and computes PSFs ahead of frames.
 
     Parameters
     ----------
@@ -66,7 +71,7 @@ class Workshop:
 
     def __init__(
         self,
-        worker: WorkerHandle,
+        worker: WorkerHandle | InlineWorker,
         engine: FrameEngine,
         limits: BuildLimits,
         *,
@@ -78,19 +83,27 @@ class Workshop:
         self.streams: list[StreamEyes] = []
         self.frame_s = 0.0  # what the last frame took to filter
         self._limits = limits
-        self._loads: list[_Loading] = []
         self._released: list[Any] = []
         self._going: list[Any] = []
+        self._is_warming = False
 
     @property
     def stores_mb(self) -> float:
-        """Return what the stores of all streams take."""
-        return held_mb(self.streams)
+        """Return what the PSFs of all streams take."""
+        return sum(prepared.store.memory_mb for prepared in self._prepared())
+
+    def _prepared(self) -> list[PreparedStore]:
+        return [
+            prepared
+            for stream in self.streams
+            for eye in stream.eyes
+            for prepared in eye.stores
+        ]
 
     @property
-    def is_loading(self) -> bool:
+    def is_warming(self) -> bool:
         """Return whether `advance` has something to do at once."""
-        return bool(self._loads)
+        return self._is_warming
 
     def accept(
         self,
@@ -105,8 +118,7 @@ class Workshop:
         # Accepted in the same pass counts as well: its build has not begun, but its
         # sender awaits an ending too.
         building = stream.building
-        begun = building is not None and not building.extends
-        replaced = [building.eye] if building is not None and begun else []
+        replaced = [building.eye] if building is not None else []
         unfinished = stream.unfinished_eye()
         if unfinished is not None and unfinished not in replaced:
             replaced.append(unfinished)
@@ -136,13 +148,10 @@ class Workshop:
         self.worker.close()
 
     def cancel(self, stream: StreamEyes) -> None:
-        """Stop what is being built and loaded for a stream."""
+        """Stop what is being estimated for a stream."""
         if stream.ticket is not None:
             self.worker.cancel(stream.ticket)
         stream.ticket = stream.building = None
-        for loading in self._loads_of(stream):
-            self._loads.remove(loading)
-            loading.upload.give_up()
 
     def free_retired(self, stream: StreamEyes) -> None:
         """Free the stores that a stream has given up."""
@@ -162,11 +171,17 @@ class Workshop:
         if dropped:
             threading.Thread(target=dropped.clear, daemon=True).start()
 
-    def advance(self) -> None:
-        """Take in what the worker has to say; keep one build of each stream going.
+    def advance(self, *, ahead: bool = True) -> None:
+        """Take in what the worker has to say, and compute PSFs ahead for a while.
 
-        Built stores are copied to the engine in slices: half of a frame's time at once,
-        within `LOAD_RANGE_S`, so that no frame is late by more.
+        That takes half of a frame's time at most, within `WARM_RANGE_S`, so that no
+        frame is late by more.
+
+        Parameters
+        ----------
+        ahead : bool
+            For eyes in use, too, what their next frames will need; else only for new
+            eyes.
         """
         self._drop_released()
         for event in self.worker.poll():
@@ -174,134 +189,149 @@ class Workshop:
             # Without a stream, it has ended or wants something newer.
             if stream is not None:
                 self._handle(stream, event)
-        low_s, high_s = LOAD_RANGE_S
-        load_s = min(max(LOAD_SHARE * self.frame_s, low_s), high_s)
-        self._advance_loads(time.monotonic() + load_s)
         for stream in list(self.streams):
-            if stream.builds_in_vain:
-                self.cancel(stream)
             following = stream.next_build()
             if stream.building is None and following is not None:
                 stream.building = following
-                stream.ticket = self.worker.submit(self._job(stream, following))
-
-    def _job(self, stream: StreamEyes, wanted: Wanted) -> BuildJob:
-        return BuildJob(
-            profile=wanted.eye.profile,
-            settings=wanted.eye.settings,
-            camera=wanted.camera,
-            limits=self._limits,
-            look_at=stream.look_at,
-            ranges=wanted.ranges,
-            with_preview=wanted.with_preview,
-        )
+                stream.ticket = self.worker.submit(
+                    BuildJob(
+                        profile=following.eye.profile,
+                        settings=following.eye.settings,
+                        camera=following.camera,
+                        limits=self._limits,
+                    )
+                )
+        low_s, high_s = WARM_RANGE_S
+        warm_s = min(max(WARM_SHARE * self.frame_s, low_s), high_s)
+        self._warm(time.monotonic() + warm_s, ahead)
+        self._limit_memory()
 
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
         if stream.building is None:
             return  # its last word, after it was given up
         wanted = stream.building
         if isinstance(event, BuildProgress):
-            if not wanted.extends:
-                stage, eye = event.stage, wanted.eye
-                stream.on_event(BuildingEye(eye, event.fraction, stage))
+            fraction = EYE_SHARE * event.fraction
+            stream.on_event(BuildingEye(wanted.eye, fraction, event.stage))
         elif isinstance(event, BuildDone):
+            stream.ticket = stream.building = None
             try:
-                self._make_room(wanted, event.built.memory_mb)
-            except OutOfMemory as error:
-                self._give_up(stream, wanted, error)
+                loaded = self.engine.load(event.built.store)
+                loaded.set_psf_engine(self._limits.psf_engine)
+            except Exception as error:
+                if not isinstance(error, FilterError):
+                    log.exception("an eye could not be loaded")
+                    error = RenderFailed(f"{type(error).__name__}: {error}")
+                self._fail(stream, wanted, error)
                 return
-            if event.built.is_complete:
-                stream.ticket = None
-            upload = Upload(self.engine.load_steps(event.built.store))
-            self._loads.append(_Loading(stream, wanted, event.built, upload))
+            prepared = PreparedStore(
+                wanted.camera, loaded, wanted.eye.accepted_s, event.built.notes
+            )
+            stream.put_in_place(wanted.eye, prepared)
+            self.free_retired(stream)
         elif isinstance(event, BuildError):
             self._fail(stream, wanted, event.error)
 
-    def _make_room(self, wanted: Wanted, size_mb: float) -> None:
-        max_mb = self._limits.max_stores_mb
-        try:
-            make_room(
-                self.streams,
-                wanted,
-                size_mb,
-                max_mb=max_mb,
-                now_s=time.monotonic(),
-            )
-        finally:
-            for stream in self.streams:
-                self.free_retired(stream)
+    # PSFs ahead of frames
 
-    def _loads_of(self, stream: StreamEyes) -> list[_Loading]:
-        return [loading for loading in self._loads if loading.stream is stream]
+    def _warm(self, until_s: float, ahead: bool) -> None:
+        """Compute PSFs of first frames, then of what comes next, until some time."""
+        self._is_warming = False
+        for stream in list(self.streams):
+            while (found := stream.warming()) is not None:
+                if not self._warm_first(stream, *found, until_s):
+                    self._is_warming = True
+                    break
+                if time.monotonic() > until_s:
+                    break
+        for stream in self.streams:
+            if not ahead or time.monotonic() > until_s:
+                return
+            if stream.warming() is None:
+                self._warm_ahead(stream, until_s)
 
-    def _advance_loads(self, deadline_s: float) -> None:
-        """Go on with the oldest load: a stream's preview before the rest."""
-        while self._loads:
-            loading = self._loads[0]
-            stream = loading.stream
-            try:
-                loaded = loading.upload.advance(deadline_s)
-                if loaded is None:
-                    return
-            except Exception as error:
-                if not isinstance(error, FilterError):
-                    log.exception("a store could not be loaded")
-                    error = RenderFailed(f"{type(error).__name__}: {error}")
-                self._give_up(stream, loading.wanted, error)
-            else:
-                self._loads.pop(0)
-                self._released.append(loading.built)
-                self._put_in_place(loading, loaded)
-
-    def _put_in_place(self, loading: _Loading, loaded: LoadedStore) -> None:
-        stream, wanted, built = loading.stream, loading.wanted, loading.built
-        if built.is_complete:
-            stream.building = None
-        stream.put_in_place(
-            wanted.eye,
-            PreparedStore(
-                wanted.camera,
-                loaded,
-                built.is_complete,
-                wanted.ranges if built.is_complete else built.ranges,
-                built.build_ms / MS_PER_S,
-                memory_mb=built.memory_mb,
-            ),
-        )
-        self.free_retired(stream)
-        if wanted.extends:
-            return  # its sender knows that the eye is ready
-        stream.on_event(
-            EyeReady(
-                wanted.eye,
-                wanted.camera,
-                build_ms=built.build_ms,
-                psf_count=built.psf_count,
-                memory_mb=built.memory_mb,
-                notes=built.notes,
-                is_complete=built.is_complete,
-            )
-        )
-
-    def _give_up(self, stream: StreamEyes, wanted: Wanted, error: FilterError) -> None:
-        """End the building of a store that the worker may still be busy with."""
-        if stream.ticket is not None:
-            self.worker.cancel(stream.ticket)
-        self._fail(stream, wanted, error)
-
-    def _fail(
+    def _warm_first(
         self,
         stream: StreamEyes,
-        wanted: Wanted,
-        error: FilterError,
+        eye: AcceptedProfile,
+        prepared: PreparedStore,
+        until_s: float,
+    ) -> bool:
+        """Compute what a first frame needs; return whether that is over."""
+        store, use = prepared.store, stream.use.last
+        try:
+            if eye.settings.prepare == "ranges":
+                left = store.missing_psfs()
+            else:
+                left = store.missing_psfs(
+                    use or first_frame(prepared.camera, eye.settings)
+                )
+            if left.size:
+                store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
+        except NotPrepared:
+            share = store.computed_count / (store.computed_count + left.size)
+            fraction = EYE_SHARE + (1.0 - EYE_SHARE) * share
+            stream.on_event(BuildingEye(eye, fraction, "psfs"))
+            return False
+        except FilterError as error:
+            self._fail(stream, Wanted(eye, prepared.camera), error)
+            return True
+        self._set_ready(stream, eye, prepared)
+        return True
+
+    def note_served(self, stream: StreamEyes, plan: RenderPlan) -> None:
+        """Take note that a frame was rendered: what it went through is ready."""
+        for prepared in list(plan.eye.stores):
+            if not prepared.is_ready and prepared.store in plan.stores:
+                self._set_ready(stream, plan.eye, prepared)
+
+    def _set_ready(
+        self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore
     ) -> None:
-        """End the building of a store, whether it failed there or at being loaded."""
-        stream.ticket = None
-        self.cancel(stream)
-        if wanted.extends:
-            log.warning("no more PSFs for a stream: %s", error)
-            stream.fail_extension(wanted, error)
+        stream.set_ready(eye, prepared)
+        stream.on_event(
+            EyeReady(
+                eye,
+                prepared.camera,
+                build_ms=MS_PER_S * (time.monotonic() - prepared.started_s),
+                psf_count=prepared.store.computed_count,
+                memory_mb=prepared.store.memory_mb,
+                notes=prepared.notes,
+                is_complete=True,
+            )
+        )
+
+    def _warm_ahead(self, stream: StreamEyes, until_s: float) -> None:
+        """Compute what the next frames will need at the speed of the last."""
+        prepared, last = stream.serving(), stream.use.last
+        if prepared is None or last is None or last is stream.use.warmed:
             return
+        store = prepared.store
+        try:
+            for state in stream.use.states_ahead():
+                left = store.missing_psfs(last, state=state)
+                if left.size:
+                    store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
+        except NotPrepared:
+            self._is_warming = True
+            return
+        except FilterError:
+            pass  # a frame that needs it says so
+        stream.use.warmed = last
+
+    def _limit_memory(self) -> None:
+        """Evict PSFs of the eyes used longest ago beyond ``max_stores_mb``."""
+        beyond_mb = self.stores_mb - self._limits.max_stores_mb
+        for prepared in sorted(self._prepared(), key=lambda own: own.used_s):
+            if beyond_mb <= 0.0:
+                return
+            before_mb = prepared.store.memory_mb
+            prepared.store.evict(KEPT_SHARE * max(before_mb - beyond_mb, 0.0))
+            beyond_mb -= before_mb - prepared.store.memory_mb
+
+    def _fail(self, stream: StreamEyes, wanted: Wanted, error: FilterError) -> None:
+        """End the preparation of an eye for a camera."""
+        self.cancel(stream)
         stream.fail_build(wanted.eye, wanted.camera, error)
         self.free_retired(stream)
         stream.on_event(EyeFailed(wanted.eye, error))

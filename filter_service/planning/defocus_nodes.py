@@ -8,7 +8,6 @@ fewer nodes.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import product
 
@@ -186,11 +185,9 @@ class _Rays:
         if shifts_dpt is not None:
             shifts = shifts_dpt[place].T
         needed = self._needed(index[place], lows, highs, shifts)
-        pieces = iter(
-            _spread(*own)
-            for own in zip(lows.tolist(), highs.tolist(), needed, strict=True)
-        )
-        return [np.concatenate([next(pieces) for _ in range(n)]) for n in counts]
+        values, sizes = _spread(lows, highs, needed)
+        ends = np.cumsum(sizes)[np.cumsum(counts) - 1]
+        return np.split(values, ends[:-1])
 
     def _needed(
         self,
@@ -296,21 +293,22 @@ def _reach_px(
 
 
 def _spread(
-    low_dpt: float, high_dpt: float, needed: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Nodes from end to end of a range, as many as its ladder asks for."""
-    if high_dpt - low_dpt < EXACT_DPT:
-        return np.array([low_dpt])
-    if not needed[-1] <= MAX_GROUP_NODES:  # NaN is none either
+    lows: NDArray[np.float64], highs: NDArray[np.float64], needed: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Nodes from end to end of ranges (n,), and how many each has."""
+    # Whoever only reads plans need not load numba.
+    from filter_service.planning.spread_loops import spread_nodes
+
+    is_range = highs - lows >= EXACT_DPT
+    bad = np.flatnonzero(is_range & ~(needed[:, -1] <= MAX_GROUP_NODES))  # or NaN
+    if bad.size:
+        k = int(bad[0])
         raise GridTooLarge(
-            f"defocus from {low_dpt:.4g} to {high_dpt:.4g} dpt needs {needed[-1]:.3g} "
-            "PSFs at one place in the image",
+            f"defocus from {lows[k]:.4g} to {highs[k]:.4g} dpt needs "
+            f"{needed[k, -1]:.3g} PSFs at one place in the image",
             field="settings.object_range_dpt",
             allowed=f"ranges and an eye that need at most {MAX_GROUP_NODES:,}",
         )
-    if not needed[-1] > 0.0:  # PSFs are so wide that no difference shows
-        return np.array([low_dpt, high_dpt])
-    count = 1 + max(1, math.ceil(needed[-1] - 1e-9))
-    ladder = np.linspace(low_dpt, high_dpt, _LADDER)
-    nodes = np.interp(np.linspace(0.0, needed[-1], count), needed, ladder)
-    return np.unique(nodes)  # ends that differ by a rounding error are one
+    return spread_nodes(
+        np.ascontiguousarray(lows), np.ascontiguousarray(highs), needed, EXACT_DPT
+    )

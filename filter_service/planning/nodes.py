@@ -45,6 +45,10 @@ class RaggedNodes:
         """Group (n,) of each node."""
         return np.repeat(np.arange(len(self.starts) - 1), self.counts)
 
+    def group_at(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Group (n,) of some nodes."""
+        return np.searchsorted(self.starts, nodes, side="right") - 1
+
     @cached_property
     def lowest_dpt(self) -> float:
         """Smallest value of all groups."""
@@ -135,7 +139,8 @@ class CachePlan:
         node is one defocus for all channels; the chromatic difference where it is what
         they see of one object, as where few distances are read and in the paper's
         grids.
-    prediction : PlanPrediction
+    prediction : PlanPrediction or None
+        None where it was not asked for: it takes longer than the plan.
     is_limited : (n_groups,)
         Groups that end where the blur is as large as kernels may be.
     shrink_ratio : (n_groups,), optional
@@ -149,7 +154,7 @@ class CachePlan:
     accommodations_dpt: NDArray[np.float64]
     defocus: RaggedNodes
     channel_shift_dpt: NDArray[np.float64]
-    prediction: PlanPrediction
+    prediction: PlanPrediction | None
     is_limited: NDArray[np.bool_]
     shrink_ratio: NDArray[np.float64] | None = None
 

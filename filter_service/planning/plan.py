@@ -105,7 +105,11 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
 
 
 def unchecked_plan(
-    eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
+    eye: EyeOptics,
+    spec: GridSpec,
+    *,
+    target_db: float | None = None,
+    predict: bool = True,
 ) -> CachePlan:
     """Plan like `plan_cache`, however large.
 
@@ -113,6 +117,8 @@ def unchecked_plan(
     ----------
     target_db : float, optional
         What interpolation may cost; the spec's tolerance says where it is None.
+    predict : bool
+        Say what all of it would cost.
     """
     allowed_error = target_error(spec)
     if target_db is not None:
@@ -132,10 +138,12 @@ def unchecked_plan(
         **vars(axes),
         defocus=defocus.nodes,
         channel_shift_dpt=defocus.channel_shift_dpt,
-        prediction=PlanPrediction(0, 0.0, 0.0, 0, 0.0, {}),
+        prediction=None,
         is_limited=defocus.is_limited,
         shrink_ratio=defocus.shrink_ratio,
     )
+    if not predict:
+        return plan
     errors = _errors(use, plan)
     prediction = PlanPrediction(
         **predicted_cost(eye, spec, plan),

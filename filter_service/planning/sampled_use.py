@@ -193,10 +193,23 @@ def _blur_scale(use: Use, pupils_mm: NDArray) -> NDArray[np.float64]:
 
 def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
     """Mean square error of the states when one axis is interpolated between nodes."""
-    lower, upper, share = bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]])
-    twice = use.taken(np.tile(np.arange(share.size), 2))
-    neighbours = moved(twice, axis, nodes[np.append(lower, upper)])
-    return AXIS_FACTOR[axis] * _error(use, neighbours, share)
+    return axis_errors(use, axis, [nodes])[0]
+
+
+def axis_errors(use: Use, axis: str, choices: list[NDArray]) -> list[float]:
+    """Return the same of several choices of nodes; an eye is asked once for all."""
+    found = [
+        bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]]) for nodes in choices
+    ]
+    ends = [nodes[low] for nodes, (low, _, _) in zip(choices, found, strict=True)]
+    ends += [nodes[high] for nodes, (_, high, _) in zip(choices, found, strict=True)]
+    count = use.vergence_dpt.size
+    repeated = use.taken(np.tile(np.arange(count), 2 * len(choices)))
+    neighbours = moved(repeated, axis, np.concatenate(ends))
+    own = use.taken(np.tile(np.arange(count), len(choices)))
+    share = np.concatenate([share for _, _, share in found])
+    errors = _errors_of(own, neighbours, share).reshape(len(choices), count)
+    return (AXIS_FACTOR[axis] * errors.mean(axis=1)).tolist()
 
 
 def defocus_error(use: Use, plan: CachePlan) -> float:
@@ -248,6 +261,13 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
 
 def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
     """Mean square error with all lower neighbours and then all upper ones."""
+    return float(_errors_of(use, neighbours, share).mean())
+
+
+def _errors_of(
+    use: Use, neighbours: PupilStates, share: NDArray
+) -> NDArray[np.float64]:
+    """Square errors (P,) of states with all lower neighbours, then all upper ones."""
     found = np.zeros(share.size)
     for light_ratio, added_dpt in light_of_foci(use):
         lower_px, upper_px = np.split(
@@ -262,7 +282,7 @@ def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
             share_ratio=share,
             unit_px=use.unit_px,
         )
-    return float(found.mean())
+    return found
 
 
 def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:

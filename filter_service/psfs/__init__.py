@@ -1,9 +1,11 @@
-"""The PSF cache: built, packed, kept on disk, read for a frame.
+"""PSFs on the nodes of a plan: computed on demand, packed, read for a frame.
 
 eye_for_spec         the eye of a profile, for what a cache covers
-build_store          every PSF of a plan, in chunks
+node_wavefronts      wavefronts of a plan's nodes
+node_blur            their geometric blur
+blur_loops           its compiled loop
+compute_kernels      from nodes to packed kernels
 wide_primaries       kernels of primaries of two wavelengths
-several_foci         how sharp kernels are that have several foci
 psf_engine           on the CPU or the GPU
 gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers
@@ -12,12 +14,12 @@ gpu_build_passes     their passes
 gpu_build_records    their records
 boxes                what kernels are cut to
 pack                 kernels cut to boxes, in 16 bits
-store                the cache, and the layers of a frame
+store                the PSFs of an eye, and the layers of a frame
 field_defocus        change of defocus over the field
 read_kernels         which cached kernels a state reads, as plain arrays
 read_loops           the compiled loops that read them
 layer_loops          where a frame's layers lie
-store_cache          stores kept on disk
+store_cache          eyes and nodes kept on disk
 cache_folder         where, if anywhere
 kept_eyes            whose, to be listed and erased
 store_codec          objects as JSON and arrays

@@ -22,6 +22,12 @@ def pack_reach(reach_px: NDArray) -> NDArray[np.uint32]:
     )
 
 
+def unpack_reach(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Four reaches (..., 4) out of words (...)."""
+    little = np.ascontiguousarray(words, "<u4")
+    return little[..., None].view(np.uint8)
+
+
 def square_kernel(
     weights: NDArray[np.uint16], offset: int, reach_px: NDArray, radius_px: int
 ) -> NDArray[np.float64]:

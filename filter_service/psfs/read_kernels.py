@@ -22,6 +22,10 @@ class StoreTables(NamedTuple):
         Four reaches, a byte a side.
     radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
         See `PsfStore`.
+    is_computed : (n_psfs,)
+        Whether there is a kernel; without one all else but its blur is 0.
+    last_used : (n_psfs,)
+        Number of the frame that read it last.
     """
 
     values_dpt: NDArray[np.float64]
@@ -33,10 +37,12 @@ class StoreTables(NamedTuple):
     groups_per_field: int
     offsets: NDArray[np.uint32]
     reach_words: NDArray[np.uint32]
-    radius_px: NDArray[np.int64]
-    blur_px: NDArray[np.float64]
-    spread_px: NDArray[np.float64]
-    peak_ratio: NDArray[np.float64]
+    radius_px: NDArray[np.int32]
+    blur_px: NDArray[np.float32]
+    spread_px: NDArray[np.float32]
+    peak_ratio: NDArray[np.float32]
+    is_computed: NDArray[np.bool_]
+    last_used: NDArray[np.uint32]
 
 
 class StateReads(NamedTuple):

@@ -62,26 +62,6 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def largest_radius_px(tables, reads, zero_dpt, low_dpt, high_dpt):
-    """Largest kernel that layers from one distance to another can read."""
-    largest = 0
-    for field in range(zero_dpt.shape[0]):
-        for corner in range(reads.groups.size):
-            group = field * tables.groups_per_field + reads.groups[corner]
-            scale, low, high = reads.scales[corner], np.inf, -np.inf
-            for channel in range(RGB):
-                shift_dpt = tables.channel_shift_dpt[group, channel]
-                zero = zero_dpt[field, channel]
-                low = min(low, (zero + low_dpt) * scale - shift_dpt)
-                high = max(high, (zero + high_dpt) * scale - shift_dpt)
-            first, start, _ = bracket(tables, group, low, tables.starts[group])
-            _, last, _ = bracket(tables, group, high, start)
-            for psf in range(RGB * first, RGB * (last + 1)):
-                largest = max(largest, tables.radius_px[psf])
-    return largest
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def channel_taps(tables, reads, group, channel, total_dpt, uppers, psfs, weights):
     """PSFs and weights (2 n_corners,) that make up one channel of a total defocus.
 

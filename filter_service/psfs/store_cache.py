@@ -1,4 +1,4 @@
-"""Finished PSF stores on disk, for the next time the same eye is wanted.
+"""Estimated eyes and their nodes on disk, for the next time the same eye is wanted.
 
 A folder of files, each named by hashes of what decides its content: the profile; the
 grid and the code.  Several services may share it without a lock: files appear complete
@@ -51,9 +51,16 @@ log = logging.getLogger("ocufilter.cache")
 
 @dataclass(frozen=True)
 class Stored:
-    """What is kept of a build."""
+    """What is kept of an eye.
 
-    store: Any
+    Attributes
+    ----------
+    parts : dict
+        See `PsfStore.parts`.
+    notes : tuple of str
+    """
+
+    parts: dict[str, Any]
     notes: tuple[str, ...]
 
 
@@ -163,7 +170,7 @@ class StoreCache:
 
     def save(self, key: str, stored: Stored) -> None:
         """Keep a store; where that fails the log says why, and nothing else happens."""
-        if self._folder is None or stored.store.memory_mb * MB > self._max_bytes:
+        if self._folder is None:
             return
         started_s = time.monotonic()
         try:

@@ -11,6 +11,7 @@ image_cells    cells of the image that share kernels
 cell_maps      from their pixels to those of stored kernels
 map_loops      compiled loops over those maps
 frame_states   what stays while pupil, focus and gaze stay
+frame_use      what a frame asks for, and which PSFs that needs
 frame_kernels  recipes of a frame's kernels
 kernel_loops   their compiled loops
 kernel_tables  the same as the passes read it

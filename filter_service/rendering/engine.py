@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any, Protocol, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.rendering.frame_use import FrameUse
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, Output
 
 
 class LoadedStore(Protocol):
-    """A PSF store that an engine can filter frames with."""
+    """A PSF store that an engine can filter frames with; see `FrameStore`."""
+
+    @property
+    def computed_count(self) -> int: ...  # noqa: D102
+    @property
+    def memory_mb(self) -> float: ...  # noqa: D102
+
+    def set_psf_engine(self, choice: str) -> None: ...  # noqa: D102
+
+    def missing_psfs(  # noqa: D102
+        self,
+        use: FrameUse | None = None,
+        *,
+        state: tuple[float, float] | None = None,
+    ) -> NDArray[np.int64]: ...
+
+    def fill(  # noqa: D102
+        self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
+    ) -> None: ...
+
+    def evict(self, max_mb: float) -> None: ...  # noqa: D102
 
     def release(self) -> None:
         """Free what the engine holds of it; once."""
@@ -39,6 +61,8 @@ class Rendered(Protocol):
     @property
     def clamped_depth_count(self) -> int: ...  # noqa: D102
     @property
+    def bad_color_count(self) -> int: ...  # noqa: D102
+    @property
     def overflow_count(self) -> int: ...  # noqa: D102
     @property
     def pupil_diameter_mm(self) -> float: ...  # noqa: D102
@@ -60,9 +84,6 @@ class FrameEngine(Protocol):
     def trim(self) -> None:
         """Give back memory that frames use again, after a while without any."""
 
-    def forget(self) -> None:
-        """Forget what frames left, so that the next is filtered as the first."""
-
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Have a function called in the middle of frames, where this engine can.
 
@@ -70,12 +91,8 @@ class FrameEngine(Protocol):
         filter another frame, or have a store taken.  Returns whether it is called.
         """
 
-    def load_steps(self, store: Any) -> Generator[LoadedStore | None]:
-        """Take a store in slices, so that frames go on between.
-
-        Yields None after each slice and in the end the loaded store; closing the
-        generator before gives the load up.
-        """
+    def load(self, store: Any) -> LoadedStore:
+        """Take a store, whose kernels may all be computed later."""
 
     def render(
         self,
@@ -90,6 +107,7 @@ class FrameEngine(Protocol):
         output: Output = "linear",
         gaze_deg: tuple[float, float] | None = None,
         out: NDArray[Any] | None = None,
+        until_s: float | None = None,
     ) -> Rendered:
         """Filter one view through the eye of a loaded store.
 
@@ -99,11 +117,15 @@ class FrameEngine(Protocol):
             0 is exact, 1 leaves no visible difference, more is faster.
         out : array, optional
             Memory of the shape and type of the picture, which an engine may use for it.
+        until_s : float, optional
+            Time of `time.monotonic` after which no more PSFs are computed.
 
         Raises
         ------
         FilterError
             `BadMessage`, `CameraMismatch` or another `RenderError`.
+        NotPrepared
+            PSFs that the frame needs were not computed by ``until_s``.
         """
 
 

@@ -1,12 +1,19 @@
 """What becomes of a view before it is filtered: depth filled, colour made finite."""
 
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import TILE_SIZE_PX
+from filter_service.psfs.boxes import MAX_REACH_PX
+from filter_service.psfs.store import FrameLayers
+from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
+from filter_service.settings import MAX_VERGENCE_DPT
+
+BORDER_ROOM_PX = 2
 
 IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 
@@ -34,7 +41,7 @@ def fill_missing_depth(
     return depth_m[rows, columns], count
 
 
-def border_px_of(view: RgbdView, reach_px: int) -> int:
+def border_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     """Return columns and rows to add around a view with a hidden layer, whole tiles.
 
     Next to the border of an image no surface is whole, for part of its light would come
@@ -42,7 +49,23 @@ def border_px_of(view: RgbdView, reach_px: int) -> int:
     """
     if view.surface_count == 1:
         return 0
+    reach_px = reach_px_of(view, layers, image) + BORDER_ROOM_PX
     return -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
+
+
+def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
+    """Bound how far light of a view is spread, px, by its nearest and farthest depth.
+
+    By rays and the diffraction that kernels keep: which PSFs there are must not count.
+    """
+    depths_m = [m[m >= LEAST_DEPTH_M] for m in view.surface_depths_m]
+    far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)
+    near_m = min((float(m.min(initial=np.inf)) for m in depths_m), default=np.inf)
+    stretch_ratio = radial_stretch(view).max() if view.depth_kind == "planar" else 1.0
+    low_dpt = 1.0 / (far_m * stretch_ratio) if far_m > 0.0 else 0.0
+    high_dpt = 1.0 / near_m
+    reach_px = layers.reach_px(low_dpt, high_dpt, max_px=MAX_REACH_PX)
+    return ceil(image.maps.largest_stretch_ratio * reach_px)
 
 
 def extended(view: RgbdView, border_px: int) -> RgbdView:
@@ -75,3 +98,20 @@ def object_dpt(view: RgbdView, depth_m: NDArray[np.float32]) -> NDArray[np.float
     with np.errstate(divide="ignore"):
         inverse = 1.0 / depth_m.astype(np.float64)
     return inverse / radial_stretch(view) if view.depth_kind == "planar" else inverse
+
+
+def object_range_dpt(view: RgbdView) -> tuple[float, float]:
+    """Farthest and nearest object distance of a view, as (low, high) dpt.
+
+    Missing depth is filled first, by the rule of `fill_missing_depth`; what is hidden
+    counts where it is.  Nearer than the nearest distance that may be prepared counts as
+    that.
+    """
+    filled_m, _ = fill_missing_depth(view.depth_m)
+    distance_dpt = object_dpt(view, filled_m)
+    if view.hidden_depth_m is not None:
+        holds = view.hidden_depth_m > 0.0
+        hidden_m = np.where(holds, view.hidden_depth_m, filled_m)
+        distance_dpt = np.stack([distance_dpt, object_dpt(view, hidden_m)])
+    low_dpt, high_dpt = float(distance_dpt.min()), float(distance_dpt.max())
+    return min(low_dpt, MAX_VERGENCE_DPT), min(high_dpt, MAX_VERGENCE_DPT)

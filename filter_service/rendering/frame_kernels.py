@@ -6,15 +6,20 @@ are (field node, layer interval) pairs, and those from the cache.  Its loops are
 when a frame first needs them: numba takes 0.3 s to import.
 """
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import RECIPE_TAPS, RGB
+from filter_service.errors import NotPrepared
 from filter_service.psfs.read_kernels import StoreTables
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.image_cells import ImageCells
+
+Fill = Callable[[NDArray[np.int64]], None]
 
 
 @dataclass(frozen=True)
@@ -94,18 +99,30 @@ def interval_count(layers: FrameLayers) -> int:
 
 
 def frame_kernels(
-    tables: StoreTables,
+    store: PsfStore,
     layers: FrameLayers,
     image: ImageCells,
     used: NDArray[np.bool_],
+    *,
+    tables: StoreTables | None = None,
+    fill: Fill | None = None,
 ) -> FrameKernels:
-    """Plan the kernels of used (cell, interval) pairs.
+    """Plan the kernels of used (cell, interval) pairs; compute the PSFs that lack.
 
     Parameters
     ----------
-    tables : StoreTables
-        Of the store; what it has as offsets stands in the recipes.
+    store : PsfStore
     used : (n_cells, n_intervals)
+    tables : StoreTables, optional
+        Those of the store, with other offsets, which stand in the recipes.
+    fill : callable, optional
+        Computes PSFs (n,) that are missing, as `PsfStore.fill`, which it is where it is
+        None.
+
+    Raises
+    ------
+    NotPrepared
+        ``fill`` ran out of time.
     """
     from filter_service.rendering.kernel_loops import fill_kernels, used_nodes
 
@@ -117,7 +134,9 @@ def frame_kernels(
         weight_ratio,
         n_fields,
     )
-    nodes = _node_kernels(tables, layers, *pairs)
+    nodes = _node_kernels(
+        store, tables or store.tables, fill or store.fill, layers, *pairs
+    )
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
     made = {
         "weight_ratio": np.empty(parts.shape),
@@ -140,8 +159,39 @@ def frame_kernels(
     )
 
 
+def missing_psfs(
+    store: PsfStore,
+    layers: FrameLayers,
+    image: ImageCells,
+    used: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """Return the PSFs (n,) that kernels of used pairs lack."""
+    from filter_service.rendering.kernel_loops import used_nodes
+
+    *_, fields, intervals = used_nodes(
+        np.ascontiguousarray(used),
+        np.ascontiguousarray(image.nodes),
+        np.ascontiguousarray(image.weight_ratio),
+        len(layers.layer_zero_dpt),
+    )
+    found: list[NDArray[np.int64]] = []
+
+    def note(psfs: NDArray[np.int64]) -> None:
+        found.append(psfs)
+        raise NotPrepared
+
+    with suppress(NotPrepared):
+        _node_kernels(store, store.tables, note, layers, fields, intervals)
+    return found[0] if found else np.zeros(0, np.int64)
+
+
 def _node_kernels(
-    tables: StoreTables, layers: FrameLayers, fields: NDArray, intervals: NDArray
+    store: PsfStore,
+    tables: StoreTables,
+    fill: Fill,
+    layers: FrameLayers,
+    fields: NDArray,
+    intervals: NDArray,
 ) -> NodeKernels:
     from filter_service.rendering.kernel_loops import fill_recipes, used_recipes
 
@@ -152,15 +202,24 @@ def _node_kernels(
     recipes = np.zeros((count, RGB, 3, RECIPE_TAPS), dtype=np.uint32)
     reach_px, radius_px = np.empty((count, 4), np.int64), np.empty(count, np.int64)
     peak_ratio, spread_px = np.empty(count), np.empty(count)
-    fill_recipes(
-        tables,
-        layers.reads,
-        recipe_fields,
-        layers.layer_dpt[recipe_layers, None] + layers.layer_zero_dpt[recipe_fields],
-        recipes,
-        recipes.view(np.float32),
-        (reach_px, radius_px, peak_ratio, spread_px),
-    )
+    missing = np.empty(store.psf_count, np.int64)
+    while True:
+        store.frame_number += 1
+        n_missing = fill_recipes(
+            tables,
+            layers.reads,
+            recipe_fields,
+            layers.layer_dpt[recipe_layers, None]
+            + layers.layer_zero_dpt[recipe_fields],
+            recipes,
+            recipes.view(np.float32),
+            (reach_px, radius_px, peak_ratio, spread_px),
+            missing,
+            np.uint32(store.frame_number),
+        )
+        if not n_missing:
+            break
+        fill(missing[:n_missing].copy())
     return NodeKernels(
         near=near,
         far=far,

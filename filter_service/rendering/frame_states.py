@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from filter_service.psfs.field_defocus import FieldAxes
 from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.rendering.frame_use import FrameUse, psfs_for
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
@@ -30,7 +31,7 @@ class Timer(Protocol):
         """Add the time within to a stage."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class FrameStore:
     """A PSF store with the image cells of its camera; engines add their own to it."""
 
@@ -41,6 +42,57 @@ class FrameStore:
     def node_scale(self) -> NDArray[np.float64]:
         """Scale of the stored pixels, see `stored_scale`; it takes 3 ms."""
         return stored_scale(self.store.spec, self.store.plan)
+
+    @property
+    def computed_count(self) -> int:
+        """Number of PSFs that are computed."""
+        return self.store.computed_count
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory of their kernels."""
+        return self.store.memory_mb
+
+    def set_psf_engine(self, choice: str) -> None:
+        """Have PSFs computed by "cpu" or "gpu", or whichever "auto" finds."""
+        from filter_service.psfs.psf_engine import psf_engine
+
+        self.store.engine = psf_engine(choice)
+
+    def missing_psfs(
+        self,
+        use: FrameUse | None = None,
+        *,
+        state: tuple[float, float] | None = None,
+    ) -> NDArray[np.int64]:
+        """Return the PSFs (n,) that a frame needs and that are not computed.
+
+        Parameters
+        ----------
+        use : FrameUse, optional
+            Of the frame; whatever any frame may need where it is None.
+        state : (pupil_diameter_mm, focus_dpt), optional
+            Another than the frame's.
+        """
+        if use is None:
+            return np.flatnonzero(~self.store.tables.is_computed)
+        return psfs_for(self.store, use, self._cells_at, state=state)
+
+    def fill(
+        self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
+    ) -> None:
+        """Compute PSFs, see `PsfStore.fill`."""
+        self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
+
+    def evict(self, max_mb: float) -> None:
+        """Evict the PSFs used longest ago, see `PsfStore.evict`."""
+        self.store.evict(int(max_mb * 1e6 / self.store.kernels.itemsize))
+
+    def _cells_at(self, gaze_deg: tuple[float, float]) -> ImageCells:
+        spec = self.store.spec
+        if gaze_deg == spec.settings.gaze_deg or not spec.follows_field:
+            return self.image
+        return image_cells(spec, self.store.plan, gaze_deg, node_scale=self.node_scale)
 
 
 class FrameStates:
@@ -56,7 +108,6 @@ class FrameStates:
 
     def _start_anew(self, handle: FrameStore | None) -> None:
         self._handle = handle
-        self._cell_px: int | None = None
         self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
@@ -91,11 +142,15 @@ class FrameStates:
         return self._layers[1]
 
     def cells(
-        self, timer: Timer, handle: FrameStore, gaze_deg: tuple[float, float]
+        self,
+        timer: Timer,
+        handle: FrameStore,
+        gaze_deg: tuple[float, float],
+        cell_px: int | None = None,
     ) -> ImageCells:
-        """Cells of a gaze."""
+        """Cells of a gaze, larger ones than usual where ``cell_px`` says so."""
         self._forget_others(handle)
-        spec, state = handle.store.spec, (gaze_deg, self._cell_px)
+        spec, state = handle.store.spec, (gaze_deg, cell_px)
         if state == (spec.settings.gaze_deg, None):
             return handle.image
         if self._image is None or self._image[0] != state:
@@ -106,7 +161,7 @@ class FrameStates:
                         spec,
                         handle.store.plan,
                         gaze_deg,
-                        cell_px=self._cell_px,
+                        cell_px=cell_px,
                         node_scale=handle.node_scale,
                     ),
                 )
@@ -132,7 +187,3 @@ class FrameStates:
             weights = axes.weights(image.corner_h_deg, image.corner_v_deg)
             self._corner_weights = axes, image, weights
         return self._corner_weights[2]
-
-    def coarsen(self, image: ImageCells) -> None:
-        """Take cells twice as wide from now on."""
-        self._cell_px = 2 * image.cell_px

@@ -24,11 +24,9 @@ CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 47.4 dB
 of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""
 
-TEXELS_PER_PIXEL = {"quality": (10.0, 10.0), "dynamic": (1.3, 10.0)}
-"""Of the single kernels of a frame, for each pixel: beyond the first, cells are made
-twice as wide; beyond the second, wider still.  At 1280x720 the first halves the time to
-make the kernels of myopia, astigmatism and cataract, for 1 to 2 dB; cells four times as
-wide would cost cataract 4 dB more."""
+TEXELS_PER_PIXEL = 10.0
+"""Of the single kernels of a frame, for each pixel: beyond it cells are made twice as
+wide, for memory is short.  16 bytes a texel: 150 MB at 1280x720."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
@@ -159,11 +157,11 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
     """
     if not can_coarsen(image):
         return
-    first, last = TEXELS_PER_PIXEL[spec.settings.mode]
-    allowed = first if image.cell_px <= usual_cell_px(spec) else last
-    if n_texels > allowed * spec.camera.width_px * spec.camera.height_px:
+    allowed = TEXELS_PER_PIXEL * spec.camera.width_px * spec.camera.height_px
+    if n_texels > allowed:
         raise KernelsTooLarge(
-            f"the frame's kernels have {n_texels} texels, more than {allowed:g} a pixel"
+            f"the frame's kernels have {n_texels} texels; expected at most "
+            f"{TEXELS_PER_PIXEL:g} a pixel"
         )
 
 

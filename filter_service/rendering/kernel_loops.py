@@ -80,8 +80,13 @@ def used_recipes(fields, intervals, n_fields, n_layers):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
+def fill_recipes(
+    tables, reads, fields, total_dpt, words, steps, sizes, missing, frame_number
+):
     """Write recipes, and what is known of the kernels that they make.
+
+    Returns how many PSFs are missing: then recipes are of no use until those are
+    computed.
 
     Parameters
     ----------
@@ -94,8 +99,13 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
     steps : (n, 3, 3, 8), float32
         The same memory.
     sizes : reach_px (n, 4), radius_px (n,), peak_ratio (n,), spread_px (n,)
+    missing : (n_psfs,)
+        Written: numbers of PSFs that have no kernel, each once.
+    frame_number : int
+        Written to ``tables.last_used`` of each PSF that is read.
     """
     reach_px, radius_px, peak_ratio, spread_px = sizes
+    n_missing = 0
     n_taps = 2 * reads.groups.size
     psfs, weights = np.empty(n_taps, np.int64), np.empty(n_taps)
     uppers = np.empty((RGB, reads.groups.size), np.int64)
@@ -115,6 +125,14 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
             peak = spread = 0.0
             for tap in range(n_taps):
                 psf, weight = psfs[tap], weights[tap]
+                if weight > 0.0:
+                    is_new = tables.last_used[psf] != frame_number
+                    tables.last_used[psf] = frame_number
+                    if not tables.is_computed[psf]:
+                        if is_new:
+                            missing[n_missing] = psf
+                            n_missing += 1
+                        continue
                 word, per_peak = (
                     tables.reach_words[psf],
                     weight * tables.peak_ratio[psf],
@@ -132,6 +150,7 @@ def fill_recipes(tables, reads, fields, total_dpt, words, steps, sizes):
         reach_px[n, 0], reach_px[n, 1] = left, right
         reach_px[n, 2], reach_px[n, 3] = up, down
         radius_px[n], peak_ratio[n], spread_px[n] = widest_px, highest, narrowest_px
+    return n_missing
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

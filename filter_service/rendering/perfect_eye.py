@@ -7,7 +7,8 @@ from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan, PlanPrediction, RaggedNodes
+from filter_service.planning.nodes import CachePlan, RaggedNodes
+from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rgbd_view import RgbdView
@@ -34,7 +35,7 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
     float
         The largest change of a pixel's value, which a perfect eye leaves as it is.
     """
-    *_, handle = engine.load_steps(perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS)))
+    handle = engine.load(perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS)))
     depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
     changes = []
     for dtype, output, accumulation in VARIANTS:
@@ -69,25 +70,24 @@ def perfect_store(camera: Camera) -> PsfStore:
     eye = MeasuredWavefront.from_profile(
         parse_profile({"kind": "prescription", "sphere_dpt": 0.0})
     )
+    plan = CachePlan(
+        h_deg=np.zeros(1),
+        v_deg=np.zeros(1),
+        pupils_mm=np.array([PUPIL_MM]),
+        accommodations_dpt=np.zeros(1),
+        defocus=RaggedNodes.of([np.zeros(1)]),
+        channel_shift_dpt=np.zeros((1, RGB)),
+        prediction=None,
+        is_limited=np.zeros(1, bool),
+    )
     one = np.ones(RGB)
-    return PsfStore(
-        spec=spec,
-        eye=eye,
-        plan=CachePlan(
-            h_deg=np.zeros(1),
-            v_deg=np.zeros(1),
-            pupils_mm=np.array([PUPIL_MM]),
-            accommodations_dpt=np.zeros(1),
-            defocus=RaggedNodes.of([np.zeros(1)]),
-            channel_shift_dpt=np.zeros((1, RGB)),
-            prediction=PlanPrediction(RGB, 0.0, 0.0, 1, np.inf, {}),
-            is_limited=np.zeros(1, bool),
-        ),
-        kernels=np.full(RGB, WEIGHT_MAX, np.uint16),
+    packed = PackedKernels(
+        weights=np.full(RGB, WEIGHT_MAX, np.uint16),
         offsets=np.arange(RGB),
         reach_px=np.zeros((RGB, 4), np.int64),
         radius_px=np.zeros(RGB, np.int64),
-        blur_px=0.0 * one,
-        spread_px=16.0 * one,
         peak_ratio=one,
+        spread_px=16.0 * one,
+        lost_energy_ratio=0.0 * one,
     )
+    return PsfStore.of_kernels(eye, spec, plan, packed, blur_px=0.0 * one)

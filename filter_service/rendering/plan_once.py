@@ -39,7 +39,7 @@ def plan_once() -> None:
     layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
     image = image_cells(store.spec, store.plan)
     used = np.ones((image.count, interval_count(layers)), bool)
-    kernels = frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels(store, layers, image, used)
     kernel_tables(kernels, kernel_levels(kernels), used.shape)
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan

@@ -21,7 +21,12 @@ from filter_service.constants import (
 )
 from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.store import FrameLayers, PsfStore
-from filter_service.rendering.frame import extended, fill_missing_depth, object_dpt
+from filter_service.rendering.frame import (
+    border_px_of,
+    extended,
+    fill_missing_depth,
+    object_dpt,
+)
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     NodeKernels,
@@ -157,13 +162,14 @@ def gather(
     linear_rgb : (height, width, 3)
     """
     filled_m, _ = fill_missing_depth(view.depth_m)
-    border_px = layers.max_radius_px + 2 if view.surface_count > 1 else 0
-    view = extended(replace(view, depth_m=filled_m), border_px)
+    image = image_cells(store.spec, store.plan, gaze_deg)
+    view = replace(view, depth_m=filled_m)
+    border_px = border_px_of(view, layers, image)
+    view = extended(view, border_px)
     distances_dpt = surface_vergences_dpt(view, layers)
     holds = ~np.isnan(distances_dpt)
     linear = np.stack([_linear_color(color) for color in view.surface_colors])
     n_intervals = interval_count(layers)
-    image = image_cells(store.spec, store.plan, gaze_deg)
     position = np.interp(
         np.where(holds, distances_dpt, 0.0)
         + field_change_dpt(view, layers, image, border_px),
@@ -174,7 +180,7 @@ def gather(
     cell = np.broadcast_to(cell_index(view, image, border_px), holds.shape)
     used = np.zeros((image.count, n_intervals), bool)
     used[cell[holds], interval[holds]] = True
-    kernels = frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels(store, layers, image, used)
     kernel_of = np.zeros(used.shape, np.int64)
     kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     kernel = kernel_of[cell, interval]

@@ -66,7 +66,7 @@ class ServiceConfig:
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
-        Where finished PSFs are kept for the next time; they tell of a person's eyes.
+        Where estimated eyes and the nodes of their PSFs are kept for the next time.
         ``""`` keeps none, which is so unless ``$OCUFILTER_CACHE_DIR`` names a folder.
     store_cache_max_mb : int
         What that folder may hold; those unused for longest go.
@@ -75,8 +75,8 @@ class ServiceConfig:
         process may use, capped by a container's quota.  Several devices share them,
         those apart that name a number of their own.
     build_niceness : int
-        Of what is computed after a profile's first PSFs, so that the render loop wins
-        where cores are few.
+        No effect, kept for configuration files of earlier releases: PSFs are computed
+        by the frames that need them.
     cancel_grace_s : float
         A build that does not stop within this time is stopped by force.
     build_limit_s : float

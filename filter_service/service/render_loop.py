@@ -165,7 +165,7 @@ class RenderLoop:
                 selector.modify(known[descriptor].fileobj, events)
 
     def _wait_s(self) -> float:
-        if self._workshop.is_loading:
+        if self._workshop.is_warming:
             return 0.0
         if self._workshop.worker.needs_attention_soon:
             return ATTENTION_WAIT_S

@@ -42,7 +42,6 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
     if config.gl_device != AUTO:
         os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # the same
     worker = WorkerHandle(
-        niceness=config.build_niceness,
         cancel_grace_s=config.cancel_grace_s,
         build_limit_s=config.build_limit_s,
     )

@@ -25,8 +25,8 @@ import numpy as np
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView

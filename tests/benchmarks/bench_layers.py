@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from tests.benchmarks.engines import ENGINES, open_renderer
 from tests.benchmarks.harness import (
     Row,

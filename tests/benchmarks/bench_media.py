@@ -17,8 +17,8 @@ import numpy as np
 from estimator.media.straylight import Straylight, cie_glare_per_sr
 from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.haze import add_haze
 from filter_service.rendering.media_effects import (
     MediaEffects,

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.harness import (
     Row,

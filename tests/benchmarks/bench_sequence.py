@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from tests.benchmarks.engines import ENGINES, renderer_maker, working_memory_mb
 from tests.benchmarks.harness import (
     OUT,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered

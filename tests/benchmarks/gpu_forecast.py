@@ -24,8 +24,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from estimator.profiles.parse import parse_profile
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.bench_gpu import (
     EYES,

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 
 from numpy.typing import NDArray
 
-from filter_service.psfs.build_store import build_psf_store
-from filter_service.psfs.store import frame_layers
+from filter_service.psfs.store import build_psf_store, frame_layers
 from filter_service.rendering import reference
 from tests.benchmarks.peer_problem import KeptForState, Problem
 from tests.benchmarks.view_sources import EyeState

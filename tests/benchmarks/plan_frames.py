@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.harness import Row
 from tests.numerical.plan_cases import spec_for, traced_eye

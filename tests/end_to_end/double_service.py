@@ -26,7 +26,6 @@ def open_workshop(config, closing):
         raise RenderFailed("the double has no such device")
     worker = WorkerHandle(
         "tests.end_to_end.doubles:build",
-        config.build_niceness,
         config.cancel_grace_s,
         config.build_limit_s,
         warm_up="",

@@ -16,8 +16,6 @@ from filter_service.camera import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
 
-SLICE_BYTES = 4 * 2**20
-
 
 @dataclass
 class StoreDouble:
@@ -26,9 +24,23 @@ class StoreDouble:
     follows_field: bool
     ballast: np.ndarray
     n_released: int = 0
+    computed_count: int = 1
+
+    @property
+    def memory_mb(self):
+        return self.ballast.nbytes / 1e6
 
     def release(self):
         self.n_released += 1
+
+    def set_psf_engine(self, choice):
+        """There are none."""
+
+    def missing_psfs(self, use=None, *, state=None):
+        return np.zeros(0, np.int64)
+
+    def evict(self, max_mb):
+        """Nothing goes."""
 
 
 @dataclass
@@ -41,6 +53,7 @@ class RenderedDouble:
     focus_dpt: float
     gaze_deg: tuple[float, float]
     overflow_count: int = 0
+    bad_color_count: int = 0
     notes: list = field(default_factory=list)
 
 
@@ -55,20 +68,14 @@ class EngineDouble:
     def trim(self):
         """Nothing is held."""
 
-    def forget(self):
-        """No frame leaves anything."""
-
     def call_between(self, function, interval_s):
         """Frames are not long here."""
         return False
 
-    def load_steps(self, store: StoreDouble):
-        """Read the ballast in slices, as a copy to a GPU would."""
-        for first in range(0, store.ballast.size, SLICE_BYTES):
-            part = store.ballast[first : first + SLICE_BYTES]
-            assert (part == store.mark).all()
-            yield None
-        yield store
+    def load(self, store: StoreDouble):
+        """Read the ballast, as a copy to a GPU would."""
+        assert (store.ballast == store.mark).all()
+        return store
 
     def render(
         self,
@@ -83,6 +90,7 @@ class EngineDouble:
         output="linear",
         gaze_deg=None,
         out=None,
+        until_s=None,
     ):
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape
@@ -142,22 +150,16 @@ def read_profile(body):
 
 
 def build(job, *, progress, cancelled):
-    """Take ``build_s``; ``crash``, ``deaf``, ``fail`` in the body do what they say.
-
-    With ``preview_mark`` there is a preview of that mark after ``preview_s``; its first
-    note says which pupil it is for.
-    """
+    """Take ``build_s``; ``crash``, ``deaf``, ``fail`` in the body do what they say."""
     body = job.profile.body
     if body.get("crash"):
         os.kill(os.getpid(), signal.SIGKILL)
-    if "preview_mark" in body:
-        _work(body.get("preview_s", 0.0), body, progress, cancelled)
-        looked_at = job.look_at and f"{job.look_at.pupil_diameter_mm:g} mm"
-        yield _store(job, body["preview_mark"], str(looked_at), is_complete=False)
     if body.get("fail"):
         raise ValueError("the double was told to fail")
     _work(body.get("build_s", 0.0), body, progress, cancelled)
-    yield _store(job, body["mark"], "a double", is_complete=True)
+    ballast = np.full(int(body.get("ballast_mb", 0.1) * 1e6), body["mark"], np.uint8)
+    store = StoreDouble(body["mark"], job.camera, job.settings.follows_field, ballast)
+    return BuiltStore(store, ("a double",))
 
 
 def _work(build_s, body, progress, cancelled):
@@ -167,11 +169,3 @@ def _work(build_s, body, progress, cancelled):
         if cancelled() and not body.get("deaf"):
             raise BuildCancelled("cancelled")
         time.sleep(0.005)
-
-
-def _store(job, mark, note, *, is_complete):
-    body = job.profile.body
-    ballast = np.full(int(body.get("ballast_mb", 0.1) * 1e6), mark, np.uint8)
-    store = StoreDouble(mark, job.camera, job.settings.follows_field, ballast)
-    build_ms = 1000 * body.get("build_s", 0.0)
-    return BuiltStore(store, build_ms, 1, ballast.nbytes / 1e6, (note,), is_complete)

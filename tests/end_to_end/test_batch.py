@@ -107,7 +107,7 @@ def test_the_manifest_tells_of_every_frame(room, usual):
     lines = (usual / "manifest.jsonl").read_text().splitlines()
     job, *frames = map(json.loads, lines)
     assert job["profiles"]["normal"] == {"kind": "preset", "name": "emmetropia"}
-    assert job["settings"]["pupil_range_mm"] == [4.0, 4.0]
+    assert job["settings"]["pupil_range_mm"] == [2.0, 7.0]
     assert len(frames) == 2 * COUNT
     first = next(r for r in frames if (r["profile"], r["frame"]) == ("myopia", "000"))
     assert first["missing_depth_count"] == 6
@@ -229,7 +229,7 @@ def refusal(capsys, *arguments):
 def test_another_job_in_the_same_folder_is_refused(room, usual, tmp_path, capsys):
     arguments = (room, *PROFILES, *MODE, "--fov-deg", 20)
     error = refusal(capsys, *arguments, "-o", usual, "--pupil-mm", 5)
-    assert "settings.pupil_range_mm is [5.0, 5.0], and was [4.0, 4.0]" in error
+    assert "states.pupil_mm is 5.0, and was 4.0" in error
     assert "--overwrite" in error
     fewer = refusal(capsys, room, *PROFILES[:2], *MODE, "--fov-deg", 20, "-o", usual)
     assert "is not given, and was" in fewer
@@ -338,8 +338,8 @@ def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
         (("{room}", "-p", "myopia", "--focus-dpt", "near"), "--focus-dpt 'near'"),
         (("{room}", "-p", "myopia", "--workers", "0"), "--workers 0: allowed is 1"),
         (
-            ("{room}", "-p", "myopia", "--settings", '{"prepare": "stream"}'),
-            "prepare is 'stream'; allowed in a batch: 'ranges'",
+            ("{room}", "-p", "myopia", "--settings", '{"accuracy": "balanced"}'),
+            "accuracy is 'balanced'",
         ),
         (("{room}", "-p", "myopia", "--half"), "--half: allowed with --format npy"),
     ],

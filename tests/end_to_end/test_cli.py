@@ -70,7 +70,8 @@ def filter_arguments(folder, *extra, profile="emmetropia", fov_deg=50, out="out.
 
 NO_OPENGL = {"GLCONTEXT_LINUX_LIBEGL": "libnothing.so"}
 
-IDENTITY = ("--no-diffraction", "--no-chromatic", "--pupil-mm", "3")
+PLAIN = ("--mode", "on-axis", "--eye-model", "wavefront")
+IDENTITY = ("--no-diffraction", "--no-chromatic", "--pupil-mm", "3", *PLAIN)
 
 
 def test_doctor_reports_a_machine_that_can_serve():
@@ -191,7 +192,8 @@ def test_missing_depth_is_filled_and_counted(scene):
 
 def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
     folder, _ = scene
-    finished = run(*filter_arguments(folder, "--pupil-mm", 7, profile="cataract"))
+    wide = (*PLAIN, "--pupil-mm", 7)
+    finished = run(*filter_arguments(folder, *wide, profile="cataract"))
     assert finished.returncode == 0, finished.stderr
     assert "capped" in finished.stdout
 
@@ -268,7 +270,7 @@ def test_a_hidden_layer_is_seen_around_a_blurred_edge(scene):
     np.save(folder / "behind_m.npy", hidden_m.astype(np.float32))
     files = ("--hidden-color", folder / "behind.npy")
     files += ("--hidden-depth", folder / "behind_m.npy")
-    defocus = (*IDENTITY[:2], "--pupil-mm", "8")
+    defocus = (*IDENTITY[:2], *PLAIN, "--pupil-mm", "8")
     shown = []
     for extra in (defocus, (*defocus, *files)):
         summary = run_json(*filter_arguments(folder, *extra, fov_deg=20))

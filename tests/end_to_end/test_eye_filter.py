@@ -19,6 +19,7 @@ from filter_service import (
     FilterSettings,
     RgbdView,
 )
+from filter_service.building.inline_worker import InlineWorker
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import (
@@ -26,14 +27,12 @@ from filter_service.errors import (
     BuildCancelled,
     BuildFailed,
     NoProfile,
-    OutOfMemory,
     ServiceTimeout,
 )
-from filter_service.filtering import store_memory
 from filter_service.filtering.workshop import Workshop
+from filter_service.rendering.native import NativeRenderer
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
 from tests.end_to_end.printed_script import printed_by
-from tests.numerical.synthetic import psnr_db
 
 CAMERA = Camera.from_fov(60.0, width_px=16, height_px=8)
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
@@ -80,12 +79,12 @@ def test_a_picture_comes_through_the_eye_of_the_profile(eye_filter, events):
 def test_frames_go_through_the_old_eye_while_the_new_one_is_built(eye_filter, events):
     eye_filter.set_profile(eye(1))
     eye_filter.filter(COLOR, DEPTH_M, **SEE)
-    eye_filter.set_profile(eye(3, preview_mark=2, preview_s=0.05, build_s=0.1))
+    eye_filter.set_profile(eye(3, build_s=0.15))
     marks = []
     deadline_s = time.monotonic() + 10.0
     while marks[-1:] != [3] and time.monotonic() < deadline_s:
         marks.append(mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)))
-    assert list(dict.fromkeys(marks)) == [1, 2, 3]
+    assert list(dict.fromkeys(marks)) == [1, 3]
     assert len(marks) > 20, "frames waited for the build"
     assert any(isinstance(event, BuildingEye) for event in events)
 
@@ -249,94 +248,64 @@ def test_a_plain_script_gets_the_picture_that_the_service_gives(tmp_path):
     assert len(np.unique(mine[18, :, 1])) > 4, "nothing was blurred"
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """A workshop for 10 MB of PSFs, in which a store is idle after 0.2 s."""
-    monkeypatch.setattr(store_memory, "IDLE_S", 0.2)
-    worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
-    limits = BuildLimits(max_stores_mb=10)
-    workshop = Workshop(worker, EngineDouble(0.0), limits)
-    yield workshop
-    workshop.close()
-
-
-def seen_through(eye_filter):
-    return mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE, timeout_s=10.0))
-
-
-def test_psfs_unused_for_longest_make_room_and_are_made_again(small):
-    with ExitStack() as closing:
-        made = [
-            closing.enter_context(EyeFilter(None, CAMERA, workshop=small))
-            for _ in range(3)
-        ]
-        for mark, eye_filter in enumerate(made[:2]):
-            eye_filter.set_profile(eye(mark, ballast_mb=4))
-            assert seen_through(eye_filter) == mark
-        time.sleep(0.3)
-        assert seen_through(made[1]) == 1  # so the other is the one that goes
-        made[2].set_profile(eye(2, ballast_mb=4))
-        assert seen_through(made[2]) == 2
-        assert [len(eye_filter.prepared_stores) for eye_filter in made] == [0, 1, 1]
-        assert small.stores_mb == pytest.approx(8)
-        time.sleep(0.3)
-        assert seen_through(made[0]) == 0, "it is prepared again"
-        assert small.stores_mb == pytest.approx(8)
-        made[0].set_profile(eye(7, ballast_mb=4))
-        made[0].wait(10.0)
-        assert seen_through(made[0]) == 7
-
-
-def test_psfs_in_use_stay_and_what_has_no_room_is_said(small, events):
+def test_psfs_of_the_eye_used_longest_ago_are_evicted(rng):
+    """And are computed again when a frame comes for it: the picture is the same."""
+    color = rng.integers(0, 256, (68, 120, 3)).astype(np.uint8)
+    depth_m = rng.uniform(0.4, 4.0, (68, 120)).astype(np.float32)
+    camera = Camera.from_fov(50.0, width_px=120, height_px=68)
+    own = Workshop(InlineWorker(), NativeRenderer(), BuildLimits())
     with (
-        EyeFilter(None, CAMERA, workshop=small) as first,
-        EyeFilter(None, CAMERA, workshop=small, on_event=events.append) as second,
+        EyeFilter("myopia", camera, workshop=own) as first,
+        EyeFilter("keratoconus", camera, workshop=own) as second,
     ):
-        first.set_profile(eye(1, ballast_mb=6))
-        second.set_profile(eye(2, ballast_mb=1))
-        assert (seen_through(first), seen_through(second)) == (1, 2)
-        second.set_profile(eye(3, ballast_mb=6))
-        with pytest.raises(OutOfMemory, match=r"6 MB.*max_stores_mb"):
-            while not isinstance(events[-1], EyeFailed):
-                assert (seen_through(first), seen_through(second)) == (1, 2)
-            raise events[-1].error
-        assert (seen_through(first), seen_through(second)) == (1, 2)
-        second.set_profile(eye(4, ballast_mb=2))
-        assert second.wait(10.0).is_complete
-        assert seen_through(second) == 4
+        before = first.filter(color, depth_m, **SEE).color
+        (stored,) = [prepared.store.store for prepared in first.prepared_stores]
+        second.filter(color, depth_m, **SEE)
+        assert stored.generation == 0
+        own._limits = BuildLimits(max_stores_mb=0.5 * own.stores_mb)
+        second.advance()
+        assert stored.generation == 1 and stored.memory_mb < 0.5 * own.stores_mb
+        np.testing.assert_array_equal(first.filter(color, depth_m, **SEE).color, before)
+    own.close()
 
 
-def test_a_focus_that_jumps_is_waited_for(rng):
-    """Frame after frame elsewhere; what is seen is what a prepared eye sees."""
+def test_every_frame_of_a_focus_that_jumps_shows_the_asked_state(rng):
+    """Frame after frame elsewhere; each is what a filter sees that was asked first."""
     color = rng.integers(0, 256, (135, 240, 3)).astype(np.uint8)
     depth_m = np.full((135, 240), 2.0, np.float32)
     depth_m[:, :80], depth_m[:, 160:] = 0.3, np.inf
     camera = Camera.from_fov(50.0, width_px=240, height_px=135)
-    prepared = FilterSettings(
-        pupil_range_mm=(5.0, 5.0), focus_range_dpt=(0.0, 4.0), prepare="ranges"
-    )
-    foci_dpt = (0.0, 2.0, 4.0)
 
-    def pictures(settings, *, whole):
-        with EyeFilter("emmetropia", camera, settings) as eye_filter:
-            frames = [
+    def pictures(states, **settings):
+        with EyeFilter("emmetropia", camera, settings, engine="native") as eye_filter:
+            return [
                 eye_filter.filter(
-                    color,
-                    depth_m,
-                    pupil_diameter_mm=5.0,
-                    focus_dpt=focus_dpt,
-                    output="linear",
-                    whole=whole,
-                )
-                for focus_dpt in foci_dpt
+                    color, depth_m, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
+                ).color.tobytes()
+                for pupil_mm, focus_dpt in states
             ]
-        assert not whole or all(frame.is_complete for frame in frames)
-        return [frame.color for frame in frames]
 
-    wanted = pictures(prepared, whole=True)
-    jumping = pictures(FilterSettings(), whole=False)
-    patient = pictures(FilterSettings(), whole=True)
-    for k, dpt in enumerate(foci_dpt):
-        # a loose preview of this very state has 30; of another, 18 to 27
-        assert psnr_db(jumping[k], wanted[k]) > 28.0, f"at {dpt} dpt"
-        assert psnr_db(patient[k], wanted[k]) > 34.0, f"at {dpt} dpt"
+    states = [(5.0, 0.0), (3.0, 4.0), (6.5, 2.0)]
+    jumping = pictures(states)
+    assert jumping == pictures(states[::-1])[::-1]
+    assert jumping[1:2] == pictures(states[1:2])
+    assert len(set(jumping)) == 3
+
+
+def test_a_frame_stops_computing_psfs_when_its_time_is_over(rng):
+    color = rng.integers(0, 256, (135, 240, 3)).astype(np.uint8)
+    depth_m = rng.uniform(0.4, 4.0, (135, 240)).astype(np.float32)
+    camera = Camera.from_fov(50.0, width_px=240, height_px=135)
+    view = RgbdView(color, depth_m, camera.tangents)
+    with EyeFilter("cataract", camera, engine="native") as eye_filter:
+        eye_filter.wait()
+        state = {"pupil_diameter_mm": 6.0, "focus_dpt": 1.0}
+        seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
+        assert seen is None and eye_filter.is_extending
+        n_tries, end_s = 0, time.monotonic() + 60.0
+        while seen is None and time.monotonic() < end_s:
+            n_tries += 1
+            seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
+        assert seen is not None and not eye_filter.is_extending
+        whole = eye_filter.filter(view, **state)
+    np.testing.assert_array_equal(seen.color, whole.color)

@@ -58,7 +58,8 @@ def test_the_plan_as_json_follows_mode_tolerance_and_gaze(arguments):
     assert normal["h_deg"][0] == pytest.approx(-normal["h_deg"][-1])
     assert fine["h_deg"][-1] < normal["h_deg"][-1] - 5.0
     assert (paper["psf_count"], len(paper["h_deg"])) == (17577, 31)
-    assert set(normal["error_db_by_axis"]) == {"h", "v", "defocus"}
+    axes = {"h", "v", "pupil", "accommodation", "defocus"}
+    assert set(normal["error_db_by_axis"]) == axes
 
 
 def test_a_gaze_out_of_range_is_refused(arguments):

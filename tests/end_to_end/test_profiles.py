@@ -231,69 +231,22 @@ def test_old_eyes_are_freed(client):
     assert max(memory_mb[4:]) - min(memory_mb[4:]) < 45.0, memory_mb
 
 
-def test_a_preview_shows_the_new_eye_at_once_and_the_whole_follows(client):
+def test_set_profile_waits_until_it_is_ready(client):
     view = make_view()
-    client.set_profile(double(11), views=[view])
-    client.filter(view, **SEE)
-    ready = client.set_profile(
-        double(22, preview_mark=21, preview_s=0.1, build_s=0.5), wait="first"
-    )
-    assert not ready.is_complete
-    assert ready.notes == ("4 mm",), "the preview is for the last frame's pupil"
-    events = stream(
-        client,
-        view,
-        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 22,
-    )
-    frames = [(t, e) for t, e in events if isinstance(e, FilteredFrame)]
-    assert [e.is_complete for _, e in events if isinstance(e, Ready)] == [True]
-    marks = [mark_of(e) for _, e in frames]
-    assert marks == sorted(marks)
-    assert marks.count(21) > 10, "the preview did not serve"
-    for _, event in frames:
-        assert event.header.is_complete == (mark_of(event) != 21)
-        assert event.header.generation == ready.generation
-    assert np.diff([t for t, _ in frames]).max() < 0.3
-
-
-def test_set_profile_waits_for_the_whole_unless_told_otherwise(client):
-    view = make_view()
-    body = double(32, preview_mark=31, build_s=0.1)
-    ready = client.set_profile(body, views=[view])
-    assert ready.is_complete
-    assert mark_of(client.filter(view, **SEE)) == 32
+    body = double(32, build_s=0.1)
+    for wait in (True, "first"):
+        assert client.set_profile(body, views=[view], wait=wait).is_complete
+        assert mark_of(client.filter(view, **SEE)) == 32
     with pytest.raises(ValueError, match="'first'"):
         client.set_profile(body, wait="last")
 
 
-def test_a_newer_profile_stops_a_build_between_preview_and_whole(client):
-    view = make_view()
-    client.set_profile(double(41), views=[view])
-    client.filter(view, **SEE)
-    slow = client.set_profile(double(43, preview_mark=42, build_s=60.0), wait="first")
-    assert mark_of(client.filter(view, **SEE)) == 42
-    accepted = client.set_profile(double(44, build_s=0.3), wait=False)
-    events = stream(
-        client,
-        view,
-        until=lambda e: isinstance(e, FilteredFrame) and mark_of(e) == 44,
-    )
-    frames = [e for _, e in events if isinstance(e, FilteredFrame)]
-    assert {mark_of(e) for e in frames} == {42, 44}
-    assert accepted.generation == slow.generation + 1
-    (cancelled,) = [e for _, e in events if isinstance(e, ErrorReply)]
-    assert (cancelled.code, cancelled.profile_id) == (
-        "build_cancelled",
-        slow.profile_id,
-    )
-
-
-def test_a_profile_that_fails_after_its_preview_leaves_the_old_eye(client):
+def test_a_profile_that_fails_leaves_the_old_eye(client):
     view = make_view()
     client.set_profile(double(51), views=[view])
     client.filter(view, **SEE)
     with pytest.raises(errors.BuildFailed, match="told to fail"):
-        client.set_profile(double(53, preview_mark=52, fail=True))
+        client.set_profile(double(53, fail=True))
     assert mark_of(client.filter(view, **SEE)) == 51
 
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from estimator.profiles.parse import parse_profile
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build_store import build_psf_store
-from filter_service.psfs.store import PsfStore
+from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view

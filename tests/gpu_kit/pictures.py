@@ -13,7 +13,7 @@ from PIL import Image
 
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rendering.native.library import library_path

@@ -1,12 +1,12 @@
 """Stores in which every PSF is one given kernel: filtering has a closed form then."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.signal import fftconvolve
 
 from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.psfs.pack import PackedKernels
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.perfect_eye import PUPIL_MM, perfect_store
 from filter_service.rgbd_view import RgbdView
 
@@ -53,13 +53,16 @@ class OneKernelBench:
 def _store(kernel, camera, spread_px):
     radius_px = kernel.shape[0] // 2
     one = np.ones(RGB)
-    return replace(
-        perfect_store(camera),
-        kernels=np.round(kernel / kernel.max() * WEIGHT_MAX).astype(np.uint16).ravel(),
+    perfect = perfect_store(camera)
+    packed = PackedKernels(
+        weights=np.round(kernel / kernel.max() * WEIGHT_MAX).astype(np.uint16).ravel(),
         offsets=np.zeros(RGB, np.int64),
         reach_px=np.full((RGB, 4), radius_px),
         radius_px=np.full(RGB, radius_px),
-        blur_px=radius_px * one,
         spread_px=spread_px * one,
         peak_ratio=kernel.max() * one,
+        lost_energy_ratio=0.0 * one,
+    )
+    return PsfStore.of_kernels(
+        perfect.eye, perfect.spec, perfect.plan, packed, radius_px * one
     )

@@ -46,23 +46,6 @@ def layer_blur_px(store, reads, zero_dpt, at_dpt):
     return blur_px.reshape(len(at_dpt), n_fields * RGB)
 
 
-def largest_radius_px(store, reads, zero_dpt, layer_dpt):
-    """Largest kernel from the lowest to the highest node that layers read."""
-    fields = np.arange(len(zero_dpt))
-    n_groups = store.plan.pupils_mm.size * store.plan.accommodations_dpt.size
-    largest = 0
-    for group, scale, _ in zip(*reads, strict=True):
-        groups = fields * n_groups + group
-        shift_dpt = store.plan.channel_shift_dpt[groups]
-        low = ((zero_dpt + layer_dpt[0]) * scale - shift_dpt).min(axis=1)
-        high = ((zero_dpt + layer_dpt[-1]) * scale - shift_dpt).max(axis=1)
-        first, _, _ = store.plan.defocus.bracket(groups, low)
-        _, last, _ = store.plan.defocus.bracket(groups, high)
-        for start, end in zip(RGB * first, RGB * (last + 1), strict=True):
-            largest = max(largest, int(store.radius_px[start:end].max()))
-    return largest
-
-
 def layer_distances_dpt(
     object_range_dpt, *, ends_dpt, blur_radius_px, blur_px_per_dpt, blur_ratio
 ):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filter_service.constants import USED_PARTS
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.expected_pairs import MARGIN_DPT, part_edges_dpt
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.pair_loops import carry_over, spread, used_pairs

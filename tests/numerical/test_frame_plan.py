@@ -10,6 +10,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.constants import RECIPE_TAPS, RGB, THREADS
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.boxes import box_sizes
+from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.read_loops import layer_blur_px
 from filter_service.psfs.store import PsfStore, frame_layers
 from filter_service.rendering import frame_kernels
@@ -40,18 +41,17 @@ def store_for(name, model="traced", **settings):
     count = RGB * plan.defocus.values_dpt.size
     rng = np.random.default_rng(count)
     node_px = np.abs(np.repeat(plan.defocus.values_dpt, RGB)) * 4.0
-    return PsfStore(
-        spec=spec,
-        eye=eye,
-        plan=plan,
-        kernels=np.zeros(1, np.uint16),
+    packed = PackedKernels(
+        weights=np.zeros(1, np.uint16),
         offsets=np.cumsum(rng.integers(1, 900, count)),
         reach_px=rng.integers(0, 40, (count, 4)),
         radius_px=rng.integers(0, 60, count),
-        blur_px=node_px + rng.random(count),
         spread_px=rng.uniform(0.3, 30.0, count),
         peak_ratio=rng.uniform(1e-4, 1.0, count),
+        lost_energy_ratio=np.zeros(count),
     )
+    blur_px = node_px + rng.random(count)
+    return PsfStore.of_kernels(eye, spec, plan, packed, blur_px)
 
 
 CASES = {
@@ -131,8 +131,8 @@ def test_layers_equal_the_plain_statement(case):
         blur_ratio=0.1 if store.spec.settings.mode == "dynamic" else 0.05,
     )
     np.testing.assert_allclose(layers.layer_dpt, expected_dpt, rtol=RTOL, atol=1e-9)
-    largest_px = plan_twin.largest_radius_px(store, reads, zero_dpt, at_dpt)
-    assert layers.max_radius_px == largest_px
+    blur_px = plan_twin.layer_blur_px(store, reads, zero_dpt, at_dpt).max(axis=1)
+    np.testing.assert_allclose(layers.layer_blur_px, blur_px, rtol=RTOL)
     assert reads.weights.sum() == pytest.approx(1.0, rel=RTOL)
     assert (reads.weights > 0.0).all()
 
@@ -161,7 +161,7 @@ def test_defocus_is_the_eyes(case, request):
 
 def test_kernels_equal_the_plain_statement(case):
     store, layers, image, used = case
-    kernels = frame_kernels.frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels.frame_kernels(store, layers, image, used)
     nodes, expected = plan_twin.frame_kernels(store, layers, image, used)
     recipes, plain = kernels.nodes.recipes, nodes.pop("recipes")
     words = slice(0, 2 * RECIPE_TAPS)
@@ -181,7 +181,7 @@ def test_kernels_equal_the_plain_statement(case):
 
 def test_tables_equal_the_plain_statement(case):
     store, layers, image, used = case
-    kernels = frame_kernels.frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels.frame_kernels(store, layers, image, used)
     levels = kernel_levels(kernels)
     sizes, starts, scale = plan_twin.kernel_levels(
         kernels.reach_px, kernels.spread_px, kernels.peak_ratio

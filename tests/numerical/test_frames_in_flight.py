@@ -7,7 +7,7 @@ import pytest
 
 from filter_service.constants import RGB
 from filter_service.gl.gpu import Gpu
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from filter_service.gl.gpu import Gpu
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view

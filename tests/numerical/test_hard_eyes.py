@@ -7,9 +7,10 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
+from filter_service.errors import GridTooLarge
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native.renderer import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -112,7 +113,9 @@ def test_blur_beyond_all_kernels_is_refused_in_words():
     )
     spec = GridSpec(telescope, settings)
     eye, _ = eye_for_spec(parse_profile(HARD["-20 dpt"]), spec)
-    with pytest.raises(ValueError, match=r"smaller pupil|fewer pixels|even mode"):
+    with pytest.raises(
+        (ValueError, GridTooLarge), match=r"smaller pupil|fewer pixels|even mode"
+    ):
         build_psf_store(eye, spec)
 
 

@@ -14,8 +14,8 @@ from estimator.profiles.parse import parse_profile
 from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
 from estimator.wavefront.chief_rays import chief_shift_mrad
 from filter_service.planning.field_directions import field_deg
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import NO_LATERAL_COLOR, eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.schematic_eyes import (

@@ -90,7 +90,7 @@ def test_a_frame_between_the_parts_of_another_changes_neither(lanes, eyes):
     between = []
 
     def come_between():
-        *_, taken = lanes.load_steps(other_store)
+        taken = lanes.load(other_store)
         seen = lanes.render(other_view, taken, **STATE)
         between.append((seen.color.tobytes(), "rests_ms" in seen.stage_times_ms))
 

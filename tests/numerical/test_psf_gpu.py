@@ -23,10 +23,10 @@ from filter_service.psfs import (
     gpu_build_records,
 )
 from filter_service.psfs.boxes import square_kernel
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.gpu_build import gpu_psf_batch
 from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.psf_engine import psf_engine
+from filter_service.psfs.store import build_psf_store
 from tests.grid_specs import grid_spec
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,

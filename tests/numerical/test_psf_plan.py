@@ -22,7 +22,7 @@ from filter_service.planning.nodes import (
 )
 from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
 from filter_service.planning.sampled_use import sample_use
-from filter_service.psfs.build_store import build_psf_store
+from filter_service.psfs.store import build_psf_store
 from tests.lens_truth import worn_eye
 from tests.numerical.plan_cases import (
     mean_db,

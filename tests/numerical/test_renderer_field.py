@@ -15,8 +15,8 @@ from filter_service.planning.field_directions import (
     pixel_from_mrad,
     unit_direction,
 )
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import image_error, mean_db

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimator.psf.compute import PsfTooLarge
+from filter_service.errors import GridTooLarge
 from filter_service.psfs.boxes import MAX_REACH_PX
 from filter_service.rendering import reference
 from tests.numerical.one_kernel import OneKernelBench, disc
@@ -75,7 +75,7 @@ def test_merged_squares_under_the_widest_kernel_lose_nothing(engine):
 
 
 def test_a_kernel_beyond_the_cap_is_refused_with_its_radius(engine):
-    with pytest.raises(PsfTooLarge, match="at most 255 px"):
+    with pytest.raises(GridTooLarge, match="at most 255 px"):
         Bench(
             engine,
             {"kind": "prescription", "sphere_dpt": -6.0},

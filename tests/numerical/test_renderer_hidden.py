@@ -8,6 +8,7 @@ import pytest
 from filter_service import constants
 from filter_service.errors import BadMessage
 from filter_service.rendering import reference
+from filter_service.rendering.frame import border_px_of
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
 from tests.numerical.made_fragments import made_fragments
@@ -148,7 +149,7 @@ def test_what_no_edge_uncovers_makes_no_fragments(bench, rng):
     wall = np.full((HEIGHT, WIDTH), True)
     view = layered(bench, wall, texture(rng, HEIGHT, WIDTH), np.ones(3))
     hidden = bench.render(view, **STATE, merge=False)
-    border_px = 8 * -(-(bench.layers(**STATE).max_radius_px + 2) // 8)
+    border_px = border_px_of(view, bench.layers(**STATE), bench.handle.image)
     seen_count = (WIDTH + 2 * border_px) * (HEIGHT + 2 * border_px)
     assert hidden.fragment_count == seen_count
     some = bench.render(disc_view(bench, rng), **STATE, merge=False)
@@ -171,7 +172,7 @@ def test_strips_change_nothing(gl_engine, rng, monkeypatch):
     bench = Bench(gl_engine, EMMETROPE, **SIZE, **PURE)
     view = disc_view(bench, rng)
     whole = bench.render(view, **STATE)
-    rows = 2 * 24 + 64  # halos, and tile rows between
+    rows = 2 * 16 + 48  # halos, and tile rows between
     monkeypatch.setattr(bench.gpu, "max_block_bytes", 2 * 16 * 152 * rows)
     room = np.empty_like(whole.color)
     cut = bench.render(view, **STATE, out=room)
@@ -230,7 +231,7 @@ def test_surfaces_never_merge_with_each_other(engine):
     red, blue = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     view = layered(bench, DISC, red, blue, near_dpt=1.2, far_dpt=0.2)
     result = bench.render(view)
-    border_px = 8 * -(-(bench.layers().max_radius_px + 2) // 8)
+    border_px = border_px_of(view, bench.layers(), bench.handle.image)
     made = made_fragments(bench, WIDTH + 2 * border_px, HEIGHT + 2 * border_px, 2)
     hidden = made.surface == 1
     assert (made.edge_px[hidden] > 1).any()

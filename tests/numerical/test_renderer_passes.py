@@ -91,7 +91,7 @@ def made_kernels(bench, view, **state):
     words = kernel_passes.words_per_cell(layers)
     used = read(bench, "USED", (image.count, words), np.uint32)
     used = used_pairs(used, frame_kernels.interval_count(layers))
-    return frame_kernels.frame_kernels(bench.store.tables, layers, image, used)
+    return frame_kernels.frame_kernels(bench.store, layers, image, used)
 
 
 @pytest.mark.parametrize("mode", ["on-axis", "dynamic"])

@@ -18,9 +18,8 @@ from estimator.wavefront.field_wavefronts import (
 )
 from estimator.wavefront.moved_plane import moved_polynomial
 from filter_service.camera import Camera
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.store import frame_layers
+from filter_service.psfs.store import build_psf_store, frame_layers
 from filter_service.rendering import reference
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.image_cells import image_cells
@@ -173,7 +172,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     used = np.zeros((1, interval_count(layers)), bool)
     used[0, k] = True
     image = image_cells(spec, store.plan)
-    kernels = frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels(store, layers, image, used)
     blended = reference.kernel_pairs(store, kernels)[0, 0, ..., 1]
     direct = wavefront_aberrations(
         estimated.surfaces(focus_dpt, pupil_diameter_mm=pupil_mm),

@@ -5,11 +5,14 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
-from filter_service.filtering.one_image import filter_one_image, image_spec
+from filter_service.planning.grid import GridSpec
 from filter_service.planning.plan import unchecked_plan
 from filter_service.planning.slopes import PupilStates
+from filter_service.psfs.store import build_psf_store
 from filter_service.psfs.wide_primaries import mean_batch, states_of_primaries
+from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
+from filter_service.settings import FilterSettings
 from tests.benchmarks.bench_displays import (
     HALF_WIDTH_MRAD,
     PITCH_MRAD,
@@ -33,22 +36,27 @@ def white_point(display, *, wide):
     half = side * PITCH_MRAD / 2e3
     depth_m = np.ones((side, side), np.float32)
     view = RgbdView(color, depth_m, (-half, half, half, -half), "radial")
-    spec = image_spec(
+    settings = FilterSettings(
+        eye_model="wavefront",
+        mode="on-axis",
+        display=display,
+        wide_primaries=wide,
+        pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+        focus_range_dpt=(1.0, 1.0),
+        object_range_dpt=(1.0, 1.0),
+    )
+    spec = GridSpec(view.camera, settings, kept_energy_ratio=0.998)
+    store = build_psf_store(parse_profile(PERFECT), spec)
+    assert store.computed_count == 3
+    renderer = NativeRenderer()
+    seen = renderer.render(
         view,
+        renderer.load(store),
         pupil_diameter_mm=PUPIL_MM,
         focus_dpt=1.0,
-        settings={
-            "eye_model": "wavefront",
-            "mode": "on-axis",
-            "display": display,
-            "wide_primaries": wide,
-        },
+        render_tolerance=0.0,
     )
-    found = filter_one_image(
-        view, parse_profile(PERFECT), spec, render_tolerance=0.0, engine="native"
-    )
-    assert found.plan.prediction.psf_count == 3
-    return np.moveaxis(found.rendered.color, 2, 0)
+    return np.moveaxis(seen.color, 2, 0)
 
 
 @pytest.mark.parametrize("name", list(measured_displays()))

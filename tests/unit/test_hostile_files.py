@@ -656,29 +656,34 @@ def test_an_eye_that_is_out_of_focus_as_none_is(mode):
     assert caught.value.field == "profile" and "1000 dpt" in caught.value.allowed
 
 
+def spread(low_dpt, high_dpt, needed):
+    """Nodes of one range."""
+    return _spread(np.array([low_dpt]), np.array([high_dpt]), needed[None])[0]
+
+
 def test_nodes_of_defocus_ascend_whatever_is_needed():
     flat = np.zeros(49)
-    np.testing.assert_array_equal(_spread(1.0, 2.0, flat), [1.0, 2.0])
+    np.testing.assert_array_equal(spread(1.0, 2.0, flat), [1.0, 2.0])
     steep = np.linspace(0.0, 1e9, 49)
     with pytest.raises(GridTooLarge) as caught:
-        _spread(1.0, 2.0, steep)
+        spread(1.0, 2.0, steep)
     assert caught.value.field == "settings.object_range_dpt"
     with pytest.raises(GridTooLarge):
-        _spread(1.0, 2.0, steep * np.nan)
-    close = _spread(5e21, 5e21 + 2e6, np.linspace(0.0, 3.0, 49))
+        spread(1.0, 2.0, steep * np.nan)
+    close = spread(5e21, 5e21 + 2e6, np.linspace(0.0, 3.0, 49))
     assert (np.diff(close) > 0.0).all()
 
 
 def test_what_a_computation_says_reaches_a_client_with_a_field(monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise ValueError("zero-size array to reduction operation minimum")
 
-    monkeypatch.setattr(from_profile, "plan_cache", fail)
+    monkeypatch.setattr(from_profile, "unchecked_plan", fail)
     job = BuildJob(
         parse_profile({"kind": "preset", "name": "myopia"}),
         FilterSettings(mode="on-axis", eye_model="wavefront"),
         Camera(64, 48, (-0.5, 0.5, 0.4, -0.4)),
     )
     with pytest.raises(BuildFailed) as caught:
-        list(from_profile.build(job, progress=lambda *_: None, cancelled=lambda: False))
+        from_profile.build(job, progress=lambda *_: None, cancelled=lambda: False)
     assert caught.value.field == "settings" and caught.value.allowed

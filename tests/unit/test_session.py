@@ -2,7 +2,6 @@
 
 import pytest
 
-from filter_service.building.jobs import LookAt
 from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, CreditExceeded, NoProfile
 from filter_service.filtering.accepted_profile import PreparedStore
@@ -19,28 +18,33 @@ class Store:
     """Stands for a loaded store."""
 
 
-LOOK_AT = LookAt(pupil_diameter_mm=4.0, focus_dpt=0.0)
-
-
 def make_stream(**changes):
     return StreamEyes(on_event=lambda event: None, **{"max_cameras": 2} | changes)
 
 
 def planned(stream, *cameras):
-    return stream.plan(cameras, LOOK_AT)
+    return stream.plan(cameras)
 
 
 def add(stream, profile_id, *cameras, settings=DEFAULTS):
     return stream.add_profile(None, settings, cameras, profile_id=profile_id)
 
 
+def load_one(stream):
+    """Load what the stream asks for next; return its eye and the prepared store."""
+    following = stream.next_build()
+    prepared = PreparedStore(following.camera, Store(), 0.0)
+    stream.put_in_place(following.eye, prepared)
+    return following.eye, prepared
+
+
 def build_all(stream):
-    """Build what the stream asks for; return the stores in order."""
+    """Make ready what the stream asks for; return the stores in order."""
     stores = []
-    while (following := stream.next_build()) is not None:
-        stores.append(Store())
-        prepared = PreparedStore(following.camera, stores[-1])
-        stream.put_in_place(following.eye, prepared)
+    while stream.next_build() is not None:
+        eye, prepared = load_one(stream)
+        stream.set_ready(eye, prepared)
+        stores.append(prepared.store)
     return stores
 
 
@@ -138,68 +142,54 @@ def test_the_end_frees_all_stores():
     assert stream.retired == stores
 
 
-def preview_of(stream):
-    """Put a preview of the next build in place; return its store."""
-    eye, camera = stream.next_build()[:2]
-    store = Store()
-    stream.put_in_place(eye, PreparedStore(camera, store, is_complete=False))
-    return store
-
-
-def test_a_preview_serves_until_the_whole_replaces_it_and_only_then_the_old_eye_goes():
+def test_the_old_eye_serves_until_a_first_frame_through_the_new_one_is_prepared():
     stream = make_stream()
-    add(stream, 1, SMALL)
+    old = add(stream, 1, SMALL)
     (old_store,) = build_all(stream)
     new = add(stream, 2)
-    preview = preview_of(stream)
+    eye, prepared = load_one(stream)
+    assert eye is new and stream.next_build() is None
+    assert stream.warming() == (new, prepared)
+    assert stream.unfinished_eye() is new
     plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores, plan.is_complete) == (new, (preview,), False)
-    assert stream.next_build()[:2] == (new, SMALL), "the whole is still to be built"
-    assert stream.retired == []
-    (whole,) = build_all(stream)
-    assert stream.retired == [preview]
+    assert (plan.eye, plan.stores) == (old, (old_store,))
+    stream.set_ready(new, prepared)
+    assert stream.warming() is None and stream.unfinished_eye() is None
     plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores, plan.is_complete) == (new, (whole,), True)
-    assert stream.retired == [preview, old_store]
+    assert (plan.eye, plan.stores) == (new, (prepared.store,))
+    assert stream.retired == [old_store]
+    assert stream.serving() is prepared
 
 
-def test_a_profile_that_fails_after_its_preview_gives_way_to_the_old_one():
+def test_without_an_old_eye_frames_go_through_the_one_that_is_being_prepared():
+    stream = make_stream()
+    add(stream, 1, SMALL)
+    assert planned(stream, SMALL) is None
+    _, prepared = load_one(stream)
+    assert planned(stream, SMALL).stores == (prepared.store,)
+    assert stream.serving() is None
+
+
+def test_an_eye_that_fails_while_it_is_prepared_gives_way_to_the_old_one():
+    stream = make_stream()
+    old = add(stream, 1, SMALL)
+    build_all(stream)
+    new = add(stream, 2)
+    _, prepared = load_one(stream)
+    stream.fail_build(new, SMALL, BuildFailed("no"))
+    assert planned(stream, SMALL).eye is old
+    assert stream.retired == [prepared.store]
+
+
+def test_a_newer_profile_replaces_an_eye_that_is_being_prepared():
     stream = make_stream()
     old = add(stream, 1, SMALL)
     build_all(stream)
     add(stream, 2)
-    preview = preview_of(stream)
-    assert planned(stream, SMALL).stores == (preview,)
-    stream.fail_build(*stream.next_build()[:2], BuildFailed("no"))
-    assert planned(stream, SMALL).eye is old
-    assert stream.retired == [preview]
-
-
-def test_a_preview_without_an_old_eye_stays_when_the_whole_fails():
-    stream = make_stream()
-    add(stream, 1, SMALL)
-    preview = preview_of(stream)
-    stream.fail_build(*stream.next_build()[:2], BuildFailed("no"))
-    assert planned(stream, SMALL).stores == (preview,)
-    assert stream.next_build() is None
-    assert stream.unfinished_eye() is None
-
-
-def test_a_newer_profile_finds_the_preview_in_use_and_no_ending_said():
-    stream = make_stream()
-    add(stream, 1, SMALL)
-    build_all(stream)
-    second = add(stream, 2)
-    preview = preview_of(stream)
-    planned(stream, SMALL)
-    assert stream.unfinished_eye() is second
+    _, prepared = load_one(stream)
     third = add(stream, 3)
-    plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores) == (second, (preview,))
-    assert stream.eyes == [third, second]
-    build_all(stream)
-    assert planned(stream, SMALL).eye is third
-    assert stream.unfinished_eye() is None
+    assert stream.eyes == [third, old]
+    assert stream.retired == [prepared.store]
 
 
 def test_the_second_view_of_a_pair_needs_its_own_store_over_the_field_only():
@@ -214,11 +204,3 @@ def test_the_second_view_of_a_pair_needs_its_own_store_over_the_field_only():
         assert eye.wanted == cameras
         build_all(stream)
         assert planned(stream, left, right) is not None
-
-
-def test_what_the_last_frame_looked_at_is_remembered():
-    stream = make_stream()
-    add(stream, 1, SMALL)
-    assert stream.look_at is None
-    planned(stream, SMALL)
-    assert stream.look_at == LookAt(4.0, 0.0)

@@ -18,9 +18,10 @@ from estimator.profiles.parse import parse_profile
 from filter_service.__main__ import app
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
+from filter_service.planning.plan import plan_cache
 from filter_service.psfs import store_cache, store_codec, store_file
-from filter_service.psfs.build_store import build_psf_store
 from filter_service.psfs.kept_eyes import erase_eyes, kept_eyes
+from filter_service.psfs.store import PsfStore
 from filter_service.psfs.store_cache import StoreCache, Stored, eye_name, store_key
 from tests.grid_specs import grid_spec
 
@@ -59,7 +60,7 @@ def is_same(first, second):
 @pytest.fixture(scope="module")
 def stored():
     eye = MeasuredWavefront.from_profile(PROFILE)
-    return Stored(build_psf_store(eye, SPEC), ("a note",))
+    return Stored(PsfStore(eye, SPEC, plan_cache(eye, SPEC)).parts, ("a note",))
 
 
 @pytest.fixture
@@ -76,11 +77,11 @@ def path(cache, stored):
 def test_a_store_comes_back_whole_and_its_eye_answers_the_same(cache, stored, path):
     again = cache.load(key_of(1), go_on=nothing)
     assert is_same(again, stored)
-    assert again.store.spec == stored.store.spec
+    assert again.parts["spec"] == stored.parts["spec"]
     assert again.notes == ("a note",)
     state = {"pupil_diameter_mm": 4.0, "accommodation_dpt": 0.0, "wavelength_nm": 550.0}
-    assert again.store.eye.total_defocus_dpt(**state) == pytest.approx(
-        stored.store.eye.total_defocus_dpt(**state), abs=0
+    assert again.parts["eye"].total_defocus_dpt(**state) == pytest.approx(
+        stored.parts["eye"].total_defocus_dpt(**state), abs=0
     )
     assert cache.load(key_of(2), go_on=nothing) is None
 
@@ -183,8 +184,9 @@ def test_a_full_folder_loses_what_was_used_longest_ago(tmp_path, stored):
     cache.save(key_of(3), stored)
     there = {p.stem for p in cache._folder.iterdir()}
     assert there == {key_of(0), key_of(2), key_of(3)}
-    StoreCache(str(tmp_path / "none"), max_mb=1e-6).save(key_of(0), stored)
-    assert not (tmp_path / "none").exists()
+    small = StoreCache(str(tmp_path / "small"), max_mb=1e-6)
+    small.save(key_of(0), stored)
+    assert list((tmp_path / "small").iterdir()) == []
 
 
 def test_without_a_folder_nothing_is_kept(stored, tmp_path, monkeypatch):
@@ -298,9 +300,9 @@ def test_the_code_version_follows_every_file(tmp_path, monkeypatch):
 
 
 def test_what_is_no_data_is_not_stored(cache, stored, caplog):
-    strange = Stored(replace(stored.store, methods={"by": print}), ())
+    strange = Stored(stored.parts | {"by": print}, ())
     cache.save(key_of(1), strange)
-    assert "methods" in caplog.text
+    assert "parts.by" in caplog.text
     assert not cache._path(key_of(1)).exists()
     assert list(cache._folder.iterdir()) == []
 

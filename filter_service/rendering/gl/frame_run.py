@@ -5,7 +5,7 @@ Between the two the processor is free for another view.
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from math import ceil
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
-from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame import (
+    border_px_of,
+    extended,
+    fill_missing_depth,
+    reach_px_of,
+)
 from filter_service.rendering.frame_options import FrameOptions
 from filter_service.rendering.gl.expected_pairs import FrameState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
@@ -69,10 +74,12 @@ class FrameRun:
         pupil_diameter_mm: float,
         focus_dpt: float,
         fill_depth: bool,
+        until_s: float | None = None,
     ):
         self.timer = StageTimer(gpu)
         self._gpu, self._kept, self._options = gpu, kept, options
-        self._room = room
+        self._room, self._until_s = room, until_s
+        self._cell_px: int | None = None
         self._missing_count: int | None = None
         self.layers: FrameLayers = kept.states.layers(
             self.timer, kept.handle, pupil_diameter_mm, focus_dpt, options.tolerance
@@ -109,7 +116,7 @@ class FrameRun:
         try:
             begun.begin()
         except KernelsTooLarge:
-            self._kept.states.coarsen(plan.state.image)
+            self._cell_px = 2 * plan.state.image.cell_px
             return None
         return begun
 
@@ -119,7 +126,7 @@ class FrameRun:
             try:
                 return self._joined(begun.plan, [begun])
             except KernelsTooLarge:
-                self._kept.states.coarsen(begun.plan.state.image)
+                self._cell_px = 2 * begun.plan.state.image.cell_px
         return self._whole()
 
     def _whole(self) -> tuple[NDArray, Counts]:
@@ -130,14 +137,14 @@ class FrameRun:
             try:
                 return self._joined(plan, runs)
             except KernelsTooLarge:
-                self._kept.states.coarsen(plan.state.image)
+                self._cell_px = 2 * plan.state.image.cell_px
 
     def _plan(self) -> _Plan:
         kept, view = self._kept, self._view
-        image = kept.states.cells(self.timer, kept.handle, self._options.gaze_deg)
-        stretch_ratio = image.maps.largest_stretch_ratio
-        reach_px = ceil(stretch_ratio * self.layers.max_radius_px) + 2
-        border_px = border_px_of(view, reach_px)
+        image = kept.states.cells(
+            self.timer, kept.handle, self._options.gaze_deg, self._cell_px
+        )
+        border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = kept.states.corner_change_dpt(self.timer, self.layers, image)
@@ -146,7 +153,11 @@ class FrameRun:
             border_px,
             FrameState(self.layers, image, change_dpt),
             white_level(view.color),
-            cut_in_strips(whole, reach_px, self._gpu.max_block_bytes),
+            cut_in_strips(
+                whole,
+                partial(reach_px_of, view, self.layers, image),
+                self._gpu.max_block_bytes,
+            ),
         )
 
     def _joined(self, plan: _Plan, runs: "list[_StripRun]") -> tuple[NDArray, Counts]:
@@ -199,17 +210,20 @@ class FrameRun:
 
     def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
         """Return kernels for used pairs."""
-        handle = self._kept.handle
         return self._kept.kernels.kernels(
-            handle.store, handle.pages, self.layers, image, used, self.timer
+            self._kept.handle, self.layers, image, used, self.timer, self._fill
         )
 
     def expected(self, state: FrameState) -> KernelSet | None:
         """Return kernels that will serve, it seems."""
-        handle = self._kept.handle
         return self._kept.kernels.expected(
-            handle.store, handle.pages, state, self.timer
+            self._kept.handle, state, self.timer, self._fill
         )
+
+    def _fill(self, psfs: NDArray[np.int64]) -> None:
+        """Compute the PSFs that a frame lacks, as one of its stages."""
+        with self.timer.wall("psf_compute_ms"):
+            self._kept.handle.store.fill(psfs, until_s=self._until_s)
 
     def room_of(self, plan: _Plan) -> NDArray | None:
         """Return where a strip's picture goes at once, if it is the whole's."""

@@ -52,11 +52,6 @@ class KeptEyes:
             self._kept.remove(kept)
             self._let_go(kept)
 
-    def forget(self) -> None:
-        """Let go of all eyes."""
-        while self._kept:
-            self._let_go(self._kept.pop())
-
     def _let_go(self, kept: KeptEye) -> None:
         kept.kernels.forget()
         self._free.append(kept.kernels)

@@ -1,6 +1,7 @@
 """The passes that make a frame's kernels from the cache; kept between frames."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from filter_service.gl.passes import Atlas, BufferPart, Pages
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.frame_kernels import (
+    Fill,
     FrameKernels,
     frame_kernels,
     interval_count,
@@ -37,6 +39,16 @@ MAX_KERNEL_TEXELS = 24 * 2**20
 """Of a frame: 400 MB, 16 bytes each."""
 
 _WORD_BYTES = 4
+
+
+class Handle(Protocol):
+    """A loaded store."""
+
+    store: PsfStore
+    pages: Pages
+
+    def sync(self) -> None:
+        """Copy the kernels that were computed since the last time."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +106,14 @@ class KernelMaker:
         self._pairs.note(state, words)
 
     def expected(
-        self, store: PsfStore, pages: Pages, state: FrameState, timer: StageTimer
+        self, handle: Handle, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
         """Return kernels that will serve a frame, it seems: the last, or new ones.
 
         None where nothing is known, or where it pays to ask the GPU: a software
         renderer does not keep one waiting.
         """
-        kept = self.kept(pages, state.layers, state.image)
+        kept = self.kept(handle, state.layers, state.image)
         if kept is not None or self._gpu.is_software:
             return kept
         with timer.wall("psf_plan_ms"):
@@ -109,18 +121,18 @@ class KernelMaker:
         if used is None:
             return None
         try:
-            return self.kernels(store, pages, state.layers, state.image, used, timer)
+            return self.kernels(handle, state.layers, state.image, used, timer, fill)
         except KernelsTooLarge:
             return None  # those that are really used may fit
 
     def kept(
-        self, pages: Pages, layers: FrameLayers, image: ImageCells
+        self, handle: Handle, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
         """Return the last frame's kernels, if they were made for the same state.
 
         And are still there: another renderer of this context has memory of that name.
         """
-        key = (pages, layers, image)
+        key = (handle, layers, image)
         if not self._gpu.is_owner(self._memory, self):
             return None
         if self._made_for is None or any(
@@ -131,27 +143,30 @@ class KernelMaker:
 
     def kernels(
         self,
-        store: PsfStore,
-        pages: Pages,
+        handle: Handle,
         layers: FrameLayers,
         image: ImageCells,
         used: NDArray[np.bool_],
         timer: StageTimer,
+        fill: Fill,
     ) -> KernelSet:
         """Return kernels for all used (cell, interval) pairs (n_cells, n_intervals)."""
-        kept = self.kept(pages, layers, image)
+        kept = self.kept(handle, layers, image)
         if kept is not None and not kept.lacks(used):
             return kept
         self._made_for = None  # stays so if what follows fails
         with timer.wall("psf_plan_ms"):
             planned = None
             if kept is not None:  # the next frame may use those of the last
-                planned = _plan_if_they_fit(store, layers, image, used | kept.have)
-            plan = planned or _plan(store, layers, image, used)
+                planned = _plan_if_they_fit(
+                    handle.store, layers, image, used | kept.have, fill
+                )
+            plan = planned or _plan(handle.store, layers, image, used, fill)
+            handle.sync()
             tables = kernel_tables(plan.kernels, plan.levels, used.shape)
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(plan, tables, pages)
-        self._made_for = (pages, layers, image)
+            self._set = self._blend(plan, tables, handle.pages)
+        self._made_for = (handle, layers, image)
         return self._set
 
     def _blend(self, plan: "_Plan", tables: KernelTables, pages: Pages) -> KernelSet:
@@ -207,7 +222,11 @@ class _Plan:
 
 
 def _plan(
-    store: PsfStore, layers: FrameLayers, image: ImageCells, used: NDArray[np.bool_]
+    store: PsfStore,
+    layers: FrameLayers,
+    image: ImageCells,
+    used: NDArray[np.bool_],
+    fill: Fill,
 ) -> _Plan:
     """Plan kernels for pairs.
 
@@ -216,7 +235,7 @@ def _plan(
     KernelsTooLarge
         Larger cells would have fewer texels.
     """
-    kernels = frame_kernels(store.tables, layers, image, used)
+    kernels = frame_kernels(store, layers, image, used, fill=fill)
     levels = kernel_levels(kernels)
     check_texels(int(levels.sizes[:, 0].sum()), image, store.spec)
     if levels.texel_count > MAX_KERNEL_TEXELS and can_coarsen(image):

@@ -1,7 +1,6 @@
 """Filters views: checks, stores on the GPU, frames begun and finished."""
 
-from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -24,23 +23,58 @@ from filter_service.rendering.gl.kept_eyes import KeptEyes
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rgbd_view import RgbdView
 
-UPLOAD_LINES = 512
-"""Lines of the cache copied in one step: 4 MB, 1 to 3 ms on a software renderer."""
+FIRST_WORDS = 2**20
+"""Of a store's copy on the GPU: 2 MB; it grows by doubling."""
 
 
-@dataclass(frozen=True)
 class GlStore(FrameStore):
-    """A store whose kernels are on the GPU."""
+    """A store whose kernels are on the GPU, as far as `sync` has seen them.
 
-    gpu: Gpu
-    pages: Pages
-    is_released: bool = False
+    Attributes
+    ----------
+    pages : Pages
+        The kernels.
+    is_released : bool
+        Nothing is to be kept of it.
+    """
+
+    def __init__(self, gpu: Gpu, store: PsfStore) -> None:
+        super().__init__(store, image_cells(store.spec, store.plan))
+        self._gpu = gpu
+        self.pages: Pages | None = None
+        self.is_released = False
+        self._n_words = self._capacity = 0
+        self._generation = store.generation
+        with gpu.context:
+            self.sync()
+        _ = store.defocus  # made here and not by the first frame
+
+    def sync(self) -> None:
+        """Copy the kernels that were computed since the last time, in the context."""
+        words = self.store.kernels
+        if words.size > self._capacity or self.pages is None:
+            self._free()
+            self._capacity = max(2 * words.size, FIRST_WORDS)
+            self.pages = self._gpu.pages(self._capacity)
+            self._n_words = 0
+        if self._generation != self.store.generation:
+            self._generation, self._n_words = self.store.generation, 0
+        if self._n_words < words.size:
+            first = self._n_words // STORE_SIDE
+            lines = _lines(words, first, -(-words.size // STORE_SIDE))
+            self._gpu.write_pages(self.pages, first, lines)
+            self._n_words = words.size
 
     def release(self) -> None:
         """Free the GPU copy."""
-        object.__setattr__(self, "is_released", True)
-        with self.gpu.context:  # without one, the driver frees nothing
+        self.is_released = True
+        with self._gpu.context:  # without one, the driver frees nothing
+            self._free()
+
+    def _free(self) -> None:
+        if self.pages is not None:
             self.pages.release()
+        self.pages = None
 
 
 class FilterRenderer:
@@ -57,9 +91,8 @@ class FilterRenderer:
         return str(self._gpu.info["renderer"])
 
     def load(self, store: PsfStore) -> GlStore:
-        """Copy a store's kernels to the GPU at once."""
-        *_, loaded = self.load_steps(store)
-        return loaded
+        """Take a store, whose kernels may all be computed later."""
+        return GlStore(self._gpu, store)
 
     def trim(self) -> None:
         """Keep what is held: a GPU's buffers are bounded, and dear to make anew.
@@ -68,45 +101,9 @@ class FilterRenderer:
         """
         self._kept.drop_released()
 
-    def forget(self) -> None:
-        """Forget what frames left of their states; the buffers stay."""
-        self._kept.forget()
-
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Do without: no frame keeps a GPU for long."""
         return False
-
-    def load_steps(
-        self, store: PsfStore, *, lines_per_step: int = UPLOAD_LINES
-    ) -> Generator[GlStore | None]:
-        """Copy a store's kernels in steps of a few MB, so that frames go on between.
-
-        Yields
-        ------
-        GlStore or None
-            None after each step, and in the end the loaded store.  The copy is given up
-            when the generator is closed before.
-        """
-        n_lines = -(-store.kernels.size // STORE_SIDE)
-        with self._gpu.context:
-            pages = self._gpu.pages(store.kernels.size)
-        try:
-            for first in range(0, n_lines, lines_per_step):
-                lines = _lines(store.kernels, first, first + lines_per_step)
-                with self._gpu.context:
-                    self._gpu.write_pages(pages, first, lines)
-                yield None
-        except GeneratorExit:
-            with self._gpu.context:
-                pages.release()
-            raise
-        _ = store.defocus, store.tables  # made here and not by the first frame
-        yield GlStore(
-            store=store,
-            gpu=self._gpu,
-            pages=pages,
-            image=image_cells(store.spec, store.plan),
-        )
 
     def render(self, view: RgbdView, handle: GlStore, **options: Any) -> FilteredView:
         """Filter one view through the eye of a loaded store; options as of `begin`."""
@@ -125,6 +122,7 @@ class FilterRenderer:
         output: str = "linear",
         gaze_deg: tuple[float, float] | None = None,
         out: NDArray[Any] | None = None,
+        until_s: float | None = None,
     ) -> Callable[[], FilteredView]:
         """Have the GPU begin with a view; call what is returned for the answer.
 
@@ -139,6 +137,8 @@ class FilterRenderer:
             Errors of merging and layers against the usual; 0 is exact.
         out : array, optional
             Memory for the picture, of its shape and type.
+        until_s : float, optional
+            Time of `time.monotonic` after which no more PSFs are computed.
 
         Raises
         ------
@@ -146,6 +146,9 @@ class FilterRenderer:
             Arrays or options that cannot be used.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
+        NotPrepared
+            PSFs that the frame needs were not computed by ``until_s``; what is returned
+            raises it, too.
         OutOfGpuMemory, RenderFailed
         """
         options = frame_options(
@@ -168,6 +171,7 @@ class FilterRenderer:
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
                 fill_depth=self._lacks_depth,
+                until_s=until_s,
             )
         return partial(self._finish, run, options)
 

@@ -1,5 +1,6 @@
 """A frame cut into strips of rows whose buffers fit the GPU's storage blocks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,17 +27,25 @@ class Rows:
     kept: slice
 
 
-def cut_in_strips(view: RgbdView, reach_px: int, max_block_bytes: int) -> list[Rows]:
+def cut_in_strips(
+    view: RgbdView, reach_of: Callable[[], int], max_block_bytes: int
+) -> list[Rows]:
     """Cut a frame so that each strip's buffers fit a storage block.
 
     Strips start on rows of bins, so that lists and merged squares are the whole's.
+
+    Parameters
+    ----------
+    reach_of : callable
+        Tells how far light is spread, px, where the frame has to be cut.
     """
-    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
     rows = rows // BIN_SIZE_PX * BIN_SIZE_PX
     if rows >= view.height_px:
         return [Rows(view, 0, slice(None))]
+    reach_px = reach_of()
+    halo = -(-reach_px // BIN_SIZE_PX) * BIN_SIZE_PX
     step = rows - 2 * halo
     if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(

@@ -9,6 +9,7 @@ from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX
 from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.store import FrameLayers
 from filter_service.rendering.frame_kernels import (
+    Fill,
     FrameKernels,
     frame_kernels,
     pair_index,
@@ -58,15 +59,20 @@ def plan_kernels(
     layers: FrameLayers,
     image: ImageCells,
     used: NDArray[np.bool_],
+    fill: Fill,
 ) -> KernelPlan:
-    """Plan the kernels of used pairs.
+    """Plan the kernels of used pairs; compute the PSFs that lack.
 
     Raises
     ------
     KernelsTooLarge
         With larger cells there would be fewer.
+    NotPrepared
+        ``fill`` ran out of time.
     """
-    kernels = frame_kernels(handle.tables, layers, image, used)
+    kernels = frame_kernels(
+        handle.store, layers, image, used, tables=handle.tables, fill=fill
+    )
     widths, heights = box_sizes(kernels.reach_px)
     check_texels(int((widths * heights).sum()), image, handle.store.spec)
     nodes = kernels.nodes

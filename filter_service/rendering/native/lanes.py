@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 from filter_service.psfs.store import PsfStore
@@ -38,11 +38,6 @@ class NativeLanes:
         self._main.trim()
         self._other.trim()
 
-    def forget(self) -> None:
-        """Forget what frames left of their states."""
-        self._main.forget()
-        self._other.forget()
-
     def close(self) -> None:
         """End the threads; the engine is of no use after."""
         self._main.close()
@@ -54,12 +49,8 @@ class NativeLanes:
         return True
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Take a store at once."""
+        """Take a store, whose kernels may all be computed later."""
         return self._other.load(store)
-
-    def load_steps(self, store: PsfStore) -> Generator[NativeStore | None]:
-        """Take a store in steps of a few ms, which may come between, too."""
-        return self._other.load_steps(store)
 
     def render(
         self, view: RgbdView, handle: NativeStore, **options: Any

@@ -1,13 +1,11 @@
 """A PSF store as the native engine reads it: with coarse kernels beside it."""
 
-from collections.abc import Generator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.psfs.boxes import pack_reach
+from filter_service.psfs.boxes import box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
@@ -24,9 +22,6 @@ were 0.1 dB farther from the truth at 1280x720."""
 KEPT_SPREAD_RATIO = 0.25
 """Coarse forms are made of cached kernels with that part of the least spread: a kernel
 of the frame is blended from wider and narrower ones.  Narrower ones are one pixel."""
-
-KERNELS_PER_STEP = 4096
-"""Made coarse in one step of loading: a few milliseconds."""
 
 
 class StoredKernels(NamedTuple):
@@ -46,83 +41,107 @@ class StoredKernels(NamedTuple):
     reach: NDArray[np.uint32]
 
 
-@dataclass(frozen=True)
 class NativeStore(FrameStore):
     """A store in all resolutions.
 
     Attributes
     ----------
-    tables : StoreTables
-        The store's, with the number of each kernel in the place of its offset.
-    resolutions : tuple of StoredKernels
+    resolutions : list of StoredKernels
+        Of the kernels that `sync` has seen.
     is_released : bool
         Nothing is to be kept of it.
     """
 
-    tables: StoreTables
-    resolutions: tuple[StoredKernels, ...]
-    is_released: bool = False
+    def __init__(self, store: PsfStore) -> None:
+        super().__init__(store, image_cells(store.spec, store.plan))
+        self._numbers = np.arange(store.psf_count, dtype=np.uint32)
+        self.is_released = False
+        self._start_anew()
+        _ = store.defocus  # made here and not by the first frame
+
+    def _start_anew(self) -> None:
+        """Forget all kernels; whoever still reads those keeps their arrays."""
+        count = self.store.psf_count
+        self._generation, self._n_seen = self.store.generation, 0
+        self._n_texels = [0] * RESOLUTIONS
+        self.resolutions = [
+            StoredKernels(
+                np.empty(0, np.uint16),
+                np.zeros(count, np.uint64),
+                np.zeros(count, np.uint32),
+            )
+            for _ in range(RESOLUTIONS)
+        ]
+
+    @property
+    def tables(self) -> StoreTables:
+        """The store's, with the number of each kernel in the place of its offset."""
+        return self.store.tables._replace(offsets=self._numbers)
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory of kernels in all resolutions."""
+        return self.store.memory_mb + 2.0 * sum(self._n_texels[1:]) / 1e6
 
     def release(self) -> None:
         """Let renderers forget it; its memory goes with the last who has it."""
-        object.__setattr__(self, "is_released", True)
+        self.is_released = True
 
+    def sync(self, library: Library, threads: int) -> None:
+        """Take the kernels that were computed since the last time.
 
-def load_steps(
-    library: Library, threads: int, store: PsfStore
-) -> Generator[NativeStore | None]:
-    """Make the coarse forms in steps of a few milliseconds.
+        With the threads of the renderer at hand: the one that loaded it may be gone.
+        """
+        store = self.store
+        if store.generation != self._generation:
+            self._start_anew()
+        self._n_seen, added = store.added_since(self._n_seen)
+        psfs = np.ascontiguousarray(added, np.int64)
+        if not psfs.size:
+            return
+        fine = self.resolutions[0]
+        fine.first_texel[psfs] = store.tables.offsets[psfs]
+        fine.reach[psfs] = store.tables.reach_words[psfs]
+        self.resolutions[0] = fine._replace(words=store.words)
+        for resolution in range(1, RESOLUTIONS):
+            library.shrink(self._shrink_job(resolution, psfs, threads))
 
-    Yields
-    ------
-    NativeStore or None
-        None after each step, and in the end the store.
-    """
-    reach = pack_reach(store.reach_px)
-    first = np.array(store.offsets, np.uint64)
-    resolutions = [StoredKernels(store.kernels, first, reach)]
-    for resolution in range(1, RESOLUTIONS):
-        coarse = _empty_coarse(store, resolution)
-        resolutions.append(coarse)
-        for start in range(0, store.psf_count, KERNELS_PER_STEP):
-            end = min(start + KERNELS_PER_STEP, store.psf_count)
-            _shrink(library, threads, resolutions, resolution, start, end)
-            yield None
-    _ = store.defocus  # made here and not by the first frame
-    numbers = np.arange(store.psf_count, dtype=np.uint32)
-    yield NativeStore(
-        store=store,
-        image=image_cells(store.spec, store.plan),
-        tables=store.tables._replace(offsets=numbers),
-        resolutions=tuple(resolutions),
-    )
+    def _shrink_job(
+        self, resolution: int, psfs: NDArray[np.int64], threads: int
+    ) -> ShrinkJob:
+        """Make room for the coarse forms of kernels (n,); narrow ones have one texel.
 
-
-def _empty_coarse(store: PsfStore, resolution: int) -> StoredKernels:
-    """Room for the kernels that are wide enough, and their reaches in coarse pixels."""
-    size_px = 2**resolution
-    reach = (store.reach_px + size_px // 2) // size_px
-    kept = store.spread_px >= KEPT_SPREAD_RATIO * COARSE_SPREAD_PX[resolution]
-    reach = np.where(kept[:, None], reach, 0)
-    texels = (reach[:, 0] + reach[:, 1] + 1) * (reach[:, 2] + reach[:, 3] + 1)
-    first = (np.cumsum(texels) - texels).astype(np.uint64)
-    return StoredKernels(
-        np.empty(int(texels.sum()), np.uint16), first, pack_reach(reach)
-    )
-
-
-def _shrink(library, threads, resolutions, resolution, start, end) -> None:
-    fine, coarse = resolutions[0], resolutions[resolution]
-    job = ShrinkJob(
-        threads=threads,
-        from_words=fine.words.ctypes.data,
-        from_first=fine.first_texel.ctypes.data,
-        from_reach=fine.reach.ctypes.data,
-        to_words=coarse.words.ctypes.data,
-        to_first=coarse.first_texel.ctypes.data,
-        to_reach=coarse.reach.ctypes.data,
-        resolution=resolution,
-        first=start,
-        last=end,
-    )
-    library.shrink(job)
+        The arrays that the job points to are the store's, and ``psfs``.
+        """
+        store, coarse = self.store, self.resolutions[resolution]
+        size_px = 2**resolution
+        reach_px = unpack_reach(store.tables.reach_words[psfs]).astype(np.int64)
+        reach_px = (reach_px + size_px // 2) // size_px
+        is_kept = (
+            store.tables.spread_px[psfs]
+            >= KEPT_SPREAD_RATIO * COARSE_SPREAD_PX[resolution]
+        )
+        reach_px = np.where(is_kept[:, None], reach_px, 0)
+        widths, heights = box_sizes(reach_px)
+        ends = np.cumsum(widths * heights)
+        first, count = self._n_texels[resolution], int(ends[-1])
+        if first + count > coarse.words.size:
+            grown = np.empty(2 * (first + count), np.uint16)
+            grown[:first] = coarse.words[:first]
+            coarse = self.resolutions[resolution] = coarse._replace(words=grown)
+        coarse.first_texel[psfs] = (first + ends - widths * heights).astype(np.uint64)
+        coarse.reach[psfs] = pack_reach(reach_px)
+        self._n_texels[resolution] = first + count
+        fine = self.resolutions[0]
+        return ShrinkJob(
+            threads=threads,
+            from_words=fine.words.ctypes.data,
+            from_first=fine.first_texel.ctypes.data,
+            from_reach=fine.reach.ctypes.data,
+            to_words=coarse.words.ctypes.data,
+            to_first=coarse.first_texel.ctypes.data,
+            to_reach=coarse.reach.ctypes.data,
+            kernels=psfs.ctypes.data,
+            resolution=resolution,
+            count=psfs.size,
+        )

@@ -135,9 +135,9 @@ class ShrinkJob(c.Structure):
         ("to_words", POINTER),
         ("to_first", POINTER),
         ("to_reach", POINTER),
+        ("kernels", POINTER),
         ("resolution", c.c_int32),
-        ("first", c.c_int32),
-        ("last", c.c_int32),
+        ("count", c.c_int32),
     )
 
 

@@ -2,10 +2,10 @@
 
 import time
 import weakref
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
-from math import ceil
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,13 @@ from filter_service.errors import RenderFailed
 from filter_service.psfs.store import FrameLayers, PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame_kernels import Fill
 from filter_service.rendering.frame_options import (
     FrameOptions,
     frame_options,
     picture_room,
 )
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
-from filter_service.rendering.native import native_store
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kept_states import KeptState, KeptStates
@@ -57,6 +57,8 @@ class NativeRenderer:
         self._n_threads = self._loops.thread_count(self._threads)
         self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
         self._between: object = None
+        self._rest_between: Callable[[], None] | None = None
+        self._is_syncing = False
         self._rested_s = 0.0  # in all
         self._kept = KeptStates()
         self._arrays = Arrays()
@@ -79,10 +81,6 @@ class NativeRenderer:
         self._arrays = Arrays()
         self._kept = KeptStates()
 
-    def forget(self) -> None:
-        """Forget what frames left of their states; the memory stays."""
-        self._kept = KeptStates()
-
     def close(self) -> None:
         """End the threads; the renderer is of no use after."""
         self._end()
@@ -94,20 +92,18 @@ class NativeRenderer:
         """
 
         def rest() -> None:
+            if self._is_syncing:  # a frame between would find half of a store
+                return
             started_s = time.perf_counter()
             function()
             self._rested_s += time.perf_counter() - started_s
 
         self._between = self._loops.call_between(self._threads, rest, interval_s)
+        self._rest_between = rest
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Take a store at once."""
-        *_, loaded = self.load_steps(store)
-        return loaded
-
-    def load_steps(self, store: PsfStore) -> Generator[NativeStore | None]:
-        """Take a store in steps of a few ms; see `native_store.load_steps`."""
-        return native_store.load_steps(self._loops, self._threads, store)
+        """Take a store, whose kernels may all be computed later."""
+        return NativeStore(store)
 
     def render(
         self,
@@ -122,6 +118,7 @@ class NativeRenderer:
         output: str = "linear",
         gaze_deg: tuple[float, float] | None = None,
         out: NDArray[Any] | None = None,
+        until_s: float | None = None,
     ) -> FilteredView:
         """Filter one view through the eye of a loaded store.
 
@@ -134,6 +131,8 @@ class NativeRenderer:
             Errors of merging, coarse kernels and layers against the usual; 0 is exact.
         out : array, optional
             Memory for the picture, of its shape and type.
+        until_s : float, optional
+            Time of `time.monotonic` after which no more PSFs are computed.
 
         Raises
         ------
@@ -141,6 +140,8 @@ class NativeRenderer:
             Arrays or options that cannot be used.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
+        NotPrepared
+            PSFs that the frame needs were not computed by ``until_s``.
         RenderFailed
             Memory ran out.
         """
@@ -158,12 +159,16 @@ class NativeRenderer:
         layers = kept.states.layers(
             timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
         )
+        fill = partial(self._fill, timer, handle, until_s)
+        cell_px = None
         while True:
-            image = kept.states.cells(timer, handle, options.gaze_deg)
+            image = kept.states.cells(timer, handle, options.gaze_deg, cell_px)
             try:
-                return self._render(timer, view, kept, layers, image, options, out)
+                return self._render(
+                    timer, view, kept, layers, image, options, out, fill
+                )
             except KernelsTooLarge:
-                kept.states.coarsen(image)
+                cell_px = 2 * image.cell_px
 
     def _render(
         self,
@@ -174,13 +179,14 @@ class NativeRenderer:
         image,
         options: FrameOptions,
         out,
+        fill: Fill,
     ) -> FilteredView:
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, kept.arrays
         )
         missing_count, used = self._pixels(timer, frame, view, kept, layers, image)
         with timer.wall("psf_plan_ms"):
-            plan = self._planned(kept, layers, image, used)
+            plan = self._planned(kept, layers, image, used, fill)
             frame.set_kernels(plan)
             frame.set_store(kept.handle)
         with timer.wall("merge_ms"):
@@ -235,8 +241,7 @@ class NativeRenderer:
             whole = replace(view, depth_m=filled_m)
             if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
                 whole = replace(whole, hidden_color=None, hidden_depth_m=None)
-            reach = image.maps.largest_stretch_ratio * layers.max_radius_px
-            border_px = border_px_of(whole, ceil(reach) + 2)
+            border_px = border_px_of(whole, layers, image)
             whole = extended(whole, border_px)
         change_dpt = kept.states.corner_change_dpt(timer, layers, image)
         with timer.wall("fragments_ms"):
@@ -245,13 +250,29 @@ class NativeRenderer:
             self._loops.run("pixels", frame.c)
         return missing_count, used
 
-    def _planned(self, kept: KeptState, layers, image, used) -> KernelPlan:
+    def _planned(self, kept: KeptState, layers, image, used, fill: Fill) -> KernelPlan:
         """Plan kernels, or return the last frame's if they serve."""
         state = (kept.handle, layers, image)
         if kept.plan is None or not kept.plan.serves(state, used):
             kept.plan = None  # stays so if what follows fails
-            kept.plan = plan_kernels(kept.handle, layers, image, used)
+            kept.plan = plan_kernels(kept.handle, layers, image, used, fill)
+            self._is_syncing = True
+            try:
+                kept.handle.sync(self._loops, self._threads)
+            finally:
+                self._is_syncing = False
         return kept.plan
+
+    def _fill(
+        self,
+        timer: "StageTimes",
+        handle: NativeStore,
+        until_s: float | None,
+        psfs: NDArray[np.int64],
+    ) -> None:
+        """Compute the PSFs that a frame lacks, as one of its stages."""
+        with timer.inner("psf_compute_ms"):
+            handle.store.fill(psfs, until_s=until_s, between=self._rest_between)
 
     def _blend(
         self, timer, frame: FrameRecord, plan: KernelPlan, kept: KeptState
@@ -278,16 +299,26 @@ class StageTimes:
 
     def __init__(self, rested_s: Callable[[], float]) -> None:
         self._ms: dict[str, float] = {}
+        self._inner_ms = 0.0
         self._rested_s = rested_s
         self._before_s = rested_s()
 
     @contextmanager
     def wall(self, name: str):
         """Time a stage; entering a name twice adds up."""
-        started_s = time.perf_counter() - self._rested_s()
+        started_s, inner_ms = time.perf_counter() - self._rested_s(), self._inner_ms
         yield
         elapsed_ms = 1e3 * (time.perf_counter() - self._rested_s() - started_s)
+        elapsed_ms -= self._inner_ms - inner_ms
         self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
+
+    @contextmanager
+    def inner(self, name: str):
+        """Time a stage within another, whose time is then without it."""
+        before_ms = sum(self._ms.values())
+        with self.wall(name):
+            yield
+        self._inner_ms += sum(self._ms.values()) - before_ms
 
     def result_ms(self) -> dict[str, float]:
         """Return times by stage."""

@@ -87,8 +87,9 @@ typedef struct {
     uint16_t *to;
     const uint64_t *to_first;
     const uint32_t *to_reach;
+    const int64_t *kernels;   /* which, count of them */
     int32_t resolution;
-    int32_t first, last;      /* kernels */
+    int32_t count;
 } shrink_job;
 
 typedef struct {

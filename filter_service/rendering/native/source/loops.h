@@ -75,7 +75,7 @@ static void all_splats(frame *f) {
 }
 
 static void all_shrinks(shrink_job *job) {
-    int items = (job->last - job->first + SHRUNK_AN_ITEM - 1) / SHRUNK_AN_ITEM;
+    int items = (job->count + SHRUNK_AN_ITEM - 1) / SHRUNK_AN_ITEM;
     pool_run(job->threads, items, shrink_some, job);
 }
 

@@ -1,4 +1,4 @@
-/* Cached kernels in pixels of 2 and 4 px, made once when a store is loaded. */
+/* Cached kernels in pixels of 2 and 4 px, made once for each. */
 
 #include "frame.h"
 #include "vectors.h"
@@ -20,7 +20,7 @@ static float whole_light(const uint16_t *from, int count) {
 
 /* Means over coarse pixels, in steps of the same size.  The middle coarse pixel has its
  * middle where the kernel has it. */
-static void shrink_kernel(const shrink_job *job, int kernel) {
+static void shrink_kernel(const shrink_job *job, int64_t kernel) {
     int size = 1 << job->resolution;
     int half = size / 2;
     float per_light = 1.0f / (float)(size * size);
@@ -59,7 +59,7 @@ static void shrink_kernel(const shrink_job *job, int kernel) {
 static void shrink_some(void *argument, int item, int thread) {
     const shrink_job *job = argument;
     (void)thread;
-    int first = job->first + item * SHRUNK_AN_ITEM;
-    int last = smaller_int(first + SHRUNK_AN_ITEM, job->last);
-    for (int kernel = first; kernel < last; ++kernel) shrink_kernel(job, kernel);
+    int first = item * SHRUNK_AN_ITEM;
+    int last = smaller_int(first + SHRUNK_AN_ITEM, job->count);
+    for (int k = first; k < last; ++k) shrink_kernel(job, job->kernels[k]);
 }

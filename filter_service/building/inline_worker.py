@@ -1,0 +1,73 @@
+"""A worker without a process: estimates an eye when it is polled.
+
+For a program that has nothing else to do meanwhile: to start a process takes longer
+than most eyes do.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+
+from filter_service.building.jobs import BuildJob
+from filter_service.building.worker_handle import (
+    BuildDone,
+    BuildError,
+    BuildEvent,
+    BuildProgress,
+)
+from filter_service.errors import BuildFailed, FilterError
+
+log = logging.getLogger("ocufilter.worker")
+
+
+class InlineWorker:
+    """Does what a `WorkerHandle` has done, in the caller's thread."""
+
+    file_descriptor = None
+    is_busy = False
+    needs_attention_soon = False
+    n_restarts = 0
+
+    def __init__(self) -> None:
+        self._queue: deque[tuple[int, BuildJob]] = deque()
+        self._next_ticket = 1
+
+    def start(self) -> None:
+        """Do nothing: there is no process."""
+
+    def close(self) -> None:
+        """Forget what waits."""
+        self._queue.clear()
+
+    def submit(self, job: BuildJob) -> int:
+        """Put a job at the end of the queue; return its ticket."""
+        ticket = self._next_ticket
+        self._next_ticket += 1
+        self._queue.append((ticket, job))
+        return ticket
+
+    def cancel(self, ticket: int) -> None:
+        """Forget a job."""
+        self._queue = deque(item for item in self._queue if item[0] != ticket)
+
+    def poll(self) -> list[BuildEvent]:
+        """Estimate the eye that waits first; return what happened."""
+        from filter_service.building.from_profile import build
+
+        if not self._queue:
+            return []
+        ticket, job = self._queue.popleft()
+        events: list[BuildEvent] = []
+
+        def progress(fraction: float, stage: str) -> None:
+            events.append(BuildProgress(ticket, fraction, stage))
+
+        try:
+            built = build(job, progress=progress, cancelled=lambda: False)
+        except Exception as error:
+            if not isinstance(error, FilterError):
+                log.exception("an eye could not be estimated")
+                error = BuildFailed(f"{type(error).__name__}: {error}")
+            return [*events, BuildError(ticket, error)]
+        return [*events, BuildDone(ticket, built)]

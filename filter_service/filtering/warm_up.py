@@ -1,0 +1,60 @@
+"""The last frames of a stream, and the states that its next ones will have.
+
+Computing PSFs ahead, while nothing else is to be done, saves the next frame time and
+cannot change a picture: a frame computes whatever it lacks.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from filter_service.rendering.frame_use import FrameUse, SeenView
+from filter_service.rgbd_view import RgbdView
+
+SPEED_S = 0.25
+"""Time over which the speed of pupil and focus is taken."""
+
+LEAD_S = (0.1, 0.3)
+"""So far ahead the state is predicted: what comes next, and what comes after."""
+
+
+class StreamUse:
+    """The last frames of a stream."""
+
+    def __init__(self) -> None:
+        self._states: deque[tuple[float, float, float]] = deque()
+        self.last: FrameUse | None = None
+        self.warmed: FrameUse | None = None  # for which everything is computed ahead
+
+    def note(
+        self,
+        views: Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None,
+        at_s: float,
+    ) -> None:
+        """Take in a frame."""
+        seen = tuple(SeenView.of(view) for view in views)
+        self.last = FrameUse(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
+        self._states.append((at_s, pupil_diameter_mm, focus_dpt))
+        while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
+            self._states.popleft()
+
+    def states_ahead(self) -> list[tuple[float, float]]:
+        """Pupils and foci that the next frames will have at the speed of the last."""
+        if len(self._states) < 2:
+            return []
+        (first_s, *first), (last_s, *last) = self._states[0], self._states[-1]
+        if last_s - first_s < 1e-3:
+            return []
+        found = []
+        for lead_s in LEAD_S:
+            steps = lead_s / (last_s - first_s)
+            pupil_mm, focus_dpt = (
+                b + steps * (b - a) for a, b in zip(first, last, strict=True)
+            )
+            found.append((pupil_mm, focus_dpt))
+        return found

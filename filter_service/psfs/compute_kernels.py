@@ -1,0 +1,70 @@
+"""Computes the kernels of a store: from states of the eye to packed PSFs."""
+
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.eye_optics import EyeOptics
+from estimator.psf.compute import PsfBatch
+from estimator.threads import thread_count
+from filter_service.constants import RGB
+from filter_service.planning.cost import COMPUTED_BEYOND
+from filter_service.planning.grid import GridSpec
+from filter_service.planning.nodes import CachePlan
+from filter_service.planning.slopes import apodisation
+from filter_service.psfs.node_wavefronts import NodeWavefronts
+from filter_service.psfs.pack import PackedKernels, pack_kernels
+from filter_service.psfs.psf_engine import PsfEngine
+from filter_service.psfs.wide_primaries import mean_batch
+
+
+def computed_kernels(
+    eye: EyeOptics,
+    spec: GridSpec,
+    plan: CachePlan,
+    wavefronts: NodeWavefronts,
+    psfs: NDArray[np.int64],
+    engine: PsfEngine,
+) -> tuple[PackedKernels, Counter[str]]:
+    """Compute some PSFs (n,) of a plan; kernels, and how many by which method."""
+    groups, channels = plan.defocus.group_at(psfs // RGB), psfs % RGB
+    total_dpt = plan.defocus.values_dpt[psfs // RGB]
+    total_dpt = total_dpt + plan.channel_shift_dpt[groups, channels]
+    n_primaries = wavefronts.wavelength_nm.shape[1]
+    each = np.repeat(groups, n_primaries)
+    found = wavefronts.at(groups, channels, total_dpt)
+    zernike_um = found.zernike_um
+    if plan.shrink_ratio is not None:
+        zernike_um = zernike_um * plan.shrink_ratio[each, None]
+    rings = eye.rings
+    batch = engine.compute(
+        zernike_um,
+        pupil_diameter_mm=found.circle_diameter_mm,
+        pupil_ellipse=found.pupil_ellipse,
+        stiles_crawford=apodisation(eye, spec),
+        pupil_screen=rings
+        and rings.seen_from(wavefronts.h_deg[each], wavefronts.v_deg[each]),
+        wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),
+        pixel_from_mrad=wavefronts.pixel_from_mrad[each],
+        diffraction=spec.settings.diffraction,
+        max_radius_px=spec.max_blur_radius_px,
+        min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
+    )
+    batch = mean_batch(batch, n_primaries)
+    packed = pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=_pool())
+    return packed, _methods(batch)
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_count())
+
+
+def _methods(batch: PsfBatch) -> Counter[str]:
+    """PSFs by the method that has the larger share in them."""
+    by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
+    counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
+    return Counter({name: number for name, number in counts.items() if number})

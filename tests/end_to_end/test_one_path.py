@@ -1,0 +1,93 @@
+"""One image through the command, a batch, `EyeFilter` and the service: the same pixels.
+
+Each with its defaults; the widest ranges hold what the image asks for.
+"""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from clients.filter_client import FilterClient
+from clients.service_process import ServiceProcess
+from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
+from filter_service.__main__ import app
+from tests.batch_kills import start
+
+FOV_DEG = 50.0
+SEE = {"pupil_diameter_mm": 4.3, "focus_dpt": 0.7}
+WIDTH, HEIGHT = 160, 90
+CAMERA = Camera.from_fov(FOV_DEG, width_px=WIDTH, height_px=HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def image():
+    rng = np.random.default_rng(11)
+    color = rng.integers(0, 256, (HEIGHT // 3, WIDTH // 4, 3)).astype(np.uint8)
+    color = color.repeat(3, axis=0).repeat(4, axis=1)
+    depth_m = np.full((HEIGHT, WIDTH), 2.5, np.float32)
+    depth_m[20:60, 30:90] = 0.5
+    return color, depth_m
+
+
+@pytest.fixture(scope="module")
+def in_process(image):
+    with EyeFilter("keratoconus", CAMERA, engine="native") as eye_filter:
+        return eye_filter.filter(*image, **SEE, output="linear").color
+
+
+@pytest.fixture
+def files(image, tmp_path):
+    color, depth_m = tmp_path / "color.npy", tmp_path / "depth.npy"
+    for path, array in zip((color, depth_m), image, strict=True):
+        np.save(path, array)
+    return color, depth_m
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_command_gives_the_same(in_process, files, tmp_path):
+    color, depth = files
+    printed = run(
+        *("filter", "--color", color, "--depth", depth, "--fov-deg", FOV_DEG),
+        *("--profile", "keratoconus", "--pupil-mm", SEE["pupil_diameter_mm"]),
+        *("--focus-dpt", SEE["focus_dpt"], "--engine", "native"),
+        *("-o", tmp_path / "seen.npy", "--json"),
+    )
+    np.testing.assert_array_equal(np.load(tmp_path / "seen.npy"), in_process)
+    settings = json.loads(printed)["settings"]
+    assert FilterSettings(**settings) == FilterSettings()  # those that it went by
+
+
+def test_the_service_gives_the_same(in_process, image):
+    with (
+        ServiceProcess({"engine": "native"}, start_timeout_s=60.0) as service,
+        FilterClient(service.endpoint, timeout_s=60.0) as client,
+    ):
+        client.set_profile("keratoconus", views=[CAMERA])
+        view = RgbdView(*image, CAMERA.tangents)
+        seen = client.filter(view, **SEE, output="linear")
+    np.testing.assert_array_equal(seen.color, in_process)
+
+
+def test_a_batch_gives_the_same(in_process, files, tmp_path):
+    room = tmp_path / "room"
+    (room / "color").mkdir(parents=True)
+    (room / "depth").mkdir()
+    for path, name in zip(files, ("color", "depth"), strict=True):
+        path.rename(room / name / "0001.npy")
+    process = start(
+        *(room, "-p", "keratoconus", "--fov-deg", FOV_DEG),
+        *("--pupil-mm", SEE["pupil_diameter_mm"], "--focus-dpt", SEE["focus_dpt"]),
+        *("--engine", "native", "--format", "npy", "--workers", 1),
+        *("-o", tmp_path / "seen"),
+    )
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 0, error
+    (seen,) = (tmp_path / "seen").rglob("*.npy")
+    np.testing.assert_array_equal(np.load(seen), in_process)

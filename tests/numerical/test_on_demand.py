@@ -1,0 +1,302 @@
+"""PSFs that are computed when frames need them: a frame depends on its input alone."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filter_service.errors import NotPrepared, OutOfMemory
+from filter_service.planning.plan import unchecked_plan
+from filter_service.planning.slopes import PupilStates, state_survey
+from filter_service.psfs.store import PsfStore, build_psf_store, frame_layers
+from filter_service.rendering.frame_kernels import frame_kernels, interval_count
+from filter_service.rendering.frame_use import FrameUse, SeenView, first_frame
+from filter_service.rgbd_view import RgbdView
+from filter_service.settings import FilterSettings
+from tests.numerical.plan_cases import spec_for, traced_eye
+from tests.numerical.synthetic import depth_scene, psnr_db, tangents, texture
+
+WIDTH, HEIGHT, FOV_DEG = 150, 101, 50.0
+STATES = (
+    {"pupil_diameter_mm": 3.3, "focus_dpt": 0.2},
+    {"pupil_diameter_mm": 4.9, "focus_dpt": 1.7},
+    {"pupil_diameter_mm": 4.2, "focus_dpt": 0.9, "render_tolerance": 0.0},
+    {"pupil_diameter_mm": 6.1, "focus_dpt": 0.0},
+)
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Eye, spec and plan of a keratoconus whose pupil and focus may move."""
+    spec = spec_for(
+        WIDTH,
+        HEIGHT,
+        FOV_DEG,
+        mode="dynamic",
+        tolerance="loose",
+        pupil_range_mm=(3.0, 6.5),
+        focus_range_dpt=(0.0, 2.0),
+        object_range_dpt=(0.0, 3.0),
+    )
+    eye = traced_eye("keratoconus", spec)
+    return eye, spec, unchecked_plan(eye, spec, predict=False)
+
+
+@pytest.fixture(scope="module")
+def views():
+    rng = np.random.default_rng(3)
+    color = (255 * texture(rng, HEIGHT, WIDTH, cell_px=3)).astype(np.uint8)
+    plain_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    many_m = rng.uniform(0.35, 4.0, (HEIGHT, WIDTH)).astype(np.float32)
+    lines = tangents(WIDTH, HEIGHT, FOV_DEG)
+    return [RgbdView(color, m, lines) for m in (depth_scene(), plain_m, many_m)]
+
+
+def frames(views):
+    return [(view, state) for view in views for state in STATES]
+
+
+def pictures(renderer, store, asked):
+    handle = renderer.load(store)
+    return [
+        renderer.render(view, handle, **state, output="srgb8").color.tobytes()
+        for view, state in asked
+    ]
+
+
+@pytest.fixture(scope="module")
+def alone(known, views):
+    """Every frame as the first of an eye."""
+    from filter_service.rendering.native import NativeRenderer
+
+    asked = frames(views)
+    return [pictures(NativeRenderer(), PsfStore(*known), [one])[0] for one in asked]
+
+
+def test_a_frame_is_the_same_after_any_others(known, views, alone):
+    from filter_service.rendering.native import NativeRenderer
+
+    asked = frames(views)
+    store = PsfStore(*known)
+    assert pictures(NativeRenderer(), store, asked) == alone
+    assert pictures(NativeRenderer(), store, asked[::-1]) == alone[::-1]
+    backwards = pictures(NativeRenderer(), PsfStore(*known), asked[::-1])
+    assert backwards == alone[::-1]
+
+
+def test_a_frame_is_the_same_on_one_thread(known, views, alone, monkeypatch):
+    from filter_service.psfs import compute_kernels
+    from filter_service.rendering.native import NativeRenderer
+
+    monkeypatch.setenv("OCUFILTER_THREADS", "1")
+    compute_kernels._pool.cache_clear()
+    found = pictures(NativeRenderer(n_threads=1), PsfStore(*known), frames(views))
+    compute_kernels._pool.cache_clear()
+    assert found == alone
+
+
+def test_a_frame_is_the_same_with_every_psf_computed_before(known, views, alone):
+    from filter_service.rendering.native import NativeRenderer
+
+    eye, spec, plan = known
+    whole = build_psf_store(eye, spec, plan=plan)
+    assert whole.computed_count == whole.psf_count
+    assert pictures(NativeRenderer(), whole, frames(views)) == alone
+
+
+def test_a_frame_is_the_same_when_its_psfs_were_evicted(known, views, alone):
+    from filter_service.rendering.native import NativeRenderer
+
+    eye, spec, plan = known
+    store, renderer = PsfStore(eye, spec, plan), NativeRenderer()
+    handle = renderer.load(store)
+    for (view, state), expected in zip(frames(views), alone, strict=True):
+        store.evict(0)
+        seen = renderer.render(view, handle, **state, output="srgb8")
+        assert seen.color.tobytes() == expected
+    assert store.generation == len(alone)
+
+
+def test_the_gl_engine_shows_the_same_after_any_others(known, views, gpu):
+    from filter_service.rendering.gl import FilterRenderer
+
+    asked = [(view, STATES[k]) for view in views[:2] for k in (0, 2)]
+
+    def colors(order):
+        renderer = FilterRenderer(gpu)
+        handle = renderer.load(PsfStore(*known))
+        found = [renderer.render(v, handle, **s).color.copy() for v, s in order]
+        handle.release()
+        return found
+
+    forwards, backwards = colors(asked), colors(asked[::-1])[::-1]
+    for one, other in zip(forwards, backwards, strict=True):
+        assert psnr_db(one, other) >= 100.0
+
+
+def test_kernels_do_not_depend_on_what_is_computed_with_them(known):
+    eye, spec, plan = known
+    together, one_by_one = PsfStore(eye, spec, plan), PsfStore(eye, spec, plan)
+    rng = np.random.default_rng(5)
+    some = np.sort(rng.choice(together.psf_count, 60, replace=False))
+    together.fill(some)
+    for psf in rng.permutation(some):
+        one_by_one.fill(np.array([psf]))
+    for psf in some:
+        assert kernel_of(together, psf) == kernel_of(one_by_one, psf)
+    for name in ("spread_px", "peak_ratio", "radius_px"):
+        np.testing.assert_array_equal(
+            getattr(together, name), getattr(one_by_one, name), err_msg=name
+        )
+
+
+def kernel_of(store, psf):
+    width, height = store.box_sizes_of(np.array([psf]))
+    start = int(store.offsets[psf])
+    return store.kernels[start : start + int((width * height)[0])].tobytes()
+
+
+def test_only_what_a_frame_reads_is_computed(known, views):
+    from filter_service.rendering.native import NativeRenderer
+
+    store, renderer = PsfStore(*known), NativeRenderer()
+    handle = renderer.load(store)
+    renderer.render(views[1], handle, **STATES[0])
+    first = store.computed_count
+    assert 0 < first < 0.5 * store.psf_count
+    seen = renderer.render(views[1], handle, **STATES[0])
+    assert store.computed_count == first
+    assert "psf_compute_ms" not in seen.stage_times_ms
+
+
+def test_a_frame_without_time_says_so_and_the_next_goes_on(known, views, alone):
+    from filter_service.rendering.native import NativeRenderer
+
+    store, renderer = PsfStore(*known), NativeRenderer()
+    handle = renderer.load(store)
+    view, state = frames(views)[0]
+    counts = []
+    for _ in range(1000):
+        try:
+            seen = renderer.render(
+                view, handle, **state, output="srgb8", until_s=time.monotonic()
+            )
+        except NotPrepared:
+            counts.append(store.computed_count)
+        else:
+            break
+    assert seen.color.tobytes() == alone[0]
+    assert counts == sorted(set(counts))
+
+
+def test_memory_is_limited(known, views):
+    from filter_service.rendering.native import NativeRenderer
+
+    eye, spec, plan = known
+    renderer = NativeRenderer()
+    whole = PsfStore(eye, spec, plan)
+    pictures(renderer, whole, frames(views))
+    limit_mb = 0.8 * whole.memory_mb
+    small = PsfStore(eye, replace(spec, memory_budget_mb=limit_mb), plan)
+    handle = renderer.load(small)
+    for view, state in frames(views[:2]):
+        renderer.render(view, handle, **state)
+        assert small.memory_mb <= limit_mb
+    assert small.generation > 0
+    tiny = PsfStore(eye, replace(spec, memory_budget_mb=0.001), plan)
+    with pytest.raises(OutOfMemory, match="one frame take"):
+        renderer.render(views[0], renderer.load(tiny), **STATES[0])
+
+
+def test_layers_do_not_depend_on_computed_psfs(known):
+    eye, spec, plan = known
+    empty, whole = PsfStore(eye, spec, plan), build_psf_store(eye, spec, plan=plan)
+    for state in STATES:
+        state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
+        one, other = (frame_layers(store, **state) for store in (empty, whole))
+        np.testing.assert_array_equal(one.layer_dpt, other.layer_dpt)
+
+
+def test_the_blur_of_nodes_is_that_of_their_psfs(known):
+    """Against the survey of each wavefront: other rays, other wavelengths."""
+    eye, spec, plan = known
+    store = PsfStore(eye, spec, plan)
+    some = np.arange(0, store.psf_count, 37)
+    surveyed_px = state_survey(eye, spec, states_of(store, some)).blur_radius_px
+    found_px = store.blur_px[some]
+    assert np.all(np.abs(found_px - surveyed_px) <= 0.15 * surveyed_px + 0.5)
+
+
+def states_of(store, psfs):
+    """States of the eye whose PSFs these are."""
+    plan, spec = store.plan, store.spec
+    nodes, channels = psfs // 3, psfs % 3
+    groups = plan.defocus.group_of_node[nodes]
+    v, h, pupil, used = np.unravel_index(groups, plan.group_shape)
+    return PupilStates(
+        h_deg=plan.h_deg[h],
+        v_deg=plan.v_deg[v],
+        pupil_diameter_mm=plan.pupils_mm[pupil],
+        accommodation_dpt=plan.accommodations_dpt[used],
+        wavelength_nm=spec.channel_wavelengths_nm[channels],
+        total_defocus_dpt=plan.defocus.values_dpt[nodes]
+        + plan.channel_shift_dpt[groups, channels],
+    )
+
+
+def test_the_wavefronts_of_nodes_are_the_eyes(known):
+    store = PsfStore(*known)
+    some = np.arange(0, store.psf_count, 101)
+    states = states_of(store, some)
+    truth = store.eye.wavefronts(**vars(states))
+    groups = store.plan.defocus.group_at(some // 3)
+    found = store.wavefronts.at(groups, some % 3, states.total_defocus_dpt)
+    np.testing.assert_allclose(found.zernike_um, truth.zernike_um, atol=1e-12)
+    np.testing.assert_allclose(found.pupil_ellipse, truth.pupil_ellipse, atol=1e-12)
+
+
+def test_what_is_computed_ahead_is_what_the_frame_needs(known, views):
+    from filter_service.rendering.native import NativeRenderer
+
+    for view, state in frames(views[:2]):
+        state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
+        store, renderer = PsfStore(*known), NativeRenderer()
+        handle = renderer.load(store)
+        use = FrameUse(0.0, *state.values(), None, (SeenView.of(view),))
+        ahead = handle.missing_psfs(use)
+        handle.fill(ahead, until_s=time.monotonic() + 60.0, batch_count=512)
+        assert store.computed_count == ahead.size
+        renderer.render(view, handle, **state)
+        assert store.computed_count <= 1.15 * ahead.size
+
+
+def test_a_first_frame_is_guessed(known):
+    eye, spec, plan = known
+    from filter_service.rendering.native import NativeRenderer
+
+    handle = NativeRenderer().load(PsfStore(eye, spec, plan))
+    use = first_frame(spec.camera, FilterSettings(pupil_range_mm=(5.0, 6.0)))
+    assert use.pupil_diameter_mm == 5.0
+    assert 0 < handle.missing_psfs(use).size < handle.missing_psfs().size
+
+
+def test_a_plan_without_time_asks_for_what_it_lacks(known):
+    eye, spec, plan = known
+    store = PsfStore(eye, spec, plan)
+    layers = frame_layers(store, pupil_diameter_mm=4.0, focus_dpt=0.0)
+    from filter_service.rendering.image_cells import image_cells
+
+    image = image_cells(spec, plan)
+    used = np.zeros((image.count, interval_count(layers)), bool)
+    used[0, 0] = True
+    asked = []
+
+    def fill(psfs):
+        asked.append(psfs)
+        store.fill(psfs)
+
+    frame_kernels(store, layers, image, used, fill=fill)
+    assert len(asked) == 1 and asked[0].size == store.computed_count
+    frame_kernels(store, layers, image, used, fill=fill)
+    assert len(asked) == 1
