@@ -172,8 +172,8 @@ def test_strips_change_nothing(gl_engine, rng, monkeypatch):
     bench = Bench(gl_engine, EMMETROPE, **SIZE, **PURE)
     view = disc_view(bench, rng)
     whole = bench.render(view, **STATE)
-    rows = 2 * 16 + 48  # halos, and tile rows between
-    monkeypatch.setattr(bench.gpu, "max_block_bytes", 2 * 16 * 152 * rows)
+    rows = 2 * 16 + 32  # halos, and tile rows between
+    monkeypatch.setattr(bench.gpu, "max_block_bytes", 2 * 16 * 120 * rows)
     room = np.empty_like(whole.color)
     cut = bench.render(view, **STATE, out=room)
     assert cut.color is room
