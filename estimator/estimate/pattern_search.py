@@ -1,6 +1,6 @@
 """Pattern search over the 45 parameters: the baseline of the earlier work.
 
-Generalised pattern search as published (prior_implementation.md 1.2): squared error
+Generalised pattern search as published (Csoba & Kunkli 2023): squared error
 with weights by radial order and a penalty on wrong signs, parameters scaled to their
 ranges, mesh factors 1/2 and 2.  It asks for no derivative and pays for that in time;
 `estimation.py` has the method to use.

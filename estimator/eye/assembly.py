@@ -35,7 +35,7 @@ def eye_surfaces(
     retina : RetinaShape, optional
         Instead of the sphere of radius eye length / 2.
     lens_rule : {"C", "compat"}
-        ``compat`` is the rule of the published data sets (optics.md 4, rule A).
+        ``compat`` is the rule of the published data sets (rule A of `lens_shape`).
 
     Raises
     ------

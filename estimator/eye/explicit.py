@@ -56,7 +56,7 @@ OFFSET_LIMIT_MM = 2.0
 
 
 def is_explicit_eye(data: object) -> bool:
-    """Tell an eye given by surfaces from the profiles of DESIGN 5."""
+    """Tell an eye given by surfaces from other kinds of profiles."""
     return isinstance(data, Mapping) and "surfaces" in data
 
 

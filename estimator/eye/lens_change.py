@@ -19,8 +19,8 @@ from estimator.eye.lens_shape import (
 from estimator.eye.parameters import EyeParameters, column
 
 SMALLEST_DIAMETER_RATIO = 0.84
-"""Smallest lens diameter over the relaxed one.  The earlier search stopped at 0.91, on
-which most of its targets then sat (optics.md 0, defect 4)."""
+"""Smallest lens diameter over the relaxed one.  The search of Csoba & Kunkli
+2023 stopped at 0.91, where most of its published targets lie."""
 
 SMALLEST_AQUEOUS_MM = 1.0
 """Depth of the anterior chamber below which the lens would press on the cornea."""

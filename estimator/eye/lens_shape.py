@@ -1,4 +1,4 @@
-"""Shape of the lens from its diameter and volume (optics.md 4).
+"""Shape of the lens from its diameter and volume.
 
 Two conic caps that meet at the equator cannot hold a real lens: it has a thick rounded
 rim.  Both rules give the caps a share of the volume and the rim a thickness.
@@ -78,7 +78,7 @@ def compat_lens_shape(
 ) -> LensShape:
     """Rule A, of the published data sets: for comparison with their tables only.
 
-    Its cap volume has a sign slip for hyperboloids, kept here on purpose (optics.md 4).
+    Its cap volume has a sign slip for hyperboloids, kept here on purpose.
 
     Raises
     ------

@@ -32,7 +32,7 @@ class Parameter(NamedTuple):
     allowed: tuple[float, float]
     """Range a profile may give and estimation stays in."""
     mean: float
-    """Of the population (prior_implementation.md 1.2, after the earlier work)."""
+    """Of the population, after Csoba & Kunkli 2023."""
     deviation: float
     """Standard deviation of the prior: the earlier work's dead zone, or the spread of
     eyes where that is wider; small for the corneal rotations, which the offsets can

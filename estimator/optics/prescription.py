@@ -38,7 +38,7 @@ def power_vector(
 ) -> tuple[float, float, float]:
     """M, J0 and J45 in dpt at the cornea, in the eye frame (x to the person's right).
 
-    The examiner sees the eye mirrored, so the axis A becomes 180 - A (DESIGN 3),
+    The examiner sees the eye mirrored, so the axis A becomes 180 - A,
     which changes the sign of J45 alone.  Thibos, Wheeler & Horner 1997.  With
     ``depth_mm`` they are those so far behind the cornea.
     """

@@ -8,7 +8,7 @@ MM_PER_M = 1000.0
 MRAD_PER_RAD = 1000.0
 
 REFERENCE_WAVELENGTH_NM = 555.0
-"""Wavelength at which accommodation and pupil sizes are defined (DESIGN 3, 4)."""
+"""Wavelength at which accommodation and pupil sizes are defined (CONVENTIONS.md)."""
 
 RGB_WAVELENGTHS_NM = (618.0, 536.0, 453.0)
 """The single wavelengths that stand best for the primaries of common displays, see

@@ -177,7 +177,7 @@ def flip_horizontal(zernike_um: ArrayLike) -> NDArray[np.float64]:
 
 
 def remove_central_tilt(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Set C(1,±1) so that the slope at the pupil centre is zero (DESIGN 4, tilt)."""
+    """Set C(1,±1) so that the slope at the pupil centre is zero."""
     zernike_um = np.array(zernike_um, dtype=np.float64)
     slope = zernike_gradient(0.0, 0.0)
     for row, j in ((0, index_from_nm(1, 1)), (1, index_from_nm(1, -1))):

@@ -1,7 +1,7 @@
 """A profile used as the measured wavefront: the light option, with no eye model.
 
-Pupil, object, focus and wavelength act on the measurement by closed formulas
-(DESIGN 4): coefficients rescale downwards, defocus shifts by vergence,
+Pupil, object, focus and wavelength act on the measurement by closed formulas:
+coefficients rescale downwards, defocus shifts by vergence,
 accommodation and chromatic difference.  It knows one field, and takes it for all.
 """
 

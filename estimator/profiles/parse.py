@@ -2,7 +2,7 @@
 
 A profile arrives as a JSON object (file or wire), an ``.abp`` file of the paper's
 framework, or a CSV of coefficients, and leaves as an `EyeProfile` in the eye frame
-(x to the person's right, y up).  DESIGN 5.
+(x to the person's right, y up).
 """
 
 import json

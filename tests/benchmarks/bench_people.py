@@ -310,7 +310,7 @@ def field_rows() -> Iterator[Row]:
 
 
 def print_table(rows: list[Row]) -> None:
-    """Print the table of `periphery.md`, a method a line."""
+    """Print errors over the retina, a method a line."""
     print(f"{'retina, deg':34s}" + "".join(f"{a:+7.0f}" for a in ANGLES_DEG))
     names = dict.fromkeys(row.error_name for row in rows if "retina" in row.setting)
     units = {"power_error_dpt": "dpt", "rms_um": "um"}

@@ -9,7 +9,7 @@ from estimator.optics.zernike import N_TERMS, nm_from_index
 from estimator.profiles.parse import EyeProfile, Measurement
 
 POPULATION_UM = {
-    # pupil, mm: {index: (mean, standard deviation)}, um (Thibos 2002; optics.md 3.4)
+    # pupil, mm: {index: (mean, standard deviation)}, um (Thibos 2002)
     4.5: {
         **{6: (-0.017, 0.059), 7: (-0.004, 0.075), 8: (0.0, 0.052), 9: (0.0, 0.044)},
         12: (0.030, 0.034),

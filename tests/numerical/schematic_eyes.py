@@ -171,7 +171,7 @@ def turned_zernike(zernike_um, angle_rad):
 
 
 def field_axes(h_deg, v_deg):
-    """ex, ey, u as DESIGN 3 has them, by cross products."""
+    """ex, ey, u of CONVENTIONS.md, by cross products."""
     h, v = math.radians(h_deg), math.radians(v_deg)
     u = np.array([math.sin(h) * math.cos(v), math.sin(v), -math.cos(h) * math.cos(v)])
     ex = np.cross(u, [0.0, 1.0, 0.0])

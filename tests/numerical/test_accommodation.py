@@ -132,7 +132,7 @@ def test_lens_shrinks_thickens_and_moves_its_pole_forward(myope):
     grown_mm = shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
     assert grown_mm > 0.0 > state.lens_diameter_change_mm
     assert state.aqueous_thickness_change_mm == pytest.approx(-grown_mm, abs=1e-12)
-    # optics.md 4: about -0.09 mm of diameter per dioptre of the lens, and the eye gets
+    # Expected: about -0.09 mm of diameter per dioptre of the lens, and the eye gets
     # some 0.8 of the lens's power
     slope_mm_dpt = state.lens_diameter_change_mm / state.accommodation_dpt
     assert -0.16 < slope_mm_dpt < -0.08
@@ -277,7 +277,7 @@ def test_spot_and_refraction_agree_where_aberrations_are_small():
 
 
 def test_a_far_sighted_eye_runs_into_the_bound_of_the_published_search():
-    # optics.md 0, defect 4: most published targets sit on 0.91 of the diameter
+    # Most published targets sit on 0.91 of the diameter
     relaxed = _far_sighted()
     found = focus_by_spot(relaxed, focus_dpt=6.0)
     ratio = found.lens_diameter_mm / relaxed.lens_diameter_mm

@@ -3,7 +3,7 @@
 Published, at 30 deg: myopes +0.80 dpt and emmetropes -0.41 dpt (Mutti et al. 2000, 822
 children, +-1.3 and +-0.8 dpt between eyes), so 1.2 dpt between the two.  Eyes with a
 homogeneous lens are more hyperopic there than measured ones, so the difference is what
-the model must show.  Retinas by refraction: Atchison 2006 (optics.md 1.4).
+the model must show.  Retinas by refraction: Atchison 2006.
 """
 
 import numpy as np

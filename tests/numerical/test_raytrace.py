@@ -165,7 +165,7 @@ def test_light_goes_back_the_way_it_came(rng):
 
 
 def _sag_mm(surface, x, y):
-    """The formula of DESIGN 6 and textbook Zernike terms, written out."""
+    """The formula of an aspheric surface and textbook Zernike terms, written out."""
     rx, ry = surface.radius_mm
     k1 = 1.0 + surface.conic_constant
     root = np.sqrt(1.0 - k1 * (x**2 / rx**2 + y**2 / ry**2))
