@@ -219,10 +219,7 @@ class Workshop:
                 loaded = self.engine.load(event.built.store)
                 loaded.set_psf_engine(self._limits.psf_engine)
             except Exception as error:
-                if not isinstance(error, FilterError):
-                    log.exception("an eye could not be loaded")
-                    error = RenderFailed(f"{type(error).__name__}: {error}")
-                self._fail(stream, wanted, error)
+                self._fail(stream, wanted, _as_filter_error(error))
                 return
             prepared = PreparedStore(
                 wanted.camera, loaded, wanted.eye.accepted_s, event.built.notes
@@ -273,14 +270,15 @@ class Workshop:
             fraction = EYE_SHARE + (1.0 - EYE_SHARE) * share
             stream.on_event(BuildingEye(eye, fraction, "psfs"))
             return False
-        except FilterError as error:
-            self._fail(stream, Wanted(eye, prepared.camera), error)
+        except Exception as error:  # other streams go on
+            wanted = Wanted(eye, prepared.camera)
+            self._fail(stream, wanted, _as_filter_error(error))
             return True
         self._set_ready(stream, eye, prepared)
         return True
 
     def note_served(self, stream: StreamEyes, plan: RenderPlan) -> None:
-        """Take note that a frame was rendered: what it went through is ready."""
+        """Mark the stores that a frame was rendered with as ready."""
         for prepared in list(plan.eye.stores):
             if not prepared.is_ready and prepared.store in plan.stores:
                 self._set_ready(stream, plan.eye, prepared)
@@ -315,8 +313,8 @@ class Workshop:
         except NotPrepared:
             self._is_warming = True
             return
-        except FilterError:
-            pass  # a frame that needs it says so
+        except Exception as error:  # other streams go on; a frame that needs it fails
+            log.info("PSFs ahead of frames: %s", _as_filter_error(error))
         stream.use.warmed = last
 
     def _limit_memory(self) -> None:
@@ -335,3 +333,11 @@ class Workshop:
         stream.fail_build(wanted.eye, wanted.camera, error)
         self.free_retired(stream)
         stream.on_event(EyeFailed(wanted.eye, error))
+
+
+def _as_filter_error(error: Exception) -> FilterError:
+    """Return an error as clients get it; one that is not foreseen is logged."""
+    if isinstance(error, FilterError):
+        return error
+    log.error("an eye could not be prepared", exc_info=error)
+    return RenderFailed(f"{type(error).__name__}: {error}")

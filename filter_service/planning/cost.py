@@ -62,7 +62,16 @@ def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
     channels = RGB if spec.settings.chromatic else 1
     count = channels * len(plan.defocus.values_dpt)
     psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
-    nodes, channel = psfs // channels, psfs % channels
+    return states_of(spec, plan, psfs // channels, psfs % channels)
+
+
+def states_of(
+    spec: GridSpec,
+    plan: CachePlan,
+    nodes: NDArray[np.int64],
+    channel: NDArray[np.int64],
+) -> PupilStates:
+    """States of the eye (n,) whose PSFs some nodes and channels of a plan have."""
     groups = plan.defocus.group_of_node[nodes]
     v, h, pupil, used = np.unravel_index(groups, plan.group_shape)
     return PupilStates(

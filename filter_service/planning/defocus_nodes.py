@@ -296,7 +296,7 @@ def _spread(
     lows: NDArray[np.float64], highs: NDArray[np.float64], needed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Nodes from end to end of ranges (n,), and how many each has."""
-    # Whoever only reads plans need not load numba.
+    # Imported here: reading a plan must not load numba.
     from filter_service.planning.spread_loops import spread_nodes
 
     is_range = highs - lows >= EXACT_DPT

@@ -14,7 +14,8 @@ gpu_build_passes     their passes
 gpu_build_records    their records
 boxes                what kernels are cut to
 pack                 kernels cut to boxes, in 16 bits
-store                the PSFs of an eye, and the layers of a frame
+store                the PSFs of an eye
+frame_layers         how a state reads them, and the layers of a frame
 field_defocus        change of defocus over the field
 read_kernels         which cached kernels a state reads, as plain arrays
 read_loops           the compiled loops that read them

@@ -1,5 +1,5 @@
 from .eye_for_spec import eye_for_spec as eye_for_spec
+from .frame_layers import frame_layers as frame_layers
 from .store import PsfStore as PsfStore
 from .store import build_psf_store as build_psf_store
-from .store import frame_layers as frame_layers
 from .store_cache import StoreCache as StoreCache

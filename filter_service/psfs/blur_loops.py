@@ -9,9 +9,7 @@ from filter_service.constants import RGB
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_blur_px(
-    zero_px, per_dpt, values_dpt, starts, shift_dpt, shrink_ratio, foci_dpt, blur_px
-):
+def fill_blur_px(zero_px, per_dpt, values_dpt, starts, shift_dpt, foci_dpt, blur_px):
     """Write the blur (n_nodes * 3,) of nodes in groups.
 
     Parameters
@@ -20,7 +18,6 @@ def fill_blur_px(
         Where rays land at 0 dpt, and how far they move by one.
     values_dpt, starts : see `RaggedNodes`
     shift_dpt : (n_groups, 3)
-    shrink_ratio : (n_groups,)
     foci_dpt : (3, n_foci)
         Where light is in focus; infinity for none.
     """
@@ -39,4 +36,4 @@ def fill_blur_px(
                         y = zero_px[group, ray, 1] + away_dpt * per_dpt[group, ray, 1]
                         largest = max(largest, x * x + y * y)
                     least = min(least, largest)
-                blur_px[RGB * node + channel] = shrink_ratio[group] * math.sqrt(least)
+                blur_px[RGB * node + channel] = math.sqrt(least)

@@ -1,4 +1,4 @@
-"""Computes the kernels of a store: from states of the eye to packed PSFs."""
+"""Computes the kernels of a store: from the wavefronts of nodes to packed PSFs."""
 
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -29,19 +29,36 @@ def computed_kernels(
     psfs: NDArray[np.int64],
     engine: PsfEngine,
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute some PSFs (n,) of a plan; kernels, and how many by which method."""
+    """Compute some PSFs of a plan.
+
+    Parameters
+    ----------
+    psfs : (n,)
+        Numbers: node n of the plan and channel c have PSF 3 n + c.
+
+    Returns
+    -------
+    kernels : PackedKernels
+        Of the n PSFs.
+    methods : Counter
+        PSFs by the method that computed the larger share of each.
+
+    Raises
+    ------
+    PsfTooLarge
+        A PSF blurs farther than ``spec.max_blur_radius_px``.
+    ValueError
+        No light arrives within a kernel.
+    """
     groups, channels = plan.defocus.group_at(psfs // RGB), psfs % RGB
     total_dpt = plan.defocus.values_dpt[psfs // RGB]
     total_dpt = total_dpt + plan.channel_shift_dpt[groups, channels]
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)
-    zernike_um = found.zernike_um
-    if plan.shrink_ratio is not None:
-        zernike_um = zernike_um * plan.shrink_ratio[each, None]
     rings = eye.rings
     batch = engine.compute(
-        zernike_um,
+        found.zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
         stiles_crawford=apodisation(eye, spec),

@@ -24,7 +24,7 @@ def node_blur_px(
 
     Rays are those of green light.  With several foci it is that of the nearest.
     """
-    # Whoever only reads plans need not load numba.
+    # Imported here: reading a plan must not load numba.
     from filter_service.psfs.blur_loops import fill_blur_px
 
     groups = np.arange(len(wavefronts.h_deg))
@@ -44,9 +44,6 @@ def node_blur_px(
             for dpt in (0.0, 1.0)
         )
     )
-    shrink_ratio = plan.shrink_ratio
-    if shrink_ratio is None:
-        shrink_ratio = np.ones(len(zero_px))
     foci_dpt = np.zeros((RGB, 1))
     if eye.rings is not None:
         own_dpt = [
@@ -62,7 +59,6 @@ def node_blur_px(
         np.array(plan.defocus.values_dpt, np.float64),
         np.array(plan.defocus.starts, np.int64),
         np.array(plan.channel_shift_dpt, np.float64, order="C"),
-        np.array(shrink_ratio, np.float64),
         foci_dpt,
         blur_px,
     )

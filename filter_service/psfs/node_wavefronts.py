@@ -27,7 +27,8 @@ class NodeWavefronts:
     Attributes
     ----------
     zernike_um : (n_groups, 3, n_primaries, 28)
-        At a total defocus of 0 dpt in the middle of the channel.
+        At a total defocus of 0 dpt in the middle of the channel, made flatter by the
+        plan's ``shrink_ratio``.
     per_dpt_um : (n_groups, 3, n_primaries, 28)
         What a dioptre adds.
     circle_diameter_mm : (n_groups, 3, n_primaries)
@@ -70,6 +71,10 @@ class NodeWavefronts:
             for added_dpt in (0.0, 1.0)
         )
         zernike_um = zero.zernike_um
+        per_dpt_um = one.zernike_um - zero.zernike_um
+        if plan.shrink_ratio is not None:
+            each = np.repeat(plan.shrink_ratio, RGB * n_primaries)[:, None]
+            zernike_um, per_dpt_um = each * zernike_um, each * per_dpt_um
         if spec.settings.lateral_color and spec.settings.chromatic:
             shift_mrad = lateral_shift_mrad(eye, spec, states)
             radius_mm = zero.circle_diameter_mm / 2.0
@@ -79,9 +84,7 @@ class NodeWavefronts:
         )
         return cls(
             zernike_um=zernike_um.reshape(*shape, zernike_um.shape[-1]),
-            per_dpt_um=(one.zernike_um - zero.zernike_um).reshape(
-                *shape, zernike_um.shape[-1]
-            ),
+            per_dpt_um=per_dpt_um.reshape(*shape, per_dpt_um.shape[-1]),
             circle_diameter_mm=zero.circle_diameter_mm.reshape(shape),
             pupil_ellipse=zero.pupil_ellipse.reshape(*shape, -1),
             wavelength_nm=spec.primary_wavelengths_nm.T.copy(),

@@ -6,27 +6,27 @@ Plain arrays without GL: engines copy what is new (`PsfStore.added_since`).
 from __future__ import annotations
 
 import time
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.field.eye_optics import EyeOptics
-from estimator.optics.vergence import ObjectVergence
 from filter_service.constants import RGB
-from filter_service.errors import GridTooLarge, NotPrepared, OutOfMemory
-from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
+from filter_service.errors import (
+    BuildFailed,
+    GridTooLarge,
+    NotPrepared,
+    OutOfMemory,
+)
+from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
-from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.boxes import pack_reach, unpack_reach
-from filter_service.psfs.field_defocus import EyeDefocus, FieldDefocus
-from filter_service.psfs.read_kernels import StateReads, StoreTables
+from filter_service.psfs.field_defocus import EyeDefocus
+from filter_service.psfs.read_kernels import StoreTables
 
 if TYPE_CHECKING:  # they load numba, and the service gets ready before
     from estimator.profiles.parse import EyeProfile
@@ -64,10 +64,7 @@ class PsfStore:
     Attributes
     ----------
     tables : StoreTables
-        Per PSF: where it lies, how large it is.  Zeros where it is not computed.
-    is_computed : (n_psfs,), bool
-    last_used : (n_psfs,), uint32
-        Number of the frame that read it last.
+        For each PSF: whether it is computed, where its kernel lies, how large it is.
     frame_number : int
         Of the frame that is being planned; whoever plans one increments it.
     generation : int
@@ -184,6 +181,8 @@ class PsfStore:
             Some are left at ``until_s``.
         GridTooLarge
             A kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
+        BuildFailed
+            No PSF can be computed for a state of this eye.
         OutOfMemory
             They exceed ``spec.memory_budget_mb`` together.
         """
@@ -213,6 +212,12 @@ class PsfStore:
                     str(error),
                     field="settings.pupil_range_mm",
                     allowed="a smaller pupil, other objects or fewer pixels per degree",
+                ) from error
+            except ValueError as error:
+                raise BuildFailed(
+                    f"no PSFs can be computed for this eye ({error})",
+                    field="settings",
+                    allowed="ranges, and a camera, that this eye can be seen through",
                 ) from error
             self.methods += methods
             if not self.spec.settings.chromatic:
@@ -264,7 +269,13 @@ class PsfStore:
         return int(self.spec.memory_budget_mb * 1e6 / BYTES_PER_TEXEL)
 
     def evict(self, max_words: int) -> None:
-        """Evict the kernels used longest ago; those of the current frame stay."""
+        """Evict the least recently used kernels; those of the current frame stay.
+
+        Parameters
+        ----------
+        max_words : int
+            Texels that may stay.
+        """
         tables = self.tables
         own = np.flatnonzero(tables.is_computed)
         if not self.spec.settings.chromatic:
@@ -274,6 +285,8 @@ class PsfStore:
         sizes = widths * heights
         is_kept = np.cumsum(sizes) <= max_words
         is_kept |= tables.last_used[by_use] >= self.frame_number
+        if is_kept.all():
+            return
         kept = np.sort(by_use[is_kept])
         widths, heights = self.box_sizes_of(kept)
         sizes = widths * heights
@@ -422,225 +435,3 @@ def build_psf_store(
     store = PsfStore(eye, spec, plan or plan_cache(eye, spec), engine=engine)
     store.fill(progress=None if progress is None else lambda f: progress(f, "psfs"))
     return store
-
-
-@dataclass(frozen=True)
-class FrameLayers:
-    """How an eye in one state reads its cache, and the layers that frames then have.
-
-    Attributes
-    ----------
-    layer_dpt : (n_layers,)
-        Ascending: an object's vergence plus the change of defocus over the field, so
-        that at one layer field nodes have the same defocus and are blended at equal
-        blur.
-    vergence : ObjectVergence
-        From distances of objects to vergences.
-    field : FieldDefocus
-        That change; none in the paper's grids, whose nodes are object distances.
-    vergence_range_dpt : (low, high)
-        Vergences that the layers are for.
-    layer_zero_dpt : (n_fields, 3)
-        Total defocus at layer 0 dpt, per field node and channel.
-    reads : StateReads
-        Cached neighbours of the state.
-    layer_blur_px : (n_layers,)
-        Largest geometric blur radius over field and channels.
-    edge_reach_px : float
-        How much farther than rays a kernel reaches: the diffraction at the pupil's edge
-        that ``spec.kept_energy_ratio`` keeps.
-    """
-
-    layer_dpt: NDArray[np.float64]
-    vergence: ObjectVergence
-    vergence_range_dpt: tuple[float, float]
-    field: FieldDefocus
-    layer_zero_dpt: NDArray[np.float64]
-    reads: StateReads
-    layer_blur_px: NDArray[np.float64]
-    edge_reach_px: float
-    pupil_diameter_mm: float
-    focus_dpt: float
-    blur_px_per_dpt: float
-    notes: tuple[str, ...]
-
-    def reach_px(self, low_dpt: float, high_dpt: float, *, max_px: int) -> int:
-        """Bound how far light of objects between two distances is spread, px."""
-        low, high = (float(self.vergence.vergence_dpt(d)) for d in (low_dpt, high_dpt))
-        change_low, change_high = self.field.range_dpt
-        first, last = np.searchsorted(
-            self.layer_dpt, [low + change_low, high + change_high]
-        )
-        within = slice(max(first - 1, 0), last + 1)
-        blur_px = float(self.layer_blur_px[within].max(initial=0.0))
-        return min(int(np.ceil(blur_px + self.edge_reach_px)), max_px)
-
-
-def frame_layers(
-    store: PsfStore,
-    *,
-    pupil_diameter_mm: float,
-    focus_dpt: float,
-    object_range_dpt: tuple[float, float] | None = None,
-    step_ratio: float = 1.0,
-) -> FrameLayers:
-    """Plan a frame's layers for a pupil and focus.
-
-    The pupil is clamped to the cache's range and to what was measured, with a note.
-
-    Parameters
-    ----------
-    object_range_dpt : (low, high), optional
-        Distances in the frame; default and limit is the cache's range.
-    step_ratio : float
-        Steps between layers against the usual.
-
-    References
-    ----------
-    Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
-    """
-    # Whoever holds a store need not load numba: the service gets ready before.
-    from filter_service.psfs.layer_loops import layer_distances_dpt
-    from filter_service.psfs.read_loops import layer_blur_px
-
-    plan, eye = store.plan, store.eye
-    pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
-    accommodation_dpt = eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
-    reached_dpt = eye.sharpest_dpt(accommodation_dpt, pupil_diameter_mm=pupil_mm)
-    is_met = abs(reached_dpt - focus_dpt) <= OUT_OF_REACH_DPT
-    if not is_met or pupil_mm != pupil_diameter_mm:
-        notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-    at_infinity_dpt, change = store.defocus.state(
-        pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
-    )
-    layer_zero_dpt = at_infinity_dpt - store.defocus.change_at_nodes_dpt(change)
-    corners = tuple(
-        (pupil, used, pupil_weight * used_weight)
-        for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
-        for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
-        if pupil_weight * used_weight > 0.0
-    )
-    notes += _limit_notes(store, corners)
-    reads = _state_reads(store, pupil_mm, corners)
-    far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
-    far_near_dpt = (
-        float(eye.vergence.vergence_dpt(far_dpt)),
-        float(eye.vergence.vergence_dpt(near_dpt)),
-    )
-    low_dpt, high_dpt = change.range_dpt
-    in_focus_dpt = _in_focus_dpt(store, layer_zero_dpt[plan.axis_node])
-    blur_px_per_dpt = store.spec.blur_px_per_dpt(pupil_mm)
-    layer_dpt = layer_distances_dpt(
-        *(store.tables, reads, layer_zero_dpt),
-        (far_near_dpt[0] + low_dpt, far_near_dpt[1] + high_dpt),
-        np.append(in_focus_dpt, _plane_ends_dpt(store, change)),
-        *(blur_px_per_dpt, LAYER_BLUR_RATIO[store.spec.settings.mode], step_ratio),
-    )
-    return FrameLayers(
-        layer_dpt=layer_dpt,
-        vergence=eye.vergence,
-        vergence_range_dpt=far_near_dpt,
-        field=change,
-        layer_zero_dpt=layer_zero_dpt,
-        reads=reads,
-        layer_blur_px=layer_blur_px(store.tables, reads, layer_zero_dpt, layer_dpt).max(
-            axis=1
-        ),
-        edge_reach_px=_edge_reach_px(store.spec, pupil_mm),
-        pupil_diameter_mm=pupil_mm,
-        focus_dpt=reached_dpt,
-        blur_px_per_dpt=blur_px_per_dpt,
-        notes=notes,
-    )
-
-
-def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
-    """Distance beyond the rays that holds all but the light that kernels may drop.
-
-    A circular pupil of diameter D sends 2 lambda / (pi² D r) of its light farther than
-    r from the spot's edge.
-    """
-    if not spec.settings.diffraction:
-        return 1.0  # a pixel that a ray lands in
-    wavelength_um = float(spec.channel_wavelengths_nm.max()) / 1e3
-    lost = max(1.0 - spec.kept_energy_ratio, 1e-6)
-    reach_mrad = 2.0 * wavelength_um / (np.pi**2 * pupil_mm * lost)
-    return reach_mrad / min(spec.pixel_pitch_mrad)
-
-
-def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64]:
-    """Return where layers of several planes end: in the gaps are no PSFs."""
-    ranges_dpt = store.spec.object_ranges_dpt
-    if len(ranges_dpt) == 1:
-        return np.zeros(0)
-    vergences_dpt = store.eye.vergence.vergence_dpt(np.array(ranges_dpt))
-    return (vergences_dpt + change.range_dpt).ravel()
-
-
-def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
-    if not store.plan.has_limits:
-        return ()
-    limited = store.plan.is_limited.reshape(store.plan.group_shape)
-    if not any(limited[:, :, pupil, used].any() for pupil, used, _ in corners):
-        return ()
-    return (
-        f"blur beyond {store.spec.max_blur_radius_px} px, in part of the field, is "
-        "drawn as that",
-    )
-
-
-def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
-    usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
-    low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
-    if low_mm == high_mm:  # one node for a range
-        low_mm, high_mm = usable_pupils_mm(store.eye, store.spec)
-    clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
-    if abs(clamped_mm - usable_mm) <= 1e-9:
-        return clamped_mm, ()
-    note = (
-        f"pupil {pupil_diameter_mm:g} mm is outside the prepared "
-        f"{low_mm:.3g} to {high_mm:.3g} mm: {clamped_mm:.3g} mm used"
-    )
-    return clamped_mm, (note,)
-
-
-def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
-    """Return the nodes on both sides of a value and their weights.
-
-    As `bracket_axis` has them, in plain numbers: that costs a tenth.
-    """
-    axis = nodes.tolist()
-    upper = min(bisect_left(axis, value), len(axis) - 1)
-    lower = max(upper - 1, 0)
-    upper = min(lower + 1, len(axis) - 1)
-    span = axis[upper] - axis[lower] or 1.0
-    share = min(max((value - axis[lower]) / span, 0.0), 1.0)
-    return [(lower, 1.0 - share), (upper, share)]
-
-
-def _in_focus_dpt(
-    store: PsfStore, at_infinity_dpt: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Vergences at which some channel is sharp; at several foci, where an eye has."""
-    if store.eye.rings is None:
-        return -at_infinity_dpt
-    channels_nm = store.spec.channel_wavelengths_nm.tolist()
-    return np.concatenate(
-        [
-            store.eye.rings.main_dpt(nm) - zero_dpt
-            for nm, zero_dpt in zip(channels_nm, at_infinity_dpt, strict=True)
-        ]
-    )
-
-
-def _state_reads(store: PsfStore, pupil_mm: float, corners: tuple) -> StateReads:
-    plan = store.plan
-    n_used = plan.accommodations_dpt.size
-    scales = np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners])
-    if store.eye.rings is not None:  # foci stay where they are in any pupil
-        scales = np.ones(len(corners))
-    return StateReads(
-        groups=np.array([pupil * n_used + used for pupil, used, _ in corners]),
-        scales=scales,
-        weights=np.array([weight for _, _, weight in corners]),
-    )

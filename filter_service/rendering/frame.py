@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.boxes import MAX_REACH_PX
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
 from filter_service.settings import MAX_VERGENCE_DPT

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from filter_service.constants import RECIPE_TAPS, RGB
 from filter_service.errors import NotPrepared
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.read_kernels import StoreTables
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.image_cells import ImageCells
 
 Fill = Callable[[NDArray[np.int64]], None]

@@ -9,8 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.errors import OutOfMemory
 from filter_service.psfs.field_defocus import FieldAxes
-from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.psfs.frame_layers import FrameLayers, frame_layers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_use import FrameUse, psfs_for
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 
@@ -73,8 +75,18 @@ class FrameStore:
             Of the frame; whatever any frame may need where it is None.
         state : (pupil_diameter_mm, focus_dpt), optional
             Another than the frame's.
+
+        Raises
+        ------
+        OutOfMemory
+            All are asked for, and some were evicted for want of memory.
         """
         if use is None:
+            if self.store.generation:
+                raise OutOfMemory(
+                    f"the PSFs of all ranges take more than {self.memory_mb:.0f} MB",
+                    allowed='narrower ranges, or "prepare": "stream"',
+                )
             return np.flatnonzero(~self.store.tables.is_computed)
         return psfs_for(self.store, use, self._cells_at, state=state)
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.camera import Camera
-from filter_service.psfs.store import FrameLayers, PsfStore, frame_layers
+from filter_service.psfs.frame_layers import FrameLayers, frame_layers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
 from filter_service.rendering.frame_kernels import interval_count, missing_psfs
 from filter_service.rendering.image_cells import ImageCells

@@ -11,7 +11,7 @@ from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
-from filter_service.psfs.store import frame_layers
+from filter_service.psfs.frame_layers import frame_layers
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
     frame_kernels,

@@ -20,7 +20,8 @@ from filter_service.constants import (
     PAPER_TIE_BREAK_M,
 )
 from filter_service.psfs.boxes import square_kernel
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import (
     border_px_of,
     extended,

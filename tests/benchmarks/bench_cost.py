@@ -27,7 +27,8 @@ from scipy.signal import fftconvolve
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from filter_service.constants import TILE_SIZE_PX
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering import reference
 from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView

@@ -14,7 +14,8 @@ import time
 import numpy as np
 
 from estimator.profiles.parse import parse_profile
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering import reference
 from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.frame_runs import timed_frames

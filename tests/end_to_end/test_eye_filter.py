@@ -27,9 +27,11 @@ from filter_service.errors import (
     BuildCancelled,
     BuildFailed,
     NoProfile,
+    RenderFailed,
     ServiceTimeout,
 )
 from filter_service.filtering.workshop import Workshop
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.native import NativeRenderer
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
 from tests.end_to_end.printed_script import printed_by
@@ -266,6 +268,32 @@ def test_psfs_of_the_eye_used_longest_ago_are_evicted(rng):
         second.advance()
         assert stored.generation == 1 and stored.memory_mb < 0.5 * own.stores_mb
         np.testing.assert_array_equal(first.filter(color, depth_m, **SEE).color, before)
+    own.close()
+
+
+def test_psfs_that_cannot_be_computed_fail_their_eye_alone(monkeypatch, rng):
+    """While they are computed ahead, too: the other streams of the process go on."""
+    camera = Camera.from_fov(50.0, width_px=64, height_px=36)
+    color = rng.integers(0, 256, (36, 64, 3)).astype(np.uint8)
+    depth_m = np.full((36, 64), 2.0, np.float32)
+    own, events = Workshop(InlineWorker(), NativeRenderer(), BuildLimits()), []
+    with EyeFilter(
+        "myopia", camera, workshop=own, on_event=events.append
+    ) as eye_filter:
+        before = eye_filter.filter(color, depth_m, **SEE).color
+
+        def fail(*_, **__):
+            raise FloatingPointError("not foreseen")
+
+        eye_filter.set_profile("keratoconus")
+        with monkeypatch.context() as broken:
+            broken.setattr(FrameStore, "fill", fail)
+            with pytest.raises(RenderFailed, match="FloatingPointError: not foreseen"):
+                eye_filter.wait(20.0)
+        assert isinstance(events[-1], EyeFailed)
+        after = eye_filter.filter(color, depth_m, **SEE)
+    assert after.generation == 1
+    np.testing.assert_array_equal(after.color, before)
     own.close()
 
 

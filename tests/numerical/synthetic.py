@@ -6,7 +6,8 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from estimator.profiles.parse import parse_profile
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_twin import layer_blur_px

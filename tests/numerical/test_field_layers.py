@@ -9,7 +9,8 @@ from filter_service.planning.plan import plan_cache
 from filter_service.planning.slopes import PupilStates, state_frames
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.field_defocus import EyeDefocus
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import spec_for, traced_eye

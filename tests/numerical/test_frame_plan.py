@@ -10,9 +10,10 @@ from estimator.profiles.parse import parse_profile
 from filter_service.constants import RECIPE_TAPS, RGB, THREADS
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.boxes import box_sizes
+from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.read_loops import layer_blur_px
-from filter_service.psfs.store import PsfStore, frame_layers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.cell_maps import CellMaps
 from filter_service.rendering.image_cells import image_cells

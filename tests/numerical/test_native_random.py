@@ -5,7 +5,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from filter_service.psfs.store import frame_layers
+from filter_service.psfs.frame_layers import frame_layers
 from filter_service.rendering import reference
 from filter_service.rendering.native import frame_record
 from filter_service.rendering.perfect_eye import PUPIL_MM

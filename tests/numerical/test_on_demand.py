@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filter_service.errors import NotPrepared, OutOfMemory
+from filter_service.errors import BuildFailed, NotPrepared, OutOfMemory
+from filter_service.planning.cost import states_of
 from filter_service.planning.plan import unchecked_plan
-from filter_service.planning.slopes import PupilStates, state_survey
-from filter_service.psfs.store import PsfStore, build_psf_store, frame_layers
+from filter_service.planning.slopes import state_survey
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.frame_use import FrameUse, SeenView, first_frame
 from filter_service.rgbd_view import RgbdView
@@ -112,10 +114,12 @@ def test_a_frame_is_the_same_when_its_psfs_were_evicted(known, views, alone):
     store, renderer = PsfStore(eye, spec, plan), NativeRenderer()
     handle = renderer.load(store)
     for (view, state), expected in zip(frames(views), alone, strict=True):
+        store.frame_number += 1  # so that nothing is of the current frame
         store.evict(0)
+        assert store.computed_count == 0
         seen = renderer.render(view, handle, **state, output="srgb8")
         assert seen.color.tobytes() == expected
-    assert store.generation == len(alone)
+    assert store.generation == len(alone) - 1  # the first time there was nothing
 
 
 def test_the_gl_engine_shows_the_same_after_any_others(known, views, gpu):
@@ -223,32 +227,16 @@ def test_the_blur_of_nodes_is_that_of_their_psfs(known):
     eye, spec, plan = known
     store = PsfStore(eye, spec, plan)
     some = np.arange(0, store.psf_count, 37)
-    surveyed_px = state_survey(eye, spec, states_of(store, some)).blur_radius_px
+    states = states_of(spec, plan, some // 3, some % 3)
+    surveyed_px = state_survey(eye, spec, states).blur_radius_px
     found_px = store.blur_px[some]
     assert np.all(np.abs(found_px - surveyed_px) <= 0.15 * surveyed_px + 0.5)
-
-
-def states_of(store, psfs):
-    """States of the eye whose PSFs these are."""
-    plan, spec = store.plan, store.spec
-    nodes, channels = psfs // 3, psfs % 3
-    groups = plan.defocus.group_of_node[nodes]
-    v, h, pupil, used = np.unravel_index(groups, plan.group_shape)
-    return PupilStates(
-        h_deg=plan.h_deg[h],
-        v_deg=plan.v_deg[v],
-        pupil_diameter_mm=plan.pupils_mm[pupil],
-        accommodation_dpt=plan.accommodations_dpt[used],
-        wavelength_nm=spec.channel_wavelengths_nm[channels],
-        total_defocus_dpt=plan.defocus.values_dpt[nodes]
-        + plan.channel_shift_dpt[groups, channels],
-    )
 
 
 def test_the_wavefronts_of_nodes_are_the_eyes(known):
     store = PsfStore(*known)
     some = np.arange(0, store.psf_count, 101)
-    states = states_of(store, some)
+    states = states_of(store.spec, store.plan, some // 3, some % 3)
     truth = store.eye.wavefronts(**vars(states))
     groups = store.plan.defocus.group_at(some // 3)
     found = store.wavefronts.at(groups, some % 3, states.total_defocus_dpt)
@@ -300,3 +288,37 @@ def test_a_plan_without_time_asks_for_what_it_lacks(known):
     assert len(asked) == 1 and asked[0].size == store.computed_count
     frame_kernels(store, layers, image, used, fill=fill)
     assert len(asked) == 1
+
+
+def test_what_a_computation_refuses_is_an_error_of_the_service(known, monkeypatch):
+    from filter_service.psfs import compute_kernels
+
+    def fail(*_):
+        raise ValueError("PSF 3 has no light within 7 px of the chief ray")
+
+    store = PsfStore(*known)
+    monkeypatch.setattr(compute_kernels, "computed_kernels", fail)
+    with pytest.raises(BuildFailed, match="no light within 7 px") as caught:
+        store.fill(np.arange(4))
+    assert caught.value.field == "settings" and caught.value.allowed
+    assert store.computed_count == 0
+
+
+def test_nothing_moves_where_there_is_nothing_to_evict(known):
+    store = PsfStore(*known)
+    store.fill(np.arange(0, 300, 7))
+    store.evict(store.kernels.size)
+    assert store.generation == 0
+
+
+def test_all_ranges_that_do_not_fit_are_refused(known):
+    from filter_service.rendering.native import NativeRenderer
+
+    store = PsfStore(*known)
+    handle = NativeRenderer().load(store)
+    assert handle.missing_psfs().size == store.psf_count
+    store.fill(np.arange(60))
+    store.frame_number += 1
+    store.evict(0)
+    with pytest.raises(OutOfMemory, match="all ranges"):
+        handle.missing_psfs()

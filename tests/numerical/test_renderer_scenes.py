@@ -5,7 +5,8 @@ from functools import cache
 import pytest
 
 from estimator.profiles.parse import parse_profile, preset_names
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering import reference
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view

@@ -19,7 +19,8 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 from filter_service.camera import Camera
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.store import build_psf_store, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import build_psf_store
 from filter_service.rendering import reference
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.image_cells import image_cells

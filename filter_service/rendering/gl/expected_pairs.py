@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import USED_PARTS
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 
 MARGIN_DPT = 1e-3

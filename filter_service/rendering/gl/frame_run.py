@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import (
     border_px_of,
     extended,

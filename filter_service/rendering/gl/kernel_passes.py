@@ -11,7 +11,8 @@ from filter_service.errors import GridTooLarge
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Atlas, BufferPart, Pages
 from filter_service.gl.stage_timer import StageTimer
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_kernels import (
     Fill,
     FrameKernels,

@@ -4,7 +4,7 @@ from filter_service.constants import BIN_TILES, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Buffer
 from filter_service.gl.stage_timer import StageTimer
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rgbd_view import RgbdView
 
 MAX_GROUPS = 65535

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LEVEL, MIN_BLUR_RANGE, TILE_SIZE_PX
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rendering.native.arrays import Arrays

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX
 from filter_service.psfs.boxes import box_sizes
-from filter_service.psfs.store import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.frame_kernels import (
     Fill,
     FrameKernels,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from estimator.threads import thread_count
 from filter_service.errors import RenderFailed
-from filter_service.psfs.store import FrameLayers, PsfStore
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
 from filter_service.rendering.frame_kernels import Fill
