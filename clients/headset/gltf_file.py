@@ -89,12 +89,12 @@ def read_parts(path: Path) -> Iterator[Part]:
     for name in required if isinstance(required, list) else [required]:
         if not isinstance(name, str) or not name.startswith(_KNOWN_EXTENSIONS):
             file.refuse(f"needs the extension {name!s:.60}, not known here")
-    placed = [
-        (matrix, primitive)
-        for matrix, mesh in placed_meshes(file)
-        if abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO
-        for primitive in _primitives(file, mesh)
-    ]
+    placed = []
+    for matrix, mesh in placed_meshes(file):
+        if abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO:
+            placed += [(matrix, primitive) for primitive in _primitives(file, mesh)]
+        if len(placed) > MAX_DRAWS:  # a million would take half a minute to count
+            file.refuse(f"more than {MAX_DRAWS:,} parts", f"at most {MAX_DRAWS:,}")
     _check_counts(file, [primitive for _, primitive in placed])
     textures = _Textures(file)
     materials = [_material(file, primitive) for _, primitive in placed]
@@ -134,8 +134,6 @@ def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
 
 def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
     """Refuse too many of anything; a primitive counts each time that it is placed."""
-    if len(primitives) > MAX_DRAWS:
-        file.refuse(f"{len(primitives):,} parts", f"at most {MAX_DRAWS:,}")
     counts = {id(p): _triangle_count(file, p) for p in primitives}
     n_triangles = sum(counts[id(p)] for p in primitives)
     if n_triangles > MAX_TRIANGLES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ MAX_NODE_DEPTH = 1000
 _SIZES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
-def placed_meshes(file: Container) -> list[tuple[Array, int]]:
-    """Return [(world_from_mesh (4, 4), number of the mesh), ...] of the file's scene.
+def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
+    """Yield (world_from_mesh (4, 4), number of the mesh) of the file's scene.
 
     Raises
     ------
@@ -24,12 +25,12 @@ def placed_meshes(file: Container) -> list[tuple[Array, int]]:
         Nodes that are no tree, too deep, or placed by what are not numbers.
     """
     if not file.list_of("scenes"):
-        return []
+        return
     scene = file.entry("scenes", file.header.get("scene", 0))
     nodes = file.list_of("nodes")
-    found: list[tuple[Array, int]] = []
     seen: set[int] = set()
-    waiting = [(k, np.eye(4), 1) for k in reversed(_numbers(file, scene, "nodes"))]
+    origin = np.eye(4)
+    waiting = [(k, origin, 1) for k in reversed(_numbers(file, scene, "nodes"))]
     while waiting:
         k, world_from_parent, depth = waiting.pop()
         if not 0 <= k < len(nodes):
@@ -47,10 +48,9 @@ def placed_meshes(file: Container) -> list[tuple[Array, int]]:
             file.refuse(f"damaged: node {k} is placed by {np.inf}", "finite numbers")
         if "mesh" in node:
             file.entry("meshes", node["mesh"])
-            found.append((world_from_node, node["mesh"]))
+            yield world_from_node, node["mesh"]
         children = _numbers(file, node, "children")
         waiting += [(c, world_from_node, depth + 1) for c in reversed(children)]
-    return found
 
 
 def _numbers(file: Container, entry: dict[str, Any], field: str) -> list[int]:
