@@ -38,6 +38,7 @@ class Bench(StrEnum):
     RENDER = "render"
     LIVE = "live"
     FOLLOW = "follow"
+    LEVELS = "levels"
     FIELD = "field"
     OCCLUSION = "occlusion"
     SEQUENCE = "sequence"
@@ -73,6 +74,7 @@ BENCH_MODULES = {
     Bench.RENDER: "tests.benchmarks.bench_render",
     Bench.LIVE: "tests.benchmarks.bench_live",
     Bench.FOLLOW: "tests.benchmarks.bench_follow",
+    Bench.LEVELS: "tests.benchmarks.bench_levels",
     Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SEQUENCE: "tests.benchmarks.bench_sequence",
