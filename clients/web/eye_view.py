@@ -20,7 +20,7 @@ from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, Rgb
 
 MS_PER_S = 1e3
 PSF_SLICE_S = 0.05
-"""Computing PSFs goes on for so long before newer entries are looked at."""
+"""Time limit for computing PSFs before the page checks for newer entries."""
 
 FULL = FilterSettings()
 QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")

@@ -1,7 +1,7 @@
 """A worker without a process: estimates an eye when it is polled.
 
-For a program that has nothing else to do meanwhile: to start a process takes longer
-than most eyes do.
+For programs with nothing else to do meanwhile: starting a process takes longer than
+estimating most eyes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ log = logging.getLogger("ocufilter.worker")
 
 
 class InlineWorker:
-    """Does what a `WorkerHandle` has done, in the caller's thread."""
+    """The interface of `WorkerHandle`, in the caller's thread."""
 
     file_descriptor = None
     is_busy = False
@@ -37,7 +37,7 @@ class InlineWorker:
         """Do nothing: there is no process."""
 
     def close(self) -> None:
-        """Forget what waits."""
+        """Discard queued jobs."""
         self._queue.clear()
 
     def submit(self, job: BuildJob) -> int:
@@ -48,11 +48,11 @@ class InlineWorker:
         return ticket
 
     def cancel(self, ticket: int) -> None:
-        """Forget a job."""
+        """Remove a queued job."""
         self._queue = deque(item for item in self._queue if item[0] != ticket)
 
     def poll(self) -> list[BuildEvent]:
-        """Estimate the eye that waits first; return what happened."""
+        """Run the first queued job; return its events."""
         from filter_service.building.from_profile import build
 
         if not self._queue:

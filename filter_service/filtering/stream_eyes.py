@@ -21,7 +21,7 @@ from filter_service.settings import FilterSettings
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """Through which eye a frame is seen, with one store for each view."""
+    """The eye that renders a frame, with one store for each view."""
 
     eye: AcceptedProfile
     stores: tuple[LoadedStore, ...]
@@ -99,7 +99,7 @@ class StreamEyes:
         return None
 
     def is_newest(self, plan: RenderPlan) -> bool:
-        """Return whether a frame is seen through the newest eye."""
+        """Return whether the newest eye renders a frame."""
         return plan.eye is self.eyes[0]
 
     def add_profile(

@@ -13,10 +13,10 @@ from filter_service.rendering.frame_use import FrameUse, SeenView
 from filter_service.rgbd_view import RgbdView
 
 SPEED_S = 0.25
-"""Time over which the speed of pupil and focus is taken."""
+"""Interval over which the speed of pupil and focus is measured."""
 
 LEAD_S = (0.1, 0.3)
-"""So far ahead the state is predicted: what comes next, and what comes after."""
+"""Prediction horizons: the next frame, and those after it."""
 
 
 class StreamUse:
@@ -36,7 +36,7 @@ class StreamUse:
         gaze_deg: tuple[float, float] | None,
         at_s: float,
     ) -> None:
-        """Take in a frame."""
+        """Record a frame."""
         seen = tuple(SeenView.of(view) for view in views)
         self.last = FrameUse(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
@@ -44,7 +44,7 @@ class StreamUse:
             self._states.popleft()
 
     def states_ahead(self) -> list[tuple[float, float]]:
-        """Pupils and foci that the next frames will have at the speed of the last."""
+        """Return predicted states (pupil_diameter_mm, focus_dpt), one a horizon."""
         if len(self._states) < 2:
             return []
         (first_s, *first), (last_s, *last) = self._states[0], self._states[-1]

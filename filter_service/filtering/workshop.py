@@ -51,13 +51,13 @@ WARM_SHARE = 0.5
 range, so that a stream is never late by a whole frame."""
 
 WARM_BATCH = 64
-"""PSFs computed between two looks at the time."""
+"""PSFs per batch; the deadline is checked after each."""
 
 log = logging.getLogger("ocufilter")
 
 
 class Workshop:
-    """Has the eyes of profiles estimated, and computes PSFs ahead of frames.
+    """Estimates eyes in the worker, and computes PSFs before frames need them.
 
     Parameters
     ----------
@@ -172,16 +172,16 @@ class Workshop:
             threading.Thread(target=dropped.clear, daemon=True).start()
 
     def advance(self, *, ahead: bool = True) -> None:
-        """Take in what the worker has to say, and compute PSFs ahead for a while.
+        """Process the worker's events, then compute PSFs ahead for a limited time.
 
-        That takes half of a frame's time at most, within `WARM_RANGE_S`, so that no
-        frame is late by more.
+        The limit is half of a frame's time, within `WARM_RANGE_S`, so that no frame is
+        late by more.
 
         Parameters
         ----------
         ahead : bool
-            For eyes in use, too, what their next frames will need; else only for new
-            eyes.
+            Predict what the next frames of eyes in use need, too; otherwise compute
+            PSFs for new eyes alone.
         """
         self._drop_released()
         for event in self.worker.poll():
@@ -300,7 +300,7 @@ class Workshop:
         )
 
     def _warm_ahead(self, stream: StreamEyes, until_s: float) -> None:
-        """Compute what the next frames will need at the speed of the last."""
+        """Compute what the next frames need if pupil and focus keep their speed."""
         prepared, last = stream.serving(), stream.use.last
         if prepared is None or last is None or last is stream.use.warmed:
             return
@@ -336,7 +336,7 @@ class Workshop:
 
 
 def _as_filter_error(error: Exception) -> FilterError:
-    """Return an error as clients get it; one that is not foreseen is logged."""
+    """Return an error as clients receive it; log an unexpected one."""
     if isinstance(error, FilterError):
         return error
     log.error("an eye could not be prepared", exc_info=error)

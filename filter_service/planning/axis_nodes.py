@@ -38,7 +38,7 @@ MAX_NODES = 64
 """On one axis but defocus."""
 
 COUNTS_AT_ONCE = 3
-"""Numbers of nodes that are tried with one question to the eye: 12 ms, however few."""
+"""Node counts evaluated in one call of the eye, which takes 12 ms however small."""
 
 STATE_AXES = ("pupil", "accommodation")
 """A narrow range of these may have one node, in its middle; frames read it at their own

@@ -90,7 +90,7 @@ def frame_layers(
     ----------
     Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
     """
-    # Whoever holds a store need not load numba: the service gets ready before.
+    # Imported here: the service must be ready before numba is loaded.
     from filter_service.psfs.layer_loops import layer_distances_dpt
     from filter_service.psfs.read_loops import layer_blur_px
 

@@ -1,7 +1,7 @@
-"""The wavefronts of a plan's nodes, worked out once for all PSFs.
+"""The wavefronts of a plan's nodes, evaluated once for all PSFs.
 
-Nodes of a group differ by defocus alone, so that a group and channel has one wavefront.
-To ask the eye for those of a few PSFs at a time took it 12 ms, whatever their number.
+Nodes of a group differ by defocus alone, so each group and channel has one wavefront.
+Evaluating the eye for each batch of PSFs took 12 ms a batch, however small.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class NodeWavefronts:
 
     @classmethod
     def of(cls, eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> NodeWavefronts:
-        """Ask an eye for the wavefronts of a plan's groups."""
+        """Evaluate an eye's wavefronts at the groups of a plan."""
         states = PupilStates.of(
             h_deg=plan.h_deg[:, None, None, None],
             v_deg=plan.v_deg[:, None, None, None, None],
@@ -122,7 +122,7 @@ class NodeWavefronts:
 def _node_scale(
     spec: GridSpec, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Scales (n, 2, 2) at directions of which few differ."""
+    """Scales (n, 2, 2) at directions (n,), each distinct one evaluated once."""
     both = np.stack([h_deg, v_deg], axis=-1)
     few, number = np.unique(both, axis=0, return_inverse=True)
     return spec.node_pixel_from_mrad(few[:, 0], few[:, 1])[number.ravel()]

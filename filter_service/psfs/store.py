@@ -122,7 +122,7 @@ class PsfStore:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Arguments that make the store anew, without kernels."""
+        """Arguments that make an equal store without kernels."""
         return {
             "eye": self.eye,
             "spec": self.spec,
@@ -132,7 +132,7 @@ class PsfStore:
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Go to another process without kernels."""
+        """Pickle the parts alone: kernels are computed again on demand."""
         return partial(type(self), **self.parts), ()
 
     @classmethod
