@@ -6,6 +6,9 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError
@@ -29,6 +32,10 @@ class PreparedStore:
         The PSFs of a first frame are computed; from then on it serves.
     used_s : float
         When a frame last went through it, or when it was loaded.
+    pending : (n,)
+        PSFs of a first frame that are being computed.
+    next_progress_s : float
+        When progress may be told again.
     """
 
     camera: Camera
@@ -37,6 +44,8 @@ class PreparedStore:
     notes: tuple[str, ...] = ()
     is_ready: bool = False
     used_s: float = field(default_factory=time.monotonic)
+    pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    next_progress_s: float = 0.0
 
 
 @dataclass(eq=False)
