@@ -43,6 +43,13 @@ class StreamUse:
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
             self._states.popleft()
 
+    @property
+    def interval_s(self) -> float:
+        """Mean time between the last frames; 0 before the second."""
+        if len(self._states) < 2:
+            return 0.0
+        return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
+
     def states_ahead(self) -> list[tuple[float, float]]:
         """Return predicted states (pupil_diameter_mm, focus_dpt), one a horizon."""
         if len(self._states) < 2:

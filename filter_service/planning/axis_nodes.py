@@ -31,8 +31,8 @@ TOLERANCE_DB = {"loose": 43.0, "normal": 49.0, "fine": 55.0}
 Of blocks of 32x32 pixels of encoded pictures 95 % keep 36.1, 41.1 and 45.9 dB, the
 median 41.9, 46.7 and 51.5 dB (`bench_levels`, six eyes, 320x180).  Frames planned for
 49 dB, unmerged, have 46.8 to 50.1 dB at 640x360 (six eyes) and 44.8 to 47.1 dB at
-320x180 (four eyes), where a pixel holds more contrast than those that the law was fitted
-to."""
+320x180 (four eyes), where a pixel holds more contrast than those that the law was
+fitted to."""
 
 QUALITY_GAIN_DB = 3.0
 """What the mode for still eyes gives on top of it."""

@@ -43,6 +43,11 @@ def test_only_the_last_frames_tell_the_speed():
     np.testing.assert_allclose(use.states_ahead(), [(4.0, 1.0)] * len(LEAD_S))
 
 
+def test_the_interval_is_that_of_the_last_frames():
+    assert noted([(4.0, 1.0)] * 20).interval_s == pytest.approx(0.05)
+    assert noted([(4.0, 1.0)]).interval_s == 0.0
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_single_frame_tells_no_speed(count):
     assert noted([(4.0, 1.0)] * count).states_ahead() == []
