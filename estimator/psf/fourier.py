@@ -92,7 +92,7 @@ def _fast_lengths() -> NDArray[np.int64]:
     return np.array(sorted(n for n in found if 32 <= n <= MAX_LENGTH))
 
 
-_FAST_LENGTHS = _fast_lengths()
+FAST_LENGTHS = _fast_lengths()
 
 
 def plan_grids(
@@ -100,7 +100,7 @@ def plan_grids(
     extent_px: NDArray[np.float64],
     unit_px: NDArray[np.float64],
     accuracy: FourierAccuracy,
-    lengths: NDArray[np.int64] = _FAST_LENGTHS,
+    lengths: NDArray[np.int64] = FAST_LENGTHS,
 ) -> FourierPlan:
     """Smallest grids whose windows hold the spots (M, 2) and their margins.
 

@@ -22,8 +22,8 @@ def _even_polynomial(function) -> tuple[np.float32, ...]:
 
 # cos(2 pi t) and sin(2 pi t) / t to 3e-7: reduction in turns is one floor, and the
 # loop vectorises, which libm's sincos does not (about 10 times slower).
-_C = _even_polynomial(lambda t: np.cos(2.0 * np.pi * t))
-_S = _even_polynomial(lambda t: np.sin(2.0 * np.pi * t) / t)
+COSINE_OF_TURNS = _even_polynomial(lambda t: np.cos(2.0 * np.pi * t))
+SINE_OF_TURNS = _even_polynomial(lambda t: np.sin(2.0 * np.pi * t) / t)
 _HALF = np.float32(0.5)
 
 EDGE_HALF_WIDTH = 8
@@ -41,8 +41,8 @@ EDGE_STEPS = 256
 def _fill_row(row, x, mask, cosine, sine, out_re_im):
     """Mask * exp(2 pi i W) along one row; ``row`` are the 7 coefficients in x."""
     c0, c1, c2, c3, c4, c5, c6 = row[0], row[1], row[2], row[3], row[4], row[5], row[6]
-    a0, a1, a2, a3, a4, a5, a6 = _C
-    b0, b1, b2, b3, b4, b5, b6 = _S
+    a0, a1, a2, a3, a4, a5, a6 = COSINE_OF_TURNS
+    b0, b1, b2, b3, b4, b5, b6 = SINE_OF_TURNS
     for i in range(x.shape[0]):
         u = x[i]
         t = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * (c5 + u * c6)))))

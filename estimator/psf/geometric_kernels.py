@@ -20,6 +20,7 @@ CELLS_PER_PX = 1.2
 
 MIN_EDGE_POINTS = 64
 EDGE_POINTS_PER_PX = 3.0
+POINTS_AT_ONCE = 8
 """Points on the edge per pixel of the spot's size."""
 
 NEAR_PX = 2
@@ -308,7 +309,8 @@ def add_edge_light(
     `survey.needed_radius_px`.
     """
     wavelength_um, table, limit = wave
-    n_points = max(MIN_EDGE_POINTS, math.ceil(EDGE_POINTS_PER_PX * extent_px))
+    n_points = max(MIN_EDGE_POINTS, EDGE_POINTS_PER_PX * extent_px)
+    n_points = POINTS_AT_ONCE * math.ceil(n_points / POINTS_AT_ONCE)
     row = np.empty((3, 7), np.float32)
     s = math.sqrt(1.0 - shear * shear)
     c0, c1, c2, c3, c4, c5 = log_amplitude

@@ -61,8 +61,8 @@ def _monomials(points: NDArray) -> NDArray[np.float64]:
     return points[:, :1] ** EXPONENTS[:, 0] * points[:, 1:] ** EXPONENTS[:, 1]
 
 
-_NODES = _bos_nodes()
-_FROM_NODES = np.ascontiguousarray(np.linalg.inv(_monomials(_NODES)))
+NODES = _bos_nodes()
+FROM_NODES = np.ascontiguousarray(np.linalg.inv(_monomials(NODES)))
 _POWER_X = np.ascontiguousarray(EXPONENTS[:, 0])
 _POWER_Y = np.ascontiguousarray(EXPONENTS[:, 1])
 
@@ -205,7 +205,7 @@ def pupil_frames(
         np.ascontiguousarray(circle_radius_mm, dtype=np.float64),
         jacobian,
         np.ascontiguousarray(pupil_ellipse, dtype=np.float64),
-        (_NODES, _FROM_NODES, _POWER_X, _POWER_Y),
+        (NODES, FROM_NODES, _POWER_X, _POWER_Y),
         box,
         disc,
         half,

@@ -17,7 +17,7 @@ from estimator.psf.screens import ScreenTables
 
 N_EDGE = 48
 _RING_RADII = (0.2, 0.35, 0.5, 0.65, 0.8, 0.9)
-_N_RING = 24
+N_RING = 24
 RADIUS_LIMIT_PX = 1 << 14
 
 PIXEL_CORNER_PX = 0.21
@@ -90,7 +90,7 @@ class PupilSurvey:
 
 def _sample_points() -> tuple[NDArray, NDArray]:
     edge = 2.0 * math.pi * np.arange(N_EDGE) / N_EDGE
-    ring = 2.0 * math.pi * np.arange(_N_RING) / _N_RING
+    ring = 2.0 * math.pi * np.arange(N_RING) / N_RING
     x = [np.cos(edge)] + [r * np.cos(ring) for r in _RING_RADII] + [np.zeros(1)]
     y = [np.sin(edge)] + [r * np.sin(ring) for r in _RING_RADII] + [np.zeros(1)]
     return np.concatenate(x), np.concatenate(y)
@@ -105,7 +105,7 @@ def _monomial_slopes() -> tuple[NDArray, NDArray, NDArray]:
     return np.stack([x, y]), d_x, d_y
 
 
-_POINTS, _SLOPE_X, _SLOPE_Y = _monomial_slopes()
+POINTS, *SLOPES = _monomial_slopes()
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -164,12 +164,12 @@ def _passed_points() -> tuple[NDArray, NDArray]:
     """
     node, weight = np.polynomial.legendre.leggauss(_N_RADIAL)
     rings = np.append(np.sqrt((node + 1.0) / 2.0), 1.0)
-    angle = 2.0 * math.pi * np.arange(_N_RING) / _N_RING
+    angle = 2.0 * math.pi * np.arange(N_RING) / N_RING
     x, y = (np.outer(rings, f(angle)).ravel() for f in (np.cos, np.sin))
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), weight / 2.0
 
 
-_PASSED_POWERS, _RING_WEIGHTS = _passed_points()
+PASSED_POWERS, RING_WEIGHTS = _passed_points()
 
 
 def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
@@ -186,9 +186,9 @@ def _passed_light(frames: PupilFrames) -> tuple[NDArray, NDArray]:
     count = frames.shear_ratio.size
     if not frames.log_amplitude.any():
         return np.ones(count), np.ones(count)
-    intensity = np.exp(2.0 * _disc_log_amplitude(frames) @ _PASSED_POWERS)
-    rings = intensity.reshape(count, -1, _N_RING).mean(axis=2)
-    return rings[:, :-1] @ _RING_WEIGHTS, rings[:, -1]
+    intensity = np.exp(2.0 * _disc_log_amplitude(frames) @ PASSED_POWERS)
+    rings = intensity.reshape(count, -1, N_RING).mean(axis=2)
+    return rings[:, :-1] @ RING_WEIGHTS, rings[:, -1]
 
 
 def survey_pupils(frames: PupilFrames) -> PupilSurvey:
@@ -201,7 +201,7 @@ def survey_pupils(frames: PupilFrames) -> PupilSurvey:
         frames.disc_polynomial_um,
         frames.half_width_um_per_px,
         frames.shear_ratio,
-        (_POINTS, _SLOPE_X, _SLOPE_Y),
+        (POINTS, *SLOPES),
         low,
         high,
         edge,

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,35 @@ def computed_kernels(
     groups, channels = plan.defocus.group_at(psfs // RGB), psfs % RGB
     total_dpt = plan.defocus.values_dpt[psfs // RGB]
     total_dpt = total_dpt + plan.channel_shift_dpt[groups, channels]
+    asked = groups, channels, total_dpt
+    generic = partial(_generic_kernels, eye, spec, wavefronts, engine)
+    native = engine.native
+    if native is None or not native.can_compute(eye, wavefronts):
+        return generic(*asked)
+    packed, methods, left = native.kernels(
+        wavefronts,
+        *asked,
+        kept_energy_ratio=spec.kept_energy_ratio,
+        max_radius_px=spec.max_blur_radius_px,
+        diffraction=spec.settings.diffraction,
+        stiles_crawford=apodisation(eye, spec),
+    )
+    if left.size:
+        others, more = generic(*(array[left] for array in asked))
+        packed, methods = packed.with_kernels(left, others), methods + more
+    return packed, methods
+
+
+def _generic_kernels(
+    eye: EyeOptics,
+    spec: GridSpec,
+    wavefronts: NodeWavefronts,
+    engine: PsfEngine,
+    groups: NDArray[np.int64],
+    channels: NDArray[np.int64],
+    total_dpt: NDArray[np.float64],
+) -> tuple[PackedKernels, Counter[str]]:
+    """Compute PSFs (n,) by batches of whole kernels, which are cut afterwards."""
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)

@@ -5,9 +5,11 @@ third of the area of the disc about the centre.  Loops over single kernels, so c
 threads share a batch.
 """
 
+from __future__ import annotations
+
 import math
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -55,6 +57,24 @@ class PackedKernels:
     peak_ratio: NDArray[np.float64]
     spread_px: NDArray[np.float64]
     lost_energy_ratio: NDArray[np.float64]
+
+    def with_kernels(
+        self, places: NDArray[np.int64], others: PackedKernels
+    ) -> PackedKernels:
+        """Return these kernels with others in some places."""
+        arrays = {
+            name: getattr(self, name).copy()
+            for name in (
+                *("offsets", "reach_px", "radius_px"),
+                *("peak_ratio", "spread_px", "lost_energy_ratio"),
+            )
+        }
+        for name, array in arrays.items():
+            array[places] = getattr(others, name)
+        arrays["offsets"][places] += self.weights.size
+        return replace(
+            self, weights=np.concatenate([self.weights, others.weights]), **arrays
+        )
 
 
 def pack_kernels(

@@ -1,5 +1,7 @@
 """Who computes the PSFs of a cache: the GPU where there is one, else all CPU cores."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -11,8 +13,10 @@ from filter_service.gl.gpu import Gpu
 from filter_service.gl.hardware import may_have_gpu
 from filter_service.psfs.gpu_build import gpu_psf_batch
 from filter_service.psfs.gpu_build_pace import Pace
+from filter_service.psfs.native_psfs import NativePsfs, native_psfs
 
 CPU_BATCH = 768
+NATIVE_BATCH = 2048
 GPU_BATCH = 8192
 """PSFs computed between two looks at progress and cancellation: about 0.05 s of two
 cores; the GPU's number is a guess, for none was at hand."""
@@ -29,14 +33,27 @@ class PsfEngine:
         As `estimator.psf.compute.compute_psf_batch`.
     batch_count : int
         PSFs to ask for at a time.
+    native : NativePsfs, optional
+        Computes packed kernels instead, where it can.
     """
 
     name: str
     compute: Callable[..., PsfBatch]
     batch_count: int
+    native: NativePsfs | None = None
 
 
-CPU = PsfEngine("cpu", compute_psf_batch, CPU_BATCH)
+PYTHON = PsfEngine("cpu", compute_psf_batch, CPU_BATCH)
+"""Where the package was installed without a C compiler."""
+
+
+@cache
+def cpu_engine() -> PsfEngine:
+    """Return the compiled engine, or `PYTHON` where it was not built."""
+    native = native_psfs()
+    if native is None:
+        return PYTHON
+    return PsfEngine("cpu", compute_psf_batch, NATIVE_BATCH, native)
 
 
 @cache
@@ -59,16 +76,16 @@ def psf_engine(choice: str = "auto") -> PsfEngine:
     if choice not in PSF_ENGINES:
         raise ValueError(f"psf_engine {choice!r}: allowed are {', '.join(PSF_ENGINES)}")
     if choice == "cpu" or (choice == "auto" and not may_have_gpu()):
-        return CPU
+        return cpu_engine()
     try:
         gpu = Gpu()
     except RenderFailed:
         if choice == "gpu":
             raise
-        return CPU
+        return cpu_engine()
     if choice == "auto" and gpu.is_software:
         gpu.close()
-        return CPU
+        return cpu_engine()
     return PsfEngine("gpu", partial(_computed_on, gpu, Pace()), GPU_BATCH)
 
 

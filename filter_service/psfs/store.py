@@ -188,9 +188,9 @@ class PsfStore:
         """
         from estimator.psf.compute import PsfTooLarge
         from filter_service.psfs.compute_kernels import computed_kernels
-        from filter_service.psfs.psf_engine import CPU
+        from filter_service.psfs.psf_engine import cpu_engine
 
-        self.engine = self.engine or CPU
+        self.engine = self.engine or cpu_engine()
         started_s = time.perf_counter()
         psfs = np.arange(self.psf_count) if psfs is None else np.unique(psfs)
         if not self.spec.settings.chromatic:  # channels share kernels

@@ -1,6 +1,7 @@
 """The Stiles-Crawford effect in filtered pictures: the setting, and its physics."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from estimator.psf.compute import compute_psf_batch
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.psf_engine import CPU
+from filter_service.psfs.psf_engine import PYTHON
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
@@ -178,14 +179,15 @@ def test_apodised_kernels_are_narrower_and_lose_no_light(mode):
 def test_off_the_pupil_counts_alike_and_engines_hear_of_no_effect():
     spec = spec_for(pupil_mm=4.0)
     eye, _ = eye_for_spec(myope(-1.0), spec)
+    build = partial(build_psf_store, eye, engine=PYTHON)
 
     def compute(*arguments, stiles_crawford, **options):
         assert stiles_crawford is None
         return compute_psf_batch(*arguments, **options)
 
-    plain = build_psf_store(eye, spec, engine=replace(CPU, compute=compute))
-    off = build_psf_store(eye, spec.with_settings(stiles_crawford=False))
-    on = build_psf_store(eye, spec.with_settings(stiles_crawford=True))
+    plain = build_psf_store(eye, spec, engine=replace(PYTHON, compute=compute))
+    off = build(spec.with_settings(stiles_crawford=False))
+    on = build(spec.with_settings(stiles_crawford=True))
     for name in ("kernels", "offsets", "reach_px", "radius_px", "peak_ratio"):
         np.testing.assert_array_equal(getattr(off, name), getattr(plain, name))
     assert not np.array_equal(on.peak_ratio, off.peak_ratio)

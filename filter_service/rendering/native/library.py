@@ -9,6 +9,9 @@ from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from filter_service.errors import RenderFailed
 from filter_service.rendering.native import records
 
@@ -82,6 +85,37 @@ class Library:
     def shrink(self, job: records.ShrinkJob) -> None:
         """Make kernels of a store coarse."""
         self._c.ocu_shrink(self._own, ctypes.byref(job))
+
+    def psfs(
+        self,
+        job: records.PsfJob,
+        outcome: NDArray[np.int32],
+        sizes: NDArray[np.int64],
+    ) -> NDArray[np.uint16]:
+        """Compute PSFs; their kernels one after the other.
+
+        Parameters
+        ----------
+        job : PsfJob
+        outcome, sizes : (n,)
+            The arrays that the job points to.
+
+        Raises
+        ------
+        MemoryError
+        """
+        is_done = self._c.ocu_psfs(self._own, ctypes.byref(job))
+        words = None
+        try:
+            if not is_done or (outcome == records.PSF_NO_MEMORY).any():
+                raise MemoryError("no memory for PSFs")
+            words = np.empty(int(sizes.sum()), np.uint16)
+        finally:
+            address = None if words is None else words.ctypes.data
+            self._c.ocu_take_psfs(
+                self._own, ctypes.byref(job), ctypes.c_void_p(address)
+            )
+        return words
 
     def new_threads(self, count: int) -> int:
         """Start threads that loops share, the caller among them; returns a handle."""

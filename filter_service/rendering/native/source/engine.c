@@ -39,6 +39,8 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[5] = (int32_t)sizeof(recipe_image);
     sizes[6] = (int32_t)sizeof(shrink_job);
     sizes[7] = (int32_t)sizeof(fragment_light);
+    sizes[8] = (int32_t)sizeof(psf_job);
+    sizes[9] = (int32_t)sizeof(psf_tables);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }
@@ -54,3 +56,7 @@ EXPORT void ocu_place(const loops *own, frame *f) { own->place(f); }
 EXPORT void ocu_blend(const loops *own, frame *f) { own->blend(f); }
 EXPORT void ocu_splat(const loops *own, frame *f) { own->splat(f); }
 EXPORT void ocu_shrink(const loops *own, shrink_job *job) { own->shrink(job); }
+EXPORT int ocu_psfs(const loops *own, psf_job *job) { return own->psfs(job); }
+EXPORT void ocu_take_psfs(const loops *own, psf_job *job, uint16_t *words) {
+    own->take_psfs(job, words);
+}

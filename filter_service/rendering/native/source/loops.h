@@ -1,6 +1,7 @@
 /* All loops of a frame, compiled once for each kind of processor; see variants below. */
 
 #include "frame.h"
+#include "psf_job.h"
 
 typedef struct {
     const char *name;
@@ -10,6 +11,8 @@ typedef struct {
     void (*blend)(frame *f);
     void (*splat)(frame *f);
     void (*shrink)(shrink_job *job);
+    int (*psfs)(psf_job *job);
+    void (*take_psfs)(psf_job *job, uint16_t *words);
 } loops;
 
 #ifdef OCU_VARIANT
@@ -32,6 +35,12 @@ typedef struct {
 #include "picture.h"
 #include "splat.h"
 #include "shrink.h"
+#include "psf_pupils.h"
+#include "psf_tails.h"
+#include "psf_rays.h"
+#include "psf_fft.h"
+#include "psf_waves.h"
+#include "psfs.h"
 
 static void all_pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -79,7 +88,48 @@ static void all_shrinks(shrink_job *job) {
     pool_run(job->threads, items, shrink_some, job);
 }
 
-const loops OCU_VARIANT = {OCU_NAME,   all_pixels, all_merges, all_places,
-                           all_blends, all_splats, all_shrinks};
+/* Computes the PSFs of a job; 0 without memory.  `take_all_psfs` ends it. */
+static int all_psfs(psf_job *job) {
+    size_t n_threads = (size_t)pool_size(job->threads), count = (size_t)job->count;
+    psf_results *results = calloc(1, sizeof *results);
+    if (results == NULL) return 0;
+    job->results = results;
+    results->work = calloc(n_threads, sizeof *results->work);
+    results->first = calloc(count + 1, sizeof *results->first);
+    results->thread = calloc(count + 1, sizeof *results->thread);
+    if (results->work == NULL || results->first == NULL || results->thread == NULL) return 0;
+    int items = (job->count + PSFS_AN_ITEM - 1) / PSFS_AN_ITEM;
+    pool_run(job->threads, items, compute_psf_item, job);
+    return 1;
+}
+
+/* Copies the kernels, one after the other, and frees what the job held; NULL: only that. */
+static void take_all_psfs(psf_job *job, uint16_t *words) {
+    psf_results *results = job->results;
+    job->results = NULL;
+    if (results == NULL) return;
+    for (int psf = 0; words != NULL && psf < job->count; ++psf) {
+        size_t size = (size_t)job->sizes[psf];
+        memcpy(words, results->work[results->thread[psf]].words + results->first[psf],
+               sizeof *words * size);
+        words += size;
+    }
+    int n_threads = results->work == NULL ? 0 : pool_size(job->threads);
+    for (int thread = 0; thread < n_threads; ++thread) {
+        psf_work *w = results->work + thread;
+        free_wave_work(&w->waves);
+        free(w->plane.at);
+        free(w->part.at);
+        free(w->kept.at);
+        free(w->words);
+    }
+    free(results->work);
+    free(results->first);
+    free(results->thread);
+    free(results);
+}
+
+const loops OCU_VARIANT = {OCU_NAME,    all_pixels, all_merges,  all_places, all_blends,
+                           all_splats,  all_shrinks, all_psfs,   take_all_psfs};
 
 #endif

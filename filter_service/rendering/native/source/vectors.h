@@ -133,6 +133,18 @@ INLINE f32x8 root8(f32x8 value) {
 #endif
 }
 
+/* Entries of a table. */
+INLINE f32x8 entries8(const float *table, i32x8 at) {
+#ifdef OCU_AVX2
+    i32x8 all = {-1, -1, -1, -1, -1, -1, -1, -1};
+    return __builtin_ia32_gathersiv8sf(all8(0.0f), table, at, (f32x8)all, 4);
+#else
+    f32x8 found;
+    for (int i = 0; i < 8; ++i) found[i] = table[at[i]];
+    return found;
+#endif
+}
+
 /* Whole part of what is not negative. */
 INLINE i32x8 whole8(f32x8 value) { return __builtin_convertvector(value, i32x8); }
 

@@ -1,0 +1,260 @@
+"""The compiled PSF engine: from the wavefronts of nodes to packed kernels in one call.
+
+`estimator.psf` computes the same in Python; tests compare both.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cache
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.field.eye_optics import EyeOptics
+from estimator.optics.zernike import N_TERMS, monomial_matrix
+from estimator.psf import fourier, geometric, geometric_kernels, pupil, survey, switch
+from estimator.psf import fourier_kernels as waves
+from estimator.psf.compute import ACCURACY
+from estimator.psf.stiles_crawford import StilesCrawford
+from estimator.threads import thread_count
+from filter_service.errors import RenderFailed
+from filter_service.psfs.boxes import SIDES
+from filter_service.psfs.node_wavefronts import NodeWavefronts
+from filter_service.psfs.pack import (
+    CUT_STEPS,
+    MAX_CENTROID_SHIFT_RATIO,
+    PackedKernels,
+)
+from filter_service.rendering.native.library import Library, compiled_library
+from filter_service.rendering.native.records import (
+    PSF_DONE,
+    PsfJob,
+    PsfTables,
+    pointer_to,
+)
+
+MAX_PRIMARIES = 16
+
+FILTER_COUNT = 256
+"""Samples a pixel that filters are kept for: pixels of 14 mrad, pupils of 8 mm."""
+
+CORNERS_TWICE = 1.15
+"""Light beyond the four sides of a box over that outside it: what lies beyond a corner
+counts twice.  With 1.15 boxes lose 1.00 to 1.03 % where 1 % may be lost."""
+
+VECTOR = 8
+
+
+def fft_lengths() -> NDArray[np.int64]:
+    """Lengths that the engine transforms: multiples of eight."""
+    lengths = fourier.FAST_LENGTHS
+    return lengths[lengths % VECTOR == 0]
+
+
+@dataclass(frozen=True)
+class NativePsfs:
+    """The engine's library, threads and tables.
+
+    Attributes
+    ----------
+    library : Library
+    threads : int
+        Handle of threads that calls share.
+    lock : Lock
+        Held by the call that has them.
+    """
+
+    library: Library
+    threads: int
+    lock: Lock = field(default_factory=Lock)
+
+    def can_compute(self, eye: EyeOptics, wavefronts: NodeWavefronts) -> bool:
+        """Whether all but single wavefronts of an eye can be computed here."""
+        return eye.rings is None and wavefronts.wavelength_nm.shape[1] <= MAX_PRIMARIES
+
+    def kernels(
+        self,
+        wavefronts: NodeWavefronts,
+        groups: NDArray[np.int64],
+        channels: NDArray[np.int64],
+        total_dpt: NDArray[np.float64],
+        *,
+        kept_energy_ratio: float,
+        max_radius_px: int,
+        diffraction: bool = True,
+        stiles_crawford: StilesCrawford | None = None,
+    ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
+        """Compute PSFs.
+
+        Parameters
+        ----------
+        wavefronts : NodeWavefronts
+        groups, channels : (n,)
+            Of each PSF.
+        total_dpt : (n,)
+            Total defocus in the middle of the channel.
+        kept_energy_ratio : float
+            Share of a kernel's light that its box must hold.
+        max_radius_px : int
+        diffraction : bool
+        stiles_crawford : StilesCrawford, optional
+
+        Returns
+        -------
+        kernels : PackedKernels
+            Those that are left have no texels.
+        methods : Counter
+            PSFs by the method that computed the larger share of each.
+        left : (m,)
+            Places, among the n, of PSFs that `estimator.psf` has to compute or to
+            refuse.
+        """
+        count, primaries = groups.size, wavefronts.wavelength_nm.shape[1]
+        sampling = ACCURACY["normal"]
+        arrays = {
+            "zernike_um": wavefronts.zernike_um,
+            "per_dpt_um": wavefronts.per_dpt_um,
+            "circle_diameter_mm": wavefronts.circle_diameter_mm,
+            "pupil_ellipse": wavefronts.pupil_ellipse,
+            "pixel_from_mrad": wavefronts.pixel_from_mrad,
+            "wavelength_nm": wavefronts.wavelength_nm,
+            "total_dpt": total_dpt,
+        }
+        center_mm = (0.0, 0.0)
+        if stiles_crawford is not None:
+            per_mm2, _ = stiles_crawford.amplitude(wavefronts.wavelength_nm.ravel())
+            arrays["apodisation_per_mm2"] = per_mm2
+            center_mm = stiles_crawford.centre_mm
+        arrays = {n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()}
+        arrays["groups"] = np.ascontiguousarray(groups, np.int64)
+        arrays["channels"] = np.ascontiguousarray(channels, np.int64)
+        reach_px = np.zeros((count, SIDES), np.int64)
+        radius_px, sizes = np.zeros((2, count), np.int64)
+        peak, spread, lost, rays = np.zeros((4, count))
+        outcome = np.empty(count, np.int32)
+        tables, _ = _tables()
+        job = PsfJob(
+            threads=self.threads,
+            tables=ctypes.addressof(tables),
+            **{name: pointer_to(array) for name, array in arrays.items()},
+            apodisation_center_mm=center_mm,
+            cut_ratio=CORNERS_TWICE * (1.0 - kept_energy_ratio),
+            oversampling=sampling.oversampling,
+            margin=sampling.margin,
+            min_samples_per_px=sampling.min_samples_per_px,
+            reach_px=pointer_to(reach_px),
+            radius_px=pointer_to(radius_px),
+            sizes=pointer_to(sizes),
+            peak_ratio=pointer_to(peak),
+            spread_px=pointer_to(spread),
+            lost_ratio=pointer_to(lost),
+            rays_ratio=pointer_to(rays),
+            outcome=pointer_to(outcome),
+            count=count,
+            primaries=primaries,
+            max_radius_px=max_radius_px,
+            is_diffracting=diffraction,
+        )
+        with self.lock:
+            words = self.library.psfs(job, outcome, sizes)
+        is_done = outcome == PSF_DONE
+        by_rays = int(np.count_nonzero(rays[is_done] > 0.5))
+        by_waves = int(np.count_nonzero(is_done)) - by_rays
+        methods = {"geometric": by_rays, "fourier": by_waves}
+        packed = PackedKernels(
+            weights=words,
+            offsets=np.cumsum(sizes) - sizes,
+            reach_px=reach_px,
+            radius_px=radius_px,
+            peak_ratio=peak,
+            spread_px=spread,
+            lost_energy_ratio=lost,
+        )
+        found = Counter({name: n for name, n in methods.items() if n})
+        return packed, found, np.flatnonzero(~is_done)
+
+
+@cache
+def native_psfs() -> NativePsfs | None:
+    """Return the engine of this process; None where the library is not there."""
+    try:
+        library = compiled_library()
+    except RenderFailed:
+        return None
+    return NativePsfs(library, library.new_threads(thread_count()))
+
+
+@cache
+def _tables() -> tuple[PsfTables, dict[str, NDArray]]:
+    """Return the tables of the modules of `estimator.psf`, and the arrays they hold."""
+    half_width = ACCURACY["normal"].filter_half_width
+    filters = [fourier.pixel_filter(k + 1, half_width) for k in range(FILTER_COUNT)]
+    stride = -(-filters[-1].size // VECTOR) * VECTOR
+    table = np.zeros((FILTER_COUNT, stride), np.float32)
+    for row, weights in zip(table, filters, strict=True):
+        row[: weights.size] = weights
+    lengths = fft_lengths()
+    first = np.cumsum(lengths) - lengths
+    turns = np.concatenate([np.arange(n) / n for n in lengths])
+    twiddles = np.stack([np.cos(2 * np.pi * turns), -np.sin(2 * np.pi * turns)], axis=1)
+    n_points = survey.POINTS.shape[1]
+    slopes = np.zeros((2, N_TERMS, -(-n_points // VECTOR) * VECTOR), np.float32)
+    for padded, values in zip(slopes, survey.SLOPES, strict=True):
+        padded[:, :n_points] = values
+        padded[:, n_points:] = values[:, -1:]
+    fresnel = geometric.fresnel_table()
+    arrays = {
+        "monomials": monomial_matrix(),
+        "zernike_terms": np.linalg.inv(monomial_matrix()),
+        "node_xy": pupil.NODES.T,
+        "from_nodes": pupil.FROM_NODES.T,
+        "slope_x": slopes[0],
+        "slope_y": slopes[1],
+        "edge_xy": survey.POINTS[:, : survey.N_EDGE].astype(np.float32),
+        "passed_powers": survey.PASSED_POWERS,
+        "ring_weights": survey.RING_WEIGHTS,
+        "fresnel": fresnel.astype(np.float32),
+        "edge_response": fourier.edge_response(),
+        "pixel_filters": table,
+        "lengths": lengths.astype(np.int32),
+        "twiddle_first": first.astype(np.int32),
+        "twiddles": twiddles.astype(np.float32),
+    }
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    tables = PsfTables(
+        **{name: pointer_to(array) for name, array in arrays.items()},
+        cosine=waves.COSINE_OF_TURNS,
+        sine=waves.SINE_OF_TURNS,
+        fresnel_limit=geometric.FRESNEL_LIMIT,
+        least_margin_px=fourier.MARGIN_PX,
+        base_db=switch.BASE_DB,
+        per_rms_db=switch.PER_RMS_DB,
+        per_pixel_db=switch.PER_PIXEL_DB,
+        per_narrow_db=switch.PER_NARROW_DB,
+        rays_from_db=switch.GEOMETRIC_FROM_DB,
+        fade_db=switch.CROSS_FADE_DB,
+        min_cells=geometric_kernels.MIN_CELLS,
+        max_cells=geometric_kernels.MAX_CELLS,
+        cells_per_px=geometric_kernels.CELLS_PER_PX,
+        min_edge_points=geometric_kernels.MIN_EDGE_POINTS,
+        edge_points_per_px=geometric_kernels.EDGE_POINTS_PER_PX,
+        min_curvature_ratio=geometric_kernels.MIN_CURVATURE_RATIO,
+        far_px=geometric_kernels.FAR_PX,
+        near_px=geometric_kernels.NEAR_PX,
+        centroid_ratio=MAX_CENTROID_SHIFT_RATIO,
+        fresnel_count=fresnel.size,
+        edge_half_width=waves.EDGE_HALF_WIDTH,
+        edge_steps=waves.EDGE_STEPS,
+        filter_stride=stride,
+        filter_count=FILTER_COUNT,
+        filter_half_width=half_width,
+        length_count=lengths.size,
+        n_rings=survey.RING_WEIGHTS.size + 1,
+        n_ring=survey.N_RING,
+        cut_steps=CUT_STEPS,
+    )
+    return tables, arrays

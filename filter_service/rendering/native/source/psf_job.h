@@ -1,0 +1,75 @@
+/* What a call for PSFs takes and gives; records.py mirrors the layout. */
+#ifndef OCU_PSF_JOB_H
+#define OCU_PSF_JOB_H
+
+#include <stdint.h>
+
+#include "pool.h"
+
+#define N_TERMS 28            /* of a wavefront: degree 6 */
+#define N_POWERS 7
+#define N_EDGE 48             /* points of a survey on the pupil's edge */
+#define N_SURVEY 193          /* points of a survey in all, padded to */
+#define SURVEY_STRIDE 200
+#define ELLIPSE_COLUMNS 5
+#define LOG_AMPLITUDES 6
+
+/* Tables of the modules of estimator/psf, so that a number stands in one place. */
+typedef struct {
+    const double *monomials;        /* (28, 28): row j, the monomials of Zernike term j */
+    const double *zernike_terms;    /* its inverse */
+    const double *node_xy;          /* (2, 28): points that fix a polynomial */
+    const double *from_nodes;       /* (28, 28): row k, what value k adds to each term */
+    const float *slope_x, *slope_y; /* (28, SURVEY_STRIDE): of monomials at points */
+    const float *edge_xy;           /* (2, N_EDGE) */
+    const double *passed_powers;    /* (6, n_rings * n_ring) */
+    const double *ring_weights;     /* (n_rings - 1,); the last ring is the edge */
+    const float *fresnel;           /* (fresnel_count,) from -limit to limit */
+    const float *edge_response;     /* (2 half_width steps + 1,) */
+    const float *pixel_filters;     /* rows of filter_stride, for k = 1, 2 ... in turn */
+    const int32_t *lengths;         /* (length_count,) of FFTs, ascending */
+    const int32_t *twiddle_first;   /* (length_count,) pairs */
+    const float *twiddles;          /* exp(-2 pi i p / n), n pairs for each length */
+    float cosine[N_POWERS], sine[N_POWERS]; /* of turns, in squares */
+    double fresnel_limit;
+    double least_margin_px;
+    double base_db, per_rms_db, per_pixel_db, per_narrow_db, rays_from_db, fade_db;
+    double min_cells, max_cells, cells_per_px;
+    double min_edge_points, edge_points_per_px, min_curvature_ratio;
+    double far_px, near_px;
+    double centroid_ratio;
+    int32_t fresnel_count, edge_half_width, edge_steps;
+    int32_t filter_stride, filter_count, filter_half_width;
+    int32_t length_count, n_rings, n_ring, cut_steps;
+} psf_tables;
+
+enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
+
+/* Wavefronts of nodes, (groups, 3, primaries, ...), and the PSFs that are asked for. */
+typedef struct {
+    pool *threads;
+    const psf_tables *tables;
+    const double *zernike_um;         /* (..., 28) at 0 dpt */
+    const double *per_dpt_um;         /* (..., 28) */
+    const double *circle_diameter_mm; /* (...) */
+    const double *pupil_ellipse;      /* (..., 5) */
+    const double *pixel_from_mrad;    /* (groups, 2, 2) */
+    const double *wavelength_nm;      /* (3, primaries) */
+    const double *apodisation_per_mm2; /* (3, primaries), or none */
+    double apodisation_center_mm[2];
+    double cut_ratio;                 /* share of the light that is left out */
+    double oversampling, margin;
+    const int64_t *groups, *channels; /* (count,) */
+    const double *total_dpt;          /* (count,) */
+    int64_t *reach_px;                /* (count, 4): results */
+    int64_t *radius_px;
+    int64_t *sizes;                   /* texels */
+    double *peak_ratio, *spread_px, *lost_ratio, *rays_ratio;
+    int32_t *outcome;                 /* PSF_DONE, or why there is no kernel */
+    void *results;                    /* of the threads, until they are taken */
+    int32_t count, primaries;
+    int32_t max_radius_px, is_diffracting;
+    int32_t min_samples_per_px, spare;
+} psf_job;
+
+#endif

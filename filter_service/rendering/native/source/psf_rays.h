@@ -1,0 +1,392 @@
+/* Ray optics with Fresnel's edge: estimator/psf/geometric_kernels.py, which says why. */
+
+typedef float f32x2 __attribute__((vector_size(8)));
+
+/* Part of a kernel's plane: pixel (x, y), y upwards, is row top - y, column x - left. */
+typedef struct {
+    float *pixels;
+    int left, top, width, height;
+} canvas;
+
+#define MOST_CELLS 192
+#define PROFILE_STEPS 17      /* of 1/2 px near the edge's image, of 1 px farther out */
+
+INLINE void add_pair(float *to, float first, float second) {
+    f32x2 pair;
+    memcpy(&pair, to, sizeof pair);
+    pair += (f32x2){first, second};
+    memcpy(to, &pair, sizeof pair);
+}
+
+/* Coefficients in x of W, dW/dy and d^2W/dy^2 at each of some y. */
+typedef struct {
+    float of_w[N_POWERS][MOST_CELLS], of_dy[N_POWERS][MOST_CELLS],
+        of_dyy[N_POWERS][MOST_CELLS];
+} row_terms;
+
+static void fill_row_terms(double dense[N_POWERS][N_POWERS], const double *y, int count,
+                           row_terms *rows) {
+    double value[MOST_CELLS], first[MOST_CELLS], second[MOST_CELLS];
+    for (int a = 0; a < N_POWERS; ++a) {
+        for (int j = 0; j < count; ++j) value[j] = first[j] = second[j] = 0.0;
+        for (int b = N_POWERS - 1 - a; b >= 0; --b)
+            for (int j = 0; j < count; ++j) {
+                second[j] = second[j] * y[j] + 2.0 * first[j];
+                first[j] = first[j] * y[j] + value[j];
+                value[j] = value[j] * y[j] + dense[b][a];
+            }
+        for (int j = 0; j < count; ++j) {
+            rows->of_w[a][j] = (float)value[j];
+            rows->of_dy[a][j] = (float)first[j];
+            rows->of_dyy[a][j] = (float)second[j];
+        }
+    }
+}
+
+/* Spreads a weight over the pixels that a box covers, by their areas. */
+static void add_wide_box(const canvas *c, float x0, float y0, float wide, float high,
+                         float weight) {
+    double x1 = (double)x0 + wide + 1e-9, y1 = (double)y0 + high + 1e-9;
+    double per_area = weight / ((x1 - x0) * (y1 - y0));
+    int bottom = c->top - c->height + 1, right = c->left + c->width - 1;
+    int first_y = larger_int((int)floor(y0 + 0.5), bottom);
+    int last_y = smaller_int((int)floor(y1 + 0.5), c->top);
+    int first_x = larger_int((int)floor(x0 + 0.5), c->left);
+    int last_x = smaller_int((int)floor(x1 + 0.5), right);
+    for (int y = first_y; y <= last_y; ++y) {
+        double part = smaller_double(y1, y + 0.5) - larger_double(y0, y - 0.5);
+        float *row = c->pixels + (c->top - y) * c->width - c->left;
+        for (int x = first_x; x <= last_x; ++x) {
+            double share = smaller_double(x1, x + 0.5) - larger_double(x0, x - 0.5);
+            row[x] += (float)(per_area * part * share);
+        }
+    }
+}
+
+/* A vector of footprints: those of at most two pixels each way by four additions. */
+INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x8 high,
+                           f32x8 weight) {
+    f32x8 half = all8(0.5f), one = all8(1.0f), none = all8(0.0f), tiny = all8(1e-12f);
+    f32x8 column = floor8(x0 + half), row = floor8(y0 + half);
+    f32x8 over_x = x0 + wide - column - half, over_y = y0 + high - row - half;
+    column -= all8((float)c->left);
+    row = all8((float)c->top) - row;
+    i32x8 is_short = (over_x <= one) & (over_y <= one) & (column >= none)
+                     & (column < all8((float)(c->width - 1))) & (row >= one)
+                     & (row < all8((float)c->height));
+    f32x8 right = larger8(over_x, none) / (wide + tiny);
+    f32x8 up = weight * (larger8(over_y, none) / (high + tiny));
+    f32x8 low = weight - up;
+    float low_right[LANES], up_right[LANES], low_left[LANES], up_left[LANES];
+    int32_t place[LANES];
+    f32x8 part = low * right;
+    store8(low_right, part);
+    store8(low_left, low - part);
+    part = up * right;
+    store8(up_right, part);
+    store8(up_left, up - part);
+    i32x8 at = __builtin_convertvector(row, i32x8) * c->width
+               + __builtin_convertvector(column, i32x8);
+    memcpy(place, &at, sizeof place);
+    i32x8 is_lit = weight > none;
+    uint32_t lit = bits_of8(is_lit), most = bits_of8(is_short & is_lit);
+    for (uint32_t left = most; left != 0; left &= left - 1) {
+        int i = __builtin_ctz(left);
+        float *pixel = c->pixels + place[i];
+        add_pair(pixel, low_left[i], low_right[i]);
+        add_pair(pixel - c->width, up_left[i], up_right[i]);
+    }
+    for (uint32_t left = lit & ~most; left != 0; left &= left - 1) {
+        int i = __builtin_ctz(left);
+        add_wide_box(c, x0[i], y0[i], wide[i], high[i], weight[i]);
+    }
+}
+
+/* What a row of cells needs to know. */
+typedef struct {
+    const canvas *c;
+    float w[N_POWERS], d[N_POWERS], e[N_POWERS]; /* in x */
+    float cell, factor_x, factor_y, cell_x, cell_y;
+} pupil_row;
+
+#define SIX(c1, c2, c3, c4, c5, c6) \
+    (all8(c1) + x * (all8(c2) + x * (all8(c3) + x * (all8(c4) + x * (all8(c5) \
+     + x * all8(c6))))))
+
+INLINE void splat_cells(const pupil_row *r, f32x8 x, f32x8 weight) {
+    const float *w = r->w, *d = r->d, *e = r->e;
+    f32x8 half = all8(0.5f);
+    f32x8 sx = SIX(w[1], 2 * w[2], 3 * w[3], 4 * w[4], 5 * w[5], 6 * w[6]);
+    f32x8 sy = SIX(d[0], d[1], d[2], d[3], d[4], d[5]);
+    f32x8 hxx = SIX(2 * w[2], 6 * w[3], 12 * w[4], 20 * w[5], 30 * w[6], 0.0f);
+    f32x8 hxy = SIX(d[1], 2 * d[2], 3 * d[3], 4 * d[4], 5 * d[5], 0.0f);
+    f32x8 hyy = SIX(e[0], e[1], e[2], e[3], e[4], 0.0f);
+    f32x8 wide = all8(r->cell_x) * root8(hxx * hxx + hxy * hxy);
+    f32x8 high = all8(r->cell_y) * root8(hxy * hxy + hyy * hyy);
+    add_footprints(r->c, all8(r->factor_x) * sx - half * wide,
+                   all8(r->factor_y) * sy - half * high, wide, high, weight);
+}
+#undef SIX
+
+/* Weights of cells that the pupil's edge may cross: their area inside, the edge straight. */
+INLINE f32x8 edge_weights(const pupil *own, f32x8 x, float y, float cell) {
+    f32x8 zero = all8(0.0f), one = all8(1.0f), v = all8(y);
+    float room = (float)square(own->root);
+    f32x8 r = all8((float)own->shear), slope_x = x - r * v, slope_y = v - r * x;
+    f32x8 radius = root8((x * slope_x + v * slope_y) * all8(1.0f / room));
+    f32x8 steep = root8(slope_x * slope_x + slope_y * slope_y);
+    f32x8 depth = (one - radius) * radius * all8(room) / larger8(steep, all8(1e-9f));
+    return larger8(smaller8(depth * all8(1.0f / cell) + all8(0.5f), one), zero);
+}
+
+INLINE f32x8 apodised(const pupil *own, f32x8 x, double y, f32x8 weight) {
+    const double *a = own->log_amplitude;
+    for (int i = 0; i < LANES; ++i) {
+        double u = x[i];
+        weight[i] *= (float)exp(2.0 * (a[0] + u * (a[1] + a[3] * u + a[4] * y)
+                                       + y * (a[2] + a[5] * y)));
+    }
+    return weight;
+}
+
+/* Footprints of all cells of the pupil; returns their weight. */
+static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], int n_cells,
+                          const canvas *c) {
+    double cell = 2.0 / n_cells, room = square(own->root), shear = own->shear;
+    float factor_x = (float)(1.0 / own->half[0]), factor_y = (float)(1.0 / own->half[1]);
+    pupil_row r = {.c = c, .cell = (float)cell, .factor_x = factor_x, .factor_y = factor_y,
+                  .cell_x = (float)cell * factor_x, .cell_y = (float)cell * factor_y};
+    f32x8 zero = all8(0.0f), one = all8(1.0f), half = all8(0.5f), total = zero;
+    /* Within this the whole cell lies inside: the ellipse is least curved-in there. */
+    double inner = larger_double(0.0, 1.0 - 0.75 * cell / sqrt(1.0 - fabs(shear)));
+    double ys[MOST_CELLS];
+    row_terms rows;
+    for (int j = 0; j < n_cells; ++j) ys[j] = (j + 0.5) * cell - 1.0;
+    fill_row_terms(dense, ys, n_cells, &rows);
+    for (int j = 0; j < n_cells; ++j) {
+        double y = ys[j], middle = 1.0 + shear * y;
+        double edge = square(1.0 + 0.5 * cell) - y * y;
+        double reach = sqrt(larger_double(0.0, edge) * room) + cell;
+        double core = sqrt(larger_double(0.0, inner * inner - y * y) * room);
+        int first = larger_int(0, (int)floor((middle - reach) / cell));
+        int end = smaller_int(n_cells, (int)ceil((middle + reach) / cell));
+        int core_first = (int)ceil((middle - core) / cell);
+        int core_end = (int)floor((middle + core) / cell);
+        if (core_end <= core_first) core_first = core_end = end;
+        for (int a = 0; a < N_POWERS; ++a) {
+            r.w[a] = rows.of_w[a][j];
+            r.d[a] = rows.of_dy[a][j];
+            r.e[a] = rows.of_dyy[a][j];
+        }
+        /* The lanes are far from each other: neighbours share pixels, and a load would
+         * have to wait for the store before it. */
+        int span = (core_end - core_first + LANES - 1) / LANES;
+        f32x8 number = NUMBERS8 * all8((float)span) + all8((float)core_first);
+        for (int step = 0; step < span; ++step, number += one) {
+            f32x8 x = (number + half) * all8(r.cell) - one;
+            f32x8 weight = (f32x8)((i32x8)one & (number < all8((float)core_end)));
+            if (own->is_apodised) weight = apodised(own, x, y, weight);
+            total += weight;
+            splat_cells(&r, x, weight);
+        }
+        /* Both ends in turn. */
+        int before = core_first - first, count = before + larger_int(0, end - core_end);
+        span = (count + LANES - 1) / LANES;
+        number = NUMBERS8 * all8((float)span);
+        for (int step = 0; step < span; ++step, number += one) {
+            i32x8 is_after = number >= all8((float)before);
+            f32x8 skipped = (f32x8)((i32x8)all8((float)(core_end - before)) & is_after);
+            f32x8 begun = (f32x8)((i32x8)all8((float)first) & ~is_after);
+            f32x8 x = (number + skipped + begun + half) * all8(r.cell) - one;
+            f32x8 weight = edge_weights(own, x, (float)y, r.cell);
+            weight = (f32x8)((i32x8)weight & (number < all8((float)count)));
+            if (own->is_apodised) weight = apodised(own, x, y, weight);
+            total += weight;
+            splat_cells(&r, x, weight);
+        }
+    }
+    double sum = 0.0;
+    for (int i = 0; i < LANES; ++i) sum += (double)total[i];
+    return sum;
+}
+
+/* Integral of Fresnel's straight edge less its step, from the dark to v. */
+INLINE f32x8 fresnel_integral(const psf_tables *tables, f32x8 v) {
+    float limit = (float)tables->fresnel_limit, last = (float)(tables->fresnel_count - 1);
+    f32x8 place = (v + all8(limit)) * all8(last / (2.0f * limit));
+    place = larger8(smaller8(place, all8(last)), all8(0.0f));
+    i32x8 at = whole8(smaller8(place, all8(last - 1.0f)));
+    f32x8 low = entries8(tables->fresnel, at), high = entries8(tables->fresnel + 1, at);
+    f32x8 inside = low + (place - __builtin_convertvector(at, f32x8)) * (high - low);
+    f32x8 outside = all8(-1.0f / (2.0f * (float)(M_PI * M_PI))) / v;
+    i32x8 is_outside = size8(v) >= all8(limit);
+    return (f32x8)(((i32x8)outside & is_outside) | ((i32x8)inside & ~is_outside));
+}
+
+/* Ends of the profile's steps. */
+static const float profile_ends[PROFILE_STEPS + 1] = {
+    -6.25f, -5.25f, -4.25f, -3.25f, -2.25f, -1.75f, -1.25f, -0.75f, -0.25f,
+    0.25f,  0.75f,  1.25f,  1.75f,  2.25f,  3.25f,  4.25f,  5.25f,  6.25f};
+
+/* Spreads light over the four pixels that boxes of 1 / per_size px about (x, y) meet. */
+INLINE void add_boxes(const canvas *c, f32x8 x, f32x8 y, float per_size, f32x8 light) {
+    f32x8 half = all8(0.5f), zero = all8(0.0f), one = all8(1.0f);
+    f32x8 at_x = x - all8((float)c->left), at_y = all8((float)c->top) - y;
+    f32x8 column = floor8(at_x), row = floor8(at_y); /* to the left, and above */
+    uint32_t lit = bits_of8((column >= zero) & (row >= zero)
+                            & (column < all8((float)(c->width - 1)))
+                            & (row < all8((float)(c->height - 1))));
+    f32x8 right = (at_x - column - half) * all8(per_size) + half;
+    f32x8 low = (at_y - row - half) * all8(per_size) + half;
+    right = larger8(smaller8(right, one), zero);
+    low = light * larger8(smaller8(low, one), zero);
+    float low_right[LANES], up_right[LANES], low_left[LANES], up_left[LANES];
+    int32_t place[LANES];
+    f32x8 above = light - low;
+    store8(low_right, low * right);
+    store8(low_left, low - low * right);
+    store8(up_right, above * right);
+    store8(up_left, above - above * right);
+    i32x8 at = __builtin_convertvector(row, i32x8) * c->width
+               + __builtin_convertvector(column, i32x8);
+    memcpy(place, &at, sizeof place);
+    for (int i = 0; i < LANES; ++i) {
+        if (!(lit >> i & 1u)) continue;
+        float *pixel = c->pixels + place[i];
+        add_pair(pixel, up_left[i], up_right[i]);
+        add_pair(pixel + c->width, low_left[i], low_right[i]);
+    }
+}
+
+/* Cosine and sine of turns in [-1/2, 1/2]. */
+INLINE f32x8 cosine8(const psf_tables *tables, f32x8 z) {
+    f32x8 sum = all8(tables->cosine[N_POWERS - 1]);
+    for (int k = N_POWERS - 2; k >= 0; --k) sum = all8(tables->cosine[k]) + z * sum;
+    return sum;
+}
+
+INLINE f32x8 sine8(const psf_tables *tables, f32x8 t, f32x8 z) {
+    f32x8 sum = all8(tables->sine[N_POWERS - 1]);
+    for (int k = N_POWERS - 2; k >= 0; --k) sum = all8(tables->sine[k]) + z * sum;
+    return t * sum;
+}
+
+/* What diffraction at the pupil's edge changes in the spot, for eight edge points at a
+ * time that are far from each other. */
+static void add_edge_light(const psf_tables *tables, const pupil *own,
+                           double dense[N_POWERS][N_POWERS], const canvas *c) {
+    double extent = larger_double(own->high[0] - own->low[0], own->high[1] - own->low[1]);
+    int span = (int)ceil(larger_double(tables->min_edge_points,
+                                       tables->edge_points_per_px * extent) / LANES);
+    int count = span * LANES;
+    float terms[N_POWERS][N_POWERS];
+    for (int b = 0; b < N_POWERS; ++b)
+        for (int a = 0; a < N_POWERS; ++a) terms[b][a] = (float)dense[b][a];
+    f32x8 zero = all8(0.0f), two = all8(2.0f), sign = all8(-0.0f);
+    f32x8 per_ax = all8((float)(1.0 / own->half[0])), per_ay = all8((float)(1.0 / own->half[1]));
+    f32x8 sheared = all8((float)(own->shear / own->root)), shear = all8((float)own->shear);
+    f32x8 root = all8((float)own->root), per_root = all8((float)(1.0 / own->root));
+    float um = (float)own->wavelength_um;
+    for (int step = 0; step < span; ++step) {
+        f32x8 turn = NUMBERS8 * all8((float)span) + all8((float)step + 0.5f);
+        turn = turn * all8(1.0f / (float)count);
+        turn -= floor8(turn + all8(0.5f));
+        f32x8 wx = cosine8(tables, turn * turn), wy = sine8(tables, turn, turn * turn);
+        f32x8 x = wx, y = shear * wx + root * wy;
+        f32x8 nx = (wx - sheared * wy) * per_ax, ny = wy * per_root * per_ay;
+        f32x8 length = root8(nx * nx + ny * ny);
+        nx /= length;
+        ny /= length;
+        f32x8 sx = zero, sy = zero, hxx = zero, hxy = zero, hyy = zero, value = zero;
+        for (int a = N_POWERS - 1; a >= 0; --a) {
+            f32x8 w = zero, dy = zero, dyy = zero;
+            for (int b = N_POWERS - 1 - a; b >= 0; --b) {
+                dyy = dyy * y + two * dy;
+                dy = dy * y + w;
+                w = w * y + all8(terms[b][a]);
+            }
+            hxx = hxx * x + two * sx;
+            sx = sx * x + value;
+            value = value * x + w;
+            hxy = hxy * x + sy;
+            sy = sy * x + dy;
+            hyy = hyy * x + dyy;
+        }
+        sx *= per_ax;
+        sy *= per_ay;
+        hxx *= per_ax * per_ax;
+        hxy *= per_ax * per_ay;
+        hyy *= per_ay * per_ay;
+        f32x8 across = hxx * nx * nx + two * hxy * nx * ny + hyy * ny * ny;
+        f32x8 along = hxx * ny * ny - two * hxy * nx * ny + hyy * nx * nx;
+        f32x8 mixed = (hyy - hxx) * nx * ny + hxy * (nx * nx - ny * ny);
+        f32x8 least = all8((float)tables->min_curvature_ratio)
+                      * (size8(across) + size8(along) + size8(mixed)) + all8(1e-12f);
+        f32x8 curvature = across - mixed * mixed * along / (along * along + least * least);
+        f32x8 size = larger8(size8(curvature), all8(1e-6f));
+        i32x8 turned_sign = ~(i32x8)curvature & (i32x8)sign;
+        f32x8 v_per_px = (f32x8)((i32x8)root8(all8(2.0f / um) / size) | turned_sign);
+        f32x8 strength = length * all8((float)(2.0 / count / own->passed_ratio))
+                         * root8(all8(0.5f * um) / size);
+        if (own->is_apodised)
+            for (int i = 0; i < LANES; ++i) {
+                const double *a = own->log_amplitude;
+                double u = x[i], v = y[i];
+                strength[i] *= (float)exp(2.0 * (a[0] + u * (a[1] + a[3] * u + a[4] * v)
+                                                 + v * (a[2] + a[5] * v)));
+            }
+        strength = (f32x8)((i32x8)strength | turned_sign);
+        f32x8 before = fresnel_integral(tables, all8(profile_ends[0]) * v_per_px);
+        for (int i = 0; i < PROFILE_STEPS; ++i) {
+            float next = profile_ends[i + 1], own_size = next - profile_ends[i];
+            f32x8 after = fresnel_integral(tables, all8(next) * v_per_px);
+            f32x8 d = all8(next - 0.5f * own_size);
+            add_boxes(c, sx + d * nx, sy + d * ny, 1.0f / own_size,
+                      strength * (after - before));
+            before = after;
+        }
+    }
+}
+
+/* Brings pixels up to the mean light of the edge: those at least from_px away from it. */
+static void lift_to_tail(const tail *t, const canvas *c, float from_px, float scale) {
+    f32x8 border2 = all8(from_px * from_px), brightest = all8(t->brightest * scale);
+    for (int row = 0; row < c->height; ++row) {
+        float *to = c->pixels + row * c->width;
+        float y = (float)(c->top - row);
+        for (int column = 0; column < c->width; column += LANES) {
+            int count = smaller_int(LANES, c->width - column);
+            f32x8 light = all8(INFINITY);
+            memcpy(&light, to + column, sizeof(float) * (size_t)count);
+            if (from_px > 0.0f && !any8(light < brightest)) continue;
+            f32x8 nearest, x = NUMBERS8 + all8((float)(c->left + column));
+            f32x8 found = all8(scale) * tail_light8(t, x, y, &nearest);
+            found = (f32x8)((i32x8)found & (nearest >= border2));
+            light = larger8(light, found);
+            memcpy(to + column, &light, sizeof(float) * (size_t)count);
+        }
+    }
+}
+
+/* A spot in shares of the light that the pupil passes. */
+static void spot_of_rays(const psf_tables *tables, const pupil *own, int is_diffracting,
+                         const canvas *c) {
+    double dense[N_POWERS][N_POWERS] = {{0.0}};
+    for (int t = 0; t < N_TERMS; ++t) {
+        int x, y;
+        exponents(t, &x, &y);
+        dense[y][x] = own->box[t];
+    }
+    double extent = larger_double(own->high[0] - own->low[0], own->high[1] - own->low[1]);
+    double cells = larger_double(tables->min_cells / own->root, tables->cells_per_px * extent);
+    int n_cells = (int)smaller_double(tables->max_cells, ceil(cells));
+    double weight = splat_pupil(own, dense, n_cells, c);
+    float scale = (float)(1.0 / weight);
+    int count = c->width * c->height;
+    for (int i = 0; i < count; ++i) c->pixels[i] *= scale;
+    if (!is_diffracting) return;
+    add_edge_light(tables, own, dense, c);
+    for (int i = 0; i < count; ++i) c->pixels[i] = larger_float(c->pixels[i], 0.0f);
+    tail t = tail_of(tables, own);
+    lift_to_tail(&t, c, (float)tables->far_px, 1.0f);
+}

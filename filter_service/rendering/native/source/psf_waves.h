@@ -1,0 +1,300 @@
+/* Wave optics: estimator/psf/fourier.py and fourier_kernels.py, which say why.  Fields are
+ * filled, transformed and summed up in strips of sixteen columns that stay in the cache. */
+
+/* Sampling of one PSF, x before y. */
+typedef struct {
+    int length_number[2], length[2], per_px[2], size[2];
+    double samples[2];        /* of the pupil, across its box */
+    int center[2];            /* of the window, in samples */
+    int window[4];            /* pixels x0, x1, y0, y1 that it fills */
+} grid;
+
+/* What a thread keeps between PSFs. */
+typedef struct {
+    scratch mask;             /* (strips, rows, STRIP) */
+    scratch first, second;    /* rows of a strip */
+    scratch between;          /* (columns, 2, padded length of y), real and imaginary */
+    scratch sums;             /* (pixels, padded length of y) */
+    scratch line;
+    double mask_samples[2], mask_shear, mask_amplitudes[LOG_AMPLITUDES];
+    int mask_rows, mask_columns;
+} wave_work;
+
+static void free_wave_work(wave_work *w) {
+    free(w->mask.at);
+    free(w->first.at);
+    free(w->second.at);
+    free(w->between.at);
+    free(w->sums.at);
+    free(w->line.at);
+}
+
+/* Smallest grid whose window holds the spot and its margins; 0 where no FFT does. */
+static int plan_grid(const psf_job *job, const pupil *own, grid *g) {
+    const psf_tables *tables = job->tables;
+    for (int axis = 0; axis < 2; ++axis) {
+        double unit_px = own->wavelength_um / (2.0 * own->half[axis]);
+        double margin_px = larger_double(job->margin * unit_px, tables->least_margin_px);
+        double window_px = own->high[axis] - own->low[axis] + 2.0 * margin_px;
+        double per_px = larger_double(
+            ceil(job->oversampling / unit_px),
+            smaller_double(ceil(2.0 / unit_px), (double)job->min_samples_per_px));
+        for (;; per_px += 1.0) {
+            double wanted = window_px * per_px;
+            int number = 0;
+            while (number < tables->length_count && tables->lengths[number] < wanted)
+                ++number;
+            if (number == tables->length_count || per_px > tables->filter_count) return 0;
+            int length = tables->lengths[number];
+            double samples = length / (per_px * unit_px);
+            if (samples + 2 * tables->edge_half_width > length) continue;
+            g->length_number[axis] = number;
+            g->length[axis] = length;
+            g->per_px[axis] = (int)per_px;
+            g->samples[axis] = samples;
+            g->size[axis] = smaller_int(length,
+                                        (int)ceil(samples) + 2 * tables->edge_half_width);
+            break;
+        }
+        double middle_px = 0.5 * (own->low[axis] + own->high[axis]);
+        g->center[axis] = (int)rint(middle_px * g->per_px[axis]);
+        double inside = g->length[axis] / 2.0 - 1.0;
+        g->window[2 * axis] = (int)ceil((g->center[axis] - inside) / per_px + 0.5);
+        g->window[2 * axis + 1] = (int)floor((g->center[axis] + inside) / per_px - 0.5);
+    }
+    return 1;
+}
+
+/* First and last column, as reals, of an ellipse scaled by r in the row at y. */
+static void chord(double y, double r, const pupil *own, double samples, double middle,
+                  double *first, double *last) {
+    double inside = (r * r - y * y) * square(own->root);
+    *first = 0.0;
+    *last = -1.0;
+    if (r <= 0.0 || inside <= 0.0) return;
+    double half = 0.5 * samples * sqrt(inside), at = middle + 0.5 * samples * own->shear * y;
+    *first = at - half;
+    *last = at + half;
+}
+
+/* The smoothed pupil, strip by strip; kept while it is the same. */
+static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
+                     wave_work *w) {
+    int columns = g->size[0], rows = g->size[1];
+    if (w->mask_rows == rows && w->mask_columns == columns
+        && w->mask_samples[0] == g->samples[0] && w->mask_samples[1] == g->samples[1]
+        && w->mask_shear == own->shear
+        && memcmp(w->mask_amplitudes, own->log_amplitude, sizeof own->log_amplitude) == 0)
+        return 1;
+    int strips = (columns + STRIP - 1) / STRIP;
+    size_t count = (size_t)strips * (size_t)rows * STRIP;
+    w->mask_rows = 0;
+    float *mask = room_for(&w->mask, count);
+    if (mask == NULL) return 0;
+    memset(mask, 0, sizeof(float) * count);
+    double ax = 0.5 * g->samples[0], ay = 0.5 * g->samples[1];
+    double mean = 0.5 * (ax * ax + ay * ay), half = 0.5 * (ax * ax - ay * ay);
+    double least = sqrt(mean - hypot(half, own->shear * ax * ay));
+    double border = (tables->edge_half_width + 0.5) / least;
+    double middle = 0.5 * (columns - 1), middle_y = 0.5 * (rows - 1);
+    f32x8 inverse = all8((float)(1.0 / square(own->root))), r = all8((float)own->shear);
+    f32x8 per_x = all8((float)(1.0 / ax)), per_y = all8((float)(1.0 / ay));
+    int edge_count = 2 * tables->edge_half_width * tables->edge_steps + 1;
+    f32x8 steps = all8((float)tables->edge_steps);
+    f32x8 inner_half = all8((float)tables->edge_half_width);
+    float most_place = (float)(edge_count - 1);
+    const double *a = own->log_amplitude;
+    f32x8 far_value = all8(tables->edge_response[edge_count - 1]);
+    for (int j = 0; j < rows; ++j) {
+        double y = (j - middle_y) / ay;
+        f32x8 v = all8((float)y);
+        double outer_first, outer_last, inner_first, inner_last;
+        chord(y, 1.0 + border, own, g->samples[0], middle, &outer_first, &outer_last);
+        chord(y, 1.0 - border, own, g->samples[0], middle, &inner_first, &inner_last);
+        if (outer_last < outer_first) continue;
+        int first = larger_int(0, (int)floor(outer_first)) / 8 * 8;
+        int end = smaller_int(columns, (int)ceil(outer_last) + 1);
+        int in_first = (int)ceil(inner_first), in_end = (int)floor(inner_last) + 1;
+        for (int i = first; i < end; i += 8) {
+            f32x8 u = (NUMBERS8 + all8((float)(i - middle))) * per_x;
+            f32x8 value = far_value;
+            if (i < in_first || i + 8 > in_end) {
+                f32x8 across = (u - r * v) * inverse, along = (v - r * u) * inverse;
+                f32x8 radius = root8(u * across + v * along);
+                f32x8 slope_x = across * per_x, slope_y = along * per_y;
+                f32x8 steep = root8(slope_x * slope_x + slope_y * slope_y);
+                f32x8 depth = (all8(1.0f) - radius) * radius / (steep + all8(1e-12f));
+                f32x8 place = (depth + inner_half) * steps;
+                place = smaller8(larger8(place, all8(0.0f)), all8(most_place));
+                i32x8 at = whole8(smaller8(place, all8(most_place - 1.0f)));
+                f32x8 low = entries8(tables->edge_response, at);
+                f32x8 high = entries8(tables->edge_response + 1, at);
+                value = low + (place - __builtin_convertvector(at, f32x8)) * (high - low);
+            }
+            for (int k = 0; own->is_apodised && k < 8; ++k)
+                value[k] *= (float)exp(a[0] + u[k] * (a[1] + a[3] * u[k] + a[4] * y)
+                                       + y * (a[2] + a[5] * y));
+            store8(mask + ((size_t)(i / STRIP) * rows + j) * STRIP + i % STRIP, value);
+        }
+    }
+    w->mask_rows = rows;
+    w->mask_columns = columns;
+    memcpy(w->mask_samples, g->samples, sizeof g->samples);
+    w->mask_shear = own->shear;
+    memcpy(w->mask_amplitudes, own->log_amplitude, sizeof own->log_amplitude);
+    return 1;
+}
+
+/* Mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
+static void fill_strip(const psf_tables *tables, const grid *g, const float *mask,
+                       float (*row_terms)[N_POWERS], int first_column, strip_row *to) {
+    float x[STRIP];
+    for (int i = 0; i < STRIP; ++i)
+        x[i] = (float)((first_column + i - 0.5 * (g->size[0] - 1)) * 2.0 / g->samples[0]);
+    f32x8 half = all8(0.5f), zero = all8(0.0f);
+    for (int j = 0; j < g->size[1]; ++j)
+        for (int h = 0; h < 2; ++h) {
+            f32x8 share = load8(mask + j * STRIP + 8 * h);
+            if (!any8(share != zero)) {
+                to[j].re[h] = to[j].im[h] = zero;
+                continue;
+            }
+            f32x8 u = load8(x + 8 * h);
+            const float *c = row_terms[j];
+            f32x8 t = all8(c[6]);
+            for (int k = N_POWERS - 2; k >= 0; --k) t = all8(c[k]) + u * t;
+            t -= floor8(t + half);
+            to[j].re[h] = share * cosine8(tables, t * t);
+            to[j].im[h] = share * sine8(tables, t, t * t);
+        }
+    memset(to + g->size[1], 0, sizeof *to * (size_t)(g->length[1] - g->size[1]));
+}
+
+/* Adds the intensity of the strip's rows to those pixels along x that they meet. */
+static void sum_strip(const psf_tables *tables, const grid *g, const strip_row *rows,
+                      int x0, int x1, float *sums, size_t stride) {
+    int k = g->per_px[0], n = g->length[0], half = n / 2;
+    int reach = (k + 1) / 2 + tables->filter_half_width;
+    const float *filter = tables->pixel_filters + (size_t)(k - 1) * tables->filter_stride;
+    int first = larger_int(0, x0 * k - g->center[0] + half - reach);
+    int last = smaller_int(n - 1, x1 * k - g->center[0] + half + reach);
+    for (int j = first; j <= last; ++j) {
+        const strip_row *row = rows + (j + half) % n;
+        f32x8 light[2];
+        for (int h = 0; h < 2; ++h)
+            light[h] = row->re[h] * row->re[h] + row->im[h] * row->im[h];
+        int position = j - half + g->center[0];
+        int low = position - reach, high = position + reach; /* in k q */
+        int q_low = larger_int(x0, low >= 0 ? (low + k - 1) / k : -(-low / k));
+        int q_high = smaller_int(x1, high >= 0 ? high / k : -((-high + k - 1) / k));
+        for (int q = q_low; q <= q_high; ++q) {
+            f32x8 weight = all8(filter[position - q * k + reach]);
+            float *to = sums + (size_t)(q - x0) * stride;
+            store8(to, load8(to) + weight * light[0]);
+            store8(to + 8, load8(to + 8) + weight * light[1]);
+        }
+    }
+}
+
+#define MOST_LENGTH 4096
+
+/* Coefficients in x of the phase, in turns, for each row of the grid. */
+static void fill_phase_terms(double turns[N_POWERS][N_POWERS], const grid *g,
+                             float (*terms)[N_POWERS]) {
+    enum { BLOCK = 64 };
+    for (int first = 0; first < g->size[1]; first += BLOCK) {
+        int count = smaller_int(BLOCK, g->size[1] - first);
+        double y[BLOCK], value[BLOCK];
+        for (int j = 0; j < BLOCK; ++j)
+            y[j] = (first + j - 0.5 * (g->size[1] - 1)) * 2.0 / g->samples[1];
+        for (int a = 0; a < N_POWERS; ++a) {
+            for (int j = 0; j < BLOCK; ++j) value[j] = 0.0;
+            for (int b = N_POWERS - 1 - a; b >= 0; --b)
+                for (int j = 0; j < BLOCK; ++j) value[j] = value[j] * y[j] + turns[b][a];
+            /* Whole turns go before the cast, which keeps 1e-6 of the rest. */
+            for (int j = 0; j < count; ++j)
+                terms[first + j][a] = (float)(a == 0 ? value[j] - floor(value[j]) : value[j]);
+        }
+    }
+}
+
+/* A spot in shares of the light that the pupil passes; 0 without memory. */
+static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wave_work *w,
+                         const canvas *c) {
+    const psf_tables *tables = job->tables;
+    int columns = g->size[0], rows = g->size[1], n_x = g->length[0], n_y = g->length[1];
+    size_t padded = ((size_t)n_y + STRIP - 1) / STRIP * STRIP;
+    /* Only pixels of the canvas. */
+    int x0 = larger_int(g->window[0], c->left);
+    int x1 = smaller_int(g->window[1], c->left + c->width - 1);
+    int y0 = larger_int(g->window[2], c->top - c->height + 1);
+    int y1 = smaller_int(g->window[3], c->top);
+    if (x1 < x0 || y1 < y0) return 1;
+    size_t strip_floats = (size_t)larger_int(n_x, n_y) * 2 * STRIP;
+    size_t columns_padded = ((size_t)columns + STRIP - 1) / STRIP * STRIP;
+    size_t sum_count = (size_t)(x1 - x0 + 1) * padded;
+    int k = g->per_px[1], half = n_y / 2, reach = (k + 1) / 2 + tables->filter_half_width;
+    int pad = reach + k + 8;
+    size_t line_count = (size_t)(n_y + 2 * pad + tables->filter_stride);
+    strip_row *rows_of = room_for(&w->first, strip_floats);
+    strip_row *other = room_for(&w->second, strip_floats);
+    float *between = room_for(&w->between, columns_padded * 2 * padded);
+    float *sums = room_for(&w->sums, sum_count), *line = room_for(&w->line, line_count);
+    if (rows_of == NULL || other == NULL || between == NULL || sums == NULL || line == NULL
+        || !fill_mask(tables, own, g, w))
+        return 0;
+    double turns[N_POWERS][N_POWERS] = {{0.0}};
+    for (int t = 0; t < N_TERMS; ++t) {
+        int x, y;
+        exponents(t, &x, &y);
+        turns[y][x] = own->box[t] / own->wavelength_um;
+    }
+    for (int axis = 0; axis < 2; ++axis) {
+        double center_px = (double)g->center[axis] / g->per_px[axis];
+        double *tilt = axis == 0 ? &turns[0][1] : &turns[1][0];
+        *tilt -= own->half[axis] * center_px / own->wavelength_um;
+    }
+    float row_terms[MOST_LENGTH][N_POWERS];
+    fill_phase_terms(turns, g, row_terms);
+    const float *tw_x = tables->twiddles + 2 * tables->twiddle_first[g->length_number[0]];
+    const float *tw_y = tables->twiddles + 2 * tables->twiddle_first[g->length_number[1]];
+    for (int first = 0; first < columns; first += STRIP) {
+        const float *mask = (const float *)w->mask.at + (size_t)first * (size_t)rows;
+        fill_strip(tables, g, mask, row_terms, first, rows_of);
+        const strip_row *done = fft_strip(rows_of, other, n_y, tw_y);
+        turn_strip(done, n_y, padded, between + (size_t)first * 2 * padded);
+    }
+    memset(sums, 0, sizeof(float) * sum_count);
+    for (size_t first = 0; first < padded; first += STRIP) {
+        for (int i = 0; i < columns; ++i) {
+            const float *from = between + (size_t)i * 2 * padded + first;
+            for (int h = 0; h < 2; ++h) {
+                rows_of[i].re[h] = load8(from + 8 * h);
+                rows_of[i].im[h] = load8(from + padded + 8 * h);
+            }
+        }
+        memset(rows_of + columns, 0, sizeof *rows_of * (size_t)(n_x - columns));
+        const strip_row *done = fft_strip(rows_of, other, n_x, tw_x);
+        sum_strip(tables, g, done, x0, x1, sums + first, padded);
+    }
+    /* |sum|^2 (area of a pupil sample)^2 / (lambda^2 A) (angle of a sample)^2: areas and
+     * angles multiply to lambda^2 / N^2, which leaves 1 / N^2 over A in samples. */
+    double area = M_PI / 4.0 * own->root * g->samples[0] * g->samples[1];
+    float scale = (float)(1.0 / (area * n_x * n_y) / own->passed_ratio);
+    const float *filter = tables->pixel_filters + (size_t)(k - 1) * tables->filter_stride;
+    memset(line, 0, sizeof(float) * line_count);
+    for (int q = x0; q <= x1; ++q) {
+        const float *own_sums = sums + (size_t)(q - x0) * padded;
+        memcpy(line + pad, own_sums + half, sizeof(float) * (size_t)(n_y - half));
+        memcpy(line + pad + n_y - half, own_sums, sizeof(float) * (size_t)half);
+        for (int y = y0; y <= y1; ++y) {
+            const float *from = line + pad + y * k - g->center[1] + half - reach;
+            f32x8 sum = all8(0.0f);
+            for (int i = 0; i < 2 * reach + 1; i += 8) sum += load8(from + i) * load8(filter + i);
+            float light = ((sum[0] + sum[1]) + (sum[2] + sum[3]))
+                          + ((sum[4] + sum[5]) + (sum[6] + sum[7]));
+            c->pixels[(c->top - y) * c->width + q - c->left] = larger_float(scale * light, 0.0f);
+        }
+    }
+    return 1;
+}

@@ -1,0 +1,385 @@
+/* From wavefronts to packed kernels: each PSF by the method that holds for it, cut to the
+ * box that keeps its light, in sixteen bits a weight (filter_service/psfs/pack.py).  Only
+ * texels that are kept, and the spot with its surroundings, are computed. */
+
+#define MOST_PRIMARIES 16
+#define MOST_REACH_PX 255
+#define WEIGHT_MAX 65535.0
+#define PSFS_AN_ITEM 8
+#define RAYS_MARGIN_PX 7.5    /* the edge's light is laid up to 6.25 px, over two pixels */
+#define SIDES 4               /* left, right, up, down, as reaches are stored */
+
+static const int side_axis[SIDES] = {0, 0, 1, 1};
+static const double side_sign[SIDES] = {-1.0, 1.0, 1.0, -1.0};
+
+/* What a thread keeps. */
+typedef struct {
+    wave_work waves;
+    scratch plane, part, kept;
+    uint16_t *words;          /* all kernels of this thread */
+    int64_t count, room;
+} psf_work;
+
+typedef struct {
+    psf_work *work;           /* one a thread */
+    int64_t *first;           /* (count,) in the words of the thread */
+    int32_t *thread;          /* (count,) */
+} psf_results;
+
+INLINE int clamp_int(int value, int low, int high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+/* A pupil of one primary. */
+static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) {
+    const psf_tables *tables = job->tables;
+    int64_t group = job->groups[psf], channel = job->channels[psf];
+    int64_t node = (group * RGB + channel) * job->primaries + primary;
+    int64_t color = channel * job->primaries + primary;
+    double zernike_um[N_TERMS];
+    for (int t = 0; t < N_TERMS; ++t)
+        zernike_um[t] = job->zernike_um[node * N_TERMS + t]
+                        + job->total_dpt[psf] * job->per_dpt_um[node * N_TERMS + t];
+    const double *ellipse = job->pupil_ellipse + node * ELLIPSE_COLUMNS;
+    const double *jacobian = job->pixel_from_mrad + group * 4;
+    frame_pupil(tables, zernike_um, job->circle_diameter_mm[node] / 2.0, ellipse, jacobian,
+                own);
+    own->wavelength_um = job->wavelength_nm[color] / 1000.0;
+    memset(own->log_amplitude, 0, sizeof own->log_amplitude);
+    own->is_apodised = 0;
+    own->passed_ratio = 1.0;
+    own->edge_um = own->wavelength_um;
+    if (job->apodisation_per_mm2 != NULL)
+        apodise_pupil(tables, job->apodisation_per_mm2[color], job->apodisation_center_mm,
+                      ellipse, jacobian, own);
+    survey_pupil(tables, own);
+    own->rays_ratio = job->is_diffracting ? share_of_rays(tables, own) : 1.0;
+    own->weight = 1.0 / job->primaries;
+}
+
+/* Widens a box x0, x1, y0, y1 so that it holds what a pupil's engines compute. */
+static void widen_box(const pupil *own, const grid *g, int is_diffracting, int box[4]) {
+    double margin = is_diffracting ? RAYS_MARGIN_PX : 1.5;
+    for (int axis = 0; axis < 2; ++axis) {
+        int *low = box + 2 * axis, *high = low + 1;
+        if (own->rays_ratio > 0.0) {
+            *low = smaller_int(*low, (int)floor(own->low[axis] - margin));
+            *high = larger_int(*high, (int)ceil(own->high[axis] + margin));
+        }
+        if (own->rays_ratio < 1.0) {
+            *low = smaller_int(*low, g->window[2 * axis]);
+            *high = larger_int(*high, g->window[2 * axis + 1]);
+        }
+    }
+}
+
+/* Brings what a wave window does not reach up to the mean light of the edge. */
+static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
+    for (int row = 0; row < c->height; ++row) {
+        int y = c->top - row, is_done = y >= g->window[2] && y <= g->window[3];
+        for (int column = 0; column < c->width; column += LANES) {
+            f32x8 nearest, x = NUMBERS8 + all8((float)(c->left + column));
+            float found[LANES];
+            store8(found, tail_light8(t, x, (float)y, &nearest));
+            for (int i = 0; i < LANES && column + i < c->width; ++i) {
+                int at = c->left + column + i;
+                if (is_done && at >= g->window[0] && at <= g->window[1]) continue;
+                c->pixels[row * c->width + column + i] = found[i];
+            }
+        }
+    }
+}
+
+/* What choosing the box reads of a plane: light by side, from the outermost pixel on. */
+typedef struct {
+    const pupil *pupils;
+    int primaries, is_diffracting;
+    const double *lines[2];   /* light of columns from the left, and of rows from below */
+    int box[4];
+    double total, center[2];
+    double strength[2], source[2]; /* of the tail: sum, and mean place, along an axis */
+} light_of_plane;
+
+static double all_light_beyond(const light_of_plane *l, int axis, double sign, double end) {
+    double sum = 0.0;
+    if (!l->is_diffracting) return 0.0;
+    for (int p = 0; p < l->primaries; ++p)
+        sum += l->pupils[p].weight * light_beyond(l->pupils + p, axis, sign, end);
+    return sum;
+}
+
+/* Smallest reach on a side beyond which there is no more than the share; its light, and
+ * the light's moment about the middle along the axis, whose part from infinity is left
+ * out: the other side has the same. */
+static int reach_of_side(const light_of_plane *l, int side, double share, int most,
+                         double *cut, double *moment) {
+    int axis = side_axis[side];
+    double sign = side_sign[side], allowed = share * l->total;
+    const double *lines = l->lines[axis];
+    int low = l->box[2 * axis], high = l->box[2 * axis + 1];
+    int end = sign > 0.0 ? high : -low; /* of the plane, outwards */
+    double beyond = all_light_beyond(l, axis, sign, end + 0.5);
+    double middle = sign * l->center[axis], source = sign * l->source[axis];
+    int reach = end;
+    double added = 0.0;
+    if (beyond > allowed) {
+        int step = 1, far;
+        while (reach < most) {   /* outwards: doubled steps, then halved */
+            far = smaller_int(reach + step, most);
+            double light = all_light_beyond(l, axis, sign, far + 0.5);
+            if (light <= allowed) {
+                int near = reach;
+                while (far - near > 1) {
+                    int between = (near + far) / 2;
+                    double here = all_light_beyond(l, axis, sign, between + 0.5);
+                    if (here <= allowed) {
+                        far = between;
+                        light = here;
+                    } else near = between;
+                }
+                reach = far;
+                beyond = light;
+                break;
+            }
+            reach = far;
+            beyond = light;
+            step *= 2;
+        }
+        end = reach;
+    } else {
+        double light = beyond;
+        while (reach > 0) {
+            int place = sign > 0.0 ? reach - low : -reach - low;
+            if (light + lines[place] > allowed) break;
+            light += lines[place];
+            added += lines[place] * (reach - middle);
+            --reach;
+        }
+        *cut = light;
+        *moment = added;
+        if (l->is_diffracting)
+            *moment += l->strength[axis] * ((source - middle) / (end + 0.5 - source)
+                                            - log(end + 0.5 - source));
+        return reach;
+    }
+    *cut = beyond;
+    *moment = l->strength[axis] * ((source - middle) / (end + 0.5 - source)
+                                   - log(end + 0.5 - source));
+    return reach;
+}
+
+/* Reaches that cut a share of the light, less where that moved the kernel's middle. */
+static void choose_box(const psf_job *job, const light_of_plane *l, double spread_px,
+                       int most, int reach[SIDES]) {
+    const psf_tables *tables = job->tables;
+    double limit = tables->centroid_ratio * larger_double(spread_px, 1.0);
+    double share = job->cut_ratio / SIDES;
+    for (int step = 0; step <= tables->cut_steps; ++step) {
+        double cut[SIDES], moment[SIDES];
+        if (step == tables->cut_steps) share = 0.0;
+        for (int side = 0; side < SIDES; ++side)
+            reach[side] = reach_of_side(l, side, share, most, cut + side, moment + side);
+        double shift = 0.0;
+        for (int axis = 0; axis < 2; ++axis) {
+            const double *c = cut + 2 * axis, *m = moment + 2 * axis;
+            double held = l->total - c[0] - c[1];
+            shift = larger_double(shift, fabs(m[0] - m[1]) / larger_double(held, 1e-12));
+        }
+        if (shift <= limit) break;
+        share /= 2.0;
+    }
+}
+
+/* Room for so many more words; NULL without memory. */
+static uint16_t *more_words(psf_work *w, int64_t count) {
+    if (w->count + count > w->room) {
+        int64_t room = 2 * (w->count + count);
+        uint16_t *words = realloc(w->words, sizeof *words * (size_t)room);
+        if (words == NULL) return NULL;
+        w->words = words;
+        w->room = room;
+    }
+    return w->words + w->count;
+}
+
+/* Cuts a plane to its box, adds the tail where the box is larger, and brings it to steps
+ * of its peak. */
+static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
+                          const tail *tails, const canvas *c, psf_work *w) {
+    double columns[2 * MOST_REACH_PX + 64] = {0.0}, rows[2 * MOST_REACH_PX + 64] = {0.0};
+    double squares = 0.0, total = 0.0, moment_x = 0.0, moment_y = 0.0;
+    for (int row = 0; row < c->height; ++row) {
+        const float *from = c->pixels + row * c->width;
+        double sum = 0.0, square_sum = 0.0;
+        for (int column = 0; column < c->width; ++column) {
+            double value = from[column];
+            columns[column] += value;
+            sum += value;
+            square_sum += value * value;
+        }
+        rows[c->height - 1 - row] = sum;
+        squares += square_sum;
+        total += sum;
+        moment_y += sum * (c->top - row);
+    }
+    if (!(total > 0.0)) return PSF_NOT_HERE;
+    for (int column = 0; column < c->width; ++column)
+        moment_x += columns[column] * (c->left + column);
+    light_of_plane l = {
+        .pupils = pupils, .primaries = job->primaries,
+        .is_diffracting = job->is_diffracting, .lines = {columns, rows},
+        .box = {c->left, c->left + c->width - 1, c->top - c->height + 1, c->top}};
+    double outside = 0.0;
+    for (int p = 0; p < job->primaries && job->is_diffracting; ++p)
+        outside += pupils[p].weight * light_outside(pupils + p, l.box);
+    l.total = total + outside;
+    for (int axis = 0; axis < 2 && job->is_diffracting; ++axis) {
+        double sum = 0.0, places = 0.0;
+        for (int p = 0; p < job->primaries; ++p) {
+            const pupil *own = pupils + p;
+            double scale = own->weight * own->edge_um / (2.0 * M_PI * M_PI * N_EDGE);
+            for (int i = 0; i < N_EDGE; ++i) {
+                double strength = scale * fabs(own->normal[axis][i]);
+                sum += strength;
+                places += strength * own->edge[axis][i];
+            }
+        }
+        l.strength[axis] = sum;
+        l.source[axis] = places / sum;
+    }
+    l.center[0] = (moment_x + outside * l.source[0]) / l.total;
+    l.center[1] = (moment_y + outside * l.source[1]) / l.total;
+    int most = smaller_int(job->max_radius_px, MOST_REACH_PX);
+    int reach[SIDES];
+    choose_box(job, &l, total / sqrt(M_PI * squares), most, reach);
+    int left = clamp_int(reach[0], 0, most), right = clamp_int(reach[1], 0, most);
+    int up = clamp_int(reach[2], 0, most), down = clamp_int(reach[3], 0, most);
+    int width = left + right + 1, height = up + down + 1;
+    float *kept = room_for(&w->kept, (size_t)(width * height) + LANES);
+    uint16_t *words = more_words(w, (int64_t)width * height);
+    if (kept == NULL || words == NULL) return PSF_NO_MEMORY;
+    double sum = 0.0, peak = 0.0;
+    squares = 0.0;
+    for (int row = 0; row < height; ++row) {
+        int y = up - row, x = -left;
+        float *to = kept + row * width;
+        int is_inside = y <= c->top && y > c->top - c->height;
+        while (x <= right) {
+            if (is_inside && x >= c->left && x < c->left + c->width) {
+                int count = smaller_int(right, c->left + c->width - 1) - x + 1;
+                memcpy(to + x + left, c->pixels + (c->top - y) * c->width + x - c->left,
+                       sizeof(float) * (size_t)count);
+                x += count;
+                continue;
+            }
+            int end = is_inside && x < c->left ? smaller_int(right + 1, c->left) : right + 1;
+            for (; x < end; x += LANES) {
+                f32x8 light = all8(0.0f), nearest, place = NUMBERS8 + all8((float)x);
+                for (int p = 0; p < job->primaries && job->is_diffracting; ++p)
+                    light += all8((float)pupils[p].weight)
+                             * tail_light8(tails + p, place, (float)y, &nearest);
+                memcpy(to + x + left, &light,
+                       sizeof(float) * (size_t)smaller_int(LANES, end - x));
+            }
+            x = end;
+        }
+        for (int column = 0; column < width; ++column) {
+            double value = to[column];
+            sum += value;
+            squares += value * value;
+            peak = larger_double(peak, value);
+        }
+    }
+    if (!(sum > 0.0)) return PSF_NOT_HERE;
+    int farthest = 0;
+    float per_step = (float)(WEIGHT_MAX / peak);
+    for (int row = 0; row < height; ++row) {
+        int y = up - row, outermost = -1;
+        const float *from = kept + row * width;
+        uint16_t *to = words + row * width;
+        for (int column = 0; column < width; ++column)
+            to[column] = (uint16_t)smaller_float(from[column] * per_step + 0.5f, 65535.0f);
+        for (int x = left; x >= 0 && outermost < 0; --x)
+            if (to[left - x] > 0) outermost = x;
+        for (int x = right; x > outermost; --x)
+            if (to[left + x] > 0) outermost = x;
+        if (outermost >= 0) farthest = larger_int(farthest, outermost * outermost + y * y);
+    }
+    job->reach_px[4 * psf + 0] = left;
+    job->reach_px[4 * psf + 1] = right;
+    job->reach_px[4 * psf + 2] = up;
+    job->reach_px[4 * psf + 3] = down;
+    job->radius_px[psf] = (int64_t)ceil(sqrt(farthest) - 0.5);
+    job->sizes[psf] = (int64_t)width * height;
+    job->peak_ratio[psf] = peak / sum;
+    job->spread_px[psf] = sum / sqrt(M_PI * squares);
+    job->lost_ratio[psf] = smaller_double(1.0, larger_double(0.0, 1.0 - sum / l.total));
+    w->count += (int64_t)width * height;
+    return PSF_DONE;
+}
+
+static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
+    pupil pupils[MOST_PRIMARIES];
+    tail tails[MOST_PRIMARIES];
+    grid grids[MOST_PRIMARIES];
+    int box[4] = {0, 0, 0, 0}; /* the chief ray is in it */
+    double rays_ratio = 0.0;
+    for (int p = 0; p < job->primaries; ++p) {
+        pupil *own = pupils + p;
+        prepare_pupil(job, psf, p, own);
+        if (!(own->blur_px >= 0.0 && own->blur_px + 0.21 <= job->max_radius_px))
+            return PSF_NOT_HERE;
+        if (own->rays_ratio < 1.0 && !plan_grid(job, own, grids + p)) return PSF_NOT_HERE;
+        widen_box(own, grids + p, job->is_diffracting, box);
+        tails[p] = tail_of(job->tables, own);
+        rays_ratio += own->weight * own->rays_ratio;
+    }
+    int farthest = MOST_REACH_PX + 16;
+    for (int i = 0; i < 4; ++i) box[i] = clamp_int(box[i], -farthest, farthest);
+    int width = box[1] - box[0] + 1, height = box[3] - box[2] + 1, count = width * height;
+    float *plane = room_for(&w->plane, (size_t)count + LANES);
+    float *part = room_for(&w->part, (size_t)count + LANES);
+    if (plane == NULL || part == NULL) return PSF_NO_MEMORY;
+    int is_first = 1;
+    for (int p = 0; p < job->primaries; ++p)
+        for (int by_rays = 0; by_rays < 2; ++by_rays) {
+            const pupil *own = pupils + p;
+            double weight = own->weight
+                            * (by_rays ? own->rays_ratio : 1.0 - own->rays_ratio);
+            if (weight <= 0.0) continue;
+            canvas c = {is_first ? plane : part, box[0], box[3], width, height};
+            memset(c.pixels, 0, sizeof(float) * (size_t)count);
+            if (by_rays) {
+                spot_of_rays(job->tables, own, job->is_diffracting, &c);
+            } else {
+                if (!spot_of_waves(job, own, grids + p, &w->waves, &c)) return PSF_NO_MEMORY;
+                const int *window = grids[p].window;
+                if (window[0] > box[0] || window[1] < box[1] || window[2] > box[2]
+                    || window[3] < box[3])
+                    lift_beyond(tails + p, grids + p, &c);
+            }
+            float share = (float)weight;
+            if (is_first && share != 1.0f)
+                for (int i = 0; i < count; ++i) plane[i] *= share;
+            if (!is_first)
+                for (int i = 0; i < count; ++i) plane[i] += share * part[i];
+            is_first = 0;
+        }
+    job->rays_ratio[psf] = rays_ratio;
+    canvas c = {plane, box[0], box[3], width, height};
+    return pack_plane(job, psf, pupils, tails, &c, w);
+}
+
+static void compute_psf_item(void *argument, int item, int thread) {
+    const psf_job *job = argument;
+    psf_results *results = job->results;
+    psf_work *w = results->work + thread;
+    int first = item * PSFS_AN_ITEM;
+    int last = smaller_int(first + PSFS_AN_ITEM, job->count);
+    for (int psf = first; psf < last; ++psf) {
+        results->thread[psf] = thread;
+        results->first[psf] = w->count;
+        job->sizes[psf] = 0;
+        job->outcome[psf] = compute_psf(job, psf, w);
+    }
+}
