@@ -100,12 +100,15 @@ def _generic_kernels(
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )
     batch = mean_batch(batch, n_primaries)
-    packed = pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio, pool=_pool())
+    packed = pack_kernels(
+        batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pack_pool()
+    )
     return packed, _methods(batch)
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
+def pack_pool() -> ThreadPoolExecutor:
+    """Threads that cut kernels."""
     return ThreadPoolExecutor(thread_count())
 
 

@@ -196,4 +196,4 @@ def test_a_frame_says_where_its_blur_is_limited():
     eye = traced_eye("emmetropia", spec)
     store = build_psf_store(eye, spec)
     assert "blur beyond 6 px" in " ".join(frame_layers(store, **STATE).notes)
-    assert store.radius_px.max() <= 6
+    assert store.reach_px.max() <= 6

@@ -185,7 +185,7 @@ def look(engine, profile, h_deg, *, lateral_color=True, eye_model="traced"):
         object_range_dpt=(2.5, 3.0),
         mode="quality",
         tolerance="fine",
-        kept_energy_ratio=0.998,
+        kept_energy_ratio=0.99,  # wider kernels would widen the cells
         lateral_color=lateral_color,
     )
     eye, notes = eye_for_spec(

@@ -22,8 +22,9 @@ FRAMES = (
     "tests/numerical/test_renderer_wide.py",
     "tests/numerical/test_native_random.py",
     "tests/numerical/test_field_layers.py",
+    "tests/numerical/test_native_psfs.py",
 )
-"""Every size and radius, odd depths, hidden layers, kernels over the field."""
+"""Every size and radius, odd depths, hidden layers, kernels over the field, PSFs."""
 
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 
@@ -45,16 +46,25 @@ def test_packed_words_are_those_of_python():
     assert int(defined["RESOLUTIONS"], 0) == records.RESOLUTIONS
 
 
-def test_fields_of_the_frame_s_record_are_those_of_the_source_in_order():
-    text = (SOURCE / "frame.h").read_text(encoding="utf-8")
-    body = text[text.rindex("typedef struct {") : text.rindex("} frame;")]
+@pytest.mark.parametrize(
+    ("file", "name", "record"),
+    [
+        ("frame.h", "frame", records.Frame),
+        ("psf_job.h", "psf_job", records.PsfJob),
+        ("psf_job.h", "psf_tables", records.PsfTables),
+    ],
+)
+def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):
+    text = (SOURCE / file).read_text(encoding="utf-8")
+    before = text[: text.index(f"}} {name};")]
+    body = before[before.rindex("typedef struct {") :]
     body = re.sub(r"/\*.*?\*/", "", body, flags=re.S)
     declared = []
     for line in body.split(";")[:-1]:
         names = line.split("{")[-1].strip().split(None, 1)[1]
-        for name in names.split(","):
-            declared.append(re.sub(r"\[.*?\]", "", name).split("*")[-1].split()[-1])
-    assert declared == [name for name, *_ in records.Frame._fields_]
+        for field in names.split(","):
+            declared.append(re.sub(r"\[.*?\]", "", field).split("*")[-1].split()[-1])
+    assert declared == [field for field, *_ in record._fields_]
 
 
 def test_the_package_lists_every_source():

@@ -22,10 +22,10 @@ INLINE void add_pair(float *to, float first, float second) {
 typedef struct {
     float of_w[N_POWERS][MOST_CELLS], of_dy[N_POWERS][MOST_CELLS],
         of_dyy[N_POWERS][MOST_CELLS];
-} row_terms;
+} cell_terms;
 
-static void fill_row_terms(double dense[N_POWERS][N_POWERS], const double *y, int count,
-                           row_terms *rows) {
+static void fill_cell_terms(double dense[N_POWERS][N_POWERS], const double *y, int count,
+                           cell_terms *rows) {
     double value[MOST_CELLS], first[MOST_CELLS], second[MOST_CELLS];
     for (int a = 0; a < N_POWERS; ++a) {
         for (int j = 0; j < count; ++j) value[j] = first[j] = second[j] = 0.0;
@@ -160,16 +160,16 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
     /* Within this the whole cell lies inside: the ellipse is least curved-in there. */
     double inner = larger_double(0.0, 1.0 - 0.75 * cell / sqrt(1.0 - fabs(shear)));
     double ys[MOST_CELLS];
-    row_terms rows;
+    cell_terms rows;
     for (int j = 0; j < n_cells; ++j) ys[j] = (j + 0.5) * cell - 1.0;
-    fill_row_terms(dense, ys, n_cells, &rows);
+    fill_cell_terms(dense, ys, n_cells, &rows);
     for (int j = 0; j < n_cells; ++j) {
         double y = ys[j], middle = 1.0 + shear * y;
         double edge = square(1.0 + 0.5 * cell) - y * y;
-        double reach = sqrt(larger_double(0.0, edge) * room) + cell;
+        double chord = sqrt(larger_double(0.0, edge) * room) + cell;
         double core = sqrt(larger_double(0.0, inner * inner - y * y) * room);
-        int first = larger_int(0, (int)floor((middle - reach) / cell));
-        int end = smaller_int(n_cells, (int)ceil((middle + reach) / cell));
+        int first = larger_int(0, (int)floor((middle - chord) / cell));
+        int end = smaller_int(n_cells, (int)ceil((middle + chord) / cell));
         int core_first = (int)ceil((middle - core) / cell);
         int core_end = (int)floor((middle + core) / cell);
         if (core_end <= core_first) core_first = core_end = end;

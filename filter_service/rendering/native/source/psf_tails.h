@@ -39,7 +39,7 @@ INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 *nearest) {
     f32x8 near = all8(1e30f), far = all8(0.0f);
     for (int k = 0; k < TAIL_EDGES; ++k) {
         f32x8 along = x - all8(t->edge_x[k]);
-        f32x8 across = all8(square(y - t->edge_y[k]));
+        f32x8 across = all8((y - t->edge_y[k]) * (y - t->edge_y[k]));
         f32x8 distance = along * along + across;
         near = smaller8(near, distance);
         far = larger8(far, distance);

@@ -66,7 +66,7 @@ static int plan_grid(const psf_job *job, const pupil *own, grid *g) {
 }
 
 /* First and last column, as reals, of an ellipse scaled by r in the row at y. */
-static void chord(double y, double r, const pupil *own, double samples, double middle,
+static void chord_of(double y, double r, const pupil *own, double samples, double middle,
                   double *first, double *last) {
     double inside = (r * r - y * y) * square(own->root);
     *first = 0.0;
@@ -109,8 +109,8 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
         double y = (j - middle_y) / ay;
         f32x8 v = all8((float)y);
         double outer_first, outer_last, inner_first, inner_last;
-        chord(y, 1.0 + border, own, g->samples[0], middle, &outer_first, &outer_last);
-        chord(y, 1.0 - border, own, g->samples[0], middle, &inner_first, &inner_last);
+        chord_of(y, 1.0 + border, own, g->samples[0], middle, &outer_first, &outer_last);
+        chord_of(y, 1.0 - border, own, g->samples[0], middle, &inner_first, &inner_last);
         if (outer_last < outer_first) continue;
         int first = larger_int(0, (int)floor(outer_first)) / 8 * 8;
         int end = smaller_int(columns, (int)ceil(outer_last) + 1);
@@ -147,7 +147,7 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
 
 /* Mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
 static void fill_strip(const psf_tables *tables, const grid *g, const float *mask,
-                       float (*row_terms)[N_POWERS], int first_column, strip_row *to) {
+                       float (*phase_terms)[N_POWERS], int first_column, strip_row *to) {
     float x[STRIP];
     for (int i = 0; i < STRIP; ++i)
         x[i] = (float)((first_column + i - 0.5 * (g->size[0] - 1)) * 2.0 / g->samples[0]);
@@ -160,7 +160,7 @@ static void fill_strip(const psf_tables *tables, const grid *g, const float *mas
                 continue;
             }
             f32x8 u = load8(x + 8 * h);
-            const float *c = row_terms[j];
+            const float *c = phase_terms[j];
             f32x8 t = all8(c[6]);
             for (int k = N_POWERS - 2; k >= 0; --k) t = all8(c[k]) + u * t;
             t -= floor8(t + half);
@@ -174,21 +174,21 @@ static void fill_strip(const psf_tables *tables, const grid *g, const float *mas
 static void sum_strip(const psf_tables *tables, const grid *g, const strip_row *rows,
                       int x0, int x1, float *sums, size_t stride) {
     int k = g->per_px[0], n = g->length[0], half = n / 2;
-    int reach = (k + 1) / 2 + tables->filter_half_width;
+    int taps = (k + 1) / 2 + tables->filter_half_width;
     const float *filter = tables->pixel_filters + (size_t)(k - 1) * tables->filter_stride;
-    int first = larger_int(0, x0 * k - g->center[0] + half - reach);
-    int last = smaller_int(n - 1, x1 * k - g->center[0] + half + reach);
+    int first = larger_int(0, x0 * k - g->center[0] + half - taps);
+    int last = smaller_int(n - 1, x1 * k - g->center[0] + half + taps);
     for (int j = first; j <= last; ++j) {
         const strip_row *row = rows + (j + half) % n;
         f32x8 light[2];
         for (int h = 0; h < 2; ++h)
             light[h] = row->re[h] * row->re[h] + row->im[h] * row->im[h];
         int position = j - half + g->center[0];
-        int low = position - reach, high = position + reach; /* in k q */
+        int low = position - taps, high = position + taps; /* in k q */
         int q_low = larger_int(x0, low >= 0 ? (low + k - 1) / k : -(-low / k));
         int q_high = smaller_int(x1, high >= 0 ? high / k : -((-high + k - 1) / k));
         for (int q = q_low; q <= q_high; ++q) {
-            f32x8 weight = all8(filter[position - q * k + reach]);
+            f32x8 weight = all8(filter[position - q * k + taps]);
             float *to = sums + (size_t)(q - x0) * stride;
             store8(to, load8(to) + weight * light[0]);
             store8(to + 8, load8(to + 8) + weight * light[1]);
@@ -233,8 +233,8 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
     size_t strip_floats = (size_t)larger_int(n_x, n_y) * 2 * STRIP;
     size_t columns_padded = ((size_t)columns + STRIP - 1) / STRIP * STRIP;
     size_t sum_count = (size_t)(x1 - x0 + 1) * padded;
-    int k = g->per_px[1], half = n_y / 2, reach = (k + 1) / 2 + tables->filter_half_width;
-    int pad = reach + k + 8;
+    int k = g->per_px[1], half = n_y / 2, taps = (k + 1) / 2 + tables->filter_half_width;
+    int pad = taps + k + 8;
     size_t line_count = (size_t)(n_y + 2 * pad + tables->filter_stride);
     strip_row *rows_of = room_for(&w->first, strip_floats);
     strip_row *other = room_for(&w->second, strip_floats);
@@ -254,13 +254,13 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
         double *tilt = axis == 0 ? &turns[0][1] : &turns[1][0];
         *tilt -= own->half[axis] * center_px / own->wavelength_um;
     }
-    float row_terms[MOST_LENGTH][N_POWERS];
-    fill_phase_terms(turns, g, row_terms);
+    float phase_terms[MOST_LENGTH][N_POWERS];
+    fill_phase_terms(turns, g, phase_terms);
     const float *tw_x = tables->twiddles + 2 * tables->twiddle_first[g->length_number[0]];
     const float *tw_y = tables->twiddles + 2 * tables->twiddle_first[g->length_number[1]];
     for (int first = 0; first < columns; first += STRIP) {
         const float *mask = (const float *)w->mask.at + (size_t)first * (size_t)rows;
-        fill_strip(tables, g, mask, row_terms, first, rows_of);
+        fill_strip(tables, g, mask, phase_terms, first, rows_of);
         const strip_row *done = fft_strip(rows_of, other, n_y, tw_y);
         turn_strip(done, n_y, padded, between + (size_t)first * 2 * padded);
     }
@@ -288,9 +288,9 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
         memcpy(line + pad, own_sums + half, sizeof(float) * (size_t)(n_y - half));
         memcpy(line + pad + n_y - half, own_sums, sizeof(float) * (size_t)half);
         for (int y = y0; y <= y1; ++y) {
-            const float *from = line + pad + y * k - g->center[1] + half - reach;
+            const float *from = line + pad + y * k - g->center[1] + half - taps;
             f32x8 sum = all8(0.0f);
-            for (int i = 0; i < 2 * reach + 1; i += 8) sum += load8(from + i) * load8(filter + i);
+            for (int i = 0; i < 2 * taps + 1; i += 8) sum += load8(from + i) * load8(filter + i);
             float light = ((sum[0] + sum[1]) + (sum[2] + sum[3]))
                           + ((sum[4] + sum[5]) + (sum[6] + sum[7]));
             c->pixels[(c->top - y) * c->width + q - c->left] = larger_float(scale * light, 0.0f);

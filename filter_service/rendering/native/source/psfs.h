@@ -120,15 +120,15 @@ static int reach_of_side(const light_of_plane *l, int side, double share, int mo
     int end = sign > 0.0 ? high : -low; /* of the plane, outwards */
     double beyond = all_light_beyond(l, axis, sign, end + 0.5);
     double middle = sign * l->center[axis], source = sign * l->source[axis];
-    int reach = end;
+    int at = end;
     double added = 0.0;
     if (beyond > allowed) {
         int step = 1, far;
-        while (reach < most) {   /* outwards: doubled steps, then halved */
-            far = smaller_int(reach + step, most);
+        while (at < most) {   /* outwards: doubled steps, then halved */
+            far = smaller_int(at + step, most);
             double light = all_light_beyond(l, axis, sign, far + 0.5);
             if (light <= allowed) {
-                int near = reach;
+                int near = at;
                 while (far - near > 1) {
                     int between = (near + far) / 2;
                     double here = all_light_beyond(l, axis, sign, between + 0.5);
@@ -137,40 +137,40 @@ static int reach_of_side(const light_of_plane *l, int side, double share, int mo
                         light = here;
                     } else near = between;
                 }
-                reach = far;
+                at = far;
                 beyond = light;
                 break;
             }
-            reach = far;
+            at = far;
             beyond = light;
             step *= 2;
         }
-        end = reach;
+        end = at;
     } else {
         double light = beyond;
-        while (reach > 0) {
-            int place = sign > 0.0 ? reach - low : -reach - low;
+        while (at > 0) {
+            int place = sign > 0.0 ? at - low : -at - low;
             if (light + lines[place] > allowed) break;
             light += lines[place];
-            added += lines[place] * (reach - middle);
-            --reach;
+            added += lines[place] * (at - middle);
+            --at;
         }
         *cut = light;
         *moment = added;
         if (l->is_diffracting)
             *moment += l->strength[axis] * ((source - middle) / (end + 0.5 - source)
                                             - log(end + 0.5 - source));
-        return reach;
+        return at;
     }
     *cut = beyond;
     *moment = l->strength[axis] * ((source - middle) / (end + 0.5 - source)
                                    - log(end + 0.5 - source));
-    return reach;
+    return at;
 }
 
 /* Reaches that cut a share of the light, less where that moved the kernel's middle. */
 static void choose_box(const psf_job *job, const light_of_plane *l, double spread_px,
-                       int most, int reach[SIDES]) {
+                       int most, int reaches[SIDES]) {
     const psf_tables *tables = job->tables;
     double limit = tables->centroid_ratio * larger_double(spread_px, 1.0);
     double share = job->cut_ratio / SIDES;
@@ -178,7 +178,7 @@ static void choose_box(const psf_job *job, const light_of_plane *l, double sprea
         double cut[SIDES], moment[SIDES];
         if (step == tables->cut_steps) share = 0.0;
         for (int side = 0; side < SIDES; ++side)
-            reach[side] = reach_of_side(l, side, share, most, cut + side, moment + side);
+            reaches[side] = reach_of_side(l, side, share, most, cut + side, moment + side);
         double shift = 0.0;
         for (int axis = 0; axis < 2; ++axis) {
             const double *c = cut + 2 * axis, *m = moment + 2 * axis;
@@ -200,6 +200,14 @@ static uint16_t *more_words(psf_work *w, int64_t count) {
         w->room = room;
     }
     return w->words + w->count;
+}
+
+/* Light of the pupils' edges outside a box. */
+static double tail_outside(const psf_job *job, const pupil *pupils, const int box[4]) {
+    double sum = 0.0;
+    for (int p = 0; p < job->primaries && job->is_diffracting; ++p)
+        sum += pupils[p].weight * light_outside(pupils + p, box);
+    return sum;
 }
 
 /* Cuts a plane to its box, adds the tail where the box is larger, and brings it to steps
@@ -229,9 +237,7 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
         .pupils = pupils, .primaries = job->primaries,
         .is_diffracting = job->is_diffracting, .lines = {columns, rows},
         .box = {c->left, c->left + c->width - 1, c->top - c->height + 1, c->top}};
-    double outside = 0.0;
-    for (int p = 0; p < job->primaries && job->is_diffracting; ++p)
-        outside += pupils[p].weight * light_outside(pupils + p, l.box);
+    double outside = tail_outside(job, pupils, l.box);
     l.total = total + outside;
     for (int axis = 0; axis < 2 && job->is_diffracting; ++axis) {
         double sum = 0.0, places = 0.0;
@@ -250,15 +256,15 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
     l.center[0] = (moment_x + outside * l.source[0]) / l.total;
     l.center[1] = (moment_y + outside * l.source[1]) / l.total;
     int most = smaller_int(job->max_radius_px, MOST_REACH_PX);
-    int reach[SIDES];
-    choose_box(job, &l, total / sqrt(M_PI * squares), most, reach);
-    int left = clamp_int(reach[0], 0, most), right = clamp_int(reach[1], 0, most);
-    int up = clamp_int(reach[2], 0, most), down = clamp_int(reach[3], 0, most);
+    int reaches[SIDES];
+    choose_box(job, &l, total / sqrt(M_PI * squares), most, reaches);
+    int left = clamp_int(reaches[0], 0, most), right = clamp_int(reaches[1], 0, most);
+    int up = clamp_int(reaches[2], 0, most), down = clamp_int(reaches[3], 0, most);
     int width = left + right + 1, height = up + down + 1;
     float *kept = room_for(&w->kept, (size_t)(width * height) + LANES);
     uint16_t *words = more_words(w, (int64_t)width * height);
     if (kept == NULL || words == NULL) return PSF_NO_MEMORY;
-    double sum = 0.0, peak = 0.0;
+    double sum = 0.0, peak = 0.0, inside = 0.0; /* inside: of the plane's own pixels */
     squares = 0.0;
     for (int row = 0; row < height; ++row) {
         int y = up - row, x = -left;
@@ -267,8 +273,9 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
         while (x <= right) {
             if (is_inside && x >= c->left && x < c->left + c->width) {
                 int count = smaller_int(right, c->left + c->width - 1) - x + 1;
-                memcpy(to + x + left, c->pixels + (c->top - y) * c->width + x - c->left,
-                       sizeof(float) * (size_t)count);
+                const float *from = c->pixels + (c->top - y) * c->width + x - c->left;
+                for (int i = 0; i < count; ++i) inside += (double)from[i];
+                memcpy(to + x + left, from, sizeof(float) * (size_t)count);
                 x += count;
                 continue;
             }
@@ -313,7 +320,10 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
     job->sizes[psf] = (int64_t)width * height;
     job->peak_ratio[psf] = peak / sum;
     job->spread_px[psf] = sum / sqrt(M_PI * squares);
-    job->lost_ratio[psf] = smaller_double(1.0, larger_double(0.0, 1.0 - sum / l.total));
+    const int both[4] = {smaller_int(-left, l.box[0]), larger_int(right, l.box[1]),
+                         smaller_int(-down, l.box[2]), larger_int(up, l.box[3])};
+    double lost = total - inside + tail_outside(job, pupils, both);
+    job->lost_ratio[psf] = smaller_double(1.0, larger_double(0.0, lost / l.total));
     w->count += (int64_t)width * height;
     return PSF_DONE;
 }
@@ -353,9 +363,9 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
                 spot_of_rays(job->tables, own, job->is_diffracting, &c);
             } else {
                 if (!spot_of_waves(job, own, grids + p, &w->waves, &c)) return PSF_NO_MEMORY;
-                const int *window = grids[p].window;
-                if (window[0] > box[0] || window[1] < box[1] || window[2] > box[2]
-                    || window[3] < box[3])
+                const int *filled = grids[p].window;
+                if (filled[0] > box[0] || filled[1] < box[1] || filled[2] > box[2]
+                    || filled[3] < box[3])
                     lift_beyond(tails + p, grids + p, &c);
             }
             float share = (float)weight;
