@@ -189,6 +189,13 @@ def native_psfs() -> NativePsfs | None:
     return NativePsfs(library, library.new_threads(thread_count()))
 
 
+def _with_changes(table: NDArray) -> NDArray[np.float32]:
+    """Entries (n, 2) of a table (n,): values, and what to add for the next."""
+    return np.stack([table, np.diff(table, append=table[-1])], axis=1).astype(
+        np.float32
+    )
+
+
 @cache
 def _tables() -> tuple[PsfTables, dict[str, NDArray]]:
     """Return the tables of the modules of `estimator.psf`, and the arrays they hold."""
@@ -218,8 +225,8 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray]]:
         "edge_xy": survey.POINTS[:, : survey.N_EDGE].astype(np.float32),
         "passed_powers": survey.PASSED_POWERS,
         "ring_weights": survey.RING_WEIGHTS,
-        "fresnel": fresnel.astype(np.float32),
-        "edge_response": fourier.edge_response(),
+        "fresnel": _with_changes(fresnel),
+        "edge_response": _with_changes(fourier.edge_response()),
         "pixel_filters": table,
         "lengths": lengths.astype(np.int32),
         "twiddle_first": first.astype(np.int32),

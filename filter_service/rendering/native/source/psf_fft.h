@@ -4,12 +4,6 @@
 
 typedef struct { f32x8 re[2], im[2]; } strip_row; /* one row of a strip */
 
-#if defined(__clang__) || __GNUC__ >= 12
-#define MIXED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#else
-#define MIXED(a, b, ...) __builtin_shuffle(a, b, (i32x8){__VA_ARGS__})
-#endif
-
 /* Eight vectors of eight: rows become columns. */
 INLINE void turn8(f32x8 v[8]) {
     f32x8 a[8], b[8];

@@ -24,8 +24,9 @@ typedef struct {
     const float *edge_xy;           /* (2, N_EDGE) */
     const double *passed_powers;    /* (6, n_rings * n_ring) */
     const double *ring_weights;     /* (n_rings - 1,); the last ring is the edge */
-    const float *fresnel;           /* (fresnel_count,) from -limit to limit */
-    const float *edge_response;     /* (2 half_width steps + 1,) */
+    const float *fresnel;           /* (fresnel_count, 2) from -limit to limit: values,
+                                     * and what to add for the next */
+    const float *edge_response;     /* (2 half_width steps + 1, 2), likewise */
     const float *pixel_filters;     /* rows of filter_stride, for k = 1, 2 ... in turn */
     const int32_t *lengths;         /* (length_count,) of FFTs, ascending */
     const int32_t *twiddle_first;   /* (length_count,) pairs */

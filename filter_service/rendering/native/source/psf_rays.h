@@ -11,11 +11,41 @@ typedef struct {
 #define MOST_CELLS 192
 #define PROFILE_STEPS 17      /* of 1/2 px near the edge's image, of 1 px farther out */
 
-INLINE void add_pair(float *to, float first, float second) {
-    f32x2 pair;
-    memcpy(&pair, to, sizeof pair);
-    pair += (f32x2){first, second};
-    memcpy(to, &pair, sizeof pair);
+INLINE void add_pair(float *to, const float *pair) {
+    f32x2 sum, more;
+    memcpy(&sum, to, sizeof sum);
+    memcpy(&more, pair, sizeof more);
+    sum += more;
+    memcpy(to, &sum, sizeof sum);
+}
+
+/* Adds eight squares of two pixels each way: left and right in the row of `at`, and in
+ * that of `at` plus `other`. */
+INLINE void add_squares(float *pixels, int other, i32x8 at, uint32_t lit, f32x8 left,
+                        f32x8 right, f32x8 other_left, f32x8 other_right) {
+    float pairs[2 * LANES], other_pairs[2 * LANES];
+    int32_t places[LANES];
+    store8(pairs, MIXED(left, right, 0, 8, 1, 9, 4, 12, 5, 13));
+    store8(pairs + 8, MIXED(left, right, 2, 10, 3, 11, 6, 14, 7, 15));
+    store8(other_pairs, MIXED(other_left, other_right, 0, 8, 1, 9, 4, 12, 5, 13));
+    store8(other_pairs + 8, MIXED(other_left, other_right, 2, 10, 3, 11, 6, 14, 7, 15));
+    at = (i32x8)MIXED((f32x8)at, (f32x8)at, 0, 1, 4, 5, 2, 3, 6, 7);
+    memcpy(places, &at, sizeof places);
+    if (lit == 255u) {
+        for (int i = 0; i < LANES; ++i) {
+            float *pixel = pixels + places[i];
+            add_pair(pixel, pairs + 2 * i);
+            add_pair(pixel + other, other_pairs + 2 * i);
+        }
+        return;
+    }
+    static const uint8_t lane[LANES] = {0, 1, 4, 5, 2, 3, 6, 7};
+    for (int i = 0; i < LANES; ++i) {
+        if (!(lit >> lane[i] & 1u)) continue;
+        float *pixel = pixels + places[i];
+        add_pair(pixel, pairs + 2 * i);
+        add_pair(pixel + other, other_pairs + 2 * i);
+    }
 }
 
 /* Coefficients in x of W, dW/dy and d^2W/dy^2 at each of some y. */
@@ -63,40 +93,45 @@ static void add_wide_box(const canvas *c, float x0, float y0, float wide, float 
     }
 }
 
-/* A vector of footprints: those of at most two pixels each way by four additions. */
+/* A vector of footprints: those of at most two pixels each way by four additions, those
+ * of three by nine; the plane has spare pixels behind its last. */
 INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x8 high,
-                           f32x8 weight) {
-    f32x8 half = all8(0.5f), one = all8(1.0f), none = all8(0.0f), tiny = all8(1e-12f);
+                           f32x8 per_wide, f32x8 per_high, f32x8 weight) {
+    f32x8 half = all8(0.5f), one = all8(1.0f), none = all8(0.0f);
     f32x8 column = floor8(x0 + half), row = floor8(y0 + half);
     f32x8 over_x = x0 + wide - column - half, over_y = y0 + high - row - half;
     column -= all8((float)c->left);
     row = all8((float)c->top) - row;
+    i32x8 is_lit = weight > none;
     i32x8 is_short = (over_x <= one) & (over_y <= one) & (column >= none)
                      & (column < all8((float)(c->width - 1))) & (row >= one)
                      & (row < all8((float)c->height));
-    f32x8 right = larger8(over_x, none) / (wide + tiny);
-    f32x8 up = weight * (larger8(over_y, none) / (high + tiny));
-    f32x8 low = weight - up;
-    float low_right[LANES], up_right[LANES], low_left[LANES], up_left[LANES];
-    int32_t place[LANES];
-    f32x8 part = low * right;
-    store8(low_right, part);
-    store8(low_left, low - part);
-    part = up * right;
-    store8(up_right, part);
-    store8(up_left, up - part);
+    uint32_t lit = bits_of8(is_lit), most = bits_of8(is_short & is_lit);
+    f32x8 right = larger8(over_x, none) * per_wide;
+    f32x8 up = weight * (larger8(over_y, none) * per_high), low = weight - up;
     i32x8 at = __builtin_convertvector(row, i32x8) * c->width
                + __builtin_convertvector(column, i32x8);
-    memcpy(place, &at, sizeof place);
-    i32x8 is_lit = weight > none;
-    uint32_t lit = bits_of8(is_lit), most = bits_of8(is_short & is_lit);
-    for (uint32_t left = most; left != 0; left &= left - 1) {
+    add_squares(c->pixels, -c->width, at, most, low - low * right, low * right,
+                up - up * right, up * right);
+    uint32_t others = lit & ~most;
+    if (others == 0) return;
+    f32x8 two = all8(2.0f);
+    uint32_t three = bits_of8((over_x <= two) & (over_y <= two) & (column >= none)
+                              & (column < all8((float)(c->width - 2))) & (row >= two)
+                              & (row < all8((float)c->height)));
+    f32x8 last_x = larger8(over_x - one, none) * per_wide;
+    f32x8 last_y = larger8(over_y - one, none) * per_high;
+    f32x8 mid_x = smaller8(larger8(over_x, none), one) * per_wide;
+    f32x8 mid_y = smaller8(larger8(over_y, none), one) * per_high;
+    for (uint32_t left = others & three; left != 0; left &= left - 1) {
         int i = __builtin_ctz(left);
-        float *pixel = c->pixels + place[i];
-        add_pair(pixel, low_left[i], low_right[i]);
-        add_pair(pixel - c->width, up_left[i], up_right[i]);
+        f32x4 shares = {1.0f - mid_x[i] - last_x[i], mid_x[i], last_x[i], 0.0f};
+        const float rows[3] = {1.0f - mid_y[i] - last_y[i], mid_y[i], last_y[i]};
+        float *pixel = c->pixels + at[i];
+        for (int j = 0; j < 3; ++j, pixel -= c->width)
+            store4(pixel, load4(pixel) + all4(weight[i] * rows[j]) * shares);
     }
-    for (uint32_t left = lit & ~most; left != 0; left &= left - 1) {
+    for (uint32_t left = others & ~three; left != 0; left &= left - 1) {
         int i = __builtin_ctz(left);
         add_wide_box(c, x0[i], y0[i], wide[i], high[i], weight[i]);
     }
@@ -106,7 +141,7 @@ INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x
 typedef struct {
     const canvas *c;
     float w[N_POWERS], d[N_POWERS], e[N_POWERS]; /* in x */
-    float cell, factor_x, factor_y, cell_x, cell_y;
+    float cell, factor_x, factor_y, cell_x, cell_y, per_cell_x, per_cell_y;
 } pupil_row;
 
 #define SIX(c1, c2, c3, c4, c5, c6) \
@@ -121,10 +156,14 @@ INLINE void splat_cells(const pupil_row *r, f32x8 x, f32x8 weight) {
     f32x8 hxx = SIX(2 * w[2], 6 * w[3], 12 * w[4], 20 * w[5], 30 * w[6], 0.0f);
     f32x8 hxy = SIX(d[1], 2 * d[2], 3 * d[3], 4 * d[4], 5 * d[5], 0.0f);
     f32x8 hyy = SIX(e[0], e[1], e[2], e[3], e[4], 0.0f);
-    f32x8 wide = all8(r->cell_x) * root8(hxx * hxx + hxy * hxy);
-    f32x8 high = all8(r->cell_y) * root8(hxy * hxy + hyy * hyy);
+    f32x8 tiny = all8(1e-24f);
+    f32x8 square_x = hxx * hxx + hxy * hxy + tiny, square_y = hxy * hxy + hyy * hyy + tiny;
+    f32x8 per_x = inverse_root8(square_x), per_y = inverse_root8(square_y);
+    f32x8 wide = all8(r->cell_x) * square_x * per_x;
+    f32x8 high = all8(r->cell_y) * square_y * per_y;
     add_footprints(r->c, all8(r->factor_x) * sx - half * wide,
-                   all8(r->factor_y) * sy - half * high, wide, high, weight);
+                   all8(r->factor_y) * sy - half * high, wide, high,
+                   all8(r->per_cell_x) * per_x, all8(r->per_cell_y) * per_y, weight);
 }
 #undef SIX
 
@@ -156,6 +195,8 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
     float factor_x = (float)(1.0 / own->half[0]), factor_y = (float)(1.0 / own->half[1]);
     pupil_row r = {.c = c, .cell = (float)cell, .factor_x = factor_x, .factor_y = factor_y,
                   .cell_x = (float)cell * factor_x, .cell_y = (float)cell * factor_y};
+    r.per_cell_x = 1.0f / r.cell_x;
+    r.per_cell_y = 1.0f / r.cell_y;
     f32x8 zero = all8(0.0f), one = all8(1.0f), half = all8(0.5f), total = zero;
     /* Within this the whole cell lies inside: the ellipse is least curved-in there. */
     double inner = larger_double(0.0, 1.0 - 0.75 * cell / sqrt(1.0 - fabs(shear)));
@@ -216,8 +257,9 @@ INLINE f32x8 fresnel_integral(const psf_tables *tables, f32x8 v) {
     f32x8 place = (v + all8(limit)) * all8(last / (2.0f * limit));
     place = larger8(smaller8(place, all8(last)), all8(0.0f));
     i32x8 at = whole8(smaller8(place, all8(last - 1.0f)));
-    f32x8 low = entries8(tables->fresnel, at), high = entries8(tables->fresnel + 1, at);
-    f32x8 inside = low + (place - __builtin_convertvector(at, f32x8)) * (high - low);
+    f32x8 value, change;
+    pairs8(tables->fresnel, at, &value, &change);
+    f32x8 inside = value + (place - __builtin_convertvector(at, f32x8)) * change;
     f32x8 outside = all8(-1.0f / (2.0f * (float)(M_PI * M_PI))) / v;
     i32x8 is_outside = size8(v) >= all8(limit);
     return (f32x8)(((i32x8)outside & is_outside) | ((i32x8)inside & ~is_outside));
@@ -240,22 +282,11 @@ INLINE void add_boxes(const canvas *c, f32x8 x, f32x8 y, float per_size, f32x8 l
     f32x8 low = (at_y - row - half) * all8(per_size) + half;
     right = larger8(smaller8(right, one), zero);
     low = light * larger8(smaller8(low, one), zero);
-    float low_right[LANES], up_right[LANES], low_left[LANES], up_left[LANES];
-    int32_t place[LANES];
     f32x8 above = light - low;
-    store8(low_right, low * right);
-    store8(low_left, low - low * right);
-    store8(up_right, above * right);
-    store8(up_left, above - above * right);
     i32x8 at = __builtin_convertvector(row, i32x8) * c->width
                + __builtin_convertvector(column, i32x8);
-    memcpy(place, &at, sizeof place);
-    for (int i = 0; i < LANES; ++i) {
-        if (!(lit >> i & 1u)) continue;
-        float *pixel = c->pixels + place[i];
-        add_pair(pixel, up_left[i], up_right[i]);
-        add_pair(pixel + c->width, low_left[i], low_right[i]);
-    }
+    add_squares(c->pixels, c->width, at, lit, above - above * right, above * right,
+                low - low * right, low * right);
 }
 
 /* Cosine and sine of turns in [-1/2, 1/2]. */
@@ -349,8 +380,8 @@ static void add_edge_light(const psf_tables *tables, const pupil *own,
 }
 
 /* Brings pixels up to the mean light of the edge: those at least from_px away from it. */
-static void lift_to_tail(const tail *t, const canvas *c, float from_px, float scale) {
-    f32x8 border2 = all8(from_px * from_px), brightest = all8(t->brightest * scale);
+static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
+    f32x8 border2 = all8(from_px * from_px), brightest = all8(t->brightest);
     for (int row = 0; row < c->height; ++row) {
         float *to = c->pixels + row * c->width;
         float y = (float)(c->top - row);
@@ -358,10 +389,13 @@ static void lift_to_tail(const tail *t, const canvas *c, float from_px, float sc
             int count = smaller_int(LANES, c->width - column);
             f32x8 light = all8(INFINITY);
             memcpy(&light, to + column, sizeof(float) * (size_t)count);
-            if (from_px > 0.0f && !any8(light < brightest)) continue;
-            f32x8 nearest, x = NUMBERS8 + all8((float)(c->left + column));
-            f32x8 found = all8(scale) * tail_light8(t, x, y, &nearest);
-            found = (f32x8)((i32x8)found & (nearest >= border2));
+            if (!any8(light < brightest)) continue;
+            f32x8 nearest, farthest, x = NUMBERS8 + all8((float)(c->left + column));
+            tail_distances8(t, x, y, &nearest, &farthest);
+            i32x8 is_far = nearest >= border2;
+            if (!any8(is_far)) continue;
+            f32x8 found = tail_light8(t, x, y, nearest, farthest);
+            found = (f32x8)((i32x8)found & is_far);
             light = larger8(light, found);
             memcpy(to + column, &light, sizeof(float) * (size_t)count);
         }
@@ -388,5 +422,5 @@ static void spot_of_rays(const psf_tables *tables, const pupil *own, int is_diff
     add_edge_light(tables, own, dense, c);
     for (int i = 0; i < count; ++i) c->pixels[i] = larger_float(c->pixels[i], 0.0f);
     tail t = tail_of(tables, own);
-    lift_to_tail(&t, c, (float)tables->far_px, 1.0f);
+    lift_to_tail(&t, c, (float)tables->far_px);
 }

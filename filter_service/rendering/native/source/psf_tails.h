@@ -34,8 +34,9 @@ static tail tail_of(const psf_tables *tables, const pupil *own) {
     return t;
 }
 
-/* Light of eight pixels, and their squared distances to the nearest of the edge. */
-INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 *nearest) {
+/* Squared distances of eight pixels to the nearest and the farthest of the edge. */
+INLINE void tail_distances8(const tail *t, f32x8 x, float y, f32x8 *nearest,
+                            f32x8 *farthest) {
     f32x8 near = all8(1e30f), far = all8(0.0f);
     for (int k = 0; k < TAIL_EDGES; ++k) {
         f32x8 along = x - all8(t->edge_x[k]);
@@ -45,9 +46,13 @@ INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 *nearest) {
         far = larger8(far, distance);
     }
     *nearest = near;
+    *farthest = far;
+}
+
+INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 nearest, f32x8 farthest) {
     float from_y = y - t->center_y;
     f32x8 from_x = x - all8(t->center_x);
-    f32x8 close = larger8(near, all8(0.25f)), distant = larger8(far, close);
+    f32x8 close = larger8(nearest, all8(0.25f)), distant = larger8(farthest, close);
     f32x8 rho2 = from_x * from_x + all8(from_y * from_y);
     f32x8 chord2 = (all8(t->xx) * from_x + all8(t->xy * from_y)) * from_x
                    + all8(t->yy * from_y * from_y);

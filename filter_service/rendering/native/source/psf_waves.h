@@ -104,7 +104,7 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
     f32x8 inner_half = all8((float)tables->edge_half_width);
     float most_place = (float)(edge_count - 1);
     const double *a = own->log_amplitude;
-    f32x8 far_value = all8(tables->edge_response[edge_count - 1]);
+    f32x8 far_value = all8(tables->edge_response[2 * (edge_count - 1)]);
     for (int j = 0; j < rows; ++j) {
         double y = (j - middle_y) / ay;
         f32x8 v = all8((float)y);
@@ -127,9 +127,9 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
                 f32x8 place = (depth + inner_half) * steps;
                 place = smaller8(larger8(place, all8(0.0f)), all8(most_place));
                 i32x8 at = whole8(smaller8(place, all8(most_place - 1.0f)));
-                f32x8 low = entries8(tables->edge_response, at);
-                f32x8 high = entries8(tables->edge_response + 1, at);
-                value = low + (place - __builtin_convertvector(at, f32x8)) * (high - low);
+                f32x8 change;
+                pairs8(tables->edge_response, at, &value, &change);
+                value += (place - __builtin_convertvector(at, f32x8)) * change;
             }
             for (int k = 0; own->is_apodised && k < 8; ++k)
                 value[k] *= (float)exp(a[0] + u[k] * (a[1] + a[3] * u[k] + a[4] * y)

@@ -78,9 +78,10 @@ static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
     for (int row = 0; row < c->height; ++row) {
         int y = c->top - row, is_done = y >= g->window[2] && y <= g->window[3];
         for (int column = 0; column < c->width; column += LANES) {
-            f32x8 nearest, x = NUMBERS8 + all8((float)(c->left + column));
+            f32x8 nearest, farthest, x = NUMBERS8 + all8((float)(c->left + column));
             float found[LANES];
-            store8(found, tail_light8(t, x, (float)y, &nearest));
+            tail_distances8(t, x, (float)y, &nearest, &farthest);
+            store8(found, tail_light8(t, x, (float)y, nearest, farthest));
             for (int i = 0; i < LANES && column + i < c->width; ++i) {
                 int at = c->left + column + i;
                 if (is_done && at >= g->window[0] && at <= g->window[1]) continue;
@@ -210,6 +211,21 @@ static double tail_outside(const psf_job *job, const pupil *pupils, const int bo
     return sum;
 }
 
+typedef struct { double sum, squares, peak; } row_light;
+
+static row_light light_of_row(const float *from, int count) {
+    f32x8 sum = all8(0.0f), squares = sum, peak = sum;
+    for (int i = 0; i < count; i += LANES) {
+        f32x8 value = all8(0.0f);
+        if (i + LANES <= count) value = load8(from + i);
+        else memcpy(&value, from + i, sizeof(float) * (size_t)(count - i));
+        sum += value;
+        squares += value * value;
+        peak = larger8(peak, value);
+    }
+    return (row_light){sum8(sum), sum8(squares), (double)-least8(-peak)};
+}
+
 /* Cuts a plane to its box, adds the tail where the box is larger, and brings it to steps
  * of its peak. */
 static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
@@ -218,17 +234,13 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
     double squares = 0.0, total = 0.0, moment_x = 0.0, moment_y = 0.0;
     for (int row = 0; row < c->height; ++row) {
         const float *from = c->pixels + row * c->width;
-        double sum = 0.0, square_sum = 0.0;
-        for (int column = 0; column < c->width; ++column) {
-            double value = from[column];
-            columns[column] += value;
-            sum += value;
-            square_sum += value * value;
-        }
-        rows[c->height - 1 - row] = sum;
-        squares += square_sum;
-        total += sum;
-        moment_y += sum * (c->top - row);
+        for (int column = 0; column < c->width; ++column)
+            columns[column] += (double)from[column];
+        row_light light = light_of_row(from, c->width);
+        rows[c->height - 1 - row] = light.sum;
+        squares += light.squares;
+        total += light.sum;
+        moment_y += light.sum * (c->top - row);
     }
     if (!(total > 0.0)) return PSF_NOT_HERE;
     for (int column = 0; column < c->width; ++column)
@@ -274,28 +286,29 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
             if (is_inside && x >= c->left && x < c->left + c->width) {
                 int count = smaller_int(right, c->left + c->width - 1) - x + 1;
                 const float *from = c->pixels + (c->top - y) * c->width + x - c->left;
-                for (int i = 0; i < count; ++i) inside += (double)from[i];
+                inside += light_of_row(from, count).sum;
                 memcpy(to + x + left, from, sizeof(float) * (size_t)count);
                 x += count;
                 continue;
             }
             int end = is_inside && x < c->left ? smaller_int(right + 1, c->left) : right + 1;
             for (; x < end; x += LANES) {
-                f32x8 light = all8(0.0f), nearest, place = NUMBERS8 + all8((float)x);
-                for (int p = 0; p < job->primaries && job->is_diffracting; ++p)
+                f32x8 light = all8(0.0f), place = NUMBERS8 + all8((float)x);
+                for (int p = 0; p < job->primaries && job->is_diffracting; ++p) {
+                    f32x8 nearest, farthest;
+                    tail_distances8(tails + p, place, (float)y, &nearest, &farthest);
                     light += all8((float)pupils[p].weight)
-                             * tail_light8(tails + p, place, (float)y, &nearest);
+                             * tail_light8(tails + p, place, (float)y, nearest, farthest);
+                }
                 memcpy(to + x + left, &light,
                        sizeof(float) * (size_t)smaller_int(LANES, end - x));
             }
             x = end;
         }
-        for (int column = 0; column < width; ++column) {
-            double value = to[column];
-            sum += value;
-            squares += value * value;
-            peak = larger_double(peak, value);
-        }
+        row_light light = light_of_row(to, width);
+        sum += light.sum;
+        squares += light.squares;
+        peak = larger_double(peak, light.peak);
     }
     if (!(sum > 0.0)) return PSF_NOT_HERE;
     int farthest = 0;

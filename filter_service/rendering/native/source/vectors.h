@@ -133,15 +133,31 @@ INLINE f32x8 root8(f32x8 value) {
 #endif
 }
 
-/* Entries of a table. */
-INLINE f32x8 entries8(const float *table, i32x8 at) {
-#ifdef OCU_AVX2
-    i32x8 all = {-1, -1, -1, -1, -1, -1, -1, -1};
-    return __builtin_ia32_gathersiv8sf(all8(0.0f), table, at, (f32x8)all, 4);
+#if defined(__clang__) || __GNUC__ >= 12
+#define MIXED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
 #else
-    f32x8 found;
-    for (int i = 0; i < 8; ++i) found[i] = table[at[i]];
-    return found;
+#define MIXED(a, b, ...) __builtin_shuffle(a, b, (i32x8){__VA_ARGS__})
+#endif
+
+/* Entries of a table of pairs.  Single loads of whole pairs take half the time of two
+ * gathers. */
+INLINE void pairs8(const float *table, i32x8 at, f32x8 *first, f32x8 *second) {
+    typedef double f64x4 __attribute__((vector_size(32)));
+    double pair[8];
+    for (int i = 0; i < 8; ++i) memcpy(pair + i, table + 2 * at[i], sizeof *pair);
+    f64x4 low = {pair[0], pair[1], pair[4], pair[5]};
+    f64x4 high = {pair[2], pair[3], pair[6], pair[7]};
+    *first = MIXED((f32x8)low, (f32x8)high, 0, 2, 8, 10, 4, 6, 12, 14);
+    *second = MIXED((f32x8)low, (f32x8)high, 1, 3, 9, 11, 5, 7, 13, 15);
+}
+
+/* One over the square root, to 2^-22; of no number but zero. */
+INLINE f32x8 inverse_root8(f32x8 value) {
+#ifdef OCU_AVX2
+    f32x8 guess = __builtin_ia32_rsqrtps256(value);
+    return guess * (all8(1.5f) - all8(0.5f) * value * guess * guess);
+#else
+    return all8(1.0f) / root8(value);
 #endif
 }
 
