@@ -39,6 +39,7 @@ class Bench(StrEnum):
     LIVE = "live"
     FOLLOW = "follow"
     LEVELS = "levels"
+    KERNELS = "kernels"
     FIELD = "field"
     OCCLUSION = "occlusion"
     SEQUENCE = "sequence"
@@ -75,6 +76,7 @@ BENCH_MODULES = {
     Bench.LIVE: "tests.benchmarks.bench_live",
     Bench.FOLLOW: "tests.benchmarks.bench_follow",
     Bench.LEVELS: "tests.benchmarks.bench_levels",
+    Bench.KERNELS: "tests.benchmarks.bench_kernels",
     Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",
     Bench.SEQUENCE: "tests.benchmarks.bench_sequence",

@@ -6,7 +6,8 @@ node_blur            their geometric blur
 blur_loops           its compiled loop
 compute_kernels      from nodes to packed kernels
 wide_primaries       kernels of primaries of two wavelengths
-psf_engine           on the CPU or the GPU
+psf_engine           in C, on the GPU, or in Python
+native_psfs          the engine in C
 gpu_build            PSFs in compute shaders
 gpu_build_constants  their numbers
 gpu_build_pace       how much of it at a time

@@ -54,7 +54,7 @@ def computed_kernels(
     total_dpt = plan.defocus.values_dpt[psfs // RGB]
     total_dpt = total_dpt + plan.channel_shift_dpt[groups, channels]
     asked = groups, channels, total_dpt
-    generic = partial(_generic_kernels, eye, spec, wavefronts, engine)
+    generic = partial(generic_kernels, eye, spec, wavefronts, engine)
     native = engine.native
     if native is None or not native.can_compute(eye, wavefronts):
         return generic(*asked)
@@ -72,7 +72,7 @@ def computed_kernels(
     return packed, methods
 
 
-def _generic_kernels(
+def generic_kernels(
     eye: EyeOptics,
     spec: GridSpec,
     wavefronts: NodeWavefronts,

@@ -215,6 +215,8 @@ def eye_rows(
     few = photograph_walk(size_px, 12, rate_hz)
     camera = few[0].view.camera
     with Following(eye, camera) as following:
+        for moment in few:  # computes their PSFs
+            following.waited(moment)
         own_ms = float(np.median([following.waited(moment) for moment in few]))
         rate_hz = (
             min(rate_hz, OF_OWN_RATE * 1e3 / own_ms) if size_px[0] > 480 else rate_hz
