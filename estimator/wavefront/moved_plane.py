@@ -6,9 +6,11 @@ mrad/mm dW/ddepth = -|grad W|² / 2, which the terms up to the sixth order fulfi
 themselves where the chief ray has no slope.
 """
 
+from collections import Counter
 from functools import cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.units import UM_PER_MM
@@ -19,10 +21,10 @@ _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 
 @cache
-def _slope_products() -> NDArray[np.float64]:
-    """Matrix (28, 28 * 28) that takes p to q -> grad p . grad q, in monomials."""
+def _slope_products() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Terms (n, 3) and factors (n,): terms i and j of W add to term k of |grad W|²."""
     place = {tuple(e): k for k, e in enumerate(EXPONENTS.tolist())}
-    products = np.zeros((N_TERMS, N_TERMS, N_TERMS))
+    found: Counter[tuple[int, int, int]] = Counter()
     for i, (a, b) in enumerate(EXPONENTS.tolist()):
         for j, (c, d) in enumerate(EXPONENTS.tolist()):
             for factor, term in (
@@ -30,14 +32,23 @@ def _slope_products() -> NDArray[np.float64]:
                 (b * d, (a + c, b + d - 2)),
             ):
                 if factor and term in place:
-                    products[i, j, place[term]] += factor
-    return products.reshape(N_TERMS, -1)
+                    found[min(i, j), max(i, j), place[term]] += factor
+    return np.array(list(found)), np.array(list(found.values()), np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _add_products(polynomial_um, terms, factors, out):
+    for n in range(polynomial_um.shape[0]):
+        for m in range(terms.shape[0]):
+            i, j, k = terms[m]
+            out[n, k] += factors[m] * polynomial_um[n, i] * polynomial_um[n, j]
 
 
 def _squared_slopes(polynomial_um: NDArray) -> NDArray[np.float64]:
-    by_factor = polynomial_um @ _slope_products()
-    by_factor = by_factor.reshape(*polynomial_um.shape, N_TERMS)
-    return (polynomial_um[..., None, :] @ by_factor)[..., 0, :]
+    found = np.zeros_like(polynomial_um)
+    flat = np.ascontiguousarray(polynomial_um).reshape(-1, N_TERMS)
+    _add_products(flat, *_slope_products(), found.reshape(-1, N_TERMS))
+    return found
 
 
 def moved_polynomial(
