@@ -145,7 +145,7 @@ make_venv() {
 }
 
 install_packages() {
-    sources=$(echo filter_service/rendering/native/source/* filter_service/service/*.c)
+    sources=$(echo filter_service/native/source/* filter_service/service/*.c)
     wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi

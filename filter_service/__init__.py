@@ -23,6 +23,7 @@ Importing this loads nothing but names: clients stay light.
     threads          numba's thread layer
     one_blas_thread  numpy on one thread
     gl/              the OpenGL context and its shaders
+    native/          loops in C
     planning/        which PSFs an eye needs for a stated error
     psfs/            the PSF cache: built, packed, kept
     rendering/       from a frame and the cache to the picture

@@ -39,6 +39,15 @@ def weights_at(nodes, at):
 
 
 @njit(**_OPTIONS)
+def all_weights(nodes, at):
+    """Weights (n, n_nodes) at places (n,)."""
+    weights = np.empty((at.size, nodes.size))
+    for n in range(at.size):
+        weights[n] = weights_at(nodes, at[n])
+    return weights
+
+
+@njit(**_OPTIONS)
 def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     """Total defocus (n,), dpt, of fields and wavelengths at one pupil and focus.
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
+from estimator.field.defocus_loops import all_weights
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.field_wavefronts import (
     DEGREE,
@@ -83,11 +84,7 @@ def lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Weights (n, n_nodes) of the polynomial through the nodes; exact at a node."""
-    weights = np.ones((at.size, nodes.size))
-    for i, node in enumerate(nodes):
-        for other in np.delete(nodes, i):
-            weights[:, i] *= (at - other) / (node - other)
-    return weights
+    return all_weights(np.asarray(nodes, np.float64), np.asarray(at, np.float64))
 
 
 def _linear(nodes: NDArray, at: NDArray) -> NDArray[np.float64]:
@@ -242,7 +239,7 @@ class FieldInterpolation:
         pupils = slice(0, None)
         if pupil_diameter_mm is not None:
             # Only what is asked for: few calls need all wavelengths and pupils.
-            lower, _ = self._pupil_shares(pupil_diameter_mm)
+            lower = self._lower_pupils(pupil_diameter_mm)
             pupils = slice(int(lower.min()), int(lower.max()) + 2)
         values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
         return FieldValues(values, pupils.start, field, channel)
@@ -317,12 +314,17 @@ class FieldInterpolation:
         nodes_mm = self.grid.pupil_diameters_mm
         if nodes_mm.size == 1:
             return np.zeros(pupil_mm.size, np.int64), np.zeros((pupil_mm.size, 1))
-        lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
-        lower = np.clip(lower, 0, nodes_mm.size - 2)
+        lower = self._lower_pupils(pupil_mm)
         high_mm = nodes_mm[lower + 1]
         lowest = (nodes_mm[lower] / high_mm)[:, None] ** POWER
         share = ((pupil_mm / high_mm)[:, None] ** POWER - lowest) / (1.0 - lowest)
         return lower, share
+
+    def _lower_pupils(self, pupil_mm: NDArray) -> NDArray[np.int64]:
+        """Index (n,) of the traced pupil below."""
+        nodes_mm = self.grid.pupil_diameters_mm
+        lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
+        return np.clip(lower, 0, max(nodes_mm.size - 2, 0))
 
     def _channels(self, wavelength_nm: NDArray) -> NDArray[np.int64]:
         nodes_nm = self.grid.wavelengths_nm

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import signal
 import sys
 import time
@@ -39,8 +40,9 @@ class ParentGone(Exception):
 
 
 def main() -> None:
-    """Run as ``python -m``: DESCRIPTOR BUILD WARM_UP; the entry point."""
-    descriptor, build_name, warm_up_name = sys.argv[1:]
+    """Run as ``python -m``: DESCRIPTOR BUILD NICENESS WARM_UP; the entry point."""
+    descriptor, build_name, niceness, warm_up_name = sys.argv[1:]
+    os.nice(int(niceness))
     serve_builds(Connection(int(descriptor)), build_name, warm_up_name)
 
 

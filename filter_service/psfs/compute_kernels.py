@@ -15,6 +15,7 @@ from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.slopes import apodisation
+from filter_service.psfs.native_psfs import MAX_PRIMARIES, NodeRings
 from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import PsfEngine
@@ -28,6 +29,7 @@ def computed_kernels(
     wavefronts: NodeWavefronts,
     psfs: NDArray[np.int64],
     engine: PsfEngine,
+    rings: NodeRings | None = None,
 ) -> tuple[PackedKernels, Counter[str]]:
     """Compute some PSFs of a plan.
 
@@ -35,6 +37,8 @@ def computed_kernels(
     ----------
     psfs : (n,)
         Numbers: node n of the plan and channel c have PSF 3 n + c.
+    rings : NodeRings, optional
+        Those of the eye at the nodes.
 
     Returns
     -------
@@ -56,7 +60,7 @@ def computed_kernels(
     asked = groups, channels, total_dpt
     generic = partial(generic_kernels, eye, spec, wavefronts, engine)
     native = engine.native
-    if native is None or not native.can_compute(eye, wavefronts):
+    if native is None or wavefronts.wavelength_nm.shape[1] > MAX_PRIMARIES:
         return generic(*asked)
     packed, methods, left = native.kernels(
         wavefronts,
@@ -65,6 +69,7 @@ def computed_kernels(
         max_radius_px=spec.max_blur_radius_px,
         diffraction=spec.settings.diffraction,
         stiles_crawford=apodisation(eye, spec),
+        rings=rings,
     )
     if left.size:
         others, more = generic(*(array[left] for array in asked))

@@ -14,27 +14,28 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.field.eye_optics import EyeOptics
+from estimator.corrections.rings import Rings
 from estimator.optics.zernike import N_TERMS, monomial_matrix
 from estimator.psf import fourier, geometric, geometric_kernels, pupil, survey, switch
 from estimator.psf import fourier_kernels as waves
 from estimator.psf.compute import ACCURACY
+from estimator.psf.screens import BEYOND_EDGE, ONE_CENTRE, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.threads import thread_count
 from filter_service.errors import RenderFailed
+from filter_service.native.library import Library, compiled_library
+from filter_service.native.records import (
+    PSF_DONE,
+    PsfJob,
+    PsfTables,
+    pointer_to,
+)
 from filter_service.psfs.boxes import SIDES
 from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import (
     CUT_STEPS,
     MAX_CENTROID_SHIFT_RATIO,
     PackedKernels,
-)
-from filter_service.rendering.native.library import Library, compiled_library
-from filter_service.rendering.native.records import (
-    PSF_DONE,
-    PsfJob,
-    PsfTables,
-    pointer_to,
 )
 
 MAX_PRIMARIES = 16
@@ -57,6 +58,51 @@ def fft_lengths() -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
+class NodeRings:
+    """Rings of a lens in the pupils of nodes, see `estimator.psf.screens`.
+
+    Attributes
+    ----------
+    offset_mm : (n_groups, 3, n_primaries, 2)
+        Middle of the pupil, from the centre of the rings.
+    reach_mrad : (n_groups, 3, n_primaries)
+        How much farther they send light.
+    tables : (3, n_primaries, TABLE_COUNT, 2), float32
+        Complex amplitude over the squared distance from a centre.
+    radius_mm : float
+        Of the last entry.
+    lattice_mm : (pitch, inner, outer)
+        Of a honeycomb of such rings; zeros where there is one centre.
+    """
+
+    offset_mm: NDArray[np.float64]
+    reach_mrad: NDArray[np.float64]
+    tables: NDArray[np.float32]
+    radius_mm: float
+    lattice_mm: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, rings: Rings, wavefronts: NodeWavefronts) -> NodeRings:
+        """Tabulate a lens for the pupils of nodes."""
+        seen = rings.seen_from(wavefronts.h_deg, wavefronts.v_deg)
+        center_mm = np.broadcast_to(seen.centre_mm, (wavefronts.h_deg.size, 2))
+        ellipse = wavefronts.pupil_ellipse
+        offset_mm = ellipse[..., :2] - center_mm[:, None, None]
+        largest_mm = ellipse[..., 2] + np.linalg.norm(offset_mm, axis=-1)
+        is_lattice = seen.lattice_mm is not None
+        lattice_mm = seen.lattice_mm if is_lattice else ONE_CENTRE
+        radius_mm = lattice_mm[0] if is_lattice else BEYOND_EDGE * largest_mm.max()
+        square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
+        reach_mrad = np.empty(largest_mm.shape)
+        tables = np.empty((*wavefronts.wavelength_nm.shape, TABLE_COUNT, 2), np.float32)
+        for place, nm in np.ndenumerate(wavefronts.wavelength_nm):
+            reach_mrad[:, *place] = seen.reach_mrad(largest_mm[:, *place], float(nm))
+            field = seen.transmission(square_mm2, float(nm))
+            tables[place] = np.stack([field.real, field.imag], axis=-1)
+        return cls(offset_mm, reach_mrad, tables, float(radius_mm), lattice_mm)
+
+
+@dataclass(frozen=True)
 class NativePsfs:
     """The engine's library, threads and tables.
 
@@ -73,10 +119,6 @@ class NativePsfs:
     threads: int
     lock: Lock = field(default_factory=Lock)
 
-    def can_compute(self, eye: EyeOptics, wavefronts: NodeWavefronts) -> bool:
-        """Whether all but single wavefronts of an eye can be computed here."""
-        return eye.rings is None and wavefronts.wavelength_nm.shape[1] <= MAX_PRIMARIES
-
     def kernels(
         self,
         wavefronts: NodeWavefronts,
@@ -88,6 +130,7 @@ class NativePsfs:
         max_radius_px: int,
         diffraction: bool = True,
         stiles_crawford: StilesCrawford | None = None,
+        rings: NodeRings | None = None,
     ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
         """Compute PSFs.
 
@@ -103,6 +146,7 @@ class NativePsfs:
         max_radius_px : int
         diffraction : bool
         stiles_crawford : StilesCrawford, optional
+        rings : NodeRings, optional
 
         Returns
         -------
@@ -130,7 +174,12 @@ class NativePsfs:
             per_mm2, _ = stiles_crawford.amplitude(wavefronts.wavelength_nm.ravel())
             arrays["apodisation_per_mm2"] = per_mm2
             center_mm = stiles_crawford.centre_mm
+        if rings is not None:
+            arrays["ring_offset_mm"] = rings.offset_mm
+            arrays["ring_reach_mrad"] = rings.reach_mrad
         arrays = {n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()}
+        if rings is not None:
+            arrays["ring_tables"] = rings.tables
         arrays["groups"] = np.ascontiguousarray(groups, np.int64)
         arrays["channels"] = np.ascontiguousarray(channels, np.int64)
         reach_px = np.zeros((count, SIDES), np.int64)
@@ -143,6 +192,9 @@ class NativePsfs:
             tables=ctypes.addressof(tables),
             **{name: pointer_to(array) for name, array in arrays.items()},
             apodisation_center_mm=center_mm,
+            ring_steps_per_mm2=TABLE_COUNT / rings.radius_mm**2 if rings else 0.0,
+            ring_lattice_mm=rings.lattice_mm if rings else ONE_CENTRE,
+            ring_count=TABLE_COUNT,
             cut_ratio=CORNERS_TWICE * (1.0 - kept_energy_ratio),
             oversampling=sampling.oversampling,
             margin=sampling.margin,

@@ -16,7 +16,7 @@ from filter_service.psfs.gpu_build_pace import Pace
 from filter_service.psfs.native_psfs import NativePsfs, native_psfs
 
 CPU_BATCH = 768
-NATIVE_BATCH = 2048
+NATIVE_BATCH = 1024
 GPU_BATCH = 8192
 """PSFs computed between two looks at progress and cancellation: about 0.05 s of two
 cores; the GPU's number is a guess, for none was at hand."""

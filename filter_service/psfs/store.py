@@ -30,6 +30,7 @@ from filter_service.psfs.read_kernels import StoreTables
 
 if TYPE_CHECKING:  # they load numba, and the service gets ready before
     from estimator.profiles.parse import EyeProfile
+    from filter_service.psfs.native_psfs import NodeRings
     from filter_service.psfs.node_wavefronts import NodeWavefronts
     from filter_service.psfs.pack import PackedKernels
     from filter_service.psfs.psf_engine import PsfEngine
@@ -205,7 +206,7 @@ class PsfStore:
             try:
                 packed, methods = computed_kernels(
                     *(self.eye, self.spec, self.plan, self.wavefronts),
-                    *(batch, self.engine),
+                    *(batch, self.engine, self._rings),
                 )
             except PsfTooLarge as error:
                 raise GridTooLarge(
@@ -232,6 +233,14 @@ class PsfStore:
             if until_s is not None and time.monotonic() > until_s:
                 raise NotPrepared
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
+
+    @cached_property
+    def _rings(self) -> NodeRings | None:
+        """Rings of the eye's lens at the nodes, tabulated when they are needed."""
+        from filter_service.psfs.native_psfs import NodeRings
+
+        rings = self.eye.rings
+        return None if rings is None else NodeRings.of(rings, self.wavefronts)
 
     def _append(self, psfs: NDArray[np.int64], packed: PackedKernels) -> None:
         """Add kernels (n,) of PSFs (n,), or of several that share each (m, n)."""

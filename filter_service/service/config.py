@@ -75,8 +75,7 @@ class ServiceConfig:
         process may use, capped by a container's quota.  Several devices share them,
         those apart that name a number of their own.
     build_niceness : int
-        No effect, kept for configuration files of earlier releases: PSFs are computed
-        by the frames that need them.
+        Of the process that estimates eyes, beside those that filter.
     cancel_grace_s : float
         A build that does not stop within this time is stopped by force.
     build_limit_s : float
@@ -131,7 +130,7 @@ class ServiceConfig:
     store_cache_dir: str = default_cache_dir()
     store_cache_max_mb: int = 2000
     threads: int = 0
-    build_niceness: int = 5
+    build_niceness: int = 10
     cancel_grace_s: float = 3.0
     build_limit_s: float = 600.0
     alive_interval_s: float = 5.0

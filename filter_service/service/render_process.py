@@ -44,6 +44,7 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
     worker = WorkerHandle(
         cancel_grace_s=config.cancel_grace_s,
         build_limit_s=config.build_limit_s,
+        niceness=config.build_niceness,
     )
     closing.callback(worker.close)
     worker.start()  # it imports what takes long while this process does the same

@@ -321,9 +321,9 @@ def test_every_frame_of_a_focus_that_jumps_shows_the_asked_state(rng):
 
 
 def test_a_frame_stops_computing_psfs_when_its_time_is_over(rng):
-    color = rng.integers(0, 256, (135, 240, 3)).astype(np.uint8)
-    depth_m = rng.uniform(0.4, 4.0, (135, 240)).astype(np.float32)
-    camera = Camera.from_fov(50.0, width_px=240, height_px=135)
+    color = rng.integers(0, 256, (270, 480, 3)).astype(np.uint8)
+    depth_m = rng.uniform(0.4, 4.0, (270, 480)).astype(np.float32)
+    camera = Camera.from_fov(50.0, width_px=480, height_px=270)
     view = RgbdView(color, depth_m, camera.tangents)
     with EyeFilter("cataract", camera, engine="native") as eye_filter:
         eye_filter.wait()

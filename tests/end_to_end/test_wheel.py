@@ -41,7 +41,7 @@ HELD = (
 """Files of the checkout that a wheel holds, and no others."""
 
 COMPILED = {
-    "filter_service/rendering/native/_loops",
+    "filter_service/native/_loops",
     "filter_service/service/_drop_parts",
 }
 """The native engine's loops, made when the wheel is."""

@@ -13,10 +13,10 @@ from PIL import Image
 
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
+from filter_service.native.library import library_path
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
-from filter_service.rendering.native.library import library_path
 from tests.benchmarks.bench_gpu import EYES, FOCUS_DPT, PUPIL_MM
 from tests.benchmarks.harness import commit_id
 from tests.grid_specs import grid_spec

@@ -161,7 +161,7 @@ build_library(Path("/opt/ocufilter"))'
 
 install_project() {
     wanted=$(cd "$checkout"; cat tests/headset/setup_root.sh pyproject.toml \
-        constraints.txt filter_service/rendering/native/source/* | cksum)
+        constraints.txt filter_service/native/source/* | cksum)
     if [ "$(cat "$PYTHON_STAMP" 2>/dev/null || true)" = "$wanted" ]; then return; fi
     rm -f "$PYTHON_STAMP"
     copy_host_settings

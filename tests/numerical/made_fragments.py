@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filter_service import constants
-from filter_service.rendering.native.records import BLOCK, FRAGMENT, FRAGMENT_LIGHT
+from filter_service.native.records import BLOCK, FRAGMENT, FRAGMENT_LIGHT
 
 
 class Fragments(NamedTuple):

@@ -8,11 +8,11 @@ import sys
 import pytest
 
 from filter_service import constants
-from filter_service.rendering.native import records
+from filter_service.native import records
 from tests.native_build import COMPILER, build_library, extension, runtime_of
 from tests.source_tree import ROOT
 
-SOURCE = ROOT / "filter_service" / "rendering" / "native" / "source"
+SOURCE = ROOT / "filter_service" / "native" / "source"
 
 FRAMES = (
     "tests/numerical/test_renderer_hard.py",

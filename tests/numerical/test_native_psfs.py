@@ -1,28 +1,41 @@
 """The compiled PSF engine: against the Python one, the quadrature, and itself."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimator.corrections.kinoform import Kinoform
+from estimator.corrections.lenslets import Lenslets
+from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.psf import fourier
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.reference import reference_kernel
 from estimator.psf.stiles_crawford import StilesCrawford
+from filter_service.native.library import Library, library_path
 from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import pack_pool
-from filter_service.psfs.native_psfs import NativePsfs, fft_lengths, native_psfs
+from filter_service.psfs.native_psfs import (
+    NativePsfs,
+    NodeRings,
+    fft_lengths,
+    native_psfs,
+)
 from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import pack_kernels
 from filter_service.psfs.wide_primaries import mean_batch
-from filter_service.rendering.native.library import Library, library_path
 from tests.numerical.psf_cases import CASE_NAMES, case_zernike_um
 
 RGB_NM = np.array([[610.0], [536.0], [460.0]])
 KEPT = 0.99
+LENSES = {
+    "diffractive": DiffractiveRings(spacing_dpt=3.0, kinoform=Kinoform.sawtooth(0.5)),
+    "zones": RefractiveZones(outer_mm=(1.0, 1.6), powers_dpt=(0.0, 2.0)),
+    "lenslets": Lenslets(
+        power_dpt=3.5, diameter_mm=1.03, pitch_mm=1.5, inner_mm=0.5, outer_mm=16.0
+    ),
+}
 
 if native_psfs() is None:
     pytest.skip("the native engine was not built here", allow_module_level=True)
@@ -69,11 +82,13 @@ def computed(wavefronts, *, engine=None, **options):
     return engine.kernels(wavefronts, *asked(wavefronts), **options)
 
 
-def twin(wavefronts, *, diffraction=True, stiles_crawford=None):
+def twin(wavefronts, *, diffraction=True, stiles_crawford=None, rings=None):
     """The same kernels by `estimator.psf`, with FFTs of the same lengths."""
     groups, channels, total_dpt = asked(wavefronts)
     primaries = wavefronts.wavelength_nm.shape[1]
     found = wavefronts.at(groups, channels, total_dpt)
+    each = np.repeat(groups, primaries)
+    directions_deg = wavefronts.h_deg[each], wavefronts.v_deg[each]
     usual = fourier.plan_grids.__kwdefaults__
     fourier.plan_grids.__kwdefaults__ = usual | {"lengths": fft_lengths()}
     try:
@@ -82,8 +97,9 @@ def twin(wavefronts, *, diffraction=True, stiles_crawford=None):
             pupil_diameter_mm=found.circle_diameter_mm,
             pupil_ellipse=found.pupil_ellipse,
             stiles_crawford=stiles_crawford,
+            pupil_screen=rings and rings.seen_from(*directions_deg),
             wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),
-            pixel_from_mrad=wavefronts.pixel_from_mrad[np.repeat(groups, primaries)],
+            pixel_from_mrad=wavefronts.pixel_from_mrad[each],
             diffraction=diffraction,
             min_energy_ratio=1.0 - 0.2 * (1.0 - KEPT),
         )
@@ -275,8 +291,15 @@ def test_processors_without_vectors_have_the_same_kernels():
         assert error_ratio(kernel(theirs, k), kernel(ours, k)) <= 0.01, k
 
 
-def test_eyes_behind_rings_are_left_to_python():
-    wavefronts = wavefronts_of(np.zeros(28))
-    engine = native_psfs()
-    assert engine.can_compute(SimpleNamespace(rings=None), wavefronts)
-    assert not engine.can_compute(SimpleNamespace(rings=object()), wavefronts)
+@pytest.mark.parametrize("lens", LENSES)
+def test_pupils_behind_rings_are_those_of_the_python_engine(lens):
+    rings = LENSES[lens]
+    rng = np.random.default_rng(7)
+    wavefronts = wavefronts_of(random_zernike(rng, 4, 0.8), pupil_mm=4.5)
+    ours, methods, left = computed(wavefronts, rings=NodeRings.of(rings, wavefronts))
+    assert not left.size and methods == {"fourier": 12}
+    theirs = twin(wavefronts, rings=rings)
+    for k in range(12):
+        assert error_ratio(kernel(ours, k), kernel(theirs, k)) <= 0.03, k
+    without, *_ = computed(wavefronts)
+    assert error_ratio(kernel(ours, 1), kernel(without, 1)) > 0.1

@@ -87,8 +87,8 @@ def test_random_frames_are_those_of_the_twin(case):
 @given(frames())
 def test_threads_and_processors_give_the_same_picture(case):
     """To the bit for any number of threads; to rounding on processors without AVX2."""
+    from filter_service.native.library import Library, library_path
     from filter_service.rendering.native import NativeRenderer
-    from filter_service.rendering.native.library import Library, library_path
 
     rng = np.random.default_rng(case["seed"])
     height_px, width_px = case["size"]

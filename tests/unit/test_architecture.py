@@ -75,14 +75,18 @@ EYE_ROOMS = {
 
 FILTER_ROOMS = {
     "gl": (),
+    "native": (),
     "wire": (),
     "planning": (),
-    "psfs": ("planning", "gl"),
-    "rendering": ("psfs", "planning", "gl"),
+    "psfs": ("planning", "gl", "native"),
+    "rendering": ("psfs", "planning", "gl", "native"),
     "building": ("psfs", "planning"),
     "filtering": ("building", "rendering", "psfs", "planning", "gl"),
     "service": ("filtering", "building", "wire"),
-    "commands": ("service", "filtering", "rendering", "psfs", "planning", "gl"),
+    "commands": (
+        *("service", "filtering", "rendering", "psfs", "planning"),
+        *("gl", "native"),
+    ),
 }
 """A frame's data runs one way; each room knows only those before it."""
 

@@ -12,7 +12,7 @@ from filter_service.commands.doctor_checks import (
 from filter_service.commands.doctor_probes import probe_native, probe_shaders
 from filter_service.gl import shader_source
 from filter_service.gl.passes import Passes
-from filter_service.rendering.native import library
+from filter_service.native import library
 
 GOOD = {"program_count": 27, "frame_error": 0.0, "psf_error": 0.04}
 

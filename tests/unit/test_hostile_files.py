@@ -44,11 +44,11 @@ from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
 
 
 def refused(read, path, said=None):
-    """Read a file that must be refused in a second of work; return the error."""
+    """Read a file that must be refused in two seconds of work; return the error."""
     start_s = time.process_time()
     with pytest.raises(InvalidFile, match=said) as caught:
         read(path)
-    assert time.process_time() - start_s < 1.0
+    assert time.process_time() - start_s < 2.0
     assert path.name in str(caught.value)
     assert "\n" not in str(caught.value)
     return caught.value

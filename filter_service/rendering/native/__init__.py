@@ -6,10 +6,7 @@ native_store   a store with its coarse kernels
 kept_states    what is kept of each eye between frames
 kernel_plan    the kernels that a frame needs
 frame_record   what the loops are told
-records        their records, field by field
 arrays         memory that frames use again
-library        the compiled loops
-source/        the loops, in C
 """
 
 import lazy_loader

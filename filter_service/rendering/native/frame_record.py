@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import MAX_LEVEL, MIN_BLUR_RANGE, TILE_SIZE_PX
-from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rendering.frame_kernels import interval_count
-from filter_service.rendering.image_cells import ImageCells
-from filter_service.rendering.native.arrays import Arrays
-from filter_service.rendering.native.kernel_plan import KernelPlan
-from filter_service.rendering.native.native_store import COARSE_SPREAD_PX, NativeStore
-from filter_service.rendering.native.records import (
+from filter_service.native.records import (
     BLOCK,
     FRAGMENT,
     FRAGMENT_LIGHT,
@@ -23,6 +17,12 @@ from filter_service.rendering.native.records import (
     RESOLUTIONS,
     Frame,
 )
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.image_cells import ImageCells
+from filter_service.rendering.native.arrays import Arrays
+from filter_service.rendering.native.kernel_plan import KernelPlan
+from filter_service.rendering.native.native_store import COARSE_SPREAD_PX, NativeStore
 from filter_service.rgbd_view import RgbdView
 
 COLOR_KINDS = {"uint8": 0, "float32": 1, "float16": 2}

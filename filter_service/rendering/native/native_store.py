@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.native.library import Library
+from filter_service.native.records import RESOLUTIONS, ShrinkJob
 from filter_service.psfs.boxes import box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.native.library import Library
-from filter_service.rendering.native.records import RESOLUTIONS, ShrinkJob
 
 COARSE_SPREAD_PX = (0.0, 24.0, 48.0)
 """Least spread of a kernel whose merged squares may reach pixels of 1, 2 and 4 px.  At

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from estimator.threads import thread_count
 from filter_service.errors import RenderFailed
+from filter_service.native.library import Library, compiled_library
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.filtered_view import FilteredView, color_notes
@@ -28,7 +29,6 @@ from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kept_states import KeptState, KeptStates
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
-from filter_service.rendering.native.library import Library, compiled_library
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView

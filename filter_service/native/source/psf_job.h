@@ -58,6 +58,13 @@ typedef struct {
     const double *wavelength_nm;      /* (3, primaries) */
     const double *apodisation_per_mm2; /* (3, primaries), or none */
     double apodisation_center_mm[2];
+    /* Rings in the pupils; none where there is no table. */
+    const double *ring_offset_mm;     /* (..., 2): of the pupil's middle from the rings' */
+    const double *ring_reach_mrad;    /* (...): how much farther they send light */
+    const float *ring_tables;         /* (3, primaries, ring_count, 2): complex amplitude
+                                       * by squared distance */
+    double ring_steps_per_mm2;
+    double ring_lattice_mm[3];        /* of a honeycomb: pitch, inner and outer radius */
     double cut_ratio;                 /* share of the light that is left out */
     double oversampling, margin;
     const int64_t *groups, *channels; /* (count,) */
@@ -70,7 +77,7 @@ typedef struct {
     void *results;                    /* of the threads, until they are taken */
     int32_t count, primaries;
     int32_t max_radius_px, is_diffracting;
-    int32_t min_samples_per_px, spare;
+    int32_t min_samples_per_px, ring_count;
 } psf_job;
 
 #endif

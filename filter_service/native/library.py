@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.errors import RenderFailed
-from filter_service.rendering.native import records
+from filter_service.native import records
 
 FOLDER = Path(__file__).parent
 STEM = "_loops"

@@ -145,6 +145,51 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
     return 1;
 }
 
+/* Squared distance from the nearest center of a honeycomb; infinite where none is near. */
+INLINE f32x8 lattice_distance8(f32x8 u, f32x8 v, const double lattice[3]) {
+    float pitch = (float)lattice[0], high = 1.7320508075688772f * pitch;
+    f32x8 half = all8(0.5f), per_pitch = all8(1.0f / pitch), per_high = all8(1.0f / high);
+    f32x8 x = all8(pitch) * floor8(u * per_pitch + half);
+    f32x8 y = all8(high) * floor8(v * per_high + half);
+    f32x8 p = all8(pitch) * (floor8(u * per_pitch) + half);
+    f32x8 q = all8(high) * (floor8(v * per_high) + half);
+    f32x8 one = (u - x) * (u - x) + (v - y) * (v - y);
+    f32x8 other = (u - p) * (u - p) + (v - q) * (v - q);
+    i32x8 is_other = other < one;
+    x = (f32x8)(((i32x8)p & is_other) | ((i32x8)x & ~is_other));
+    y = (f32x8)(((i32x8)q & is_other) | ((i32x8)y & ~is_other));
+    f32x8 from_middle = x * x + y * y;
+    i32x8 is_there = (from_middle >= all8((float)(lattice[1] * lattice[1])))
+                     & (from_middle <= all8((float)(lattice[2] * lattice[2])));
+    return (f32x8)(((i32x8)smaller8(one, other) & is_there)
+                   | ((i32x8)all8(INFINITY) & ~is_there));
+}
+
+/* Multiplies a strip by what rings do to the light. */
+static void apply_rings(const psf_job *job, const pupil *own, const grid *g,
+                        int first_column, strip_row *rows) {
+    const double *m = own->from_box_mm;
+    f32x8 last = all8((float)(job->ring_count - 1));
+    f32x8 steps = all8((float)job->ring_steps_per_mm2);
+    for (int j = 0; j < g->size[1]; ++j) {
+        double y = (j - 0.5 * (g->size[1] - 1)) * 2.0 / g->samples[1];
+        for (int h = 0; h < 2; ++h) {
+            f32x8 x = (NUMBERS8 + all8((float)(first_column + 8 * h
+                                               - 0.5 * (g->size[0] - 1))))
+                      * all8((float)(2.0 / g->samples[0]));
+            f32x8 u = all8((float)m[0]) * x + all8((float)(m[1] * y + m[2]));
+            f32x8 v = all8((float)m[3]) * x + all8((float)(m[4] * y + m[5]));
+            f32x8 distance = u * u + v * v, re, im;
+            if (job->ring_lattice_mm[0] > 0.0)
+                distance = lattice_distance8(u, v, job->ring_lattice_mm);
+            pairs8(own->rings, whole8(smaller8(distance * steps, last)), &re, &im);
+            f32x8 own_re = rows[j].re[h], own_im = rows[j].im[h];
+            rows[j].re[h] = own_re * re - own_im * im;
+            rows[j].im[h] = own_re * im + own_im * re;
+        }
+    }
+}
+
 /* Mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
 static void fill_strip(const psf_tables *tables, const grid *g, const float *mask,
                        float (*phase_terms)[N_POWERS], int first_column, strip_row *to) {
@@ -261,6 +306,7 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
     for (int first = 0; first < columns; first += STRIP) {
         const float *mask = (const float *)w->mask.at + (size_t)first * (size_t)rows;
         fill_strip(tables, g, mask, phase_terms, first, rows_of);
+        if (own->rings != NULL) apply_rings(job, own, g, first, rows_of);
         const strip_row *done = fft_strip(rows_of, other, n_y, tw_y);
         turn_strip(done, n_y, padded, between + (size_t)first * 2 * padded);
     }

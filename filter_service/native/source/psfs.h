@@ -55,6 +55,22 @@ static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) 
     survey_pupil(tables, own);
     own->rays_ratio = job->is_diffracting ? share_of_rays(tables, own) : 1.0;
     own->weight = 1.0 / job->primaries;
+    own->rings = NULL;
+    if (job->ring_tables == NULL) return;
+    own->rings = job->ring_tables + color * 2 * job->ring_count;
+    own->rays_ratio = 0.0; /* only waves know rings */
+    double farther_px = 0.0;
+    for (int axis = 0; axis < 2; ++axis) {
+        double reach_px = job->ring_reach_mrad[node]
+                          * hypot(jacobian[2 * axis], jacobian[2 * axis + 1]);
+        own->low[axis] -= reach_px;
+        own->high[axis] += reach_px;
+        farther_px = larger_double(farther_px, reach_px);
+        for (int q = 0; q < 2; ++q)
+            own->from_box_mm[3 * axis + q] = jacobian[2 * q + axis] * own->half[q];
+        own->from_box_mm[3 * axis + 2] = job->ring_offset_mm[2 * node + axis];
+    }
+    own->blur_px += farther_px;
 }
 
 /* Widens a box x0, x1, y0, y1 so that it holds what a pupil's engines compute. */
@@ -317,8 +333,10 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
         int y = up - row, outermost = -1;
         const float *from = kept + row * width;
         uint16_t *to = words + row * width;
-        for (int column = 0; column < width; ++column)
-            to[column] = (uint16_t)smaller_float(from[column] * per_step + 0.5f, 65535.0f);
+        for (int column = 0; column < width; ++column) {
+            float steps = from[column] * per_step + before_cut[row & 3][column & 3];
+            to[column] = (uint16_t)smaller_float(steps, 65535.0f);
+        }
         for (int x = left; x >= 0 && outermost < 0; --x)
             if (to[left - x] > 0) outermost = x;
         for (int x = right; x > outermost; --x)

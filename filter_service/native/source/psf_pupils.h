@@ -14,6 +14,8 @@ typedef struct {
     double narrow_ratio, passed_ratio, edge_um, rays_ratio;
     double weight;            /* share of the kernel */
     int is_apodised;
+    const float *rings;       /* a table, or none */
+    double from_box_mm[6];    /* rows: place against the rings, of x, y and 1 */
 } pupil;
 
 /* Memory of a thread that grows. */

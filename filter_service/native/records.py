@@ -208,6 +208,11 @@ class PsfJob(c.Structure):
         ("wavelength_nm", POINTER),
         ("apodisation_per_mm2", POINTER),
         ("apodisation_center_mm", c.c_double * 2),
+        ("ring_offset_mm", POINTER),
+        ("ring_reach_mrad", POINTER),
+        ("ring_tables", POINTER),
+        ("ring_steps_per_mm2", c.c_double),
+        ("ring_lattice_mm", c.c_double * 3),
         ("cut_ratio", c.c_double),
         ("oversampling", c.c_double),
         ("margin", c.c_double),
@@ -228,7 +233,7 @@ class PsfJob(c.Structure):
         ("max_radius_px", c.c_int32),
         ("is_diffracting", c.c_int32),
         ("min_samples_per_px", c.c_int32),
-        ("spare", c.c_int32),
+        ("ring_count", c.c_int32),
     )
 
 
