@@ -25,8 +25,13 @@ from estimator.threads import thread_count
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 
-CELL_DEG = 0.25
-"""Edge of a cell, unless there would be too many of them."""
+CELL_DEG = 0.5
+"""Edge of a cell, unless there would be too many of them.
+
+Pictures of a cataract are 56 dB from those with cells of 0.125 deg.  With 0.25 deg, 59 to
+62 dB, scattering takes twice as long: 11.5 instead of 4.9 ms at 480x270, 30 instead of 16
+at 1280x720.
+"""
 
 MOST_CELLS = 384
 """Along one axis: wider fields have larger cells."""
