@@ -96,8 +96,8 @@ class WorkerHandle:
     warm_up : str
         ``module:function`` of what the process does until the first job comes.
     niceness : int
-        Of the process.  While a new eye is estimated on two busy cores, 0, 5 and 10 make
-        74, 83 and 85 % of a stream's frames whole; eyes that take long to estimate
+        Of the process.  While a new eye is estimated on two busy cores, 0, 5 and 10
+        make 74, 83 and 85 % of a stream's frames whole; eyes that take long to estimate
         hardly come with 10.
     """
 

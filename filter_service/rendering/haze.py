@@ -28,9 +28,9 @@ from filter_service.constants import RGB
 CELL_DEG = 0.5
 """Edge of a cell, unless there would be too many of them.
 
-Pictures of a cataract are 56 dB from those with cells of 0.125 deg.  With 0.25 deg, 59 to
-62 dB, scattering takes twice as long: 11.5 instead of 4.9 ms at 480x270, 30 instead of 16
-at 1280x720.
+Pictures of a cataract are 56 dB from those with cells of 0.125 deg.  With 0.25 deg, 59
+to 62 dB, scattering takes twice as long: 11.5 instead of 4.9 ms at 480x270, 30 instead
+of 16 at 1280x720.
 """
 
 MOST_CELLS = 384
