@@ -67,7 +67,7 @@ class NodeRings:
         Middle of the pupil, from the centre of the rings.
     reach_mrad : (n_groups, 3, n_primaries)
         How much farther they send light.
-    tables : (3, n_primaries, TABLE_COUNT, 2), float32
+    amplitude_ratio : (3, n_primaries, TABLE_COUNT, 2), float32
         Complex amplitude over the squared distance from a centre.
     radius_mm : float
         Of the last entry.
@@ -77,7 +77,7 @@ class NodeRings:
 
     offset_mm: NDArray[np.float64]
     reach_mrad: NDArray[np.float64]
-    tables: NDArray[np.float32]
+    amplitude_ratio: NDArray[np.float32]
     radius_mm: float
     lattice_mm: tuple[float, float, float]
 
@@ -179,7 +179,7 @@ class NativePsfs:
             arrays["ring_reach_mrad"] = rings.reach_mrad
         arrays = {n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()}
         if rings is not None:
-            arrays["ring_tables"] = rings.tables
+            arrays["ring_tables"] = rings.amplitude_ratio
         arrays["groups"] = np.ascontiguousarray(groups, np.int64)
         arrays["channels"] = np.ascontiguousarray(channels, np.int64)
         reach_px = np.zeros((count, SIDES), np.int64)

@@ -111,14 +111,12 @@ def twin(wavefronts, *, diffraction=True, stiles_crawford=None, rings=None):
 
 
 def kernel(packed, k, radius_px=255):
-    """Kernel (2R+1, 2R+1) of unit sum."""
+    """Kernel (2R+1, 2R+1) of unit sum; an octagon's corners may lie outside."""
     reach = packed.reach_px[k]
-    own = int(max(reach.max(), packed.radius_px[k]))
+    own = int(max(reach.max(), packed.radius_px[k], radius_px))
     square = square_kernel(packed.weights, int(packed.offsets[k]), reach, own)
-    full = np.zeros((2 * radius_px + 1,) * 2)
-    part = slice(radius_px - own, radius_px + own + 1)
-    full[part, part] = square / square.sum()
-    return full
+    part = slice(own - radius_px, own + radius_px + 1)
+    return square[part, part] / square.sum()
 
 
 def error_ratio(found, truth):

@@ -87,14 +87,16 @@ def test_a_frame_is_the_same_after_any_others(known, views, alone):
     assert backwards == alone[::-1]
 
 
-def test_a_frame_is_the_same_on_one_thread(known, views, alone, monkeypatch):
-    from filter_service.psfs import compute_kernels
+def test_a_frame_is_the_same_on_one_thread(known, views, alone):
+    from filter_service.psfs.native_psfs import NativePsfs, native_psfs
+    from filter_service.psfs.psf_engine import cpu_engine
     from filter_service.rendering.native import NativeRenderer
 
-    monkeypatch.setenv("OCUFILTER_THREADS", "1")
-    compute_kernels._pool.cache_clear()
-    found = pictures(NativeRenderer(n_threads=1), PsfStore(*known), frames(views))
-    compute_kernels._pool.cache_clear()
+    library = native_psfs().library
+    own = NativePsfs(library, library.new_threads(1))
+    store = PsfStore(*known, engine=replace(cpu_engine(), native=own))
+    found = pictures(NativeRenderer(n_threads=1), store, frames(views))
+    library.end_threads(own.threads)
     assert found == alone
 
 
