@@ -10,7 +10,8 @@
 //      (pixels without depth, beyond what was prepared, and without a finite colour,
 //      which is then 0).
 // Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
-// Twin: reference.gather (intervals, cells, used pairs).  Source: section 6.1; radial depth as DESIGN 3.
+// Twin: reference.gather (intervals, cells, used pairs).
+// Source: Csoba & Kunkli 2023, section 6.1; radial depth as in CONVENTIONS.md.
 
 #include "common/color.glsl"
 

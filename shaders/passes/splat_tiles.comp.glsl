@@ -11,7 +11,8 @@
 //      depth (to DISCONTINUITY_PX of blur), front to back, each of which shares what the
 //      nearer ones leave free: of a surface that another hides in part, no part is taken
 //      before the rest.
-// Twin: reference.gather.  Source: section 6.1; accumulation DESIGN 4.
+// Twin: reference.gather.
+// Source: Csoba & Kunkli 2023, section 6.1; accumulation as in shaders/README.md.
 
 #include "common/reach.glsl"
 #include "common/fragments.glsl"
