@@ -158,8 +158,8 @@ class Door:
     def run(self) -> None:
         """Serve until the keeper says so, or is gone."""
         try:
-            while self._listen_to_keeper():
-                self._turn()
+            while self._turn():
+                pass
         except LinkClosed:
             log.error("the process that owns this one is gone")
         finally:
@@ -190,7 +190,8 @@ class Door:
             self._limits = self.config.limits
         return bool(message[0] != "stop")
 
-    def _turn(self) -> None:
+    def _turn(self) -> bool:
+        """Handle what has come; return whether to go on."""
         readable, writable = self._devices.descriptors()
         readable = readable | {self._keeper.fileno()}
         if self._keeper.has_unsent:
@@ -198,6 +199,9 @@ class Door:
         self._mailbox.watch(readable, writable)
         self._mailbox.wait(self._wait_s())
         self._keeper.flush()
+        # Before clients, whose answers must not lag behind what the keeper has said.
+        if not self._listen_to_keeper():
+            return False
         for device in self._devices:
             self._listen_to(device)
         for number in self._mailbox.take_ended():
@@ -206,6 +210,7 @@ class Door:
         for device in self._devices:
             device.frames.hand_over_one()
         self._tidy()
+        return True
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
@@ -280,6 +285,7 @@ class Door:
         device.server, device.render.may_rest = server, may_rest
         self._reception.meet(device, eyes)
         device.render.is_ready = True
+        self._keeper.send(("met", device.index))
         self._reception.greet_who_waits()
 
     def _give_up(self, device: ServedDevice) -> None:

@@ -153,6 +153,7 @@ class Keeper:
         self._children = {name: _Child() for name in (DOOR, *self._devices)}
         self._standbys: dict[str, _Child] = {}
         self._lost: set[int] = set()  # devices that are given up for now
+        self._met: set[int] = set()  # devices whose render process the door works with
         self._spawned_s = 0.0  # the last process of all
         self._restarts = {name: _Restarts() for name in self._children}
         self._sessions: dict[str, object] = {}  # by key, for the next door
@@ -318,6 +319,7 @@ class Keeper:
             return
         for name, index in self._devices.items():
             if new in (DOOR, name) and self._children[name].link is not None:
+                self._met.discard(index)
                 ours, theirs = socket.socketpair()
                 self._children[name].tell(("link", index), [ours.fileno()])
                 self._children[DOOR].tell(("link", index), [theirs.fileno()])
@@ -337,6 +339,9 @@ class Keeper:
                     child.is_ready = True
                     self._endpoint = rest[0] or self._endpoint
                     self._tell_ready(name)
+                elif kind == "met":
+                    self._met.add(rest[0])
+                    self._announce()
                 elif kind == "failed":
                     self._fail(name, child, rest[0])
                     return
@@ -360,8 +365,14 @@ class Keeper:
             self._children[DOOR].tell(("found", index))
             log.info("the %s process is there again", name)
         self._tell_degraded()
-        if not self._is_announced and all(
-            child.is_ready for child in self._children.values()
+        self._announce()
+
+    def _announce(self) -> None:
+        """Say that frames may come, once the door would say so, too."""
+        if (
+            not self._is_announced
+            and all(child.is_ready for child in self._children.values())
+            and self._met == set(self._devices.values())
         ):
             self._is_announced = True
             self._when_ready(self._endpoint)
