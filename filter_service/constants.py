@@ -220,9 +220,6 @@ RGB = 3
 ENGINES = ("auto", "gl", "native")
 """What may filter frames: by what there is, compute shaders, or compiled loops."""
 
-PSF_ENGINES = ("auto", "cpu", "gpu")
-"""What may compute PSFs: by measure, compiled loops, or compute shaders."""
-
 BINDINGS = {
     "BINDING_COLOR_IN": 0,
     "BINDING_DEPTH_IN": 1,
@@ -245,15 +242,6 @@ BINDINGS = {
     "BINDING_WINDOWS": 0,
     "BINDING_STATS": 15,
     "BINDING_DISPATCHES": 5,
-    # The passes that build PSFs share no dispatch with those of a frame; core OpenGL
-    # promises eight bindings.
-    "BINDING_PSF_RECORDS": 0,
-    "BINDING_PSF_FIELD": 1,
-    "BINDING_PSF_TABLES": 2,
-    "BINDING_PSF_STRIPES": 3,
-    "BINDING_PSF_KERNELS": 4,
-    "BINDING_PSF_TOTALS": 5,
-    "BINDING_PSF_IMAGES": 6,
     "BINDING_NODES": 0,
     "BINDING_PARTS": 1,
     "BINDING_RECIPES": 2,

@@ -1,10 +1,9 @@
 """Every variant of a pass that the code may ask OpenGL for, found without OpenGL.
 
 A `Gpu` without a driver notes what is dispatched while the renderer filters the frames
-of `compile_passes` and the builder of PSFs works through every length that it has.
+of `compile_passes`.
 """
 
-from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -13,10 +12,6 @@ import numpy as np
 from filter_service import constants
 from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Gpu
 from filter_service.gl.passes import Buffer, Passes
-from filter_service.psfs.gpu_build_constants import FFT_RADICES
-from filter_service.psfs.gpu_build_pace import Pace
-from filter_service.psfs.gpu_build_passes import PsfPasses
-from filter_service.psfs.gpu_build_records import RECORD, Chunk, Jobs
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 
@@ -30,7 +25,7 @@ class Variant:
 
     def __str__(self):
         told = [f"{name}={value}" for name, value in self.defines]
-        return f"{self.name}({', '.join(n for n in told if not n.startswith('PSF_'))})"
+        return f"{self.name}({', '.join(told)})"
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ def all_variants() -> list[Variant]:
     found: set[Variant] = set()
     for kind in KINDS.values():
         found |= renderer_variants(kind)
-    return sorted(found | psf_variants(), key=str)
+    return sorted(found, key=str)
 
 
 def renderer_variants(kind: Kind) -> set[Variant]:
@@ -62,37 +57,6 @@ def renderer_variants(kind: Kind) -> set[Variant]:
     gpu = _NoGpu(kind)
     compile_passes(FilterRenderer(gpu))
     return gpu.asked
-
-
-def psf_variants() -> set[Variant]:
-    """Variants that PSFs may need."""
-    gpu = _NoGpu(KINDS["hardware"])
-    passes = PsfPasses(gpu, _AtOnce())
-    passes.begin(kernel_count=1, total_count=1)
-    for jobs in _every_job():
-        passes.waves(jobs)
-        for diffraction in (False, True):
-            passes.rays(jobs, diffraction=diffraction)
-    return gpu.asked
-
-
-def _every_job() -> Iterator[Jobs]:
-    chunks = [Chunk(0, 1, (length, length), 1, (1, 1)) for length in FFT_RADICES]
-    for is_apodised in (False, True):
-        yield Jobs(
-            members=np.zeros(1, np.int64),
-            records=np.zeros(1, RECORD),
-            chunks=chunks,
-            filter_weights=np.zeros(1, np.float32),
-            is_apodised=is_apodised,
-        )
-
-
-class _AtOnce(Pace):
-    """Queues all PSFs together: nothing is timed."""
-
-    def parts(self, kind, works, finish):
-        yield 0, len(works)
 
 
 class _NoPasses(Passes):

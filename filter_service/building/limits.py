@@ -20,6 +20,5 @@ class BuildLimits:
     max_blur_radius_px: int = 255
     max_store_mb: int = 2000
     max_stores_mb: int = 4000
-    psf_engine: str = "auto"
     store_cache_dir: str = ""
     store_cache_max_mb: int = 2000

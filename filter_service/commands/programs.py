@@ -33,7 +33,6 @@ class Bench(StrEnum):
     NETWORKS = "networks"
     PLAN = "plan"
     PSF = "psf"
-    BUILD = "build"
     LAYERS = "layers"
     RENDER = "render"
     LIVE = "live"
@@ -70,7 +69,6 @@ BENCH_MODULES = {
     Bench.NETWORKS: "tests.benchmarks.bench_networks",
     Bench.PLAN: "tests.benchmarks.bench_plan",
     Bench.PSF: "tests.benchmarks.bench_psf",
-    Bench.BUILD: "tests.benchmarks.bench_psf_build",
     Bench.LAYERS: "tests.benchmarks.bench_layers",
     Bench.RENDER: "tests.benchmarks.bench_render",
     Bench.LIVE: "tests.benchmarks.bench_live",

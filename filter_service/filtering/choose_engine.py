@@ -22,18 +22,11 @@ class ChosenEngine:
     engine : FrameEngine
     reason : str
         Why this one, in a few words.
-    psf_engine : "auto" or "cpu"
-        What builds PSFs beside it, unless told otherwise.
     """
 
     name: str
     engine: Any
     reason: str
-
-    @property
-    def psf_engine(self) -> str:
-        """The processor builds where it filters; beside gl a hardware GPU does."""
-        return "cpu" if self.name == "native" else "auto"
 
 
 def open_engine(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import cache
 
 from filter_service.building.inline_worker import InlineWorker
@@ -26,8 +25,7 @@ def open_workshop(
     Parameters
     ----------
     engine : "auto", "gl" or "native"
-        What filters frames; it also says what builds PSFs where the limits leave that
-        open.
+        What filters frames.
 
     Raises
     ------
@@ -40,8 +38,6 @@ def open_workshop(
     from filter_service.filtering.choose_engine import open_engine
 
     chosen = open_engine(engine, closing, warm_up=True)
-    if limits.psf_engine == "auto":
-        limits = replace(limits, psf_engine=chosen.psf_engine)
     # Here mypy sees that what is chosen is a `FrameEngine`.
     workshop = Workshop(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(workshop.close)

@@ -225,7 +225,6 @@ class Workshop:
             stream.ticket = stream.building = None
             try:
                 loaded = self.engine.load(event.built.store)
-                loaded.set_psf_engine(self._limits.psf_engine)
             except Exception as error:
                 self._fail(stream, wanted, _as_filter_error(error))
                 return

@@ -6,13 +6,8 @@ node_blur            their geometric blur
 blur_loops           its compiled loop
 compute_kernels      from nodes to packed kernels
 wide_primaries       kernels of primaries of two wavelengths
-psf_engine           in C, on the GPU, or in Python
+psf_engine           in C, or in Python
 native_psfs          the engine in C
-gpu_build            PSFs in compute shaders
-gpu_build_constants  their numbers
-gpu_build_pace       how much of it at a time
-gpu_build_passes     their passes
-gpu_build_records    their records
 boxes                what kernels are cut to
 pack                 kernels cut to boxes, in 16 bits
 store                the PSFs of an eye

@@ -57,7 +57,7 @@ class PsfStore:
     plan : CachePlan
         Where the nodes are.
     engine : PsfEngine, optional
-        Computes the PSFs; the processor where it is None.
+        Computes the PSFs; that of `psf_engine` where it is None.
     wavefronts : NodeWavefronts, optional
     blur_px : (n_psfs,), optional
         As `node_blur_px` gives it.
@@ -189,9 +189,9 @@ class PsfStore:
         """
         from estimator.psf.compute import PsfTooLarge
         from filter_service.psfs.compute_kernels import computed_kernels
-        from filter_service.psfs.psf_engine import cpu_engine
+        from filter_service.psfs.psf_engine import psf_engine
 
-        self.engine = self.engine or cpu_engine()
+        self.engine = self.engine or psf_engine()
         started_s = time.perf_counter()
         psfs = np.arange(self.psf_count) if psfs is None else np.unique(psfs)
         if not self.spec.settings.chromatic:  # channels share kernels

@@ -21,8 +21,6 @@ class LoadedStore(Protocol):
     @property
     def memory_mb(self) -> float: ...  # noqa: D102
 
-    def set_psf_engine(self, choice: str) -> None: ...  # noqa: D102
-
     def missing_psfs(  # noqa: D102
         self,
         use: FrameUse | None = None,

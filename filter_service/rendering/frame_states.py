@@ -55,12 +55,6 @@ class FrameStore:
         """Memory of their kernels."""
         return self.store.memory_mb
 
-    def set_psf_engine(self, choice: str) -> None:
-        """Have PSFs computed by "cpu" or "gpu", or whichever "auto" finds."""
-        from filter_service.psfs.psf_engine import psf_engine
-
-        self.store.engine = psf_engine(choice)
-
     def missing_psfs(
         self,
         use: FrameUse | None = None,

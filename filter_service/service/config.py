@@ -10,7 +10,7 @@ from typing import Any
 
 from estimator.threads import MAX_THREADS, thread_count
 from filter_service.building.limits import BuildLimits, default_cache_dir
-from filter_service.constants import ENGINES, PSF_ENGINES
+from filter_service.constants import ENGINES
 from filter_service.gl_device import checked_gl_device
 from filter_service.log_lines import LOG_FORMATS
 from filter_service.service.devices import check_devices, device_named
@@ -48,9 +48,8 @@ class ServiceConfig:
         for longest make room, and are prepared again when they are wanted.  Of several
         devices each has so much.
     engine : "auto", "gl" or "native"
-        What filters frames and, unless ``psf_engine`` says otherwise, computes PSFs:
-        a GPU's compute shaders, or compiled loops on all cores.  "auto" takes gl on a
-        hardware GPU, else native.
+        What filters frames: a GPU's compute shaders, or compiled loops on all cores.
+        "auto" takes gl on a hardware GPU, else native.
     gl_device : str
         The EGL device that OpenGL works on, by its index, which asks for the engine gl;
         "auto": the first that works, hardware before software.
@@ -60,9 +59,6 @@ class ServiceConfig:
         ``devices = ["gl:0", "gl:1"]``.  A session is on the one that was least busy at
         its beginning; a device that cannot be started again is given up.  Empty: one
         process, as ``engine`` and ``gl_device`` say.
-    psf_engine : "auto", "cpu" or "gpu"
-        What computes PSFs, where it shall be another than the engine's.  A GPU is held
-        for about 4 ms at a time, so that frames go on between.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
@@ -125,7 +121,6 @@ class ServiceConfig:
     engine: str = "auto"
     gl_device: str = "auto"
     devices: tuple[str, ...] = ()
-    psf_engine: str = "auto"
     max_cameras: int = 4
     store_cache_dir: str = default_cache_dir()
     store_cache_max_mb: int = 2000
@@ -150,7 +145,6 @@ class ServiceConfig:
         _check_bind(self.bind, has_keys=bool(self.keys_dir))
         for name, allowed in (
             ("engine", ENGINES),
-            ("psf_engine", PSF_ENGINES),
             ("log_format", LOG_FORMATS),
         ):
             if getattr(self, name) not in allowed:
@@ -201,7 +195,6 @@ class ServiceConfig:
             max_blur_radius_px=self.max_blur_radius_px,
             max_store_mb=self.max_store_mb,
             max_stores_mb=self.max_stores_mb,
-            psf_engine=self.psf_engine,
             store_cache_dir=self.store_cache_dir,
             store_cache_max_mb=self.store_cache_max_mb,
         )
@@ -246,6 +239,9 @@ CHANGEABLE = (
 )
 """What a running service takes from the file at SIGHUP; of a session those of its
 beginning hold where it was told of them."""
+
+
+REMOVED = {"psf_engine": "PSFs are computed on the processor, in C"}
 
 
 def changed_while_running(
@@ -327,6 +323,8 @@ def _words(name: str, value: object) -> tuple[str, ...]:
 def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings with the types of their fields."""
     defaults = {field.name: field.default for field in fields(ServiceConfig)}
+    for name in REMOVED.keys() & settings.keys():
+        raise ValueError(f"{name} was removed: {REMOVED[name]}; delete the setting")
     unknown = sorted(set(settings) - set(defaults))
     if unknown:
         raise ValueError(

@@ -35,7 +35,7 @@ EYES = CONDITIONS
 STREAM_S = 6.0
 SIZES = (((480, 270), 30.0), ((1280, 720), 8.0))
 OF_OWN_RATE = 0.6
-LIMITS = BuildLimits(psf_engine="cpu")
+LIMITS = BuildLimits()
 STEP = ((3.0, 0.0), (6.0, 2.5))
 WAIT_S = 120.0
 

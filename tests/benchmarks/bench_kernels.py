@@ -26,7 +26,7 @@ from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import computed_kernels, generic_kernels
 from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import PackedKernels
-from filter_service.psfs.psf_engine import PYTHON, cpu_engine
+from filter_service.psfs.psf_engine import PYTHON, psf_engine
 from filter_service.psfs.store import PsfStore
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.psf_rates import FOCUSES_DPT, PUPILS_MM, traced_slices
@@ -151,7 +151,7 @@ def lattice_rows(eye_name: str, count: int) -> list[Row]:
         name: lambda some, engine=engine: computed_kernels(
             eye, spec, plan, store.wavefronts, some, engine
         )[0]
-        for name, engine in (("C", cpu_engine()), ("twin", PYTHON))
+        for name, engine in (("C", psf_engine()), ("twin", PYTHON))
     }
 
     def total_dpt(some):
@@ -171,7 +171,7 @@ def lattice_rows(eye_name: str, count: int) -> list[Row]:
 
 def engines_of(wavefronts: NodeWavefronts, eye, spec) -> dict[str, Compute]:
     """Both engines for PSFs 3 group + channel at 0 dpt."""
-    native = cpu_engine().native
+    native = psf_engine().native
 
     def by_c(psfs):
         packed, _, left = native.kernels(

@@ -33,9 +33,6 @@ class StoreDouble:
     def release(self):
         self.n_released += 1
 
-    def set_psf_engine(self, choice):
-        """There are none."""
-
     def missing_psfs(self, use=None, *, state=None):
         return np.zeros(0, np.int64)
 

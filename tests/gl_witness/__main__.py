@@ -4,8 +4,8 @@
     python -m tests.gl_witness [tests] [frames] [layers]
 
 tests: all that draw with OpenGL, on llvmpipe and on zink over lavapipe, with the
-variants of the passes for software and those for a GPU.  frames: the same frames and
-PSFs by each, beside the native engine's and each other's.  layers: what Vulkan's
+variants of the passes for software and those for a GPU.  frames: the same frames
+by each, beside the native engine's and each other's.  layers: what Vulkan's
 validation layers say of them.  Each part has its place in results/gl_witness.json.
 It fails where a test does, or the layers find a fault.
 """

@@ -14,13 +14,12 @@ EQUAL_DB = 300.0
 
 @dataclass(frozen=True)
 class Difference:
-    """A frame or a batch of PSFs, and the same of another process.
+    """A frame, and the same of another process.
 
     Attributes
     ----------
     psnr_db, largest : float
-        In linear light with peak 1, of encoded pictures in their steps over 255; of
-        PSFs as parts of each batch's largest sample.
+        In linear light with peak 1, of encoded pictures in their steps over 255.
     counts : dict
         Counts that differ: (here, there).
     """
@@ -37,15 +36,14 @@ class Difference:
 
 
 def differences(here: Filtered, there: Filtered) -> list[Difference]:
-    """Frame by frame, and PSFs batch by batch."""
+    """Frame by frame."""
     if here.stores != there.stores or here.arrays.keys() != there.arrays.keys():
         raise ValueError("the two have filtered different things")
     return [_difference(name, here, there) for name in here.arrays]
 
 
 def _difference(name: str, here: Filtered, there: Filtered) -> Difference:
-    peak = float(np.abs(there.arrays[name]).max()) if name not in there.counts else 1.0
-    a, b = (_as_light(side.arrays[name]) / peak for side in (here, there))
+    a, b = (_as_light(side.arrays[name]) for side in (here, there))
     ours, theirs = here.counts.get(name, {}), there.counts.get(name, {})
     return Difference(
         name,
@@ -60,17 +58,8 @@ def _as_light(picture: NDArray) -> NDArray[np.float64]:
     return picture.astype(np.float64) / scale
 
 
-def summary(found: list[Difference]) -> dict:
-    """Worst of many, frames apart from PSFs."""
-    groups = {"frames": [], "psfs": []}
-    for difference in found:
-        groups["psfs" if difference.name.startswith("PSFs") else "frames"].append(
-            difference
-        )
-    return {name: _worst(group) for name, group in groups.items()}
-
-
-def _worst(group: list[Difference]) -> dict:
+def summary(group: list[Difference]) -> dict:
+    """Worst of many."""
     return {
         "compared": len(group),
         "byte for byte": sum(difference.is_none for difference in group),

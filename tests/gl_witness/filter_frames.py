@@ -1,4 +1,4 @@
-"""Filters all frames and builds all PSFs in this process, into a file.
+"""Filters all frames in this process, into a file.
 
     python -m tests.gl_witness.filter_frames ENGINE VIEWS OUT
 
@@ -11,16 +11,12 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf.compute import compute_psf_batch
-from estimator.psf.stiles_crawford import StilesCrawford
-from filter_service.psfs.gpu_build import gpu_psf_batch
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from tests.gl_witness.frames import (
@@ -30,7 +26,6 @@ from tests.gl_witness.frames import (
     TIMES,
     Case,
     load_views,
-    psf_arguments,
     store_of,
 )
 from tests.shader_variants import Variant
@@ -54,7 +49,7 @@ class Filtered:
     programs : list of str
         Variants of passes that were compiled.
     arrays : dict
-        Pictures and kernels by name.
+        Pictures by name.
     """
 
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -102,17 +97,8 @@ def _filtered(renderer, view, handle, case: Case) -> tuple[NDArray, dict[str, in
     return frame.color, {name: int(getattr(frame, name)) for name in COUNTS}
 
 
-def _psf_batches(views: dict[str, RgbdView]) -> Iterator[tuple[str, dict]]:
-    """Arguments of batches, each with and without the Stiles-Crawford effect."""
-    width_px = min(view.width_px for view in views.values())
-    effect = StilesCrawford.of_eye("OD")
-    for name, arguments in psf_arguments(width_px):
-        yield f"PSFs, {name}", arguments
-        yield f"PSFs, {name}, Stiles-Crawford", {**arguments, "stiles_crawford": effect}
-
-
 def filter_with_gl(views: dict[str, RgbdView]) -> Filtered:
-    """All frames and PSFs by the driver that the environment says."""
+    """All frames by the driver that the environment says."""
     from filter_service.gl.gpu import Gpu
     from filter_service.rendering.gl import FilterRenderer
     from tests.gl_witness.hardware_shaders import use_hardware_shaders
@@ -121,20 +107,15 @@ def filter_with_gl(views: dict[str, RgbdView]) -> Filtered:
         use_hardware_shaders()
     filtered, gpu = Filtered(), Gpu()
     filter_cases(FilterRenderer(gpu), views, filtered)
-    with gpu.context:
-        for name, arguments in _psf_batches(views):
-            filtered.arrays[name] = gpu_psf_batch(gpu, **arguments).flat_kernels
     programs = [Variant(name, tuple(defines)) for name, *defines in gpu.passes.programs]
     filtered.programs = sorted(map(str, programs))
     return filtered
 
 
 def filter_with_native(views: dict[str, RgbdView]) -> Filtered:
-    """All frames by the native engine, and PSFs by the estimator's."""
+    """All frames by the native engine."""
     filtered = Filtered()
     filter_cases(NativeRenderer(), views, filtered)
-    for name, arguments in _psf_batches(views):
-        filtered.arrays[name] = compute_psf_batch(**arguments).flat_kernels
     return filtered
 
 

@@ -1,7 +1,5 @@
-"""The frames of both scenes that every driver filters, and the PSFs that it builds."""
+"""The frames of both scenes that every driver filters."""
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,8 +13,6 @@ from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 
 PUPIL_MM, FOCUS_DPT = 5.0, 0.5
-FIELD_DEG = 8.0
-"""Across a frame with pixels of the PSFs that are built on the GPU."""
 
 TIMES = 3
 """Times a frame is filtered: kernels made anew, kept, and kept once more."""
@@ -108,26 +104,3 @@ def _spec(case: Case, view: RgbdView) -> GridSpec:
         pupil_range_mm=(PUPIL_MM, PUPIL_MM),
         focus_range_dpt=(FOCUS_DPT, FOCUS_DPT),
     )
-
-
-def psf_arguments(width_px: int) -> Iterator[tuple[str, dict]]:
-    """Name and arguments of batches of PSFs: waves of many lengths, rays, and both.
-
-    The smaller the frames, the coarser the PSFs.
-    """
-    shape = np.zeros(28)
-    shape[[3, 4, 7, 8, 9, 12]] = 0.4, 1.1, -0.5, 0.3, 0.2, 0.15
-    strengths = np.geomspace(0.02, 3.0, 12)
-    zernike_um = np.outer(np.concatenate([strengths, -strengths]), shape)
-    pupils_mm = np.resize([3.0, 5.0, 7.0], len(zernike_um))
-    common = {
-        "zernike_um": zernike_um * (pupils_mm[:, None] / 7.0) ** 2,
-        "pupil_diameter_mm": pupils_mm,
-        "wavelength_nm": 550.0,
-        "pixel_pitch_mrad": math.radians(1000.0 * FIELD_DEG / width_px),
-        "max_radius_px": 255,
-    }
-    yield "waves", {**common, "method": "fourier"}
-    yield "rays", {**common, "method": "geometric"}
-    yield "rays, no edge", {**common, "method": "geometric", "diffraction": False}
-    yield "both", common

@@ -15,7 +15,7 @@ SIZE = {"width_px": 320, "height_px": 180}
 
 
 def filter_all(folder: Path) -> dict[str, Filtered]:
-    """Frames and PSFs by the native engine and by each driver."""
+    """Frames by the native engine and by each driver."""
     views = folder / "views.npz"
     save_views(views, **SIZE)
     runs = {"native": ("native", dict(os.environ))}

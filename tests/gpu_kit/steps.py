@@ -98,15 +98,6 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
             quick=("--quick",),
         ),
         Step(
-            "psf_build",
-            "the paper's PSF set",
-            BENCHES + "bench_psf_build",
-            limit_s=90.0,
-            words=("--json",),
-            full=("--set-only",),
-            quick=("--quick",),
-        ),
-        Step(
             "pictures",
             "pictures through three eyes",
             KIT + "pictures",

@@ -89,12 +89,12 @@ def test_a_frame_is_the_same_after_any_others(known, views, alone):
 
 def test_a_frame_is_the_same_on_one_thread(known, views, alone):
     from filter_service.psfs.native_psfs import NativePsfs, native_psfs
-    from filter_service.psfs.psf_engine import cpu_engine
+    from filter_service.psfs.psf_engine import psf_engine
     from filter_service.rendering.native import NativeRenderer
 
     library = native_psfs().library
     own = NativePsfs(library, library.new_threads(1))
-    store = PsfStore(*known, engine=replace(cpu_engine(), native=own))
+    store = PsfStore(*known, engine=replace(psf_engine(), native=own))
     found = pictures(NativeRenderer(n_threads=1), store, frames(views))
     library.end_threads(own.threads)
     assert found == alone

@@ -36,7 +36,7 @@ def built(name, **settings):
         profile=parse_profile({"kind": "preset", "name": name}),
         settings=SETTINGS.changed(**settings),
         camera=CAMERA,
-        limits=BuildLimits(psf_engine="cpu"),
+        limits=BuildLimits(),
     )
     return build(job, progress=lambda *_: None, cancelled=lambda: False).store
 

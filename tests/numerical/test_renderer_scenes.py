@@ -8,6 +8,7 @@ from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering import reference
+from filter_service.rendering.native import NativeRenderer
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
@@ -48,3 +49,23 @@ def test_passes_agree_with_the_sorted_gather(engine, eye, scene, accumulation):
     if (eye, scene) in MERGING:
         assert merged.merged_count >= 0.5 * merged.color[..., 0].size
     handle.release()
+
+
+@pytest.mark.gpu
+def test_a_hardware_gpu_filters_as_the_compiled_loops(gl_engine):
+    view = scene_view("courtyard", width_px=1280, height_px=720)
+    spec = grid_spec(
+        width_px=1280,
+        height_px=720,
+        tangents=view.tangents,
+        pupil_range_mm=(5.0, 5.0),
+        mode="dynamic",
+    )
+    profile = parse_profile({"kind": "preset", "name": "keratoconus"})
+    store = build_psf_store(profile, spec)
+    colors = []
+    for renderer in (gl_engine.new_renderer(), NativeRenderer()):
+        handle = renderer.load(store)
+        colors.append(renderer.render(view, handle, **STATE).color)
+        handle.release()
+    assert psnr_db(*colors) >= 74.0

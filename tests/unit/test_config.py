@@ -69,6 +69,7 @@ def test_values_out_of_range_are_refused_by_name(name, value):
     ("text", "message"),
     [
         ("speed = 3", "unknown setting 'speed'"),
+        ("psf_engine = 'cpu'", "psf_engine was removed: .* delete the setting"),
         ("credit = 2.5", "credit is 2.5; allowed: int"),
         ("credit = true", "credit is True; allowed: int"),
         ("bind = 5577", "bind is 5577; allowed: str"),

@@ -62,25 +62,24 @@ def filtered(picture, **counts):
     return Filtered(
         counts={"frame": counts},
         stores={"frame": "same"},
-        arrays={"frame": picture, "PSFs": np.ones(4, np.float32)},
+        arrays={"frame": picture},
     )
 
 
 def test_differences_are_in_light_and_name_the_counts():
     here, there = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2, 3), np.uint8)
     there[0, 0, 0] = 51
-    found = differences(
+    (frame,) = differences(
         filtered(here, entry_count=3, kernel_count=1),
         filtered(there, entry_count=4, kernel_count=1),
     )
-    frame, psfs = found
     assert frame.largest == pytest.approx(0.2)
     assert frame.psnr_db == pytest.approx(-10 * np.log10(0.04 / 12), abs=0.1)
     assert frame.counts == {"entry_count": (3, 4)}
-    assert psfs.is_none and not frame.is_none
-    told = summary(found)
-    assert told["frames"]["other entry_count"] == 1
-    assert told["psfs"]["byte for byte"] == 1
+    assert not frame.is_none
+    told = summary([frame])
+    assert told["other entry_count"] == 1
+    assert told["byte for byte"] == 0
 
 
 def test_what_was_filtered_comes_back_from_its_file(tmp_path):

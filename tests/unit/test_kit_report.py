@@ -21,7 +21,6 @@ KEPT = {
     "gpu": "gpu",
     "stereo": "gpu",
     "render": "render_h100",
-    "psf_build": "build_h100",
     "switch": "switch",
     "field": "field",
     "cost": "cost",

@@ -122,5 +122,5 @@ def test_every_step_starts_what_exists():
 
 
 def test_tests_for_a_gpu_are_found_by_their_mark():
-    assert "tests/numerical/test_psf_gpu.py" in gpu_test_files(ROOT)
+    assert "tests/numerical/test_renderer_scenes.py" in gpu_test_files(ROOT)
     assert "tests/unit/test_depths.py" not in gpu_test_files(ROOT)

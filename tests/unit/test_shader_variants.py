@@ -10,7 +10,6 @@ from filter_service.gl.shader_source import (
     load_shader,
     shared_defines,
 )
-from filter_service.psfs.gpu_build_constants import DEFINES, FFT_RADICES
 from tests.shader_check import Compilers, check, complaints
 from tests.shader_variants import KINDS, Variant, all_variants, renderer_variants
 
@@ -36,9 +35,8 @@ def source(name):
 
 def defines_of(name):
     """Defines of each variant of a pass, with those that all passes have."""
-    shared = {**shared_defines(), **DEFINES}
     found = [v.defines for v in all_variants() if v.name == name]
-    return [{**shared, **dict(defines)} for defines in found]
+    return [{**shared_defines(), **dict(defines)} for defines in found]
 
 
 def test_every_pass_is_there():
@@ -65,11 +63,6 @@ def test_lists_of_every_length_are_sorted_by_both_rules_on_every_kind():
         assert found == {(n, p) for n in (*SORT_CAPACITIES, 0) for p in (False, True)}
 
 
-@pytest.mark.parametrize("name", ["psf_wave_rows", "psf_wave_columns"])
-def test_every_length_is_transformed(name):
-    assert {defines["FFT_LENGTH"] for defines in defines_of(name)} == set(FFT_RADICES)
-
-
 @pytest.fixture
 def compilers():
     found = Compilers.found()
@@ -79,7 +72,7 @@ def compilers():
 
 
 def test_a_sound_pass_has_no_complaints(compilers):
-    assert check(Variant("psf_ray_clear", tuple(DEFINES.items())), compilers) == []
+    assert check(Variant("scan_bins", ()), compilers) == []
 
 
 def test_a_complaint_names_file_and_line(compilers):

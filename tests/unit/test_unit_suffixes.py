@@ -33,7 +33,6 @@ DIMENSIONLESS = {
     "oversampling": "samples per sample",
     "conic_constant": "shape of a conic, 0 sphere, -1 paraboloid",
     "margin": "in lambda/D",
-    "filter_weights": "shares of angular samples in a pixel",
     "pupil_samples": "samples across the pupil, a count that need not be whole",
     "max_repeat_difference": "in units of the output it compares",
     "low": "in the unit of a network's input column, or of an entry of the page",
