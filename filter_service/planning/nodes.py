@@ -196,3 +196,24 @@ def bracket_axis(
     lower = np.maximum(upper - 1, 0)
     span = nodes[upper] - nodes[lower]
     return lower, upper, (value - nodes[lower]) / np.where(span > 0.0, span, 1.0)
+
+
+def triangle(
+    first: NDArray[np.float64], second: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Weights of the corners of half a rectangle, cut along its diagonal.
+
+    Parameters
+    ----------
+    first, second : (n,)
+        How far along two axes, 0 to 1.
+
+    Returns
+    -------
+    weights : (n, 3)
+        Of the corner (0, 0), of that between and of (1, 1).
+    is_first : (n,)
+        Whether the corner between is (1, 0), else (0, 1).
+    """
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    return np.stack([1.0 - high, high - low, low], axis=-1), first >= second

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.optics.vergence import ObjectVergence
 from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
+from filter_service.planning.nodes import CachePlan
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
 from filter_service.psfs.read_kernels import StateReads
@@ -105,12 +106,7 @@ def frame_layers(
         pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
     )
     layer_zero_dpt = at_infinity_dpt - store.defocus.change_at_nodes_dpt(change)
-    corners = tuple(
-        (pupil, used, pupil_weight * used_weight)
-        for pupil, pupil_weight in _neighbours(plan.pupils_mm, pupil_mm)
-        for used, used_weight in _neighbours(plan.accommodations_dpt, accommodation_dpt)
-        if pupil_weight * used_weight > 0.0
-    )
+    corners = _corners(plan, pupil_mm, accommodation_dpt)
     notes += _limit_notes(store, corners)
     reads = _state_reads(store, pupil_mm, corners)
     far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
@@ -195,18 +191,34 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
     return clamped_mm, (note,)
 
 
-def _neighbours(nodes: NDArray, value: float) -> list[tuple[int, float]]:
-    """Return the nodes on both sides of a value and their weights.
+def _corners(
+    plan: CachePlan, pupil_mm: float, accommodation_dpt: float
+) -> tuple[tuple[int, int, float], ...]:
+    """Nodes of pupil and accommodation around a state, and their weights.
 
-    As `bracket_axis` has them, in plain numbers: that costs a tenth.
+    The corners of a triangle, as `planning.nodes.triangle` has them; in plain numbers,
+    which costs a tenth.
     """
+    pupil, next_pupil, part = _bracket(plan.pupils_mm, pupil_mm)
+    used, next_used, used_part = _bracket(plan.accommodations_dpt, accommodation_dpt)
+    low, high = min(part, used_part), max(part, used_part)
+    between = (next_pupil, used) if part >= used_part else (pupil, next_used)
+    corners = (
+        (pupil, used, 1.0 - high),
+        (*between, high - low),
+        (next_pupil, next_used, low),
+    )
+    return tuple(corner for corner in corners if corner[-1] > 0.0)
+
+
+def _bracket(nodes: NDArray, value: float) -> tuple[int, int, float]:
+    """Return the nodes on both sides of a value and the share of the upper one."""
     axis = nodes.tolist()
     upper = min(bisect_left(axis, value), len(axis) - 1)
     lower = max(upper - 1, 0)
     upper = min(lower + 1, len(axis) - 1)
     span = axis[upper] - axis[lower] or 1.0
-    share = min(max((value - axis[lower]) / span, 0.0), 1.0)
-    return [(lower, 1.0 - share), (upper, share)]
+    return lower, upper, min(max((value - axis[lower]) / span, 0.0), 1.0)
 
 
 def _in_focus_dpt(

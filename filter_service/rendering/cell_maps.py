@@ -13,15 +13,15 @@ class MapTables(NamedTuple):
 
     Attributes
     ----------
-    node_from_cell, cell_from_node : (n_cells, 4, 2, 2)
+    node_from_cell, cell_from_node : (n_cells, 3, 2, 2)
         The map and its inverse.
-    area_ratio : (n_cells, 4)
+    area_ratio : (n_cells, 3)
         Area of a pixel of the cell in stored pixels.
-    box_ratio : (n_cells, 4)
+    box_ratio : (n_cells, 3)
         That area over that of a box with the mapped pixel's sides.
-    stretch_ratio : (n_cells, 4)
+    stretch_ratio : (n_cells, 3)
         Most by which a kernel is longer than as stored.
-    change_ratio : (n_cells, 4)
+    change_ratio : (n_cells, 3)
         By how much of its distance from the centre light moves.
     """
 
@@ -35,13 +35,13 @@ class MapTables(NamedTuple):
 
 @dataclass(frozen=True)
 class CellMaps:
-    """Maps of cells, each to its four field nodes.
+    """Maps of cells, each to its three field nodes.
 
     A kernel's part is mapped where `moves` says so; else it is read as stored.
 
     Attributes
     ----------
-    node_from_cell : (n_cells, 4, 2, 2)
+    node_from_cell : (n_cells, 3, 2, 2)
         From offsets in the cell's pixels (x right, y down) to those of the pixels that
         a node's kernels are stored in.
     """

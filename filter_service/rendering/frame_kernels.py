@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import RECIPE_TAPS, RGB
+from filter_service.constants import RECIPE_TAPS, RECIPE_WORDS, RGB
 from filter_service.errors import NotPrepared
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.read_kernels import StoreTables
@@ -36,8 +36,8 @@ class NodeKernels:
     radius_px : (n,)
     peak_ratio : (n,)
         Bound on the weights of the interval.
-    recipes : (n_recipes, 3, 24), uint32
-        Per channel eight kernel offsets, eight reaches (a byte a side), eight weights
+    recipes : (n_recipes, 3, 18), uint32
+        Per channel six kernel offsets, six reaches (a byte a side), six weights
         (float bits) that turn steps of a cached kernel into its share of a layer.
     recipe_spread_px : (n_recipes,)
         Smallest spread over the channels; decides what may merge.
@@ -60,12 +60,12 @@ class FrameKernels:
     ----------
     cells, intervals : (n,)
         Which pair a kernel serves.
-    parts : (n, 4)
+    parts : (n, 3)
         Node kernels it is blended from.
-    weight_ratio : (n, 4)
+    weight_ratio : (n, 3)
         Share of a part; where its map turns or shears, times the area of a mapped pixel
         over that of its sides.
-    maps : (n, 4, 2, 2)
+    maps : (n, 3, 2, 2)
         From offsets in the image's pixels to those of the part; exactly the identity
         where it is as good as that.
     reach_px : (n, 4)
@@ -227,7 +227,7 @@ def _node_kernels(
         reach_px=np.maximum(reach_px[near], reach_px[far]),
         radius_px=np.maximum(radius_px[near], radius_px[far]),
         peak_ratio=np.maximum(peak_ratio[near], peak_ratio[far]),
-        recipes=recipes.reshape(count, RGB, 3 * RECIPE_TAPS),
+        recipes=recipes.reshape(count, RGB, RECIPE_WORDS),
         recipe_spread_px=spread_px,
     )
 

@@ -1,7 +1,7 @@
 """The image in square cells, each with one set of kernels.
 
 PSFs change slowly over the field, so all pixels of a cell share the kernels of the
-cell's middle direction, blended there from the four field nodes around it.  That costs
+cell's middle direction, blended there from three field nodes around it.  That costs
 a frame one look-up per fragment and pixel, on axis and off, where blending in the
 splatting loop costs four (paper section 6.3).  What changes fastest over the field is
 left out of the blend: each node's kernel is mapped from the pixels it is stored in to
@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.constants import FIELD_CORNERS
 from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan, bracket_axis
+from filter_service.planning.nodes import CachePlan, bracket_axis, triangle
 from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
@@ -32,8 +33,6 @@ MIN_CELL_PX = 4
 MAX_CELL_PX = 256
 """Cells are powers of two: a merged square lies in one cell."""
 
-CORNERS = 4
-
 
 class KernelsTooLarge(Exception):
     """A frame's kernels take too much; those of larger cells take less."""
@@ -48,9 +47,9 @@ class ImageCells:
     cell_px : int
         Edge; 0 where one cell is the whole image.
     grid : (columns, rows)
-    nodes : (n_cells, 4)
+    nodes : (n_cells, 3)
         Field nodes around a cell's middle, index into [v, h] in C order.
-    weight_ratio : (n_cells, 4)
+    weight_ratio : (n_cells, 3)
         Of the nodes; sum 1.
     maps : CellMaps
         To the pixels that the nodes' kernels are stored in.
@@ -95,9 +94,9 @@ def image_cells(
         return ImageCells(
             cell_px=0,
             grid=(1, 1),
-            nodes=np.zeros((1, CORNERS), np.int64),
-            weight_ratio=np.array([[1.0, 0.0, 0.0, 0.0]]),
-            maps=CellMaps(np.broadcast_to(np.eye(2), (1, CORNERS, 2, 2))),
+            nodes=np.zeros((1, FIELD_CORNERS), np.int64),
+            weight_ratio=np.array([[1.0, 0.0, 0.0]]),
+            maps=CellMaps(np.broadcast_to(np.eye(2), (1, FIELD_CORNERS, 2, 2))),
             corner_h_deg=np.zeros((2, 2)),
             corner_v_deg=np.zeros((2, 2)),
         )
@@ -115,12 +114,7 @@ def image_cells(
         np.minimum(y_px, camera.height_px).ravel(),
         gaze_deg=gaze_deg,
     )
-    h_low, h_high, h_part = bracket_axis(plan.h_deg, h_deg)
-    v_low, v_high, v_part = bracket_axis(plan.v_deg, v_deg)
-    n_h = plan.h_deg.size
-    nodes = np.stack(
-        [v * n_h + h for v in (v_low, v_high) for h in (h_low, h_high)], axis=-1
-    )
+    nodes, weight_ratio = _field_nodes(plan, h_deg, v_deg)
     scale = spec.pixel_from_mrad(h_deg, v_deg, gaze_deg=gaze_deg)
     corner_h_deg, corner_v_deg = field_deg(
         camera,
@@ -130,16 +124,37 @@ def image_cells(
     )
     if node_scale is None:
         node_scale = stored_scale(spec, plan)
-    weights = [v * h for v in (1 - v_part, v_part) for h in (1 - h_part, h_part)]
     return ImageCells(
         cell_px=cell_px,
         grid=grid,
         nodes=nodes,
-        weight_ratio=np.stack(weights, axis=-1),
+        weight_ratio=weight_ratio,
         maps=CellMaps(_node_from_cell(node_scale[nodes], scale)),
         corner_h_deg=corner_h_deg,
         corner_v_deg=corner_v_deg,
     )
+
+
+def _field_nodes(
+    plan: CachePlan, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Nodes and weights (n_cells, 3): corners of the triangle around a direction.
+
+    Each rectangle of nodes is cut along the diagonal that crosses the direction to the
+    axis, as kernels change fastest along that: cut the other way, frames have 0.5 dB
+    more error in the median.
+    """
+    h_low, h_high, h_part = bracket_axis(plan.h_deg, h_deg)
+    v_low, v_high, v_part = bracket_axis(plan.v_deg, v_deg)
+    middle_h_deg = plan.h_deg[h_low] + plan.h_deg[h_high]
+    middle_v_deg = plan.v_deg[v_low] + plan.v_deg[v_high]
+    is_turned = middle_h_deg * middle_v_deg >= 0.0
+    h_first, h_last = np.where(is_turned, (h_high, h_low), (h_low, h_high))
+    weights, is_first = triangle(np.where(is_turned, 1.0 - h_part, h_part), v_part)
+    v_between, h_between = np.where(is_first, (v_low, h_last), (v_high, h_first))
+    rows = np.stack([v_low, v_between, v_high], axis=-1)
+    columns = np.stack([h_first, h_between, h_last], axis=-1)
+    return rows * plan.h_deg.size + columns, weights
 
 
 def can_coarsen(image: ImageCells) -> bool:
@@ -173,7 +188,7 @@ def stored_scale(spec: GridSpec, plan: CachePlan) -> NDArray[np.float64]:
 def _node_from_cell(
     node_scale: NDArray[np.float64], cell_scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return maps (n_cells, 4, 2, 2) of offsets in pixels, y downwards."""
+    """Return maps (n_cells, 3, 2, 2) of offsets in pixels, y downwards."""
     upwards = node_scale @ np.linalg.inv(cell_scale)[:, None]
     return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
 

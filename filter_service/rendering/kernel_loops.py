@@ -8,11 +8,9 @@ import math
 import numpy as np
 from numba import njit
 
-from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.constants import FIELD_CORNERS, RGB, WEIGHT_MAX
 from filter_service.psfs.read_loops import channel_taps
 from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
-
-CORNERS = 4
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -34,7 +32,7 @@ def number_used(place_of):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def used_nodes(used, nodes, weight_ratio, n_fields):
-    """Kernels' cells and intervals (n,), parts (n, 4); nodes' fields and intervals.
+    """Kernels' cells and intervals (n,), parts (n, 3); nodes' fields and intervals.
 
     A node that weighs nothing is replaced by the heaviest one.
     """
@@ -43,7 +41,7 @@ def used_nodes(used, nodes, weight_ratio, n_fields):
     for is_used in used.flat:
         count += is_used
     cells, intervals = np.empty(count, np.int64), np.empty(count, np.int64)
-    parts = np.empty((count, CORNERS), np.int64)
+    parts = np.empty((count, FIELD_CORNERS), np.int64)
     number = np.zeros(n_fields * n_intervals, np.int64)
     k = 0
     for cell in range(used.shape[0]):
@@ -52,14 +50,14 @@ def used_nodes(used, nodes, weight_ratio, n_fields):
             if not used[cell, interval]:
                 continue
             cells[k], intervals[k] = cell, interval
-            for j in range(CORNERS):
+            for j in range(FIELD_CORNERS):
                 node = nodes[cell, j] if weight_ratio[cell, j] > 0.0 else heaviest
                 parts[k, j] = node * n_intervals + interval
                 number[parts[k, j]] = 1
             k += 1
     pairs = number_used(number)
     for k in range(count):
-        for j in range(CORNERS):
+        for j in range(FIELD_CORNERS):
             parts[k, j] = number[parts[k, j]]
     return cells, intervals, parts, pairs // n_intervals, pairs % n_intervals
 
@@ -94,9 +92,9 @@ def fill_recipes(
         Field by field.
     total_dpt : (n, 3)
         Ascending within a field.
-    words : (n, 3, 3, 8), uint32
+    words : (n, 3, 3, RECIPE_TAPS), uint32
         See `NodeKernels.recipes`.
-    steps : (n, 3, 3, 8), float32
+    steps : (n, 3, 3, RECIPE_TAPS), float32
         The same memory.
     sizes : reach_px (n, 4), radius_px (n,), peak_ratio (n,), spread_px (n,)
     missing : (n_psfs,)
@@ -160,9 +158,9 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
     Parameters
     ----------
     maps : MapTables
-    weight_ratio : (n_cells, 4)
+    weight_ratio : (n_cells, 3)
     cells : (n,)
-    parts : (n, 4)
+    parts : (n, 3)
     nodes : reach_px (m, 4), radius_px (m,), peak_ratio (m,), spread_px (m, 2)
         Of the node kernels.
     made : weights, maps, reach_px, radius_px, peak_ratio, spread_px
@@ -175,7 +173,7 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
         cell = cells[k]
         reach_px[k], radius_px[k] = 0, 0
         peak_ratio[k], spread_px[k] = 0.0, 0.0
-        for j in range(CORNERS):
+        for j in range(FIELD_CORNERS):
             part, weight = parts[k, j], weight_ratio[cell, j]
             widest_px = node_radius_px[part]
             for side in range(4):

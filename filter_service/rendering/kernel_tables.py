@@ -52,7 +52,7 @@ class KernelTables:
     words : (n,), uint32
     parts : dict
         By name, first word and number of words: ``NODES`` (n, 2, 4) and ``RECIPES``
-        for blend_psfs, ``PARTS`` (n, 6, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
+        for blend_psfs, ``PARTS`` (n, 5, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
         ``KERNEL_OF`` (n_cells, n_intervals), and the work groups (n, 2) of each pass,
         kernel and first texel.
     node_texel_count : int

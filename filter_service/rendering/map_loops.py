@@ -9,7 +9,7 @@ UNMOVED_PX = 0.5
 it would blur by as much."""
 
 UNMOVED_RATIO = 0.1
-"""Maps that change a kernel's size by less are left out: what four field nodes around a
+"""Maps that change a kernel's size by less are left out: what field nodes around a
 cell differ in is blended away.  At 5 mm over the field of the demo that leaves 63 to 69
 dB to the picture with all maps (cataract, myopia, keratoconus), and takes half of the
 time of the blend."""
@@ -20,7 +20,7 @@ MAX_REACH_PX = 255
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_ratios(maps, inverse, ratios):
-    """Inverses of maps (n, 4, 2, 2), and ratios (4, n, 4) as in `MapTables`."""
+    """Inverses of maps (n, 3, 2, 2), and ratios (4, n, 3) as in `MapTables`."""
     for cell in range(maps.shape[0]):
         for j in range(maps.shape[1]):
             a, b = maps[cell, j, 0, 0], maps[cell, j, 0, 1]

@@ -5,6 +5,7 @@ import math
 from numba import njit
 
 from filter_service.constants import (
+    FIELD_CORNERS,
     KERNEL_WORDS,
     MAX_LEVEL,
     MERGE_MIN_SPREAD_PX,
@@ -119,7 +120,8 @@ def fill_records(words, floats, firsts, kernels, levels, threads, works):
                 words[works[level]], words[works[level] + 1] = k, texel
                 works[level] += 2
         at = firsts[1] + k * PART_WORDS * VECTOR
-        for j in range(VECTOR):
+        words[at + VECTOR - 1] = words[at + 2 * VECTOR - 1] = 0
+        for j in range(FIELD_CORNERS):
             words[at + j] = parts[k, j]
             floats[at + VECTOR + j] = weight_ratio[k, j]
             to = at + (2 + j) * VECTOR

@@ -1,8 +1,8 @@
-// Blends the kernels of up to four field nodes into the kernel of an image cell.
+// Blends the kernels of up to three field nodes into the kernel of an image cell.
 // Each is mapped from the pixels it is stored in to the image's: a pixel takes the light
 // of the stored pixels that its sides cover.
-// In:  the node atlas, NODES (as in blend_psfs), PARTS (four node kernels, four weights,
-//      four maps from offsets in the image to those in a node's kernel), KERNELS
+// In:  the node atlas, NODES (as in blend_psfs), PARTS (three node kernels, three weights,
+//      three maps from offsets in the image to those in a node's kernel), KERNELS
 //      (common/kernels.glsl), WORK.
 // Out: the kernel atlas, single kernels.
 // Dispatch: one group of THREADS texels per item of WORK.

@@ -1,7 +1,7 @@
 // Blends cached PSFs into node kernels: field node, both ends of an interval of layers.
 // In:  the store (16-bit weights, a texture array addressed as one line), RECIPES (per
-//      layer and channel offsets, reaches and weights of eight cached kernels: two pupils
-//      x two accommodations x two defocus nodes), NODES (records: near recipe, far
+//      layer and channel offsets, reaches and weights of six cached kernels: three nodes
+//      of pupil and accommodation x two of defocus), NODES (records: near recipe, far
 //      recipe, offset, reach; scale bits), WORK.
 // Out: the node atlas.
 // Dispatch: one group of THREADS texels per item of WORK.
@@ -9,7 +9,7 @@
 
 layout(local_size_x = THREADS) in;
 
-layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uvec4 recipes[]; };
+layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uint recipes[]; };
 layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
 layout(binding = TEXTURE_STORE) uniform usampler2DArray store;
@@ -33,20 +33,16 @@ float cached(uint offset, uint word, ivec2 at) {
     return float(texelFetch(store, place, 0).r);
 }
 
-// Weighted sum of four of a recipe's kernels.
-float blended_half(uint recipe, uint half_index, ivec2 at) {
-    vec4 weights = uintBitsToFloat(recipes[recipe + uint(RECIPE_WEIGHTS) + half_index]);
-    if (all(equal(weights, vec4(0.0)))) return 0.0;
-    uvec4 offsets = recipes[recipe + half_index];
-    uvec4 reaches = recipes[recipe + 2u + half_index];
-    return weights.x * cached(offsets.x, reaches.x, at)
-         + weights.y * cached(offsets.y, reaches.y, at)
-         + weights.z * cached(offsets.z, reaches.z, at)
-         + weights.w * cached(offsets.w, reaches.w, at);
-}
-
+// Weighted sum of a recipe's kernels.
 float blended(uint recipe, ivec2 at) {
-    return blended_half(recipe, 0u, at) + blended_half(recipe, 1u, at);
+    float sum = 0.0;
+    for (uint tap = 0u; tap < uint(RECIPE_TAPS); ++tap) {
+        float weight = uintBitsToFloat(recipes[recipe + 2u * uint(RECIPE_TAPS) + tap]);
+        if (weight > 0.0)
+            sum += weight * cached(recipes[recipe + tap],
+                                   recipes[recipe + uint(RECIPE_TAPS) + tap], at);
+    }
+    return sum;
 }
 
 vec3 recipe_weight(uint index, ivec2 at) {

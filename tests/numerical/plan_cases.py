@@ -1,7 +1,7 @@
 """Interpolated against exact kernels for the planner's tests and benchmarks.
 
-`sampled_errors` reads a plan as a frame does: four field nodes, two pupils, two
-accommodations and two nodes of defocus each, every kernel computed, none from a store.
+`sampled_errors` reads a plan as a frame does: three field nodes, three nodes of pupil
+and accommodation and two of defocus each, every kernel computed, none from a store.
 """
 
 import math
@@ -119,7 +119,7 @@ def exact_kernels(eye, spec, states):
 
 @dataclass(frozen=True)
 class _Corners:
-    """Nodes that states (P,) read, and their weights, corner by corner (P, 32)."""
+    """Nodes that states (P,) read, and their weights, corner by corner (P, 18)."""
 
     states: PupilStates
     weights: np.ndarray
@@ -132,62 +132,82 @@ def blur_scale(eye, states, pupil_mm):
     return states.pupil_diameter_mm / pupil_mm
 
 
+def _triangle(first, second):
+    """Corners of triangles: index and value on two axes, and the weight.
+
+    Parameters
+    ----------
+    first, second : (lower, upper) indices, (lower, upper) values, share
+    """
+    (i, a, s), (j, b, t) = first, second
+    larger = np.where(s >= t, (i[1], j[0]), (i[0], j[1]))
+    values = np.where(s >= t, (a[1], b[0]), (a[0], b[1]))
+    low, high = np.minimum(s, t), np.maximum(s, t)
+    return [
+        ((i[0], a[0]), (j[0], b[0]), 1.0 - high),
+        ((larger[0], values[0]), (larger[1], values[1]), high - low),
+        ((i[1], a[1]), (j[1], b[1]), low),
+    ]
+
+
 def _corners(eye, spec, plan, states, object_dpt, axes):
     """Read all axes of a plan, or only some and the others exactly."""
     count = states.h_deg.size
 
-    def ends(axis, nodes, values):
+    def ends(axis, nodes):
+        values = vars(states)[FIELD_OF_AXIS[axis]]
         if axis not in axes:
-            return [(None, values, np.ones(count))]
+            none = np.zeros(count, np.int64)
+            return (none, none), (values, values), np.zeros(count)
         lower, upper, share = bracket_axis(nodes, values)
-        return [(lower, nodes[lower], 1 - share), (upper, nodes[upper], share)]
+        return (lower, upper), (nodes[lower], nodes[upper]), share
 
-    v_ends, h_ends, pupil_ends, used_ends = (
-        ends(axis, nodes, vars(states)[FIELD_OF_AXIS[axis]])
-        for axis, nodes in (
-            ("v", plan.v_deg),
-            ("h", plan.h_deg),
-            ("pupil", plan.pupils_mm),
-            ("accommodation", plan.accommodations_dpt),
-        )
+    h, v = ends("h", plan.h_deg), ends("v", plan.v_deg)
+    middle = (h[1][0] + h[1][1]) * (v[1][0] + v[1][1])
+    is_turned = middle >= 0.0
+    h = (
+        *(tuple(np.where(is_turned, pair[::-1], pair)) for pair in h[:2]),
+        np.where(is_turned, 1.0 - h[2], h[2]),
+    )
+    fields = _triangle(h, v)
+    inner = _triangle(
+        ends("pupil", plan.pupils_mm), ends("accommodation", plan.accommodations_dpt)
     )
     channel = np.argmin(
         np.abs(spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
     found, weights = [], []
-    for v_index, v_deg, v_share in v_ends:
-        for h_index, h_deg, h_share in h_ends:
-            total_dpt = object_dpt + eye.total_defocus_dpt(
-                h_deg=h_deg,
-                v_deg=v_deg,
-                pupil_diameter_mm=states.pupil_diameter_mm,
-                accommodation_dpt=states.accommodation_dpt,
-                wavelength_nm=states.wavelength_nm,
+    for (h_index, h_deg), (v_index, v_deg), field_share in fields:
+        total_dpt = object_dpt + eye.total_defocus_dpt(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            pupil_diameter_mm=states.pupil_diameter_mm,
+            accommodation_dpt=states.accommodation_dpt,
+            wavelength_nm=states.wavelength_nm,
+        )
+        for (pupil_index, pupil_mm), (used_index, used_dpt), inner_share in inner:
+            at_dpt = total_dpt * blur_scale(eye, states, pupil_mm)
+            share = field_share * inner_share
+            columns = {
+                "h_deg": h_deg,
+                "v_deg": v_deg,
+                "pupil_diameter_mm": pupil_mm,
+                "accommodation_dpt": used_dpt,
+                "wavelength_nm": states.wavelength_nm,
+            }
+            if "defocus" not in axes:
+                found.append(columns | {"total_defocus_dpt": at_dpt})
+                weights.append(share)
+                continue
+            group = np.ravel_multi_index(
+                (v_index, h_index, pupil_index, used_index), plan.group_shape
             )
-            for pupil_index, pupil_mm, pupil_share in pupil_ends:
-                for used_index, used_dpt, used_share in used_ends:
-                    at_dpt = total_dpt * blur_scale(eye, states, pupil_mm)
-                    share = v_share * h_share * pupil_share * used_share
-                    columns = {
-                        "h_deg": h_deg,
-                        "v_deg": v_deg,
-                        "pupil_diameter_mm": pupil_mm,
-                        "accommodation_dpt": used_dpt,
-                        "wavelength_nm": states.wavelength_nm,
-                    }
-                    if "defocus" not in axes:
-                        found.append(columns | {"total_defocus_dpt": at_dpt})
-                        weights.append(share)
-                        continue
-                    group = np.ravel_multi_index(
-                        (v_index, h_index, pupil_index, used_index), plan.group_shape
-                    )
-                    shift_dpt = plan.channel_shift_dpt[group, channel]
-                    lower, upper, part = plan.defocus.bracket(group, at_dpt - shift_dpt)
-                    for index, t_share in ((lower, 1 - part), (upper, part)):
-                        node_dpt = plan.defocus.values_dpt[index] + shift_dpt
-                        found.append(columns | {"total_defocus_dpt": node_dpt})
-                        weights.append(share * t_share)
+            shift_dpt = plan.channel_shift_dpt[group, channel]
+            lower, upper, part = plan.defocus.bracket(group, at_dpt - shift_dpt)
+            for index, t_share in ((lower, 1 - part), (upper, part)):
+                node_dpt = plan.defocus.values_dpt[index] + shift_dpt
+                found.append(columns | {"total_defocus_dpt": node_dpt})
+                weights.append(share * t_share)
     return _Corners(
         PupilStates(
             **{

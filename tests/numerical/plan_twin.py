@@ -87,7 +87,7 @@ def _layers_of(stretch):
 
 
 def map_tables(node_from_cell):
-    """Inverse, area, box, stretch and change of maps (n, 4, 2, 2)."""
+    """Inverse, area, box, stretch and change of maps (n, 3, 2, 2)."""
     inverse = np.linalg.inv(node_from_cell)
     area = np.abs(np.linalg.det(node_from_cell))
     diagonal = np.diagonal(node_from_cell, axis1=-2, axis2=-1)
@@ -101,7 +101,7 @@ def map_tables(node_from_cell):
 
 
 def mapped_sizes(inverse, stretch, is_moved, reach_px, radius_px):
-    """Reaches (n, 4, 4) and radii (n, 4) of parts in the image's pixels."""
+    """Reaches (n, 3, 4) and radii (n, 3) of parts in the image's pixels."""
     row, corner = np.nonzero(is_moved)
     out = inverse[row, corner]
     left, right, up, down = (reach_px[row, corner] + 1.0).T
@@ -224,10 +224,10 @@ def tables(kernels, levels, shape, threads):
     record[:, 0, 2] = kernels.radius_px
     record[:, 0, 3] = pack_reach(kernels.reach_px)
     record[:, 1], record[:, 2] = starts, scale.view(np.uint32)
-    part = np.empty((kernels.count, 6, 4), np.uint32)
-    part[:, 0] = kernels.parts
-    part[:, 1] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
-    maps = kernels.maps.reshape(-1, 4, 4).astype(np.float32)
+    part = np.zeros((kernels.count, 5, 4), np.uint32)
+    part[:, 0, :3] = kernels.parts
+    part[:, 1, :3] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
+    maps = kernels.maps.reshape(-1, 3, 4).astype(np.float32)
     part[:, 2:] = maps.view(np.uint32)
     pair = np.zeros(shape, np.uint32)
     pair[kernels.cells, kernels.intervals] = np.arange(kernels.count)

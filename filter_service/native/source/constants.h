@@ -19,7 +19,7 @@
 #define MIN_BLUR_RANGE 1.0e-12f
 #define HALF_MAX 65504.0f
 #define RGB 3
-#define RECIPE_TAPS 8
-#define FIELD_CORNERS 4
+#define RECIPE_TAPS 6
+#define FIELD_CORNERS 3
 
 #endif

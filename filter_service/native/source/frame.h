@@ -144,13 +144,13 @@ typedef struct {
     const uint64_t *store_first[RESOLUTIONS];      /* of each cached kernel */
     const uint32_t *store_reach[RESOLUTIONS];      /* four bytes: left, right, up, down */
     float coarse_spread_px[RESOLUTIONS];           /* least spread that may use it */
-    const uint32_t *recipes;  /* (n, 3, 24): cached kernels, nothing, weights */
+    const uint32_t *recipes;  /* (n, 3, 18): cached kernels, nothing, weights */
     int32_t recipe_count;
     recipe_image *recipe_images;                   /* (n, RESOLUTIONS) */
     float *recipe_texels;
-    const int64_t *kernel_cells, *kernel_parts;    /* (n), (n, 4) */
+    const int64_t *kernel_cells, *kernel_parts;    /* (n), (n, 3) */
     const int64_t *node_near, *node_far;
-    const double *part_weights, *part_maps;        /* (n, 4), (n, 4, 2, 2) */
+    const double *part_weights, *part_maps;        /* (n, 3), (n, 3, 2, 2) */
     kernel_image *kernels;
     uint32_t *kernel_texels;
     float *blend_scratch;

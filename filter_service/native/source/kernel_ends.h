@@ -1,4 +1,4 @@
-/* A kernel at one layer: recipes of up to four field nodes, each as it is stored or mapped to
+/* A kernel at one layer: recipes of up to three field nodes, each as it is stored or mapped to
  * the cell's pixels; and its sums over merged squares.  Twins: blend_cells and merge_psfs of
  * shaders/passes. */
 
