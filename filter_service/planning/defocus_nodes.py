@@ -9,7 +9,6 @@ fewer nodes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +17,19 @@ from estimator.field.eye_optics import EyeOptics
 from filter_service.constants import RGB
 from filter_service.errors import GridTooLarge
 from filter_service.planning.error_law import (
-    allowed_difference_px,
     half_way_error,
     mean_square,
     spot_covariance,
 )
 from filter_service.planning.grid import GridSpec
+from filter_service.planning.node_blur import GroupRays
 from filter_service.planning.nodes import RaggedNodes
 from filter_service.planning.readable import ReadableDefocus, joined_ranges
+from filter_service.planning.sampled_use import unit_px
 from filter_service.planning.slopes import (
     PupilStates,
     main_foci_dpt,
     main_light_ratio,
-    slopes_px,
-    state_frames,
 )
 
 _LADDER = 49
@@ -73,10 +71,10 @@ def defocus_nodes(
     eye: EyeOptics,
     spec: GridSpec,
     groups: PupilStates,
+    group_rays: GroupRays,
     readable: ReadableDefocus,
     *,
     allowed_error: float,
-    unit_px: NDArray[np.float64],
 ) -> DefocusNodes:
     """Nodes of total defocus of every group, for a mean square error.
 
@@ -84,11 +82,10 @@ def defocus_nodes(
     ----------
     groups : PupilStates
         Field, pupil, accommodation and wavelength of each group (P,), no defocus.
+    group_rays : GroupRays
     readable : ReadableDefocus
-    unit_px : (P,)
-        lambda / pupil diameter.
     """
-    rays = _Rays.of(eye, spec, groups, unit_px=unit_px, allowed_error=allowed_error)
+    rays = _Rays.of(eye, spec, groups, group_rays, allowed_error=allowed_error)
     split = joined_ranges(readable.of_any_channel_dpt)
     whole_dpt = np.array([[own[0, 0], own[-1, 1]] for own in split])
     limited_dpt, shrink_ratio = rays.limited(whole_dpt, spec, groups)
@@ -99,11 +96,11 @@ def defocus_nodes(
     free = np.flatnonzero(~is_limited)
 
     def try_others(index: NDArray[np.int64], ranges: Ranges, shifts_dpt=None) -> None:
-        found = rays.nodes(index, ranges, shifts_dpt)
-        for k, own in zip(index.tolist(), found, strict=True):
-            if own.size < nodes[k].size:
-                nodes[k] = own
-                shift_dpt[k] = 0.0 if shifts_dpt is None else readable.shift_dpt[k]
+        nonlocal nodes
+        if not index.size:
+            return
+        nodes, taken = nodes.where_fewer(index, rays.nodes(index, ranges, shifts_dpt))
+        shift_dpt[index[taken]] = 0.0 if shifts_dpt is None else shifts_dpt[taken]
 
     several = free[[len(split[k]) > 1 for k in free.tolist()]]
     try_others(several, [split[k] for k in several.tolist()])
@@ -113,7 +110,7 @@ def defocus_nodes(
     try_others(narrow, hulls, readable.shift_dpt[narrow])
     if any(len(own) > 1 for own in shifted):
         try_others(narrow, shifted, readable.shift_dpt[narrow])
-    return DefocusNodes(RaggedNodes.of(nodes), shift_dpt, is_limited, shrink_ratio)
+    return DefocusNodes(nodes, shift_dpt, is_limited, shrink_ratio)
 
 
 @dataclass(frozen=True)
@@ -123,6 +120,9 @@ class _Rays:
     Attributes
     ----------
     zero_px, per_dpt : (P, n, 2)
+    covariance : (P, 4, 3)
+        Polynomial in defocus of the spot's covariance xx, yy, xy, px²: three
+        coefficients of each; then the mean square that a dioptre moves rays by.
     unit_px : (P,)
     half_way_error : float
         RMS error half-way between nodes.
@@ -136,6 +136,7 @@ class _Rays:
 
     zero_px: NDArray[np.float64]
     per_dpt: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     unit_px: NDArray[np.float64]
     half_way_error: float
     foci_dpt: NDArray[np.float64]
@@ -148,21 +149,23 @@ class _Rays:
         eye: EyeOptics,
         spec: GridSpec,
         groups: PupilStates,
+        rays: GroupRays,
         *,
-        unit_px: NDArray[np.float64],
         allowed_error: float,
     ) -> _Rays:
-        count = groups.h_deg.size
-        columns = vars(groups.taken(np.tile(np.arange(count), 2)))
-        columns["total_defocus_dpt"] = np.repeat([0.0, 1.0], count)
-        zero_px, one_px = np.split(
-            slopes_px(state_frames(eye, spec, PupilStates(**columns))), 2
+        zero_px, per_dpt = rays
+        at_zero, at_one, spread = map(
+            spot_covariance, (zero_px, zero_px + per_dpt, per_dpt)
         )
+        covariance = np.zeros((len(zero_px), 4, 3))
+        covariance[:, :3] = np.stack([at_zero, at_one - at_zero - spread, spread], -1)
+        covariance[:, 3, 0] = mean_square(per_dpt)
         error = half_way_error("defocus", allowed_error)
         return cls(
             zero_px,
-            one_px - zero_px,
-            unit_px,
+            per_dpt,
+            covariance,
+            unit_px(spec, groups),
             error,
             main_foci_dpt(eye, spec),
             main_light_ratio(eye, spec, groups.pupil_diameter_mm / 2.0),
@@ -174,54 +177,27 @@ class _Rays:
         index: NDArray[np.int64],
         ranges: Ranges,
         shifts_dpt: NDArray[np.float64] | None = None,
-    ) -> list[NDArray[np.float64]]:
+    ) -> RaggedNodes:
         """Nodes of some groups (n,), over one or several ranges (k, 2) of each."""
-        if not index.size:
-            return []
         counts = [len(own) for own in ranges]
         lows, highs = np.concatenate(ranges).T
         place = np.repeat(np.arange(index.size), counts)
         shifts = np.zeros((1, lows.size))
         if shifts_dpt is not None:
             shifts = shifts_dpt[place].T
-        needed = self._needed(index[place], lows, highs, shifts)
-        values, sizes = _spread(lows, highs, needed)
-        ends = np.cumsum(sizes)[np.cumsum(counts) - 1]
-        return np.split(values, ends[:-1])
+        # Imported here: reading a plan must not load numba.
+        from filter_service.planning.spread_loops import needed_intervals
 
-    def _needed(
-        self,
-        index: NDArray[np.int64],
-        lows: NDArray[np.float64],
-        highs: NDArray[np.float64],
-        shifts: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Intervals (n, _LADDER) needed up to each step through ranges (n,).
-
-        The covariance is a square polynomial of defocus: through three points of it.
-        """
-        zero_px, per_dpt = self.zero_px[index], self.per_dpt[index]
-        at_zero, at_one, spread = (
-            spot_covariance(slopes) for slopes in (zero_px, zero_px + per_dpt, per_dpt)
-        )
-        steps_dpt = (highs - lows) / (_LADDER - 1)
-        difference_px = np.sqrt(mean_square(per_dpt)) * steps_dpt
-        middles = lows + steps_dpt * (np.arange(_LADDER - 1)[:, None] + 0.5)
-        allowed_px = np.full(middles.shape, np.inf)
-        light_ratio = self.light_ratio[:, index]
-        foci = list(zip(self.foci_dpt.tolist(), light_ratio, strict=True))
-        for shift, (focus_dpt, light) in product(shifts, foci):
-            x = (middles + shift - focus_dpt)[..., None]
-            covariance = at_zero + x * (at_one - at_zero - spread) + x * x * spread
-            of_channel_px = allowed_difference_px(
-                covariance,
-                unit_px=self.unit_px[index],
-                half_way_error=self.half_way_error / light,
-            )
-            allowed_px = np.minimum(allowed_px, of_channel_px)
         needed = np.zeros((lows.size, _LADDER))
-        np.cumsum((difference_px / allowed_px).T, axis=1, out=needed[:, 1:])
-        return needed
+        needed_intervals(
+            *(self.covariance, self.unit_px, self.light_ratio, self.foci_dpt),
+            *(index[place], lows, highs, shifts),
+            self.half_way_error,
+            needed,
+        )
+        values, sizes = _spread(lows, highs, needed)
+        first = np.cumsum(counts) - counts
+        return RaggedNodes.joined(values, np.add.reduceat(sizes, first))
 
     def limited(
         self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates

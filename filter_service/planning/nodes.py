@@ -25,15 +25,48 @@ class RaggedNodes:
     @classmethod
     def of(cls, groups: list[NDArray[np.float64]]) -> "RaggedNodes":
         """Join groups, each ascending and not empty."""
-        counts = [len(group) for group in groups]
-        if not counts or min(counts) < 1:
+        counts = np.array([len(group) for group in groups], np.int64)
+        return cls.joined(np.concatenate([np.zeros(0), *groups]), counts)
+
+    @classmethod
+    def joined(
+        cls, values_dpt: NDArray[np.float64], counts: NDArray[np.int64]
+    ) -> "RaggedNodes":
+        """Cut values (n,) into groups of so many (n_groups,)."""
+        if not counts.size or counts.min() < 1:
             raise ValueError(f"groups of {counts} nodes: at least one node each")
-        if any((np.diff(group) <= 0.0).any() for group in groups):
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        rises = np.diff(values_dpt) > 0.0
+        rises[starts[1:-1] - 1] = True
+        if not rises.all():
             raise ValueError("the values of a group must ascend")
-        return cls(
-            values_dpt=np.concatenate(groups).astype(np.float64),
-            starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        return cls(values_dpt.astype(np.float64), starts.astype(np.int64))
+
+    def where_fewer(
+        self, index: NDArray[np.int64], other: "RaggedNodes"
+    ) -> tuple["RaggedNodes", NDArray[np.int64]]:
+        """Take other nodes of some groups where they are fewer.
+
+        Parameters
+        ----------
+        index : (k,)
+            Groups that `other` has nodes of.
+
+        Returns
+        -------
+        nodes : RaggedNodes
+        taken : (m,)
+            Places in `index` of the groups that have other nodes now.
+        """
+        taken = np.flatnonzero(other.counts < self.counts[index])
+        counts, first = self.counts, self.starts[:-1].copy()
+        counts[index[taken]] = other.counts[taken]
+        first[index[taken]] = self.values_dpt.size + other.starts[:-1][taken]
+        at = np.arange(counts.sum()) + np.repeat(
+            first - (np.cumsum(counts) - counts), counts
         )
+        values_dpt = np.concatenate([self.values_dpt, other.values_dpt])[at]
+        return RaggedNodes.joined(values_dpt, counts), taken
 
     @property
     def counts(self) -> NDArray[np.int64]:
@@ -141,6 +174,8 @@ class CachePlan:
         grids.
     prediction : PlanPrediction or None
         None where it was not asked for: it takes longer than the plan.
+    blur_px : (n_psfs,)
+        Geometric blur of the nodes' PSFs, see `planning.node_blur`.
     is_limited : (n_groups,)
         Groups that end where the blur is as large as kernels may be.
     shrink_ratio : (n_groups,), optional
@@ -155,6 +190,7 @@ class CachePlan:
     defocus: RaggedNodes
     channel_shift_dpt: NDArray[np.float64]
     prediction: PlanPrediction | None
+    blur_px: NDArray[np.float32]
     is_limited: NDArray[np.bool_]
     shrink_ratio: NDArray[np.float64] | None = None
 

@@ -23,12 +23,12 @@ from filter_service.planning.defocus_nodes import (
 )
 from filter_service.planning.error_law import combined_error, equal_share, psnr_db
 from filter_service.planning.grid import (
-    GREEN,
     GridSpec,
     defocus_nodes_dpt,
     nodes_through_foci_dpt,
     pupil_nodes_mm,
 )
+from filter_service.planning.node_blur import GroupRays, groups_of, node_blur_px
 from filter_service.planning.nodes import (
     CachePlan,
     PlanPrediction,
@@ -49,9 +49,8 @@ from filter_service.planning.sampled_use import (
     axis_error,
     defocus_error,
     sample_use,
-    unit_px,
 )
-from filter_service.planning.slopes import PupilStates, main_foci_dpt
+from filter_service.planning.slopes import main_foci_dpt
 from filter_service.settings import TOLERANCES
 
 __all__ = [
@@ -130,16 +129,27 @@ def unchecked_plan(
         defocus = paper_defocus(eye, spec, tuple(vars(axes).values()))
     elif spec.follows_field:
         axes, left = _field_axes(use, allowed_error)
-        defocus = _field_defocus(eye, spec, axes, left)
+        defocus = None
     else:
         axes = _central_axes(eye, spec)
         defocus = _central_defocus(eye, spec, axes)
+    groups = groups_of(spec, axes)
+    rays = GroupRays.of(eye, spec, groups)
+    if defocus is None:
+        defocus = defocus_nodes(
+            *(eye, spec, groups, rays, readable_defocus(eye, spec, axes)),
+            allowed_error=left,
+        )
     plan = CachePlan(
         **vars(axes),
         defocus=defocus.nodes,
         channel_shift_dpt=defocus.channel_shift_dpt,
         prediction=None,
         is_limited=defocus.is_limited,
+        blur_px=node_blur_px(
+            *(eye, spec, rays, defocus.nodes),
+            *(defocus.channel_shift_dpt, defocus.shrink_ratio),
+        ),
         shrink_ratio=defocus.shrink_ratio,
     )
     if not predict:
@@ -244,28 +254,6 @@ def _nodes_by_blur(
         nodes = partial(nodes_through_foci_dpt, foci_dpt=foci_dpt, **steps)
     pieces = [nodes(*range_dpt) for range_dpt in ranges_dpt.tolist()]
     return np.unique(np.concatenate(pieces))
-
-
-def _field_defocus(
-    eye: EyeOptics, spec: GridSpec, axes: PlanAxes, allowed_error: float
-) -> DefocusNodes:
-    """Nodes of every group of the field."""
-    groups = PupilStates.of(
-        h_deg=axes.h_deg[:, None, None],
-        v_deg=axes.v_deg[:, None, None, None],
-        pupil_diameter_mm=axes.pupils_mm[:, None],
-        accommodation_dpt=axes.accommodations_dpt,
-        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
-        total_defocus_dpt=0.0,
-    )
-    return defocus_nodes(
-        eye,
-        spec,
-        groups,
-        readable_defocus(eye, spec, axes),
-        allowed_error=allowed_error,
-        unit_px=unit_px(spec, groups),
-    )
 
 
 def _advice(eye: EyeOptics, spec: GridSpec) -> str:

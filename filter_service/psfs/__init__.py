@@ -2,8 +2,6 @@
 
 eye_for_spec         the eye of a profile, for what a cache covers
 node_wavefronts      wavefronts of a plan's nodes
-node_blur            their geometric blur
-blur_loops           its compiled loop
 compute_kernels      from nodes to packed kernels
 wide_primaries       kernels of primaries of two wavelengths
 psf_engine           in C, or in Python

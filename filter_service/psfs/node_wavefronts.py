@@ -63,21 +63,18 @@ class NodeWavefronts:
         if n_primaries > 1:
             states = states_of_primaries(eye, spec, states)
         shape = (states.h_deg.size // (RGB * n_primaries), RGB, n_primaries)
-        zero, one = (
-            eye.wavefronts(
-                **vars(states)
-                | {"total_defocus_dpt": states.total_defocus_dpt + added_dpt}
-            )
-            for added_dpt in (0.0, 1.0)
-        )
-        zernike_um = zero.zernike_um
-        per_dpt_um = one.zernike_um - zero.zernike_um
+        count = states.h_deg.size
+        columns = vars(states.taken(np.tile(np.arange(count), 2)))
+        columns["total_defocus_dpt"][count:] += 1.0
+        found = eye.wavefronts(**columns)  # in one call each wavefront is found once
+        zernike_um = found.zernike_um[:count]
+        per_dpt_um = found.zernike_um[count:] - zernike_um
         if plan.shrink_ratio is not None:
             each = np.repeat(plan.shrink_ratio, RGB * n_primaries)[:, None]
             zernike_um, per_dpt_um = each * zernike_um, each * per_dpt_um
         if spec.settings.lateral_color and spec.settings.chromatic:
             shift_mrad = lateral_shift_mrad(eye, spec, states)
-            radius_mm = zero.circle_diameter_mm / 2.0
+            radius_mm = found.circle_diameter_mm[:count] / 2.0
             zernike_um = with_tilt(zernike_um, radius_mm, shift_mrad)
         h_deg, v_deg = (
             angle.reshape(shape)[:, 0, 0] for angle in (states.h_deg, states.v_deg)
@@ -85,8 +82,8 @@ class NodeWavefronts:
         return cls(
             zernike_um=zernike_um.reshape(*shape, zernike_um.shape[-1]),
             per_dpt_um=per_dpt_um.reshape(*shape, per_dpt_um.shape[-1]),
-            circle_diameter_mm=zero.circle_diameter_mm.reshape(shape),
-            pupil_ellipse=zero.pupil_ellipse.reshape(*shape, -1),
+            circle_diameter_mm=found.circle_diameter_mm[:count].reshape(shape),
+            pupil_ellipse=found.pupil_ellipse[:count].reshape(*shape, -1),
             wavelength_nm=spec.primary_wavelengths_nm.T.copy(),
             pixel_from_mrad=_node_scale(spec, h_deg, v_deg),
             h_deg=h_deg,

@@ -59,8 +59,6 @@ class PsfStore:
     engine : PsfEngine, optional
         Computes the PSFs; that of `psf_engine` where it is None.
     wavefronts : NodeWavefronts, optional
-    blur_px : (n_psfs,), optional
-        As `node_blur_px` gives it.
 
     Attributes
     ----------
@@ -82,7 +80,6 @@ class PsfStore:
         *,
         engine: PsfEngine | None = None,
         wavefronts: NodeWavefronts | None = None,
-        blur_px: NDArray[np.float32] | None = None,
     ) -> None:
         self.eye, self.spec, self.plan, self.engine = eye, spec, plan, engine
         count = RGB * plan.defocus.values_dpt.size
@@ -91,10 +88,6 @@ class PsfStore:
 
             wavefronts = NodeWavefronts.of(eye, spec, plan)
         self.wavefronts = wavefronts
-        if blur_px is None:
-            from filter_service.psfs.node_blur import node_blur_px
-
-            blur_px = node_blur_px(eye, spec, plan, self.wavefronts)
         self.tables = StoreTables(
             values_dpt=np.array(plan.defocus.values_dpt, np.float64),
             keys_dpt=np.array(plan.defocus.keys_dpt, np.float64),
@@ -106,7 +99,7 @@ class PsfStore:
             offsets=np.zeros(count, np.uint32),
             reach_words=np.zeros(count, np.uint32),
             radius_px=np.zeros(count, np.int32),
-            blur_px=np.array(blur_px, np.float32),
+            blur_px=np.array(plan.blur_px, np.float32),
             spread_px=np.zeros(count, np.float32),
             peak_ratio=np.zeros(count, np.float32),
             is_computed=np.zeros(count, np.bool_),
@@ -129,7 +122,6 @@ class PsfStore:
             "spec": self.spec,
             "plan": self.plan,
             "wavefronts": self.wavefronts,
-            "blur_px": self.tables.blur_px,
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -143,10 +135,9 @@ class PsfStore:
         spec: GridSpec,
         plan: CachePlan,
         packed: PackedKernels,
-        blur_px: NDArray[np.float64],
     ) -> Self:
         """Return a store whose kernels (n_psfs,) are given."""
-        found = cls(eye, spec, plan, blur_px=blur_px.astype(np.float32))
+        found = cls(eye, spec, plan)
         found._append(np.arange(found.psf_count), packed)
         return found
 
@@ -371,7 +362,7 @@ class PsfStore:
 
     @property
     def blur_px(self) -> NDArray[np.float32]:
-        """Geometric blur radius (n_psfs,), see `node_blur_px`."""
+        """Geometric blur radius (n_psfs,), that of the plan."""
         return self.tables.blur_px
 
     @property

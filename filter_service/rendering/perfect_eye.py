@@ -78,6 +78,7 @@ def perfect_store(camera: Camera) -> PsfStore:
         defocus=RaggedNodes.of([np.zeros(1)]),
         channel_shift_dpt=np.zeros((1, RGB)),
         prediction=None,
+        blur_px=np.zeros(RGB, np.float32),
         is_limited=np.zeros(1, bool),
     )
     one = np.ones(RGB)
@@ -90,4 +91,4 @@ def perfect_store(camera: Camera) -> PsfStore:
         spread_px=16.0 * one,
         lost_energy_ratio=0.0 * one,
     )
-    return PsfStore.of_kernels(eye, spec, plan, packed, blur_px=0.0 * one)
+    return PsfStore.of_kernels(eye, spec, plan, packed)

@@ -1,5 +1,7 @@
 """Stores in which every PSF is one given kernel: filtering has a closed form then."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.signal import fftconvolve
 
@@ -63,6 +65,5 @@ def _store(kernel, camera, spread_px):
         peak_ratio=kernel.max() * one,
         lost_energy_ratio=0.0 * one,
     )
-    return PsfStore.of_kernels(
-        perfect.eye, perfect.spec, perfect.plan, packed, radius_px * one
-    )
+    plan = replace(perfect.plan, blur_px=np.full(RGB, radius_px, np.float32))
+    return PsfStore.of_kernels(perfect.eye, perfect.spec, plan, packed)

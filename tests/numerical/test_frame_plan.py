@@ -1,5 +1,6 @@
 """What a frame plans, against the plain statement of it."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -51,8 +52,8 @@ def store_for(name, model="traced", **settings):
         peak_ratio=rng.uniform(1e-4, 1.0, count),
         lost_energy_ratio=np.zeros(count),
     )
-    blur_px = node_px + rng.random(count)
-    return PsfStore.of_kernels(eye, spec, plan, packed, blur_px)
+    blur_px = (node_px + rng.random(count)).astype(np.float32)
+    return PsfStore.of_kernels(eye, spec, replace(plan, blur_px=blur_px), packed)
 
 
 CASES = {
