@@ -26,16 +26,13 @@ from filter_service.planning.sampled_use import (
     moved,
 )
 
-TOLERANCE_DB = {"loose": 43.0, "normal": 49.0, "fine": 55.0}
+TOLERANCE_DB = {"loose": 47.0, "normal": 53.0, "fine": 56.0}
 """PSNR that interpolation may cost down to on average over states, by the error law.
 Of blocks of 32x32 pixels of encoded pictures 95 % keep 36.1, 41.1 and 45.9 dB, the
 median 41.9, 46.7 and 51.5 dB (`bench_levels`, six eyes, 320x180).  Frames planned for
 49 dB, unmerged, have 46.8 to 50.1 dB at 640x360 (six eyes) and 44.8 to 47.1 dB at
 320x180 (four eyes), where a pixel holds more contrast than those that the law was
 fitted to."""
-
-QUALITY_GAIN_DB = 3.0
-"""What the mode for still eyes gives on top of it."""
 
 MAX_NODES = 64
 """On one axis but defocus."""
@@ -53,9 +50,7 @@ _STATES_ON_LADDER = 16
 
 def target_error(spec: GridSpec) -> float:
     """Mean square error that interpolation may make in all."""
-    gain_db = QUALITY_GAIN_DB if spec.settings.mode == "quality" else 0.0
-    wanted_db = TOLERANCE_DB[spec.settings.tolerance] + gain_db
-    return 10.0 ** (-wanted_db / 10.0)
+    return 10.0 ** (-TOLERANCE_DB[spec.settings.tolerance] / 10.0)
 
 
 def axis_nodes(
