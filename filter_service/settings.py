@@ -80,7 +80,7 @@ class FilterSettings(Record):
         Tolerance,
         _doc(
             "Interpolation of a planned grid: 95 % of the blocks of 32x32 pixels of a "
-            "picture keep 36 (loose), 41 (normal) or 45 dB (fine) against exact PSFs."
+            "picture keep 39 (loose), 44 (normal) or 46 dB (fine) against exact PSFs."
         ),
     ] = "normal"
     prepare: Annotated[
