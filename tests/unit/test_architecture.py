@@ -144,8 +144,8 @@ HOME = {
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
         "estimator/field/defocus_loops.py",  # of a traced eye in a new state
+        "filter_service/planning/blur_loops.py",
         "filter_service/planning/spread_loops.py",  # planning an eye
-        "filter_service/psfs/blur_loops.py",
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/psfs/layer_loops.py",
         "filter_service/rendering/map_loops.py",
