@@ -148,3 +148,21 @@ class EyeOptics(Protocol):
         ValueError
             A state outside of what is known of the eye.
         """
+
+    def wavefronts_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[..., FieldWavefronts]:
+        """`wavefronts` at fixed fields and wavelengths (n,), many states of the eye.
+
+        Returns
+        -------
+        callable
+            From ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers, and
+            ``total_defocus_dpt`` (m, n) to wavefronts (m n,).
+
+        Raises
+        ------
+        ValueError
+            A field or wavelength outside of what is known; the callable, for a pupil or
+            accommodation.
+        """

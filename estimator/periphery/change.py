@@ -19,7 +19,12 @@ from estimator.optics.zernike import (
     nm_from_index,
     rescale_pupil,
 )
-from estimator.periphery.meridian import CIRCLE_MM, TERMS, field_matrix
+from estimator.periphery.meridian import (
+    CIRCLE_MM,
+    TERMS,
+    field_matrix,
+    field_terms,
+)
 from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import EyeProfile, Measurement
 
@@ -93,11 +98,13 @@ class PeripheralChange:
         """Change (n, 28) at directions (n,), on a circle of 2 mm radius."""
         h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
         h_deg = h_deg if self.eye_side == "OD" else -h_deg
-        matrix = field_matrix(h_deg, v_deg).reshape(h_deg.size, len(TERMS), -1)
+        knots_um = self.knots_um.reshape(len(TERMS), -1)
         found_um = np.zeros((h_deg.size, N_TERMS))
-        found_um[:, TERMS[0] : TERMS[-1] + 1] = matrix @ self.knots_um + _free_products(
-            (h_deg, v_deg), (self.free_h_deg, self.free_v_deg)
-        ) @ (self.free_um * _free_variances())
+        found_um[:, TERMS[0] : TERMS[-1] + 1] = field_terms(
+            h_deg, v_deg, knots_um
+        ) + _free_products((h_deg, v_deg), (self.free_h_deg, self.free_v_deg)) @ (
+            self.free_um * _free_variances()
+        )
         return found_um if self.eye_side == "OD" else flip_horizontal(found_um)
 
 

@@ -59,6 +59,31 @@ def _spline() -> CubicSpline:
     return CubicSpline(nodes, values)
 
 
+def field_terms(
+    h_deg: ArrayLike, v_deg: ArrayLike, knots: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Terms (n, 12) at directions (n,) from those at the knots (12, 8).
+
+    The product of `field_matrix` and the knots in a tenth of its time, most of which
+    would go into zeros.
+    """
+    h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
+    angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
+    right, left = (meridian_weights(a) @ knots.T for a in (angle_deg, -angle_deg))
+    parts = 0.5 * (right + left), 0.5 * (right - left)
+    found = np.zeros((h_deg.size, len(TERMS)))
+    turned = [(np.cos(k * azimuth), np.sin(k * azimuth)) for k in range(3)]
+    for cosine, sine, *turns in _SPINS:
+        c, s = TERMS.index(cosine), None if sine is None else TERMS.index(sine)
+        for part, turn in zip(parts, turns, strict=True):
+            cos, sin = turned[turn]
+            found[:, c] += cos * part[:, c]
+            if s is not None:
+                found[:, c] -= sin * part[:, s]
+                found[:, s] += cos * part[:, s] + sin * part[:, c]
+    return found
+
+
 def field_matrix(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
     """Matrix (n, 12, 12, 8): terms at directions (n,) from terms at the knots."""
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))

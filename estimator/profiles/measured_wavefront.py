@@ -283,6 +283,14 @@ class MeasuredWavefront(FocusingEye):
             self._on_circles(radius_mm), rim_mm, radius_mm, total_defocus_dpt=total_dpt
         )
 
+    def wavefronts_at(
+        self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
+    ) -> Callable[..., FieldWavefronts]:
+        """`wavefronts` at fixed fields and wavelengths, many states of the eye."""
+        return partial(
+            self.wavefronts, h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm
+        )
+
     def _on_circles(self, radius_mm: NDArray) -> NDArray[np.float64]:
         """Measured coefficients (P, 28) on circles (P,); piston zero."""
         polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)

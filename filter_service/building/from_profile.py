@@ -13,7 +13,8 @@ from filter_service.errors import (
     GridTooLarge,
 )
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
+from filter_service.planning.nodes import PlanAxes
+from filter_service.planning.plan import PlanTooLarge, plan_axes, plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore
 from filter_service.psfs.store_cache import StoreCache, Stored, store_key
@@ -81,11 +82,13 @@ def _built(
     eye, notes = eye_for_spec(profile, spec, progress=progress, cancelled=cancelled)
     go_on()
     progress(1.0, "plan")
-    # Only with all ranges prepared at once is it known what all PSFs take.
+    # Only with all ranges prepared at once is it known what all PSFs take; else nodes
+    # are planned when frames first read them.
+    plan: PlanAxes
     if job.settings.prepare == "ranges":
         plan = plan_cache(eye, spec)
     else:
-        plan = unchecked_plan(eye, spec, predict=False)
+        plan = plan_axes(eye, spec)
     go_on()
     store = PsfStore(eye, spec, plan)
     cache.save_aside(key, Stored(store.parts, notes))

@@ -12,19 +12,19 @@ AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 
 def plan_summary(plan: "CachePlan") -> dict:
     """Nodes and prediction, ready for JSON."""
-    predicted = plan.prediction
+    predicted, defocus = plan.prediction, plan.nodes.defocus
     return {
         "h_deg": plan.h_deg.tolist(),
         "v_deg": plan.v_deg.tolist(),
         "pupils_mm": plan.pupils_mm.tolist(),
         "accommodations_dpt": plan.accommodations_dpt.tolist(),
         "defocus_range_dpt": [
-            float(plan.defocus.values_dpt.min()),
-            float(plan.defocus.values_dpt.max()),
+            float(defocus.values_dpt.min()),
+            float(defocus.values_dpt.max()),
         ],
         "defocus_counts": [
-            int(plan.defocus.counts.min()),
-            int(plan.defocus.counts.max()),
+            int(defocus.counts.min()),
+            int(defocus.counts.max()),
         ],
         **vars(predicted),
     }

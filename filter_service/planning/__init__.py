@@ -9,7 +9,8 @@ readable          defocus that frames read at a node
 axis_nodes        nodes along one axis
 defocus_nodes     nodes of defocus, group by group
 spread_loops      their compiled loop
-node_blur         geometric blur of a plan's nodes
+node_wavefronts   wavefronts of a state's field nodes
+node_blur         geometric blur of nodes
 blur_loops        its compiled loop
 nodes             a plan, and reading between its nodes
 paper_grid        the paper's fixed grids as plans

@@ -35,7 +35,7 @@ COMPUTED_BEYOND = 0.2
 
 def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
     """Fields of `PlanPrediction`: count, memory, time and cores."""
-    count = (RGB if spec.settings.chromatic else 1) * len(plan.defocus.values_dpt)
+    count = channels_of(spec) * len(plan.nodes.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
     survey = state_survey(eye, spec, states)
     texels = float(np.mean(box_texels(spec, survey)))
@@ -59,10 +59,15 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
 
 def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
     """States of a plan's PSFs: all of them, or so many spread evenly."""
-    channels = RGB if spec.settings.chromatic else 1
-    count = channels * len(plan.defocus.values_dpt)
+    channels = channels_of(spec)
+    count = channels * len(plan.nodes.defocus.values_dpt)
     psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
     return states_of(spec, plan, psfs // channels, psfs % channels)
+
+
+def channels_of(spec: GridSpec) -> int:
+    """Return the number of channels with PSFs of their own."""
+    return RGB if spec.settings.chromatic else 1
 
 
 def states_of(
@@ -72,16 +77,17 @@ def states_of(
     channel: NDArray[np.int64],
 ) -> PupilStates:
     """States of the eye (n,) whose PSFs some nodes and channels of a plan have."""
-    groups = plan.defocus.group_of_node[nodes]
-    v, h, pupil, used = np.unravel_index(groups, plan.group_shape)
+    defocus = plan.nodes.defocus
+    groups = defocus.group_at(nodes)
+    pupil, used, v, h = np.unravel_index(groups, plan.group_shape)
     return PupilStates(
         h_deg=plan.h_deg[h],
         v_deg=plan.v_deg[v],
         pupil_diameter_mm=plan.pupils_mm[pupil],
         accommodation_dpt=plan.accommodations_dpt[used],
         wavelength_nm=spec.channel_wavelengths_nm[channel],
-        total_defocus_dpt=plan.defocus.values_dpt[nodes]
-        + plan.channel_shift_dpt[groups, channel],
+        total_defocus_dpt=defocus.values_dpt[nodes]
+        + plan.nodes.channel_shift_dpt[groups, channel],
     )
 
 

@@ -81,7 +81,7 @@ def defocus_nodes(
     Parameters
     ----------
     groups : PupilStates
-        Field, pupil, accommodation and wavelength of each group (P,), no defocus.
+        Field nodes (P,) in one state, in green light without defocus.
     group_rays : GroupRays
     readable : ReadableDefocus
     """

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.optics.zernike import wavefront_polynomial
+from estimator.psf.pupil import pupil_frames
 from filter_service.constants import RGB
 from filter_service.planning.grid import GREEN, GridSpec
+from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.nodes import RaggedNodes
-from filter_service.planning.readable import PlanAxes
-from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.slopes import slopes_px
 
 
 class GroupRays(NamedTuple):
@@ -29,25 +31,26 @@ class GroupRays(NamedTuple):
     per_dpt: NDArray[np.float64]
 
     @classmethod
-    def of(cls, eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> "GroupRays":
-        """Trace groups through an eye's wavefronts."""
-        count = groups.h_deg.size
-        columns = vars(groups.taken(np.tile(np.arange(count), 2)))
-        columns["total_defocus_dpt"] = np.repeat([0.0, 1.0], count)
-        slopes = slopes_px(state_frames(eye, spec, PupilStates(**columns)))
-        return cls(slopes[:count], slopes[count:] - slopes[:count])
-
-
-def groups_of(spec: GridSpec, axes: PlanAxes) -> PupilStates:
-    """States (n_groups,) of the groups of a plan, in its order; green, no defocus."""
-    return PupilStates.of(
-        h_deg=axes.h_deg[:, None, None],
-        v_deg=axes.v_deg[:, None, None, None],
-        pupil_diameter_mm=axes.pupils_mm[:, None],
-        accommodation_dpt=axes.accommodations_dpt,
-        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
-        total_defocus_dpt=0.0,
-    )
+    def of(cls, wavefronts: NodeWavefronts) -> "GroupRays":
+        """Trace rays through wavefronts; through the mean of a wide primary's."""
+        zero_um = wavefronts.zernike_um[:, GREEN].mean(axis=1)
+        per_dpt_um = wavefronts.per_dpt_um[:, GREEN].mean(axis=1)
+        both = (2, 1)
+        slopes = slopes_px(
+            pupil_frames(
+                wavefront_polynomial(np.concatenate([zero_um, zero_um + per_dpt_um])),
+                circle_radius_mm=np.tile(
+                    wavefronts.circle_diameter_mm[:, GREEN, 0] / 2.0, 2
+                ),
+                wavelength_nm=np.full(
+                    2 * len(zero_um), wavefronts.wavelength_nm[GREEN].mean()
+                ),
+                pixel_from_mrad=np.tile(wavefronts.pixel_from_mrad, (*both, 1)),
+                pupil_ellipse=np.tile(wavefronts.pupil_ellipse[:, GREEN, 0], both),
+            )
+        )
+        at_zero_px, at_one_px = np.split(slopes, 2)
+        return cls(at_zero_px, at_one_px - at_zero_px)
 
 
 def node_blur_px(

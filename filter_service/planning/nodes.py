@@ -1,10 +1,15 @@
 """Nodes of a PSF cache: plain arrays, with the search for a value's neighbours."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from filter_service.planning.node_wavefronts import NodeWavefronts
 
 
 @dataclass(frozen=True)
@@ -23,7 +28,7 @@ class RaggedNodes:
     starts: NDArray[np.int64]
 
     @classmethod
-    def of(cls, groups: list[NDArray[np.float64]]) -> "RaggedNodes":
+    def of(cls, groups: list[NDArray[np.float64]]) -> RaggedNodes:
         """Join groups, each ascending and not empty."""
         counts = np.array([len(group) for group in groups], np.int64)
         return cls.joined(np.concatenate([np.zeros(0), *groups]), counts)
@@ -31,7 +36,7 @@ class RaggedNodes:
     @classmethod
     def joined(
         cls, values_dpt: NDArray[np.float64], counts: NDArray[np.int64]
-    ) -> "RaggedNodes":
+    ) -> RaggedNodes:
         """Cut values (n,) into groups of so many (n_groups,)."""
         if not counts.size or counts.min() < 1:
             raise ValueError(f"groups of {counts} nodes: at least one node each")
@@ -43,8 +48,8 @@ class RaggedNodes:
         return cls(values_dpt.astype(np.float64), starts.astype(np.int64))
 
     def where_fewer(
-        self, index: NDArray[np.int64], other: "RaggedNodes"
-    ) -> tuple["RaggedNodes", NDArray[np.int64]]:
+        self, index: NDArray[np.int64], other: RaggedNodes
+    ) -> tuple[RaggedNodes, NDArray[np.int64]]:
         """Take other nodes of some groups where they are fewer.
 
         Parameters
@@ -156,8 +161,11 @@ class PlanPrediction:
 
 
 @dataclass(frozen=True)
-class CachePlan:
-    """Nodes of a cache, before anything is computed.
+class PlanAxes:
+    """Nodes of a cache over field, pupil and accommodation.
+
+    Those of defocus follow from these, pupil by pupil and accommodation by
+    accommodation: `planning.plan.planned_nodes`.
 
     Attributes
     ----------
@@ -165,34 +173,16 @@ class CachePlan:
         Field directions, ascending; a single (0, 0) on axis.
     pupils_mm : (n_pupils,)
     accommodations_dpt : (n_accommodations,)
-    defocus : RaggedNodes
-        Total defocus in dpt; groups in C order [v, h, pupil, accommodation].
-    channel_shift_dpt : (n_groups, 3)
-        Channel c of a node at t is the kernel of total defocus t + shift: zero where a
-        node is one defocus for all channels; the chromatic difference where it is what
-        they see of one object, as where few distances are read and in the paper's
-        grids.
-    prediction : PlanPrediction or None
-        None where it was not asked for: it takes longer than the plan.
-    blur_px : (n_psfs,)
-        Geometric blur of the nodes' PSFs, see `planning.node_blur`.
-    is_limited : (n_groups,)
-        Groups that end where the blur is as large as kernels may be.
-    shrink_ratio : (n_groups,), optional
-        By how much wavefronts are made flatter where even the sharpest blur of a group
-        is larger; one elsewhere, and everywhere where it is None.
+    defocus_error : float
+        Mean square error that interpolation in defocus may add; 0 where the nodes do
+        not follow from it.
     """
 
     h_deg: NDArray[np.float64]
     v_deg: NDArray[np.float64]
     pupils_mm: NDArray[np.float64]
     accommodations_dpt: NDArray[np.float64]
-    defocus: RaggedNodes
-    channel_shift_dpt: NDArray[np.float64]
-    prediction: PlanPrediction | None
-    blur_px: NDArray[np.float32]
-    is_limited: NDArray[np.bool_]
-    shrink_ratio: NDArray[np.float64] | None = None
+    defocus_error: float = 0.0
 
     @cached_property
     def field_nodes_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -205,20 +195,83 @@ class CachePlan:
         """Number of the field node that is nearest to the direction of gaze."""
         return int(np.argmin(np.hypot(*self.field_nodes_deg)))
 
-    @cached_property
-    def has_limits(self) -> bool:
-        """Whether any group's blur is drawn smaller than it is."""
-        return bool(self.is_limited.any())
-
     @property
     def group_shape(self) -> tuple[int, int, int, int]:
-        """Numbers of nodes (v, h, pupil, accommodation)."""
+        """Numbers of nodes (pupil, accommodation, v, h)."""
         return (
-            len(self.v_deg),
-            len(self.h_deg),
             len(self.pupils_mm),
             len(self.accommodations_dpt),
+            len(self.v_deg),
+            len(self.h_deg),
         )
+
+
+@dataclass(frozen=True)
+class PlanNodes:
+    """Nodes of total defocus of all field nodes, in one or several states of the eye.
+
+    Attributes
+    ----------
+    defocus : RaggedNodes
+        Total defocus in dpt; a group is one field node [v, h] in one state.
+    channel_shift_dpt : (n_groups, 3)
+        Channel c of a node at t is the kernel of total defocus t + shift: zero where a
+        node is one defocus for all channels; the chromatic difference where it is what
+        they see of one object, as where few distances are read and in the paper's
+        grids.
+    blur_px : (n_psfs,)
+        Geometric blur of the nodes' PSFs, see `planning.node_blur`.
+    is_limited : (n_groups,)
+        Groups that end where the blur is as large as kernels may be.
+    shrink_ratio : (n_groups,)
+        By how much wavefronts are made flatter where even the sharpest blur of a group
+        is larger; one elsewhere.
+    wavefronts : NodeWavefronts
+        Made flatter by that.
+    """
+
+    defocus: RaggedNodes
+    channel_shift_dpt: NDArray[np.float64]
+    blur_px: NDArray[np.float32]
+    is_limited: NDArray[np.bool_]
+    shrink_ratio: NDArray[np.float64]
+    wavefronts: NodeWavefronts
+
+    @classmethod
+    def joined(cls, several: Sequence[PlanNodes]) -> PlanNodes:
+        """Join nodes of one eye and field, one after the other."""
+        if len(several) == 1:
+            return several[0]
+        return cls(
+            RaggedNodes.joined(
+                np.concatenate([one.defocus.values_dpt for one in several]),
+                np.concatenate([one.defocus.counts for one in several]),
+            ),
+            *(
+                np.concatenate([getattr(one, name) for one in several])
+                for name in (
+                    *("channel_shift_dpt", "blur_px"),
+                    *("is_limited", "shrink_ratio"),
+                )
+            ),
+            NodeWavefronts.joined([one.wavefronts for one in several]),
+        )
+
+
+@dataclass(frozen=True)
+class CachePlan(PlanAxes):
+    """All nodes of a cache, before anything is computed.
+
+    Attributes
+    ----------
+    nodes : PlanNodes
+        Groups in C order [pupil, accommodation, v, h].
+    prediction : PlanPrediction, optional
+        None where it was not asked for: it takes longer than the plan.
+    """
+
+    nodes: PlanNodes | None = None
+    prediction: PlanPrediction | None = None
 
 
 def bracket_axis(

@@ -10,12 +10,12 @@ Csoba & Kunkli 2023, section 7.2.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.defocus_nodes import DefocusNodes
 from filter_service.planning.grid import GREEN, PAPER_REACH_DEG, GridSpec
-from filter_service.planning.nodes import RaggedNodes
+from filter_service.planning.nodes import PlanAxes, RaggedNodes
+from filter_service.planning.slopes import PupilStates
 
 ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
 DISTANCE_COUNTS = {"on-axis": 33, "quality": 9, "dynamic": 9}
@@ -32,9 +32,7 @@ FOCI_DPT = {
 DISTANCES_DPT = (0.125, 8.125)
 
 
-def paper_axes(
-    eye: EyeOptics, spec: GridSpec
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray, NDArray]:
+def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     """Azimuths, elevations, pupils and accommodations.
 
     Pupils and foci outside of the ranges in use become their ends.  Foci that the eye
@@ -59,21 +57,19 @@ def paper_axes(
         (float(foci_dpt[0]), float(foci_dpt[-1])),
         pupil_range_mm=(float(usable_mm[0]), widest_mm),
     )
-    return *angles_deg, usable_mm, np.unique([low_dpt, *used_dpt[1:-1], high_dpt])
+    used_dpt = np.unique([low_dpt, *used_dpt[1:-1], high_dpt])
+    return PlanAxes(*angles_deg, usable_mm, used_dpt)
 
 
-def paper_defocus(
-    eye: EyeOptics, spec: GridSpec, axes: tuple[NDArray, NDArray, NDArray, NDArray]
-) -> DefocusNodes:
-    """Nodes of total defocus, and the channels' shifts against them."""
-    h_deg, v_deg, pupils_mm, used_dpt = axes
+def paper_defocus(eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> DefocusNodes:
+    """Nodes of total defocus of groups, and the channels' shifts against them."""
     at_infinity_dpt = eye.total_defocus_dpt(
-        h_deg=h_deg[:, None, None, None],
-        v_deg=v_deg[:, None, None, None, None],
-        pupil_diameter_mm=pupils_mm[:, None, None],
-        accommodation_dpt=used_dpt[:, None],
+        h_deg=groups.h_deg[:, None],
+        v_deg=groups.v_deg[:, None],
+        pupil_diameter_mm=groups.pupil_diameter_mm[:, None],
+        accommodation_dpt=groups.accommodation_dpt[:, None],
         wavelength_nm=spec.channel_wavelengths_nm,
-    ).reshape(-1, 3)
+    )
     green_dpt = at_infinity_dpt[:, GREEN, None]
     count = DISTANCE_COUNTS[spec.settings.mode]
     distances_dpt = np.linspace(*DISTANCES_DPT, count)

@@ -1,11 +1,13 @@
 """Decides which PSFs a cache holds, and predicts their cost, before any is computed.
 
 A frame reads total defocus t within the range that its objects, focus and channels can
-reach, at the two neighbouring nodes of pupil and accommodation; only that is planned.
+reach, at the neighbouring nodes of pupil and accommodation; only that is planned, and
+for a stream only when a frame first reads those.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,21 +25,29 @@ from filter_service.planning.defocus_nodes import (
 )
 from filter_service.planning.error_law import combined_error, equal_share, psnr_db
 from filter_service.planning.grid import (
+    GREEN,
     GridSpec,
     defocus_nodes_dpt,
     nodes_through_foci_dpt,
     pupil_nodes_mm,
 )
-from filter_service.planning.node_blur import GroupRays, groups_of, node_blur_px
+from filter_service.planning.node_blur import GroupRays, node_blur_px
+from filter_service.planning.node_wavefronts import (
+    NodeWavefronts,
+    WavefrontsOf,
+    node_evaluator,
+)
 from filter_service.planning.nodes import (
     CachePlan,
+    PlanAxes,
+    PlanNodes,
     PlanPrediction,
     RaggedNodes,
 )
 from filter_service.planning.paper_grid import paper_axes, paper_defocus
 from filter_service.planning.readable import (
-    PlanAxes,
-    check_central_defocus,
+    ReadableDefocus,
+    check_plan_defocus,
     joined_ranges,
     readable_defocus,
     usable_pupils_mm,
@@ -50,14 +60,18 @@ from filter_service.planning.sampled_use import (
     defocus_error,
     sample_use,
 )
-from filter_service.planning.slopes import main_foci_dpt
+from filter_service.planning.slopes import PupilStates, main_foci_dpt
 from filter_service.settings import TOLERANCES
 
 __all__ = [
     "CachePlan",
+    "NodePlanner",
+    "PlanAxes",
+    "PlanNodes",
     "PlanPrediction",
     "PlanTooLarge",
     "RaggedNodes",
+    "plan_axes",
     "plan_cache",
     "unchecked_plan",
 ]
@@ -119,48 +133,167 @@ def unchecked_plan(
     predict : bool
         Say what all of it would cost.
     """
-    allowed_error = target_error(spec)
-    if target_db is not None:
-        allowed_error = 10.0 ** (-target_db / 10.0)
-    check_central_defocus(eye, spec)
-    use = sample_use(eye, spec, USE_SAMPLES)
-    if spec.settings.grid == "paper":
-        axes = PlanAxes(*paper_axes(eye, spec))
-        defocus = paper_defocus(eye, spec, tuple(vars(axes).values()))
-    elif spec.follows_field:
-        axes, left = _field_axes(use, allowed_error)
-        defocus = None
-    else:
-        axes = _central_axes(eye, spec)
-        defocus = _central_defocus(eye, spec, axes)
-    groups = groups_of(spec, axes)
-    rays = GroupRays.of(eye, spec, groups)
-    if defocus is None:
-        defocus = defocus_nodes(
-            *(eye, spec, groups, rays, readable_defocus(eye, spec, axes)),
-            allowed_error=left,
-        )
+    axes = plan_axes(eye, spec, target_db=target_db)
     plan = CachePlan(
-        **vars(axes),
-        defocus=defocus.nodes,
-        channel_shift_dpt=defocus.channel_shift_dpt,
-        prediction=None,
-        is_limited=defocus.is_limited,
-        blur_px=node_blur_px(
-            *(eye, spec, rays, defocus.nodes),
-            *(defocus.channel_shift_dpt, defocus.shrink_ratio),
-        ),
-        shrink_ratio=defocus.shrink_ratio,
+        *(axes.h_deg, axes.v_deg, axes.pupils_mm, axes.accommodations_dpt),
+        defocus_error=axes.defocus_error,
+        nodes=NodePlanner(eye, spec, axes).all_nodes(),
     )
     if not predict:
         return plan
-    errors = _errors(use, plan)
+    errors = _errors(sample_use(eye, spec, USE_SAMPLES), plan)
     prediction = PlanPrediction(
         **predicted_cost(eye, spec, plan),
         interpolation_db=psnr_db(combined_error(list(errors.values()))),
         error_db_by_axis={name: psnr_db(error) for name, error in errors.items()},
     )
     return replace(plan, prediction=prediction)
+
+
+def plan_axes(
+    eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
+) -> PlanAxes:
+    """Nodes over field, pupil and accommodation that frames can read.
+
+    Parameters
+    ----------
+    target_db : float, optional
+        What interpolation may cost; the spec's tolerance says where it is None.
+
+    Raises
+    ------
+    ProfileError
+        The eye is out of focus as no eye is.
+    """
+    allowed_error = target_error(spec)
+    if target_db is not None:
+        allowed_error = 10.0 ** (-target_db / 10.0)
+    if spec.settings.grid == "paper":
+        axes = paper_axes(eye, spec)
+    elif spec.follows_field:
+        axes = _field_axes(sample_use(eye, spec, USE_SAMPLES), allowed_error)
+    else:
+        axes = _central_axes(eye, spec)
+    check_plan_defocus(eye, spec, axes)
+    return axes
+
+
+class NodePlanner:
+    """Plans the nodes of total defocus that belong to a plan's axes, state by state.
+
+    What it plans of a state is the same whatever it has planned before.
+
+    Parameters
+    ----------
+    eye : EyeOptics
+    spec : GridSpec
+    axes : PlanAxes
+    """
+
+    def __init__(self, eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> None:
+        self.eye, self.spec, self.axes = eye, spec, axes
+        self._known_dpt: dict[tuple[float, float], NDArray[np.float64]] = {}
+
+    def all_nodes(self) -> PlanNodes:
+        """Nodes of all states, in C order [pupil, accommodation]."""
+        return PlanNodes.joined(
+            [
+                self.nodes(pupil, used)
+                for pupil in range(len(self.axes.pupils_mm))
+                for used in range(len(self.axes.accommodations_dpt))
+            ]
+        )
+
+    def nodes(self, pupil: int, used: int) -> PlanNodes:
+        """Nodes of one state.
+
+        Parameters
+        ----------
+        pupil, used : int
+            Numbers of the state's nodes of pupil and accommodation.
+
+        Raises
+        ------
+        GridTooLarge
+            Too many PSFs at one place.
+        """
+        eye, spec, axes = self.eye, self.spec, self.axes
+        groups = self._groups(pupil, used)
+        wavefronts = NodeWavefronts.of(eye, spec, groups, self._wavefronts_of)
+        rays = GroupRays.of(wavefronts)
+        if spec.settings.grid == "paper":
+            found = paper_defocus(eye, spec, groups)
+        else:
+            readable = readable_defocus(
+                *(eye, spec, axes, self._ranges, self._defocus_dpt),
+                *(pupil, used),
+            )
+            found = (
+                defocus_nodes(
+                    *(eye, spec, groups, rays, readable),
+                    allowed_error=axes.defocus_error,
+                )
+                if spec.follows_field
+                else _central_defocus(eye, spec, readable, axes.pupils_mm[pupil])
+            )
+        if np.any(found.shrink_ratio != 1.0):
+            wavefronts = wavefronts.flatter(found.shrink_ratio)
+        if spec.settings.lateral_color and spec.settings.chromatic:
+            wavefronts = wavefronts.with_lateral_color(eye, spec, groups)
+        return PlanNodes(
+            defocus=found.nodes,
+            channel_shift_dpt=found.channel_shift_dpt,
+            blur_px=node_blur_px(
+                *(eye, spec, rays, found.nodes),
+                *(found.channel_shift_dpt, found.shrink_ratio),
+            ),
+            is_limited=found.is_limited,
+            shrink_ratio=found.shrink_ratio,
+            wavefronts=wavefronts,
+        )
+
+    def _groups(self, pupil: int, used: int) -> PupilStates:
+        """Field nodes in a state, in green light without defocus."""
+        h_deg, v_deg = self.axes.field_nodes_deg
+        return PupilStates.of(
+            h_deg=h_deg,
+            v_deg=v_deg,
+            pupil_diameter_mm=self.axes.pupils_mm[pupil],
+            accommodation_dpt=self.axes.accommodations_dpt[used],
+            wavelength_nm=self.spec.channel_wavelengths_nm[GREEN],
+            total_defocus_dpt=0.0,
+        )
+
+    @cached_property
+    def _ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Pupils and accommodations in use."""
+        return (
+            usable_pupils_mm(self.eye, self.spec),
+            used_accommodations_dpt(self.eye, self.spec),
+        )
+
+    def _defocus_dpt(
+        self, pupil_mm: float, accommodation_dpt: float
+    ) -> NDArray[np.float64]:
+        """Total defocus (n_v, n_h, 3) of a state at infinity; neighbours share it."""
+        state = pupil_mm, accommodation_dpt
+        if state not in self._known_dpt:
+            self._known_dpt[state] = self._defocus_of(
+                pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
+            ).reshape(len(self.axes.v_deg), len(self.axes.h_deg), -1)
+        return self._known_dpt[state]
+
+    @cached_property
+    def _wavefronts_of(self) -> WavefrontsOf:
+        return node_evaluator(self.eye, self.spec, *self.axes.field_nodes_deg)
+
+    @cached_property
+    def _defocus_of(self) -> Callable[..., NDArray[np.float64]]:
+        return self.eye.defocus_at(
+            h_deg=self.axes.h_deg[:, None],
+            v_deg=self.axes.v_deg[:, None, None],
+            wavelength_nm=self.spec.channel_wavelengths_nm,
+        )
 
 
 def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
@@ -188,8 +321,8 @@ def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     )
 
 
-def _field_axes(use: Use, allowed_error: float) -> tuple[PlanAxes, float]:
-    """Nodes but those of defocus, and the mean square error left to defocus.
+def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
+    """Nodes but those of defocus, with the mean square error left to it.
 
     Axes with few nodes meet their share with some to spare; it goes to the others.
     """
@@ -212,31 +345,23 @@ def _field_axes(use: Use, allowed_error: float) -> tuple[PlanAxes, float]:
         nodes[axis], error = axis_nodes(use, axis, range_, allowed_error=share)
         spent.append(error)
     left = equal_share(allowed_error, spent=spent, count=1)
-    return PlanAxes(*(nodes[axis] for axis in AXES[:-1])), left
+    return PlanAxes(*(nodes[axis] for axis in AXES[:-1]), left)
 
 
-def _central_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> DefocusNodes:
+def _central_defocus(
+    eye: EyeOptics, spec: GridSpec, readable: ReadableDefocus, pupil_mm: float
+) -> DefocusNodes:
     """Nodes on axis: by blur radius alone, far closer than any tolerance asks for.
 
     One distance seen in one state needs no more than the exact PSF of each channel.
     """
-    found = readable_defocus(eye, spec, axes)
-    pupils_mm = np.repeat(axes.pupils_mm, len(axes.accommodations_dpt))
-    exact_dpt = joined_ranges(found.beside_shift_dpt)
-    is_exact = np.array([np.ptp(ranges_dpt) < EXACT_DPT for ranges_dpt in exact_dpt])
-    nodes = [
-        own_dpt[:1, 0] if exact else _nodes_by_blur(eye, spec, pupil_mm, ranges_dpt)
-        for exact, own_dpt, ranges_dpt, pupil_mm in zip(
-            is_exact,
-            exact_dpt,
-            joined_ranges(found.of_any_channel_dpt),
-            pupils_mm.tolist(),
-            strict=True,
-        )
-    ]
-    return DefocusNodes.unlimited(
-        RaggedNodes.of(nodes), np.where(is_exact[:, None], found.shift_dpt, 0.0)
-    )
+    (exact_dpt,) = joined_ranges(readable.beside_shift_dpt)
+    if np.ptp(exact_dpt) < EXACT_DPT:
+        exact = RaggedNodes.of([exact_dpt[:1, 0]])
+        return DefocusNodes.unlimited(exact, readable.shift_dpt)
+    (ranges_dpt,) = joined_ranges(readable.of_any_channel_dpt)
+    nodes = RaggedNodes.of([_nodes_by_blur(eye, spec, pupil_mm, ranges_dpt)])
+    return DefocusNodes.unlimited(nodes, np.zeros_like(readable.shift_dpt))
 
 
 def _nodes_by_blur(

@@ -1,5 +1,6 @@
-"""Which defocus frames read at the nodes of a plan."""
+"""Which defocus frames read at the nodes of a state."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from estimator.eye.checked_fields import ProfileError
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.grid import GREEN, GridSpec
+from filter_service.planning.nodes import PlanAxes
 
 MAX_FIELD_STEP_DPT = 1.5
 """Change of defocus to the next field node that a node's range follows.  Only where an
@@ -21,16 +23,6 @@ the nodes of such a range would fill any memory."""
 
 GAP_ROOM_DPT = 0.25
 """Into the gap between two planes: as far as a frame's layers lie beside a plane."""
-
-
-@dataclass(frozen=True)
-class PlanAxes:
-    """Nodes of a plan but those of defocus."""
-
-    h_deg: NDArray[np.float64]
-    v_deg: NDArray[np.float64]
-    pupils_mm: NDArray[np.float64]
-    accommodations_dpt: NDArray[np.float64]
 
 
 def usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
@@ -48,7 +40,7 @@ def used_accommodations_dpt(eye: EyeOptics, spec: GridSpec) -> tuple[float, floa
 
 @dataclass(frozen=True)
 class ReadableDefocus:
-    """Total defocus that frames read, group by group in the order of a plan.
+    """Total defocus that frames read, field node by field node.
 
     Attributes
     ----------
@@ -72,17 +64,19 @@ class ReadableDefocus:
         return _hull(self.ranges_dpt - self.shift_dpt[:, None, :, None])
 
 
-def check_central_defocus(eye: EyeOptics, spec: GridSpec) -> None:
-    """Refuse an eye that is no eye on its axis, before anything is planned for it.
+def check_plan_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> None:
+    """Refuse an eye that is no eye somewhere in the field, before nodes are planned.
 
     Raises
     ------
     ProfileError
     """
     defocus_dpt = eye.total_defocus_dpt(
-        pupil_diameter_mm=np.array(usable_pupils_mm(eye, spec))[:, None, None],
-        accommodation_dpt=np.array(used_accommodations_dpt(eye, spec))[:, None],
-        wavelength_nm=spec.channel_wavelengths_nm,
+        h_deg=axes.h_deg[:, None, None],
+        v_deg=axes.v_deg[:, None, None, None],
+        pupil_diameter_mm=np.array(usable_pupils_mm(eye, spec))[:, None],
+        accommodation_dpt=np.array(used_accommodations_dpt(eye, spec)),
+        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
     )
     check_defocus(defocus_dpt)
 
@@ -109,55 +103,63 @@ def _hull(ranges_dpt: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def readable_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> ReadableDefocus:
-    """Over objects, and over every accommodation and pupil that reads a node.
+DefocusOf = Callable[[float, float], NDArray[np.float64]]
+"""From a pupil and an accommodation to the total defocus (n_v, n_h, 3) at infinity."""
+
+
+def readable_defocus(
+    eye: EyeOptics,
+    spec: GridSpec,
+    axes: PlanAxes,
+    ranges: tuple[tuple[float, float], tuple[float, float]],
+    defocus_of: DefocusOf,
+    pupil: int,
+    used: int,
+) -> ReadableDefocus:
+    """Over objects, and over every accommodation and pupil that reads a state's nodes.
 
     A node is read by states up to its neighbours, a single one by all of its range.
+
+    Parameters
+    ----------
+    ranges : ((low, high), (low, high))
+        Pupils and accommodations in use.
+    defocus_of : callable
+    pupil, used : int
+        Numbers of the state's nodes of pupil and accommodation.
     """
-    pupils_mm, of_pupil, own_pupil = _readers(
-        axes.pupils_mm, usable_pupils_mm(eye, spec)
+    pupils_mm, reads_pupil, own_pupil = _readers(axes.pupils_mm, ranges[0], pupil)
+    used_dpt, reads_used, own_used = _readers(axes.accommodations_dpt, ranges[1], used)
+    at_infinity_dpt = np.stack(
+        [
+            np.stack([defocus_of(mm, dpt) for dpt in used_dpt.tolist()], axis=-2)
+            for mm in pupils_mm.tolist()
+        ],
+        axis=2,
     )
-    used_dpt, of_used, own_used = _readers(
-        axes.accommodations_dpt, used_accommodations_dpt(eye, spec)
-    )
-    at_infinity_dpt = eye.total_defocus_dpt(
-        h_deg=axes.h_deg[:, None, None, None],
-        v_deg=axes.v_deg[:, None, None, None, None],
-        pupil_diameter_mm=pupils_mm[:, None, None],
-        accommodation_dpt=used_dpt[:, None],
-        wavelength_nm=spec.channel_wavelengths_nm,
-    )
-    check_defocus(at_infinity_dpt)
-    at_nodes_dpt = at_infinity_dpt[:, :, own_pupil][:, :, :, own_used]
-    lows = _over(at_infinity_dpt, 3, of_used, np.min)
-    highs = _over(at_infinity_dpt, 3, of_used, np.max)
+    at_node_dpt = at_infinity_dpt[:, :, own_pupil, own_used]
+    read_dpt = at_infinity_dpt[:, :, reads_pupil][:, :, :, reads_used]
+    lows, highs = read_dpt.min(axis=3), read_dpt.max(axis=3)
     if spec.blends_at_equal_blur:  # nodes are read at the defocus between them
         own_lows, own_highs = lows, highs
         for axis in (0, 1):
-            beside = _neighbours(lows.shape[axis])
-            lows = _over(lows, axis, beside, np.min)
-            highs = _over(highs, axis, beside, np.max)
+            lows = _over_neighbours(lows, axis, np.min)
+            highs = _over_neighbours(highs, axis, np.max)
         lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     objects_dpt = eye.vergence.vergence_dpt(_roomy(spec.object_ranges_dpt))
     near_far = np.stack([lows, highs], axis=-1)[..., None, :, :] + objects_dpt[:, None]
     # A pupil between two nodes reads both at equal blur, up to the other's own; one
     # with several foci reads them at the same defocus.
-    is_scaled = eye.rings is None
-    by = (p if is_scaled else np.ones(len(p)) for p in (pupils_mm, axes.pupils_mm))
-    of_reader, of_node = (p[:, None, None, None, None] for p in by)
-    scaled = near_far * of_reader
+    if eye.rings is None:
+        by = pupils_mm[reads_pupil] / pupils_mm[own_pupil]
+        near_far = near_far * by[:, None, None, None]
     ranges = np.stack(
-        [
-            _over(scaled[..., 0], 2, of_pupil, np.min),
-            _over(scaled[..., 1], 2, of_pupil, np.max),
-        ],
-        axis=-1,
+        [near_far[..., 0].min(axis=2), near_far[..., 1].max(axis=2)], axis=-1
     )
-    ranges /= of_node
     return ReadableDefocus(
-        ranges.reshape(-1, *ranges.shape[4:]),
-        (at_nodes_dpt - at_nodes_dpt[..., GREEN, None]).reshape(-1, 3),
+        ranges.reshape(-1, *ranges.shape[2:]),
+        (at_node_dpt - at_node_dpt[..., GREEN, None]).reshape(-1, 3),
     )
 
 
@@ -169,33 +171,31 @@ def _roomy(ranges_dpt: list[tuple[float, float]]) -> NDArray[np.float64]:
     return np.maximum(found, 0.0)
 
 
-Readers = tuple[NDArray[np.float64], list[list[int]], list[int]]
-
-
-def _readers(nodes: NDArray[np.float64], range_: tuple[float, float]) -> Readers:
-    """Values at which defocus is asked for, those that read each node, and the nodes.
-
-    The last two are indices into the first.
-    """
+def _readers(
+    nodes: NDArray[np.float64], range_: tuple[float, float], node: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
+    """Values at which to ask for defocus, which of them read a node, its place."""
     if len(nodes) > 1:
-        return nodes, _neighbours(len(nodes)), list(range(len(nodes)))
+        first = max(node - 1, 0)
+        values = nodes[first : node + 2]
+        return values, np.ones(values.size, bool), node - first
     values = np.unique(np.append(nodes, range_))
     # A measured wavefront has its node at rest, beside the range that is read.
-    read = np.flatnonzero((values >= range_[0]) & (values <= range_[1]))
-    return values, [read.tolist()], [int(np.searchsorted(values, nodes[0]))]
+    is_read = (values >= range_[0]) & (values <= range_[1])
+    return values, is_read, int(np.searchsorted(values, nodes[0]))
 
 
-def _neighbours(count: int) -> list[list[int]]:
-    """Return the indices of each node and of those beside it."""
-    return [list(range(max(i - 1, 0), min(i + 2, count))) for i in range(count)]
-
-
-def _over(
-    values: NDArray[np.float64], axis: int, groups: list[list[int]], extreme
+def _over_neighbours(
+    values: NDArray[np.float64], axis: int, extreme
 ) -> NDArray[np.float64]:
-    """Extremes of groups of indices along an axis."""
+    """Extremes of each field node and those beside it along an axis."""
+    count = values.shape[axis]
     return np.stack(
-        [extreme(values.take(own, axis), axis=axis) for own in groups], axis=axis
+        [
+            extreme(values.take(range(max(i - 1, 0), min(i + 2, count)), axis), axis)
+            for i in range(count)
+        ],
+        axis=axis,
     )
 
 

@@ -221,10 +221,10 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
     corner = [
         np.abs(nodes - values[:, None]).argmin(axis=1)
         for nodes, values in (
-            (plan.v_deg, states.v_deg),
-            (plan.h_deg, states.h_deg),
             (plan.pupils_mm, states.pupil_diameter_mm),
             (plan.accommodations_dpt, states.accommodation_dpt),
+            (plan.v_deg, states.v_deg),
+            (plan.h_deg, states.h_deg),
         )
     ]
     groups = np.ravel_multi_index(corner, plan.group_shape)
@@ -232,21 +232,22 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
     if not use.spec.blends_at_equal_blur:  # a group holds the range of its own field
         node = PupilStates(
             **vars(states)
-            | {"h_deg": plan.h_deg[corner[1]], "v_deg": plan.v_deg[corner[0]]}
+            | {"h_deg": plan.h_deg[corner[3]], "v_deg": plan.v_deg[corner[2]]}
         )
         own_dpt += use.vergence_dpt - states.total_defocus_dpt
         own_dpt += _at_infinity_dpt(use, node)
     channel = np.argmin(
         np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
     )
-    shift_dpt = plan.channel_shift_dpt[groups, channel]
-    scale = _blur_scale(use, plan.pupils_mm[corner[2]])
+    shift_dpt = plan.nodes.channel_shift_dpt[groups, channel]
+    scale = _blur_scale(use, plan.pupils_mm[corner[0]])
     read_dpt = (states.total_defocus_dpt + own_dpt) * scale - shift_dpt
-    lower, upper, share = plan.defocus.bracket(groups, read_dpt)
+    defocus = plan.nodes.defocus
+    lower, upper, share = defocus.bracket(groups, read_dpt)
     columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
     columns["total_defocus_dpt"] = np.concatenate(
         [
-            (plan.defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
+            (defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
             for index in (lower, upper)
         ]
     )

@@ -1,9 +1,7 @@
 """PSFs on the nodes of a plan: computed on demand, packed, read for a frame.
 
 eye_for_spec         the eye of a profile, for what a cache covers
-node_wavefronts      wavefronts of a plan's nodes
 compute_kernels      from nodes to packed kernels
-wide_primaries       kernels of primaries of two wavelengths
 psf_engine           in C, or in Python
 native_psfs          the engine in C
 boxes                what kernels are cut to

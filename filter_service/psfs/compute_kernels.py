@@ -2,6 +2,7 @@
 
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -13,30 +14,28 @@ from estimator.threads import thread_count
 from filter_service.constants import RGB
 from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan
+from filter_service.planning.node_wavefronts import NodeWavefronts
+from filter_service.planning.nodes import PlanNodes
 from filter_service.planning.slopes import apodisation
 from filter_service.psfs.native_psfs import MAX_PRIMARIES, NodeRings
-from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import PsfEngine
-from filter_service.psfs.wide_primaries import mean_batch
 
 
 def computed_kernels(
     eye: EyeOptics,
     spec: GridSpec,
-    plan: CachePlan,
-    wavefronts: NodeWavefronts,
+    nodes: PlanNodes,
     psfs: NDArray[np.int64],
     engine: PsfEngine,
     rings: NodeRings | None = None,
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute some PSFs of a plan.
+    """Compute some PSFs of nodes.
 
     Parameters
     ----------
     psfs : (n,)
-        Numbers: node n of the plan and channel c have PSF 3 n + c.
+        Numbers: node n and channel c have PSF 3 n + c.
     rings : NodeRings, optional
         Those of the eye at the nodes.
 
@@ -54,9 +53,10 @@ def computed_kernels(
     ValueError
         No light arrives within a kernel.
     """
-    groups, channels = plan.defocus.group_at(psfs // RGB), psfs % RGB
-    total_dpt = plan.defocus.values_dpt[psfs // RGB]
-    total_dpt = total_dpt + plan.channel_shift_dpt[groups, channels]
+    groups, channels = nodes.defocus.group_at(psfs // RGB), psfs % RGB
+    total_dpt = nodes.defocus.values_dpt[psfs // RGB]
+    total_dpt = total_dpt + nodes.channel_shift_dpt[groups, channels]
+    wavefronts = nodes.wavefronts
     asked = groups, channels, total_dpt
     generic = partial(generic_kernels, eye, spec, wavefronts, engine)
     native = engine.native
@@ -122,3 +122,33 @@ def _methods(batch: PsfBatch) -> Counter[str]:
     by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
     counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
     return Counter({name: number for name, number in counts.items() if number})
+
+
+def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
+    """Return a batch (P,) of the means of so many kernels each, of (count P,)."""
+    if count == 1:
+        return batch
+
+    def of_each(values: np.ndarray) -> np.ndarray:
+        return values.reshape(-1, count)
+
+    radius_px = of_each(batch.radius_px).max(axis=1)
+    sides = 2 * radius_px + 1
+    offsets = np.concatenate([[0], np.cumsum(sides**2)])
+    kernels = np.zeros(offsets[-1], np.float32)
+    for p, radius in enumerate(radius_px.tolist()):
+        side = 2 * radius + 1
+        total = kernels[offsets[p] : offsets[p + 1]].reshape(side, side)
+        for k in range(count * p, count * (p + 1)):
+            psf = batch[k]
+            edge = radius - psf.radius_px
+            total[edge : side - edge, edge : side - edge] += psf.kernel / count
+    return replace(
+        batch,
+        flat_kernels=kernels,
+        offset_count=offsets[:-1],
+        radius_px=radius_px,
+        lost_energy_ratio=of_each(batch.lost_energy_ratio).mean(axis=1),
+        blur_radius_px=of_each(batch.blur_radius_px).mean(axis=1),
+        geometric_ratio=of_each(batch.geometric_ratio).mean(axis=1),
+    )

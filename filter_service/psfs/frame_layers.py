@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.optics.vergence import ObjectVergence
 from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
-from filter_service.planning.nodes import CachePlan
+from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
 from filter_service.psfs.read_kernels import StateReads
@@ -107,8 +107,8 @@ def frame_layers(
     )
     layer_zero_dpt = at_infinity_dpt - store.defocus.change_at_nodes_dpt(change)
     corners = _corners(plan, pupil_mm, accommodation_dpt)
-    notes += _limit_notes(store, corners)
     reads = _state_reads(store, pupil_mm, corners)
+    notes += _limit_notes(store, reads.groups)
     far_dpt, near_dpt = object_range_dpt or store.spec.object_range_dpt
     far_near_dpt = (
         float(eye.vergence.vergence_dpt(far_dpt)),
@@ -164,11 +164,9 @@ def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64
     return (vergences_dpt + change.range_dpt).ravel()
 
 
-def _limit_notes(store: PsfStore, corners: tuple) -> tuple[str, ...]:
-    if not store.plan.has_limits:
-        return ()
-    limited = store.plan.is_limited.reshape(store.plan.group_shape)
-    if not any(limited[:, :, pupil, used].any() for pupil, used, _ in corners):
+def _limit_notes(store: PsfStore, groups: NDArray[np.int64]) -> tuple[str, ...]:
+    count = store.fields_count
+    if not any(store.nodes.is_limited[g : g + count].any() for g in groups.tolist()):
         return ()
     return (
         f"blur beyond {store.spec.max_blur_radius_px} px, in part of the field, is "
@@ -192,7 +190,7 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
 
 
 def _corners(
-    plan: CachePlan, pupil_mm: float, accommodation_dpt: float
+    plan: PlanAxes, pupil_mm: float, accommodation_dpt: float
 ) -> tuple[tuple[int, int, float], ...]:
     """Nodes of pupil and accommodation around a state, and their weights.
 
@@ -238,12 +236,11 @@ def _in_focus_dpt(
 
 def _state_reads(store: PsfStore, pupil_mm: float, corners: tuple) -> StateReads:
     plan = store.plan
-    n_used = plan.accommodations_dpt.size
     scales = np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners])
     if store.eye.rings is not None:  # foci stay where they are in any pupil
         scales = np.ones(len(corners))
     return StateReads(
-        groups=np.array([pupil * n_used + used for pupil, used, _ in corners]),
+        groups=store.groups_of([(pupil, used) for pupil, used, _ in corners]),
         scales=scales,
         weights=np.array([weight for _, _, weight in corners]),
     )

@@ -30,8 +30,8 @@ from filter_service.native.records import (
     PsfTables,
     pointer_to,
 )
+from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.boxes import SIDES
-from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import (
     CUT_STEPS,
     MAX_CENTROID_SHIFT_RATIO,

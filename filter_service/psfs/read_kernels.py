@@ -1,9 +1,20 @@
 """How an eye's state reads its cache: the plain arrays that `read_loops.py` takes."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from filter_service.constants import RGB
+from filter_service.planning.nodes import PlanNodes
+
+OF_PSFS = (
+    *("offsets", "reach_words", "radius_px", "spread_px", "peak_ratio"),
+    *("is_computed", "last_used"),
+)
+"""Tables that computed PSFs fill in."""
 
 
 class StoreTables(NamedTuple):
@@ -11,12 +22,10 @@ class StoreTables(NamedTuple):
 
     Attributes
     ----------
-    values_dpt, keys_dpt : (n_nodes,)
+    values_dpt : (n_nodes,)
     starts : (n_groups + 1,)
-    lowest_dpt, span_dpt : float
         See `RaggedNodes`.
     channel_shift_dpt : (n_groups, 3)
-    groups_per_field : int
     offsets : (n_psfs,)
     reach_words : (n_psfs,)
         Four reaches, a byte a side.
@@ -29,12 +38,8 @@ class StoreTables(NamedTuple):
     """
 
     values_dpt: NDArray[np.float64]
-    keys_dpt: NDArray[np.float64]
     starts: NDArray[np.int64]
-    lowest_dpt: float
-    span_dpt: float
     channel_shift_dpt: NDArray[np.float64]
-    groups_per_field: int
     offsets: NDArray[np.uint32]
     reach_words: NDArray[np.uint32]
     radius_px: NDArray[np.int32]
@@ -44,6 +49,39 @@ class StoreTables(NamedTuple):
     is_computed: NDArray[np.bool_]
     last_used: NDArray[np.uint32]
 
+    @classmethod
+    def empty(cls) -> StoreTables:
+        """Return the tables of no node."""
+        none = np.zeros(0)
+        return cls(
+            values_dpt=none,
+            starts=np.zeros(1, np.int64),
+            channel_shift_dpt=np.zeros((0, RGB)),
+            offsets=none.astype(np.uint32),
+            reach_words=none.astype(np.uint32),
+            radius_px=none.astype(np.int32),
+            blur_px=none.astype(np.float32),
+            spread_px=none.astype(np.float32),
+            peak_ratio=none.astype(np.float32),
+            is_computed=none.astype(np.bool_),
+            last_used=none.astype(np.uint32),
+        )
+
+    def grown(self, nodes: PlanNodes) -> StoreTables:
+        """Return tables of nodes that begin with those of these; no PSF is computed."""
+        more = len(nodes.blur_px) - self.offsets.size
+        return StoreTables(
+            values_dpt=np.array(nodes.defocus.values_dpt, np.float64),
+            starts=np.array(nodes.defocus.starts, np.int64),
+            channel_shift_dpt=np.array(nodes.channel_shift_dpt, np.float64, order="C"),
+            blur_px=np.array(nodes.blur_px, np.float32),
+            **{
+                name: np.append(known, np.zeros(more, known.dtype))
+                for name, known in self._asdict().items()
+                if name in OF_PSFS
+            },
+        )
+
 
 class StateReads(NamedTuple):
     """Cached neighbours in pupil and accommodation that a state reads.
@@ -51,7 +89,7 @@ class StateReads(NamedTuple):
     Attributes
     ----------
     groups : (n_corners,)
-        Group of each neighbour, counted from the first of a field node.
+        Group of each neighbour at the first field node; those at the others follow.
     scales : (n_corners,)
         Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i
         is read at total defocus t A / A_i, so no blended pair differs in size.

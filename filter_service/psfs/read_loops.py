@@ -24,12 +24,11 @@ def bracket(tables, group, t, start):
     upper one of the last and smaller t, which is mostly the one that is sought, where
     the halves of an interval are guessed wrongly every other time.
     """
-    values_dpt, keys_dpt = tables.values_dpt, tables.keys_dpt
+    values_dpt = tables.values_dpt
     first, last = tables.starts[group], tables.starts[group + 1] - 1
     t = clipped(t, values_dpt[first], values_dpt[last])
-    key = t - tables.lowest_dpt + tables.span_dpt * group
     upper = max(start, min(first + 1, last))
-    while upper < last and keys_dpt[upper] < key:
+    while upper < last and values_dpt[upper] < t:
         upper += 1
     lower = max(upper - 1, first)
     span = values_dpt[upper] - values_dpt[lower]
@@ -44,7 +43,7 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
     found_px = np.zeros((n_fields * RGB, at_dpt.size))
     for field in range(n_fields):
         for corner in range(reads.groups.size):
-            group = field * tables.groups_per_field + reads.groups[corner]
+            group = reads.groups[corner] + field
             weight, scale = reads.weights[corner], reads.scales[corner]
             for channel in range(RGB):
                 of_layer = found_px[field * RGB + channel]
@@ -62,19 +61,19 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def channel_taps(tables, reads, group, channel, total_dpt, uppers, psfs, weights):
+def channel_taps(tables, reads, field, channel, total_dpt, uppers, psfs, weights):
     """PSFs and weights (2 n_corners,) that make up one channel of a total defocus.
 
     Parameters
     ----------
-    group : int
-        First of the field node.
+    field : int
+        Number of the field node.
     uppers : (n_corners,)
         Upper nodes of a smaller total defocus, or the groups' first; brought up to
         date.
     """
     for corner in range(reads.groups.size):
-        own = group + reads.groups[corner]
+        own = reads.groups[corner] + field
         t = total_dpt * reads.scales[corner] - tables.channel_shift_dpt[own, channel]
         lower, upper, share = bracket(tables, own, t, uppers[corner])
         uppers[corner] = upper

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property, partial
+from itertools import product
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -23,15 +25,15 @@ from filter_service.errors import (
     OutOfMemory,
 )
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan
+from filter_service.planning.nodes import CachePlan, PlanAxes, PlanNodes
 from filter_service.psfs.boxes import pack_reach, unpack_reach
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.read_kernels import StoreTables
 
 if TYPE_CHECKING:  # they load numba, and the service gets ready before
     from estimator.profiles.parse import EyeProfile
+    from filter_service.planning.plan import NodePlanner
     from filter_service.psfs.native_psfs import NodeRings
-    from filter_service.psfs.node_wavefronts import NodeWavefronts
     from filter_service.psfs.pack import PackedKernels
     from filter_service.psfs.psf_engine import PsfEngine
 
@@ -44,24 +46,31 @@ KEPT_AFTER_EVICTION = 0.7
 moving the others together costs about 0.1 ms a megabyte."""
 
 
+State = tuple[int, int]
+"""Numbers of a plan's nodes of pupil and accommodation."""
+
+
 class PsfStore:
     """Kernels over field, pupil, accommodation, total defocus and channel.
 
-    Node n of ``plan.defocus`` and channel c have PSF 3 n + c.  Nodes depend on eye,
-    camera and settings alone; their kernels are computed by `fill`.
+    Node n of ``nodes`` and channel c have PSF 3 n + c.  What a node is depends on eye,
+    camera and settings alone, its number on which states were read before; kernels are
+    computed by `fill`.
 
     Parameters
     ----------
     eye : EyeOptics
     spec : GridSpec
-    plan : CachePlan
-        Where the nodes are.
+    plan : PlanAxes
+        Where the nodes are but for defocus: those of a state are planned when it is
+        first read (`groups_of`).  Or a `CachePlan`, which holds all of them.
     engine : PsfEngine, optional
         Computes the PSFs; that of `psf_engine` where it is None.
-    wavefronts : NodeWavefronts, optional
 
     Attributes
     ----------
+    nodes : PlanNodes
+        Of the states that were read; a state's groups [v, h] are beside each other.
     tables : StoreTables
         For each PSF: whether it is computed, where its kernel lies, how large it is.
     frame_number : int
@@ -72,39 +81,19 @@ class PsfStore:
         PSFs by the method that computed the larger share of each.
     """
 
+    nodes: PlanNodes
+
     def __init__(
         self,
         eye: EyeOptics,
         spec: GridSpec,
-        plan: CachePlan,
+        plan: PlanAxes,
         *,
         engine: PsfEngine | None = None,
-        wavefronts: NodeWavefronts | None = None,
     ) -> None:
         self.eye, self.spec, self.plan, self.engine = eye, spec, plan, engine
-        count = RGB * plan.defocus.values_dpt.size
-        if wavefronts is None:
-            from filter_service.psfs.node_wavefronts import NodeWavefronts
-
-            wavefronts = NodeWavefronts.of(eye, spec, plan)
-        self.wavefronts = wavefronts
-        self.tables = StoreTables(
-            values_dpt=np.array(plan.defocus.values_dpt, np.float64),
-            keys_dpt=np.array(plan.defocus.keys_dpt, np.float64),
-            starts=np.array(plan.defocus.starts, np.int64),
-            lowest_dpt=plan.defocus.lowest_dpt,
-            span_dpt=plan.defocus.span_dpt,
-            channel_shift_dpt=np.array(plan.channel_shift_dpt, np.float64, order="C"),
-            groups_per_field=plan.pupils_mm.size * plan.accommodations_dpt.size,
-            offsets=np.zeros(count, np.uint32),
-            reach_words=np.zeros(count, np.uint32),
-            radius_px=np.zeros(count, np.int32),
-            blur_px=np.array(plan.blur_px, np.float32),
-            spread_px=np.zeros(count, np.float32),
-            peak_ratio=np.zeros(count, np.float32),
-            is_computed=np.zeros(count, np.bool_),
-            last_used=np.zeros(count, np.uint32),
-        )
+        self.tables = StoreTables.empty()
+        self._first_groups: dict[State, int] = {}
         self.methods: Counter[str] = Counter()
         self.max_lost_energy_ratio = 0.0
         self.build_ms = 0.0
@@ -113,19 +102,16 @@ class PsfStore:
         self._words = np.empty(0, np.uint16)
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
+        if isinstance(plan, CachePlan):
+            self._add_nodes(self._states, plan.nodes)
 
     @property
     def parts(self) -> dict[str, Any]:
         """Arguments that make an equal store without kernels."""
-        return {
-            "eye": self.eye,
-            "spec": self.spec,
-            "plan": self.plan,
-            "wavefronts": self.wavefronts,
-        }
+        return {"eye": self.eye, "spec": self.spec, "plan": self.plan}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the parts alone: kernels are computed again on demand."""
+        """Pickle the parts alone: all else is computed again on demand."""
         return partial(type(self), **self.parts), ()
 
     @classmethod
@@ -140,6 +126,62 @@ class PsfStore:
         found = cls(eye, spec, plan)
         found._append(np.arange(found.psf_count), packed)
         return found
+
+    # Nodes
+
+    @property
+    def _states(self) -> list[State]:
+        """All states of the plan, in its order."""
+        n_pupils, n_used = self.plan.group_shape[:2]
+        return list(product(range(n_pupils), range(n_used)))
+
+    @property
+    def fields_count(self) -> int:
+        """Number of field nodes, which is that of a state's groups."""
+        return len(self.plan.v_deg) * len(self.plan.h_deg)
+
+    def groups_of(self, states: Sequence[State]) -> NDArray[np.int64]:
+        """Return the group (n,) of each state's first field node.
+
+        Parameters
+        ----------
+        states : sequence of (pupil, accommodation)
+            Numbers of nodes; states that are read for the first time are planned.
+
+        Raises
+        ------
+        GridTooLarge
+            A state needs too many PSFs at one place.
+        BuildFailed
+            No PSF can be computed for a state of this eye.
+        """
+        new = [state for state in states if state not in self._first_groups]
+        if new:
+            with self._states_of_eye():
+                planned = [self._planner.nodes(*state) for state in new]
+            self._add_nodes(new, PlanNodes.joined(planned))
+        return np.array([self._first_groups[state] for state in states])
+
+    def plan_all(self) -> None:
+        """Plan the nodes of all states, those that no frame has read yet, too."""
+        self.groups_of(self._states)
+
+    @cached_property
+    def _planner(self) -> NodePlanner:
+        from filter_service.planning.plan import NodePlanner
+
+        return NodePlanner(self.eye, self.spec, self.plan)
+
+    def _add_nodes(self, states: list[State], new: PlanNodes) -> None:
+        if self._first_groups:
+            new = PlanNodes.joined([self.nodes, new])
+        first = len(self._first_groups) * self.fields_count
+        for state in states:
+            self._first_groups[state] = first
+            first += self.fields_count
+        # Frames that were begun may still read the old arrays.
+        self.nodes, self.tables = new, self.tables.grown(new)
+        self._rings = None
 
     # Kernels
 
@@ -178,13 +220,15 @@ class PsfStore:
         OutOfMemory
             They exceed ``spec.memory_budget_mb`` together.
         """
-        from estimator.psf.compute import PsfTooLarge
         from filter_service.psfs.compute_kernels import computed_kernels
         from filter_service.psfs.psf_engine import psf_engine
 
         self.engine = self.engine or psf_engine()
         started_s = time.perf_counter()
-        psfs = np.arange(self.psf_count) if psfs is None else np.unique(psfs)
+        if psfs is None:
+            self.plan_all()
+            psfs = np.arange(self.psf_count)
+        psfs = np.unique(psfs)
         if not self.spec.settings.chromatic:  # channels share kernels
             psfs = RGB * np.unique(psfs // RGB)
         psfs = psfs[~self.tables.is_computed[psfs]]
@@ -194,23 +238,11 @@ class PsfStore:
             batch = batch[~self.tables.is_computed[batch]]  # a frame between may have
             if not batch.size:
                 continue
-            try:
+            with self._states_of_eye():
                 packed, methods = computed_kernels(
-                    *(self.eye, self.spec, self.plan, self.wavefronts),
-                    *(batch, self.engine, self._rings),
+                    *(self.eye, self.spec, self.nodes),
+                    *(batch, self.engine, self._node_rings()),
                 )
-            except PsfTooLarge as error:
-                raise GridTooLarge(
-                    str(error),
-                    field="settings.pupil_range_mm",
-                    allowed="a smaller pupil, other objects or fewer pixels per degree",
-                ) from error
-            except ValueError as error:
-                raise BuildFailed(
-                    f"no PSFs can be computed for this eye ({error})",
-                    field="settings",
-                    allowed="ranges, and a camera, that this eye can be seen through",
-                ) from error
             self.methods += methods
             if not self.spec.settings.chromatic:
                 batch = batch + np.arange(RGB)[:, None]
@@ -225,13 +257,33 @@ class PsfStore:
                 raise NotPrepared
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
 
-    @cached_property
-    def _rings(self) -> NodeRings | None:
+    def _node_rings(self) -> NodeRings | None:
         """Rings of the eye's lens at the nodes, tabulated when they are needed."""
         from filter_service.psfs.native_psfs import NodeRings
 
-        rings = self.eye.rings
-        return None if rings is None else NodeRings.of(rings, self.wavefronts)
+        if self._rings is None and self.eye.rings is not None:
+            self._rings = NodeRings.of(self.eye.rings, self.nodes.wavefronts)
+        return self._rings
+
+    @contextmanager
+    def _states_of_eye(self) -> Iterator[None]:
+        """Say what clients can do about states of an eye that have no PSFs."""
+        from estimator.psf.compute import PsfTooLarge
+
+        try:
+            yield
+        except PsfTooLarge as error:
+            raise GridTooLarge(
+                str(error),
+                field="settings.pupil_range_mm",
+                allowed="a smaller pupil, other objects or fewer pixels per degree",
+            ) from error
+        except ValueError as error:
+            raise BuildFailed(
+                f"no PSFs can be computed for this eye ({error})",
+                field="settings",
+                allowed="ranges, and a camera, that this eye can be seen through",
+            ) from error
 
     def _append(self, psfs: NDArray[np.int64], packed: PackedKernels) -> None:
         """Add kernels (n,) of PSFs (n,), or of several that share each (m, n)."""
@@ -381,7 +433,7 @@ class PsfStore:
 
     @property
     def psf_count(self) -> int:
-        """Number of nodes times channels, computed or not."""
+        """Number of planned nodes times channels, computed or not."""
         return int(self.tables.offsets.size)
 
     @property

@@ -81,6 +81,7 @@ class FrameStore:
                     f"the PSFs of all ranges take more than {self.memory_mb:.0f} MB",
                     allowed='narrower ranges, or "prepare": "stream"',
                 )
+            self.store.plan_all()
             return np.flatnonzero(~self.store.tables.is_computed)
         return psfs_for(self.store, use, self._cells_at, state=state)
 

@@ -108,10 +108,9 @@ def fill_recipes(
     psfs, weights = np.empty(n_taps, np.int64), np.empty(n_taps)
     uppers = np.empty((RGB, reads.groups.size), np.int64)
     for n in range(fields.size):
-        group = fields[n] * tables.groups_per_field
         if n == 0 or fields[n] != fields[n - 1]:
             for corner in range(reads.groups.size):
-                first = tables.starts[group + reads.groups[corner]]
+                first = tables.starts[reads.groups[corner] + fields[n]]
                 for channel in range(RGB):
                     uppers[channel, corner] = first
         left = right = up = down = widest_px = 0
@@ -119,7 +118,7 @@ def fill_recipes(
         for channel in range(RGB):
             total = total_dpt[n, channel]
             taken = uppers[channel], psfs, weights
-            channel_taps(tables, reads, group, channel, total, *taken)
+            channel_taps(tables, reads, fields[n], channel, total, *taken)
             peak = spread = 0.0
             for tap in range(n_taps):
                 psf, weight = psfs[tap], weights[tap]

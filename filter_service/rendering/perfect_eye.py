@@ -6,8 +6,10 @@ from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
-from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan, RaggedNodes
+from filter_service.planning.grid import GREEN, GridSpec
+from filter_service.planning.node_wavefronts import NodeWavefronts
+from filter_service.planning.nodes import CachePlan, PlanNodes, RaggedNodes
+from filter_service.planning.slopes import PupilStates
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import FrameEngine
@@ -75,11 +77,14 @@ def perfect_store(camera: Camera) -> PsfStore:
         v_deg=np.zeros(1),
         pupils_mm=np.array([PUPIL_MM]),
         accommodations_dpt=np.zeros(1),
-        defocus=RaggedNodes.of([np.zeros(1)]),
-        channel_shift_dpt=np.zeros((1, RGB)),
-        prediction=None,
-        blur_px=np.zeros(RGB, np.float32),
-        is_limited=np.zeros(1, bool),
+        nodes=PlanNodes(
+            defocus=RaggedNodes.of([np.zeros(1)]),
+            channel_shift_dpt=np.zeros((1, RGB)),
+            blur_px=np.zeros(RGB, np.float32),
+            is_limited=np.zeros(1, bool),
+            shrink_ratio=np.ones(1),
+            wavefronts=NodeWavefronts.of(eye, spec, _at_rest(spec)),
+        ),
     )
     one = np.ones(RGB)
     packed = PackedKernels(
@@ -92,3 +97,15 @@ def perfect_store(camera: Camera) -> PsfStore:
         lost_energy_ratio=0.0 * one,
     )
     return PsfStore.of_kernels(eye, spec, plan, packed)
+
+
+def _at_rest(spec: GridSpec) -> PupilStates:
+    """Return the one state of the perfect eye."""
+    return PupilStates.of(
+        h_deg=np.zeros(1),
+        v_deg=0.0,
+        pupil_diameter_mm=PUPIL_MM,
+        accommodation_dpt=0.0,
+        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
+        total_defocus_dpt=0.0,
+    )

@@ -4,6 +4,8 @@ Importing numba and scipy and reading the compiled loops takes 1 s, which a serv
 spends after it is ready; compiling them, once on a machine, 10 s.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from estimator.field.defocus_loops import N_DEGREES, fill_defocus, weights_at
@@ -11,7 +13,9 @@ from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
+from filter_service.planning.plan import NodePlanner
 from filter_service.psfs.frame_layers import frame_layers
+from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
     frame_kernels,
@@ -44,6 +48,7 @@ def plan_once() -> None:
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
+    _plan_nodes_once(store)
     _tell_pairs_once()
     _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
@@ -51,6 +56,13 @@ def plan_once() -> None:
     seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
     MediaEffects(Straylight()).change(light, view)
     encoded(light, "srgb8")
+
+
+def _plan_nodes_once(store: PsfStore) -> None:
+    """Of a state over the field, as frames have them planned."""
+    spec = store.spec.with_settings(mode="dynamic")
+    axes = replace(store.plan, nodes=None, h_deg=np.arange(2.0), defocus_error=1e-3)
+    NodePlanner(store.eye, spec, axes).nodes(0, 0)
 
 
 def _tell_pairs_once() -> None:

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.psf.reference import reference_kernel
 from filter_service.constants import RGB
+from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import computed_kernels, generic_kernels
-from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.psf_engine import PYTHON, psf_engine
 from filter_service.psfs.store import PsfStore
@@ -149,21 +149,21 @@ def lattice_rows(eye_name: str, count: int) -> list[Row]:
     psfs = (30 * np.sort(first)[:, None] + np.arange(30)).ravel()
     engines = {
         name: lambda some, engine=engine: computed_kernels(
-            eye, spec, plan, store.wavefronts, some, engine
+            eye, spec, store.nodes, some, engine
         )[0]
         for name, engine in (("C", psf_engine()), ("twin", PYTHON))
     }
 
     def total_dpt(some):
-        groups = plan.defocus.group_at(some // RGB)
-        shift = plan.channel_shift_dpt[groups, some % RGB]
-        return plan.defocus.values_dpt[some // RGB] + shift
+        groups = plan.nodes.defocus.group_at(some // RGB)
+        shift = plan.nodes.channel_shift_dpt[groups, some % RGB]
+        return plan.nodes.defocus.values_dpt[some // RGB] + shift
 
     return rows_of(
         f"lattice {eye_name}",
-        store.wavefronts,
+        store.nodes.wavefronts,
         total_dpt,
-        lambda some: plan.defocus.group_at(some // RGB),
+        lambda some: plan.nodes.defocus.group_at(some // RGB),
         psfs,
         engines,
     )

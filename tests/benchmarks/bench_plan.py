@@ -151,7 +151,7 @@ def rows_of(name, spec, setting, *, n_states, n_psfs, case_errors=None) -> list[
 
 
 def _shape(plan: CachePlan) -> str:
-    n_v, n_h, n_pupils, n_used = plan.group_shape
+    n_pupils, n_used, n_v, n_h = plan.group_shape
     return f"{n_h} x {n_v} x {n_pupils} x {n_used}"
 
 

@@ -65,5 +65,7 @@ def _store(kernel, camera, spread_px):
         peak_ratio=kernel.max() * one,
         lost_energy_ratio=0.0 * one,
     )
-    plan = replace(perfect.plan, blur_px=np.full(RGB, radius_px, np.float32))
+    blur_px = np.full(RGB, radius_px, np.float32)
+    nodes = replace(perfect.nodes, blur_px=blur_px)
+    plan = replace(perfect.plan, nodes=nodes)
     return PsfStore.of_kernels(perfect.eye, perfect.spec, plan, packed)

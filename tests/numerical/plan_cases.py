@@ -200,12 +200,13 @@ def _corners(eye, spec, plan, states, object_dpt, axes):
                 weights.append(share)
                 continue
             group = np.ravel_multi_index(
-                (v_index, h_index, pupil_index, used_index), plan.group_shape
+                (pupil_index, used_index, v_index, h_index), plan.group_shape
             )
-            shift_dpt = plan.channel_shift_dpt[group, channel]
-            lower, upper, part = plan.defocus.bracket(group, at_dpt - shift_dpt)
+            shift_dpt = plan.nodes.channel_shift_dpt[group, channel]
+            defocus = plan.nodes.defocus
+            lower, upper, part = defocus.bracket(group, at_dpt - shift_dpt)
             for index, t_share in ((lower, 1 - part), (upper, part)):
-                node_dpt = plan.defocus.values_dpt[index] + shift_dpt
+                node_dpt = defocus.values_dpt[index] + shift_dpt
                 found.append(columns | {"total_defocus_dpt": node_dpt})
                 weights.append(share * t_share)
     return _Corners(
@@ -312,7 +313,7 @@ def _grid_errors(eye, spec, plan, count, seed, share):
         return (1.0 - share) * nodes[lower] + share * nodes[lower + 1]
 
     # A node of the defocus groups is one distance, in green, at all of the paper's.
-    n_distances = int(plan.defocus.counts[0])
+    n_distances = int(plan.nodes.defocus.counts[0])
     object_dpt = between(np.linspace(*DISTANCES_DPT, n_distances))
     wavelengths_nm = spec.channel_wavelengths_nm
     known = {

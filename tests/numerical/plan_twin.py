@@ -23,14 +23,13 @@ from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, UNMOVED
 
 def neighbours(store, reads, fields, total_dpt):
     """PSFs and weights (n, 3, 2 n_corners) of states (n, 3) at fields (n,)."""
-    plan = store.plan
-    n_groups = plan.pupils_mm.size * plan.accommodations_dpt.size
+    nodes = store.nodes
     channels = np.arange(RGB)
     psfs, weights = [], []
     for group, scale, weight in zip(*reads, strict=True):
-        groups = fields * n_groups + group
-        lower, upper, share = plan.defocus.bracket(
-            groups[:, None], total_dpt * scale - plan.channel_shift_dpt[groups]
+        groups = fields + group
+        lower, upper, share = nodes.defocus.bracket(
+            groups[:, None], total_dpt * scale - nodes.channel_shift_dpt[groups]
         )
         psfs += [RGB * lower + channels, RGB * upper + channels]
         weights += [weight * (1.0 - share), weight * share]

@@ -40,9 +40,9 @@ def store_for(name, model="traced", **settings):
     measured = MeasuredWavefront.from_profile(profile)
     eye = traced_eye(name, spec) if model == "traced" else measured
     plan = unchecked_plan(eye, spec)
-    count = RGB * plan.defocus.values_dpt.size
+    count = RGB * plan.nodes.defocus.values_dpt.size
     rng = np.random.default_rng(count)
-    node_px = np.abs(np.repeat(plan.defocus.values_dpt, RGB)) * 4.0
+    node_px = np.abs(np.repeat(plan.nodes.defocus.values_dpt, RGB)) * 4.0
     packed = PackedKernels(
         weights=np.zeros(1, np.uint16),
         offsets=np.cumsum(rng.integers(1, 900, count)),
@@ -53,7 +53,8 @@ def store_for(name, model="traced", **settings):
         lost_energy_ratio=np.zeros(count),
     )
     blur_px = (node_px + rng.random(count)).astype(np.float32)
-    return PsfStore.of_kernels(eye, spec, replace(plan, blur_px=blur_px), packed)
+    plan = replace(plan, nodes=replace(plan.nodes, blur_px=blur_px))
+    return PsfStore.of_kernels(eye, spec, plan, packed)
 
 
 CASES = {

@@ -14,17 +14,16 @@ from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.reference import reference_kernel
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.native.library import Library, library_path
+from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.boxes import square_kernel
-from filter_service.psfs.compute_kernels import pack_pool
+from filter_service.psfs.compute_kernels import mean_batch, pack_pool
 from filter_service.psfs.native_psfs import (
     NativePsfs,
     NodeRings,
     fft_lengths,
     native_psfs,
 )
-from filter_service.psfs.node_wavefronts import NodeWavefronts
 from filter_service.psfs.pack import pack_kernels
-from filter_service.psfs.wide_primaries import mean_batch
 from tests.numerical.psf_cases import CASE_NAMES, case_zernike_um
 
 RGB_NM = np.array([[610.0], [536.0], [460.0]])

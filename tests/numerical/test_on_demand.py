@@ -8,7 +8,7 @@ import pytest
 
 from filter_service.errors import BuildFailed, NotPrepared, OutOfMemory
 from filter_service.planning.cost import states_of
-from filter_service.planning.plan import unchecked_plan
+from filter_service.planning.plan import plan_axes, unchecked_plan
 from filter_service.planning.slopes import state_survey
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore, build_psf_store
@@ -46,6 +46,13 @@ def known():
 
 
 @pytest.fixture(scope="module")
+def streamed(known):
+    """The same, whose states are planned when they are first read."""
+    eye, spec, _ = known
+    return eye, spec, plan_axes(eye, spec)
+
+
+@pytest.fixture(scope="module")
 def views():
     rng = np.random.default_rng(3)
     color = (255 * texture(rng, HEIGHT, WIDTH, cell_px=3)).astype(np.uint8)
@@ -76,25 +83,48 @@ def alone(known, views):
     return [pictures(NativeRenderer(), PsfStore(*known), [one])[0] for one in asked]
 
 
-def test_a_frame_is_the_same_after_any_others(known, views, alone):
+def test_a_frame_is_the_same_after_any_others(streamed, views, alone):
     from filter_service.rendering.native import NativeRenderer
 
     asked = frames(views)
-    store = PsfStore(*known)
+    store = PsfStore(*streamed)
     assert pictures(NativeRenderer(), store, asked) == alone
     assert pictures(NativeRenderer(), store, asked[::-1]) == alone[::-1]
-    backwards = pictures(NativeRenderer(), PsfStore(*known), asked[::-1])
+    backwards = pictures(NativeRenderer(), PsfStore(*streamed), asked[::-1])
     assert backwards == alone[::-1]
 
 
-def test_a_frame_is_the_same_on_one_thread(known, views, alone):
+def test_nodes_do_not_depend_on_what_was_planned_before(known, streamed):
+    plan, store = known[2], PsfStore(*streamed)
+    n_pupils, n_used = plan.group_shape[:2]
+    states = [(p, a) for p in range(n_pupils) for a in range(n_used)]
+    for state in states[::-1]:
+        store.groups_of([state])
+    assert store.psf_count == len(plan.nodes.blur_px)
+    whole, found = plan.nodes, store.nodes
+    fields = np.arange(store.fields_count)
+    for number, first in enumerate(store.groups_of(states).tolist()):
+        for field in fields.tolist():
+            own, same = first + field, number * fields.size + field
+            one, other = (
+                nodes.defocus.values_dpt[slice(*nodes.defocus.starts[k : k + 2])]
+                for nodes, k in ((found, own), (whole, same))
+            )
+            np.testing.assert_array_equal(one, other)
+        own, same = first + fields, number * fields.size + fields
+        for name in ("zernike_um", "per_dpt_um", "pupil_ellipse", "pixel_from_mrad"):
+            one, other = (getattr(n.wavefronts, name) for n in (found, whole))
+            np.testing.assert_array_equal(one[own], other[same])
+
+
+def test_a_frame_is_the_same_on_one_thread(streamed, views, alone):
     from filter_service.psfs.native_psfs import NativePsfs, native_psfs
     from filter_service.psfs.psf_engine import psf_engine
     from filter_service.rendering.native import NativeRenderer
 
     library = native_psfs().library
     own = NativePsfs(library, library.new_threads(1))
-    store = PsfStore(*known, engine=replace(psf_engine(), native=own))
+    store = PsfStore(*streamed, engine=replace(psf_engine(), native=own))
     found = pictures(NativeRenderer(n_threads=1), store, frames(views))
     library.end_threads(own.threads)
     assert found == alone
@@ -109,10 +139,10 @@ def test_a_frame_is_the_same_with_every_psf_computed_before(known, views, alone)
     assert pictures(NativeRenderer(), whole, frames(views)) == alone
 
 
-def test_a_frame_is_the_same_when_its_psfs_were_evicted(known, views, alone):
+def test_a_frame_is_the_same_when_its_psfs_were_evicted(streamed, views, alone):
     from filter_service.rendering.native import NativeRenderer
 
-    eye, spec, plan = known
+    eye, spec, plan = streamed
     store, renderer = PsfStore(eye, spec, plan), NativeRenderer()
     handle = renderer.load(store)
     for (view, state), expected in zip(frames(views), alone, strict=True):
@@ -124,14 +154,14 @@ def test_a_frame_is_the_same_when_its_psfs_were_evicted(known, views, alone):
     assert store.generation == len(alone) - 1  # the first time there was nothing
 
 
-def test_the_gl_engine_shows_the_same_after_any_others(known, views, gpu):
+def test_the_gl_engine_shows_the_same_after_any_others(streamed, views, gpu):
     from filter_service.rendering.gl import FilterRenderer
 
     asked = [(view, STATES[k]) for view in views[:2] for k in (0, 2)]
 
     def colors(order):
         renderer = FilterRenderer(gpu)
-        handle = renderer.load(PsfStore(*known))
+        handle = renderer.load(PsfStore(*streamed))
         found = [renderer.render(v, handle, **s).color.copy() for v, s in order]
         handle.release()
         return found
@@ -196,10 +226,10 @@ def test_a_frame_without_time_says_so_and_the_next_goes_on(known, views, alone):
     assert counts == sorted(set(counts))
 
 
-def test_memory_is_limited(known, views):
+def test_memory_is_limited(streamed, views):
     from filter_service.rendering.native import NativeRenderer
 
-    eye, spec, plan = known
+    eye, spec, plan = streamed
     renderer = NativeRenderer()
     whole = PsfStore(eye, spec, plan)
     pictures(renderer, whole, frames(views))
@@ -240,18 +270,18 @@ def test_the_wavefronts_of_nodes_are_the_eyes(known):
     some = np.arange(0, store.psf_count, 101)
     states = states_of(store.spec, store.plan, some // 3, some % 3)
     truth = store.eye.wavefronts(**vars(states))
-    groups = store.plan.defocus.group_at(some // 3)
-    found = store.wavefronts.at(groups, some % 3, states.total_defocus_dpt)
+    groups = store.nodes.defocus.group_at(some // 3)
+    found = store.nodes.wavefronts.at(groups, some % 3, states.total_defocus_dpt)
     np.testing.assert_allclose(found.zernike_um, truth.zernike_um, atol=1e-12)
     np.testing.assert_allclose(found.pupil_ellipse, truth.pupil_ellipse, atol=1e-12)
 
 
-def test_what_is_computed_ahead_is_what_the_frame_needs(known, views):
+def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
     from filter_service.rendering.native import NativeRenderer
 
     for view, state in frames(views[:2]):
         state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
-        store, renderer = PsfStore(*known), NativeRenderer()
+        store, renderer = PsfStore(*streamed), NativeRenderer()
         handle = renderer.load(store)
         use = FrameUse(0.0, *state.values(), None, (SeenView.of(view),))
         ahead = handle.missing_psfs(use)

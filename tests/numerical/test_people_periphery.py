@@ -13,6 +13,7 @@ from estimator.periphery.meridian import (
     MEASURED_DEG,
     TERMS,
     field_matrix,
+    field_terms,
     meridian_weights,
 )
 from estimator.periphery.people import load_over_field, load_people
@@ -83,6 +84,7 @@ def test_a_round_eye_about_another_axis_is_told_by_its_meridian():
     expected = nodal(h_deg, v_deg) - on_axis
     expected[:, TERMS.index(4)] -= 1e-3 * 4.0 * v_deg  # the part the meridian hides
     assert np.allclose(told, expected, atol=1e-12)
+    np.testing.assert_allclose(field_terms(h_deg, v_deg, knots), told, atol=1e-12)
 
 
 def test_the_spline_ends_softly_where_nobody_was_measured():

@@ -115,10 +115,10 @@ def test_on_axis_nodes_follow_the_blur_alone(name, model):
     eye = measured_eye(name) if model == "wavefront" else traced_eye(name, spec)
     plan = plan_cache(eye, spec)
     expected = expected_defocus(eye, spec)
-    assert plan.group_shape[:2] == (1, 1)
-    np.testing.assert_array_equal(plan.defocus.counts, [len(g) for g in expected])
+    assert plan.group_shape[2:] == (1, 1)
+    np.testing.assert_array_equal(plan.nodes.defocus.counts, [len(g) for g in expected])
     np.testing.assert_allclose(
-        plan.defocus.values_dpt, np.concatenate(expected), atol=1e-12
+        plan.nodes.defocus.values_dpt, np.concatenate(expected), atol=1e-12
     )
 
 
@@ -134,7 +134,9 @@ def test_one_distance_in_one_state_is_one_exact_psf_a_channel(model):
         wavelength_nm=spec.channel_wavelengths_nm,
     )
     np.testing.assert_allclose(
-        plan.defocus.values_dpt + plan.channel_shift_dpt[0], expected_dpt, atol=1e-9
+        plan.nodes.defocus.values_dpt + plan.nodes.channel_shift_dpt[0],
+        expected_dpt,
+        atol=1e-9,
     )
 
 
@@ -178,11 +180,12 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
                 for j in bracket_axis(
                     plan.accommodations_dpt, states.accommodation_dpt
                 )[:2]:
-                    group = np.ravel_multi_index((v, h, i, j), plan.group_shape)
+                    group = np.ravel_multi_index((i, j, v, h), plan.group_shape)
                     read = total_dpt * states.pupil_diameter_mm / plan.pupils_mm[i]
-                    read = read - plan.channel_shift_dpt[group, channel]
-                    low = plan.defocus.values_dpt[plan.defocus.starts[group]]
-                    high = plan.defocus.values_dpt[plan.defocus.starts[group + 1] - 1]
+                    read = read - plan.nodes.channel_shift_dpt[group, channel]
+                    defocus = plan.nodes.defocus
+                    low = defocus.values_dpt[defocus.starts[group]]
+                    high = defocus.values_dpt[defocus.starts[group + 1] - 1]
                     # Pupils and accommodations between nodes bend their defocus.
                     assert np.all(read > low - 0.02)
                     assert np.all(read < high + 0.02)
@@ -210,7 +213,7 @@ def test_finer_tolerances_take_more_psfs_and_err_less_as_predicted():
         plan = plan_cache(eye, spec)
         counts.append(plan.prediction.psf_count)
         measured_db.append(mean_db(sampled_errors(eye, spec, plan, count=64)))
-        assert plan.prediction.psf_count == 3 * len(plan.defocus.values_dpt)
+        assert plan.prediction.psf_count == 3 * len(plan.nodes.defocus.values_dpt)
         assert plan.prediction.interpolation_db > TOLERANCE_DB[tolerance] - 0.5
         difference_db = measured_db[-1] - plan.prediction.interpolation_db
         assert abs(difference_db) < FACTOR_TWO_DB
@@ -361,12 +364,12 @@ def test_where_nothing_fits_the_refusal_says_so():
 @pytest.mark.parametrize(
     ("settings", "shape"),
     [
-        ({**ONE_STATE, "object_range_dpt": (1.0, 1.0)}, (None, None, 1, 1)),
+        ({**ONE_STATE, "object_range_dpt": (1.0, 1.0)}, (1, 1, None, None)),
         (
             {"width_px": 40, "height_px": 23, "vertical_fov_deg": 1.0},
-            (2, 2, None, None),
+            (None, None, 2, 2),
         ),
-        ({"width_px": 1, "height_px": 1, "vertical_fov_deg": 4.0}, (2, 2, None, None)),
+        ({"width_px": 1, "height_px": 1, "vertical_fov_deg": 4.0}, (None, None, 2, 2)),
         ({"width_px": 40, "height_px": 600}, (None, None, None, None)),
         ({"chromatic": False, "diffraction": False}, (None, None, None, None)),
     ],
@@ -384,7 +387,7 @@ def test_degenerate_ranges_are_planned(settings, shape, model):
     for found, expected in zip(plan.group_shape, shape, strict=True):
         assert found == expected if expected else found >= 1
     channels = 3 if spec.settings.chromatic else 1
-    assert plan.prediction.psf_count == channels * len(plan.defocus.values_dpt)
-    assert len(plan.defocus.starts) == 1 + math.prod(plan.group_shape)
+    assert plan.prediction.psf_count == channels * len(plan.nodes.defocus.values_dpt)
+    assert len(plan.nodes.defocus.starts) == 1 + math.prod(plan.group_shape)
     assert plan.prediction.memory_mb > 0.0
     assert plan.prediction.interpolation_db > 39.0

@@ -6,10 +6,11 @@ import pytest
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from filter_service.planning.grid import GridSpec
+from filter_service.planning.node_wavefronts import states_of_primaries
 from filter_service.planning.plan import unchecked_plan
 from filter_service.planning.slopes import PupilStates
+from filter_service.psfs.compute_kernels import mean_batch
 from filter_service.psfs.store import build_psf_store
-from filter_service.psfs.wide_primaries import mean_batch, states_of_primaries
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -127,4 +128,4 @@ def test_wide_primaries_cost_twice_the_time_and_no_psf_more():
         spec = spec_for(mode="dynamic", tolerance="loose", wide_primaries=wide)
         plans.append(unchecked_plan(traced_eye("myopia", spec), spec).prediction)
     assert plans[1].psf_count == plans[0].psf_count
-    assert plans[1].build_s == pytest.approx(2.0 * plans[0].build_s)
+    assert plans[1].build_s == pytest.approx(2.0 * plans[0].build_s, rel=1e-3)

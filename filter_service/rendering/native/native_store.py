@@ -1,5 +1,7 @@
 """A PSF store as the native engine reads it: with coarse kernels beside it."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +42,13 @@ class StoredKernels(NamedTuple):
     first_texel: NDArray[np.uint64]
     reach: NDArray[np.uint32]
 
+    def with_room(self, count: int) -> StoredKernels:
+        """Return the kernels with room for so many more."""
+        return self._replace(
+            first_texel=np.append(self.first_texel, np.zeros(count, np.uint64)),
+            reach=np.append(self.reach, np.zeros(count, np.uint32)),
+        )
+
 
 class NativeStore(FrameStore):
     """A store in all resolutions.
@@ -54,21 +63,20 @@ class NativeStore(FrameStore):
 
     def __init__(self, store: PsfStore) -> None:
         super().__init__(store, image_cells(store.spec, store.plan))
-        self._numbers = np.arange(store.psf_count, dtype=np.uint32)
+        self._numbers = np.zeros(0, np.uint32)
         self.is_released = False
         self._start_anew()
         _ = store.defocus  # made here and not by the first frame
 
     def _start_anew(self) -> None:
         """Forget all kernels; whoever still reads those keeps their arrays."""
-        count = self.store.psf_count
         self._generation, self._n_seen = self.store.generation, 0
         self._n_texels = [0] * RESOLUTIONS
         self.resolutions = [
             StoredKernels(
                 np.empty(0, np.uint16),
-                np.zeros(count, np.uint64),
-                np.zeros(count, np.uint32),
+                np.zeros(0, np.uint64),
+                np.zeros(0, np.uint32),
             )
             for _ in range(RESOLUTIONS)
         ]
@@ -76,6 +84,8 @@ class NativeStore(FrameStore):
     @property
     def tables(self) -> StoreTables:
         """The store's, with the number of each kernel in the place of its offset."""
+        if self._numbers.size != self.store.psf_count:
+            self._numbers = np.arange(self.store.psf_count, dtype=np.uint32)
         return self.store.tables._replace(offsets=self._numbers)
 
     @property
@@ -95,6 +105,9 @@ class NativeStore(FrameStore):
         store = self.store
         if store.generation != self._generation:
             self._start_anew()
+        more = store.psf_count - self.resolutions[0].reach.size
+        if more:  # nodes of a state that is read for the first time
+            self.resolutions = [own.with_room(more) for own in self.resolutions]
         self._n_seen, added = store.added_since(self._n_seen)
         psfs = np.ascontiguousarray(added, np.int64)
         if not psfs.size:
