@@ -9,7 +9,7 @@ USUAL := -m "not clock and not slow and not gpu"
 ALONE := -m "clock and not slow and not gpu"
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
-BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf layers render live follow levels kernels field occlusion sequence cost peers switch headset host abuse files overload devices restart batch roundtrip web
+BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf layers render live follow levels crops kernels field occlusion sequence cost peers switch headset host abuse files overload devices restart batch roundtrip web
 
 .DEFAULT_GOAL := help
 .PHONY: demo web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-web setup-witness

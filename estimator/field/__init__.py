@@ -3,6 +3,7 @@
 eye_optics       what the cache asks of any eye
 aberration_grid  wavefronts traced at the nodes of a grid
 network_grid     the same by network
+few_colors       one wavelength traced, the others beside it
 grid_source      which of the two, by cost and error
 interpolation    between the nodes
 peripheral_rest  what people's periphery has beyond the model's

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from estimator.estimate.estimation import EstimatedEye
 from estimator.eye.accommodation import FocusedEye
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
+from estimator.field.few_colors import few_colors_grid
 from estimator.field.network_grid import network_focused, network_grid
 from estimator.machine_speed import relative_core_time
 from estimator.networks.card import NetworkUnavailable, NetworkUnfit
@@ -114,7 +115,8 @@ class GridSource:
             if progress is not None:
                 progress(1.0)
         else:
-            grid = aberration_grid(
+            trace = few_colors_grid if is_field else aberration_grid
+            grid = trace(
                 eye,
                 **axes,
                 n_rings=n_rings,

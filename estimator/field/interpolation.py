@@ -66,9 +66,24 @@ def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
     outer = max(abs(low), abs(high))
     far = max(outer - stretched(FAR_DEG), 0.0)
     wanted = 2.0 + NODES_PER_EXTENT * math.sqrt(half * outer) + FAR_NODES * far
-    count = math.ceil(wanted)
+    return _chebyshev_deg(0.5 * (low + high), half, math.ceil(wanted))
+
+
+def fewer_field_nodes_deg(
+    nodes_deg: NDArray[np.float64], ratio: float
+) -> NDArray[np.float64]:
+    """Return fewer nodes by a ratio, over the range that nodes (n,) are for."""
+    if nodes_deg.size == 1:
+        return nodes_deg
+    first, last = stretched(nodes_deg[[0, -1]])
+    half = 0.5 * (last - first) / math.cos(0.5 * math.pi / nodes_deg.size)
+    return _chebyshev_deg(0.5 * (first + last), half, math.ceil(ratio * nodes_deg.size))
+
+
+def _chebyshev_deg(middle: float, half: float, count: int) -> NDArray[np.float64]:
+    """Return nodes over a range of stretched angle."""
     unit = -np.cos(math.pi * (np.arange(count) + 0.5) / count)
-    return np.degrees(np.sinh(0.5 * (low + high) + half * unit) / STRETCH)
+    return np.degrees(np.sinh(middle + half * unit) / STRETCH)
 
 
 def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float64]:

@@ -54,7 +54,7 @@ def build_a_few_with_help() -> None:
 
 def trace_an_eye() -> None:
     """Estimate, trace and plan for one eye, for the first half of the loops."""
-    _built(FEW_PSFS)
+    _built(FEW_PSFS).plan_all()
 
 
 def build_without_tracing() -> None:

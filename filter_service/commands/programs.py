@@ -38,6 +38,7 @@ class Bench(StrEnum):
     LIVE = "live"
     FOLLOW = "follow"
     LEVELS = "levels"
+    CROPS = "crops"
     KERNELS = "kernels"
     FIELD = "field"
     OCCLUSION = "occlusion"
@@ -74,6 +75,7 @@ BENCH_MODULES = {
     Bench.LIVE: "tests.benchmarks.bench_live",
     Bench.FOLLOW: "tests.benchmarks.bench_follow",
     Bench.LEVELS: "tests.benchmarks.bench_levels",
+    Bench.CROPS: "tests.benchmarks.bench_crops",
     Bench.KERNELS: "tests.benchmarks.bench_kernels",
     Bench.FIELD: "tests.benchmarks.bench_field",
     Bench.OCCLUSION: "tests.benchmarks.bench_occlusion",

@@ -23,14 +23,11 @@ from filter_service.planning.error_law import (
 )
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.node_blur import GroupRays
+from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import RaggedNodes
 from filter_service.planning.readable import ReadableDefocus, joined_ranges
 from filter_service.planning.sampled_use import unit_px
-from filter_service.planning.slopes import (
-    PupilStates,
-    main_foci_dpt,
-    main_light_ratio,
-)
+from filter_service.planning.slopes import main_foci_dpt, main_light_ratio
 
 _LADDER = 49
 

@@ -10,13 +10,35 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.wavefront.field_wavefronts import FieldWavefronts, with_tilt
 from filter_service.constants import RGB
 from filter_service.planning.grid import GREEN, GridSpec
-from filter_service.planning.slopes import PupilStates
+
+
+@dataclass(frozen=True)
+class PupilStates:
+    """What a wavefront depends on; arrays (P,)."""
+
+    h_deg: NDArray[np.float64]
+    v_deg: NDArray[np.float64]
+    pupil_diameter_mm: NDArray[np.float64]
+    accommodation_dpt: NDArray[np.float64]
+    wavelength_nm: NDArray[np.float64]
+    total_defocus_dpt: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, **values: ArrayLike) -> PupilStates:
+        """Broadcast the fields against each other, in C order."""
+        arrays = np.broadcast_arrays(*(np.asarray(v, float) for v in values.values()))
+        return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
+
+    def taken(self, index: NDArray[np.int64] | slice) -> PupilStates:
+        """Return some of the states, in any order."""
+        return PupilStates(**{name: v[index] for name, v in vars(self).items()})
+
 
 WavefrontsOf = Callable[..., FieldWavefronts]
 """See `EyeOptics.wavefronts_at`."""

@@ -14,8 +14,8 @@ import numpy as np
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.defocus_nodes import DefocusNodes
 from filter_service.planning.grid import GREEN, PAPER_REACH_DEG, GridSpec
+from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import PlanAxes, RaggedNodes
-from filter_service.planning.slopes import PupilStates
 
 ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
 DISTANCE_COUNTS = {"on-axis": 33, "quality": 9, "dynamic": 9}

@@ -34,6 +34,7 @@ from filter_service.planning.grid import (
 from filter_service.planning.node_blur import GroupRays, node_blur_px
 from filter_service.planning.node_wavefronts import (
     NodeWavefronts,
+    PupilStates,
     WavefrontsOf,
     node_evaluator,
 )
@@ -60,7 +61,7 @@ from filter_service.planning.sampled_use import (
     defocus_error,
     sample_use,
 )
-from filter_service.planning.slopes import PupilStates, main_foci_dpt
+from filter_service.planning.slopes import main_foci_dpt
 from filter_service.settings import TOLERANCES
 
 __all__ = [

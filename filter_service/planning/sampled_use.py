@@ -9,11 +9,12 @@ from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.error_law import AXIS_FACTOR, blend_error
 from filter_service.planning.field_directions import MAX_FIELD_DEG, field_deg
 from filter_service.planning.grid import GridSpec
+from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import (
     CachePlan,
     bracket_axis,
 )
-from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.slopes import slopes_px, state_frames
 
 AXES = ("h", "v", "pupil", "accommodation", "defocus")
 FIELD_OF_AXIS = {

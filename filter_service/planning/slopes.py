@@ -4,10 +4,8 @@ Where a ray of the pupil lands is the slope of its wavefront; PSFs differ by how
 their rays lie apart, point by point of the pupil.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.optics.zernike import EXPONENTS, wavefront_polynomial
@@ -16,30 +14,9 @@ from estimator.psf.screens import ScreenTables
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.psf.survey import PupilSurvey, survey_pupils
 from filter_service.planning.grid import GridSpec
+from filter_service.planning.node_wavefronts import PupilStates
 
 N_RINGS, N_AZIMUTHS = 5, 16
-
-
-@dataclass(frozen=True)
-class PupilStates:
-    """What a wavefront depends on; arrays (P,)."""
-
-    h_deg: NDArray[np.float64]
-    v_deg: NDArray[np.float64]
-    pupil_diameter_mm: NDArray[np.float64]
-    accommodation_dpt: NDArray[np.float64]
-    wavelength_nm: NDArray[np.float64]
-    total_defocus_dpt: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, **values: ArrayLike) -> "PupilStates":
-        """Broadcast the fields against each other, in C order."""
-        arrays = np.broadcast_arrays(*(np.asarray(v, float) for v in values.values()))
-        return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
-
-    def taken(self, index: NDArray[np.int64] | slice) -> "PupilStates":
-        """Return some of the states, in any order."""
-        return PupilStates(**{name: v[index] for name, v in vars(self).items()})
 
 
 def apodisation(eye: EyeOptics, spec: GridSpec) -> StilesCrawford | None:

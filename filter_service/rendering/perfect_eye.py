@@ -7,9 +7,8 @@ from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.constants import RGB, WEIGHT_MAX
 from filter_service.planning.grid import GREEN, GridSpec
-from filter_service.planning.node_wavefronts import NodeWavefronts
+from filter_service.planning.node_wavefronts import NodeWavefronts, PupilStates
 from filter_service.planning.nodes import CachePlan, PlanNodes, RaggedNodes
-from filter_service.planning.slopes import PupilStates
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import FrameEngine

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from filter_service.planning import error_law as law
+from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.sampled_use import moved, sample_use
-from filter_service.planning.slopes import PupilStates, slopes_px, state_frames
+from filter_service.planning.slopes import slopes_px, state_frames
 from tests.benchmarks.harness import commit_id, machine_info, write_report
 from tests.numerical.plan_cases import (
     exact_kernels,

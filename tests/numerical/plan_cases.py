@@ -16,10 +16,10 @@ from estimator.field.traced_eye import TracedEye
 from estimator.profiles.files import load_profile
 from estimator.psf.compute import compute_psf_batch
 from filter_service.planning.grid import pupil_nodes_mm
+from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.paper_grid import DISTANCES_DPT
 from filter_service.planning.sampled_use import FIELD_OF_AXIS, sample_use
-from filter_service.planning.slopes import PupilStates
 from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.pack import pack_kernels
 from tests.grid_specs import grid_spec

@@ -40,6 +40,7 @@ for sphere_dpt in (0.0, -6.0):
         job = replace(FEW_PSFS, profile=parse_profile(body), settings=settings,
                       camera=camera)
         found = build(job, progress=lambda *_: None, cancelled=lambda: False)
+        found.store.plan_all()
         found.store.fill(np.arange(0, found.store.psf_count, 40))
 for missed in sorted(compiled() - before):
     print(*missed)

@@ -7,6 +7,7 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.field.aberration_grid import aberration_grid
+from estimator.field.grid_source import GridSource
 from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.prescription import power_vector, zernike_from_power_vector
@@ -307,6 +308,55 @@ def test_fields_that_light_does_not_pass_take_the_nearest_that_it_does():
     edge = eye.wavefronts(h_deg=h_high, v_deg=0.0, **rest)
     assert beyond.zernike_um == pytest.approx(edge.zernike_um)
     assert v_high < 55.0
+
+
+@pytest.mark.parametrize(
+    ("name", "h_deg", "allowed_um", "is_cut"),
+    [
+        ("emmetropia", 32.0, 8e-4, False),
+        ("keratoconus", 32.0, 1.5e-3, False),
+        ("cataract", 32.0, 3e-3, False),
+        ("cataract", 50.0, 1e-7, True),  # light does not pass everywhere
+    ],
+)
+def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, is_cut):
+    source = estimated(kind="preset", name=name)
+    ranges = ((-h_deg, h_deg), (-20.0, 20.0))
+    axes = {
+        "pupil_diameters_mm": np.linspace(2.0, 7.0, 4),
+        "focus_range_dpt": (0.0, 4.0),
+        "wavelengths_nm": np.array([453.0, 536.0, 618.0]),
+        "field_range_deg": ranges,
+    }
+    eyes = [
+        TracedEye.trace(source, make_grid=grid, **axes)
+        for grid in (aberration_grid, GridSource())
+    ]
+    rng = np.random.default_rng(5)
+    n_states = 300
+    state = {
+        "h_deg": rng.uniform(*ranges[0], n_states),
+        "v_deg": rng.uniform(*ranges[1], n_states),
+        "pupil_diameter_mm": rng.uniform(2.5, 6.0, n_states),
+        "accommodation_dpt": rng.uniform(0.0, 1.0, n_states)
+        * eyes[0].grid.accommodations_dpt[-1],
+        "wavelength_nm": rng.choice(axes["wavelengths_nm"], n_states),
+    }
+    exact, found = (eye.wavefronts(**state, total_defocus_dpt=0.0) for eye in eyes)
+    rms_um = np.sqrt(((exact.zernike_um - found.zernike_um)[:, 3:] ** 2).sum(axis=1))
+    is_middle = state["wavelength_nm"] == 536.0
+    assert rms_um[is_middle].max() < 1e-7
+    assert np.sqrt((rms_um**2).mean()) < allowed_um
+    assert (rms_um.max() < 1e-6) == is_cut
+    dpt = [eye.total_defocus_dpt(**state) for eye in eyes]
+    assert np.abs(dpt[0] - dpt[1]).max() < 2e-2
+    shift_mrad = [
+        eye.chief_ray_shift_mrad(
+            **{k: v for k, v in state.items() if k != "pupil_diameter_mm"}
+        )
+        for eye in eyes
+    ]
+    np.testing.assert_allclose(*shift_mrad, atol=2e-3)
 
 
 def test_a_vignetted_field_is_seen_through_the_open_area():

@@ -6,9 +6,8 @@ import pytest
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.node_wavefronts import states_of_primaries
+from filter_service.planning.node_wavefronts import PupilStates, states_of_primaries
 from filter_service.planning.plan import unchecked_plan
-from filter_service.planning.slopes import PupilStates
 from filter_service.psfs.compute_kernels import mean_batch
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer

@@ -678,7 +678,7 @@ def test_what_a_computation_says_reaches_a_client_with_a_field(monkeypatch):
     def fail(*_, **__):
         raise ValueError("zero-size array to reduction operation minimum")
 
-    monkeypatch.setattr(from_profile, "unchecked_plan", fail)
+    monkeypatch.setattr(from_profile, "plan_axes", fail)
     job = BuildJob(
         parse_profile({"kind": "preset", "name": "myopia"}),
         FilterSettings(mode="on-axis", eye_model="wavefront"),

@@ -1,0 +1,157 @@
+"""Wavefronts over the field of which one wavelength is traced everywhere.
+
+Colors differ from each other far less than the wavefront changes over the field, and
+more smoothly.  So the others are traced at fewer fields and accommodations, and their
+difference from that one is interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.estimate.estimation import EstimatedEye
+from estimator.eye.accommodation import FocusedEye
+from estimator.field.aberration_grid import AberrationGrid, aberration_grid
+from estimator.field.interpolation import (
+    FieldInterpolation,
+    fewer_field_nodes_deg,
+    lagrange_weights,
+    stretched,
+)
+from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
+
+FIELD_RATIO = 0.7
+"""Field nodes of the other colors along each axis, of those of the first: 7 x 6 of
+10 x 8.  Wavefronts at random places are then within 0.98e-3 um of traced ones (rms,
+emmetropia, 5 mm) instead of 0.95e-3, with 6 x 5 within 1.2e-3."""
+
+FEW_ACCOMMODATIONS = 3
+"""Of the other colors at most; with two it is 2.1e-3 um."""
+
+COLOR_AXIS = {"chief_shift_mrad": 3}
+"""Of a grid's array, where it is not the fifth."""
+
+
+def few_colors_grid(
+    eye: EstimatedEye,
+    *,
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    accommodations_dpt: ArrayLike,
+    wavelengths_nm: ArrayLike,
+    states: Sequence[FocusedEye],
+    progress: Callable[[float], None] | None = None,
+    **sampling: ArrayLike,
+) -> AberrationGrid:
+    """Return what `aberration_grid` does, in about half the time.
+
+    Where light does not pass everywhere, all is traced.
+
+    Parameters
+    ----------
+    states : (n_accommodations,)
+        The eye at each accommodation.
+    progress : callable, optional
+        Called with a fraction; may raise to cancel.
+    """
+    nm, used_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
+    place = {"h_deg": np.atleast_1d(h_deg), "v_deg": np.atleast_1d(v_deg)}
+    middle = nm.size // 2
+
+    def traced(
+        of_nm: NDArray, at: dict[str, NDArray], some: NDArray, done: float
+    ) -> AberrationGrid:
+        grid = aberration_grid(
+            eye,
+            **at,
+            accommodations_dpt=used_dpt[some],
+            wavelengths_nm=of_nm,
+            states=[states[k] for k in some.tolist()],
+            **sampling,
+        )
+        if progress is not None:
+            progress(done)
+        return grid
+
+    every = np.arange(used_dpt.size)
+    first = traced(nm[middle : middle + 1], place, every, 0.6)
+    if nm.size == 1:
+        return first
+    rest_nm, rest = np.delete(nm, middle), None
+    if _passes(first):
+        few = {
+            name: fewer_field_nodes_deg(at, FIELD_RATIO) for name, at in place.items()
+        }
+        ends = np.linspace(0, used_dpt.size - 1, FEW_ACCOMMODATIONS)
+        coarse = traced(rest_nm, few, np.unique(ends.round().astype(int)), 1.0)
+        if _passes(coarse):
+            rest = _like(first, coarse)
+    if rest is None:
+        rest = traced(rest_nm, place, every, 1.0)
+    return _joined(first, rest, middle)
+
+
+def _passes(grid: AberrationGrid) -> bool:
+    return bool(
+        FieldInterpolation.is_open(grid).all()
+        and np.isfinite(grid.chief_shift_mrad).all()
+    )
+
+
+def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
+    """Other colors at the nodes of the first, from few nodes."""
+    to_coarse, to_all = (
+        [
+            lagrange_weights(transformed(nodes), transformed(at))
+            for nodes, at, transformed in (
+                (from_.h_deg, to.h_deg, stretched),
+                (from_.v_deg, to.v_deg, stretched),
+                (from_.accommodations_dpt, to.accommodations_dpt, np.asarray),
+            )
+        ]
+        for from_, to in ((first, coarse), (coarse, first))
+    )
+
+    def of(name: str) -> NDArray[np.float64]:
+        known, few = getattr(first, name), getattr(coarse, name)
+        if name == "ellipse_mm":
+            known, few = rim_from_ellipse(known), rim_from_ellipse(few)
+        axis = COLOR_AXIS.get(name, 4) - 1  # of the accommodations
+        found = known + _moved(few - _moved(known, to_coarse, axis), to_all, axis)
+        return ellipse_from_rim(found) if name == "ellipse_mm" else found
+
+    names = [f.name for f in fields(first) if getattr(first, f.name).ndim > 1]
+    return replace(
+        first,
+        wavelengths_nm=coarse.wavelengths_nm,
+        **{name: of(name) for name in names},
+    )
+
+
+def _moved(
+    values: NDArray[np.float64], weights: list[NDArray[np.float64]], axis: int
+) -> NDArray[np.float64]:
+    """Values [h, v, ...] at other nodes of field and of accommodation, an axis."""
+    for along, own in zip((0, 1, axis), weights, strict=True):
+        values = np.moveaxis(np.tensordot(own, values, (1, along)), 0, along)
+    return values
+
+
+def _joined(first: AberrationGrid, rest: AberrationGrid, middle: int) -> AberrationGrid:
+    """Return the first color's grid with the others around it."""
+
+    def of(name: str) -> NDArray[np.float64]:
+        own, others = getattr(first, name), getattr(rest, name)
+        if own.ndim == 1:
+            return own
+        axis = COLOR_AXIS.get(name, 4)
+        before, after = np.split(others, [middle], axis=axis)
+        return np.concatenate([before, own, after], axis=axis)
+
+    nm = np.insert(rest.wavelengths_nm, middle, first.wavelengths_nm)
+    names = (f.name for f in fields(first) if f.name != "wavelengths_nm")
+    return AberrationGrid(wavelengths_nm=nm, **{name: of(name) for name in names})
