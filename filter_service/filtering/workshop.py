@@ -45,10 +45,14 @@ EYE_SHARE = 0.3
 KEPT_SHARE = 0.8
 """Of the memory that an eye may keep: room for what comes next."""
 
-WARM_RANGE_S = (0.004, 0.03)
-WARM_SHARE = 0.5
-"""Time between two frames for PSFs ahead: this share of a frame's time, within the
-range, so that a stream is never late by a whole frame."""
+FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
+"""Time between two frames for the first PSFs of a new eye: as long as a frame took,
+within the range.  With half of it and 0.03 s at most, beside a stream of 1280x720 that
+takes all of two cores, new eyes were seen after 1.1 to 2.5 s instead of 0.7 to 1.5."""
+
+AHEAD_RANGE_S, AHEAD_SHARE = (0.004, 0.03), 0.5
+"""The same for PSFs that the next frames may need: a stream is never late by a whole
+frame for them."""
 
 WARM_BATCH = 256
 """PSFs per batch; the deadline is checked after each.  On two cores they take 5 ms."""
@@ -182,8 +186,7 @@ class Workshop:
     def advance(self, *, ahead: bool = True) -> None:
         """Process the worker's events, then compute PSFs ahead for a limited time.
 
-        The limit is half of a frame's time, within `WARM_RANGE_S`, so that no frame is
-        late by more.
+        The limit is about a frame's time: `FIRST_SHARE`, `AHEAD_SHARE`.
 
         Parameters
         ----------
@@ -209,9 +212,9 @@ class Workshop:
                         limits=self._limits,
                     )
                 )
-        low_s, high_s = WARM_RANGE_S
-        warm_s = min(max(WARM_SHARE * self.frame_s, low_s), high_s)
-        self._warm(time.monotonic() + warm_s, ahead)
+        self._warm_first_frames()
+        if ahead:
+            self._warm_ahead_of_streams()
         self._limit_memory()
 
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
@@ -238,8 +241,14 @@ class Workshop:
 
     # PSFs ahead of frames
 
-    def _warm(self, until_s: float, ahead: bool) -> None:
-        """Compute PSFs of first frames, then of what comes next, until some time."""
+    def _share_of_frame_s(self, share: float, range_s: tuple[float, float]) -> float:
+        """Return a share of a frame's time, within a range."""
+        low_s, high_s = range_s
+        return min(max(share * self.frame_s, low_s), high_s)
+
+    def _warm_first_frames(self) -> None:
+        """Compute PSFs of new eyes' first frames, for the time that these have."""
+        until_s = time.monotonic() + self._share_of_frame_s(FIRST_SHARE, FIRST_RANGE_S)
         self._is_warming = False
         for stream in list(self.streams):
             while (found := stream.warming()) is not None:
@@ -247,8 +256,12 @@ class Workshop:
                 if time.monotonic() > until_s:
                     self._is_warming |= not is_over
                     break
+
+    def _warm_ahead_of_streams(self) -> None:
+        """Compute PSFs that the next frames of eyes in use may need."""
+        until_s = time.monotonic() + self._share_of_frame_s(AHEAD_SHARE, AHEAD_RANGE_S)
         for stream in self.streams:
-            if not ahead or time.monotonic() > until_s:
+            if self._is_warming or time.monotonic() > until_s:
                 return
             if stream.warming() is None:
                 self._warm_ahead(stream, until_s)
