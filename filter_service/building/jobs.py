@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,12 +16,19 @@ USUAL_LIMITS = BuildLimits()
 
 @dataclass(frozen=True)
 class BuildJob:
-    """One eye for one camera."""
+    """One eye for one camera.
+
+    Attributes
+    ----------
+    near : (pupil_diameter_mm, focus_dpt), optional
+        Around this state nodes are planned once the eye is sent; none are without it.
+    """
 
     profile: EyeProfile
     settings: FilterSettings
     camera: Camera
     limits: BuildLimits = USUAL_LIMITS
+    near: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,12 @@ class BuiltStore:
 
     store: Any
     notes: tuple[str, ...] = ()
+
+    def parts_ahead(self, job: BuildJob) -> Iterator[Any]:
+        """Yield what frames will need of the store, for its ``take``."""
+        planned = getattr(self.store, "planned_ahead", None)
+        if planned is not None and job.near is not None:
+            yield from planned(*job.near)
 
 
 Build = Callable[..., BuiltStore]

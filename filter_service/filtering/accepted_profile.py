@@ -36,6 +36,8 @@ class PreparedStore:
         PSFs of a first frame that are being computed.
     next_progress_s : float
         When progress may be told again.
+    ticket : int
+        Of its build.
     """
 
     camera: Camera
@@ -46,6 +48,7 @@ class PreparedStore:
     used_s: float = field(default_factory=time.monotonic)
     pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     next_progress_s: float = 0.0
+    ticket: int = 0
 
 
 @dataclass(eq=False)

@@ -20,6 +20,7 @@ from filter_service.building.worker_handle import (
     BuildDone,
     BuildError,
     BuildEvent,
+    BuildPart,
     BuildProgress,
     WorkerHandle,
 )
@@ -196,6 +197,9 @@ class Workshop:
         """
         self._drop_released()
         for event in self.worker.poll():
+            if isinstance(event, BuildPart):
+                self._take_part(event)
+                continue
             stream = next((s for s in self.streams if s.ticket == event.ticket), None)
             # Without a stream, it has ended or wants something newer.
             if stream is not None:
@@ -210,6 +214,7 @@ class Workshop:
                         settings=following.eye.settings,
                         camera=following.camera,
                         limits=self._limits,
+                        near=_state_near(stream, following),
                     )
                 )
         self._warm_first_frames()
@@ -232,12 +237,19 @@ class Workshop:
                 self._fail(stream, wanted, _as_filter_error(error))
                 return
             prepared = PreparedStore(
-                wanted.camera, loaded, wanted.eye.accepted_s, event.built.notes
+                *(wanted.camera, loaded, wanted.eye.accepted_s, event.built.notes),
+                ticket=event.ticket,
             )
             stream.put_in_place(wanted.eye, prepared)
             self.free_retired(stream)
         elif isinstance(event, BuildError):
             self._fail(stream, wanted, event.error)
+
+    def _take_part(self, event: BuildPart) -> None:
+        """Give a store what the worker planned for it, if it is still in use."""
+        for prepared in self._prepared():
+            if prepared.ticket == event.ticket:
+                prepared.store.take(event.part)
 
     # PSFs ahead of frames
 
@@ -368,6 +380,12 @@ class Workshop:
         stream.fail_build(wanted.eye, wanted.camera, error)
         self.free_retired(stream)
         stream.on_event(EyeFailed(wanted.eye, error))
+
+
+def _state_near(stream: StreamEyes, wanted: Wanted) -> tuple[float, float]:
+    """Return the pupil and focus that the next frame is likely to have."""
+    use = stream.use.last or first_frame(wanted.camera, wanted.eye.settings)
+    return use.pupil_diameter_mm, use.focus_dpt
 
 
 def _as_filter_error(error: Exception) -> FilterError:

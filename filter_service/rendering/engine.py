@@ -34,6 +34,8 @@ class LoadedStore(Protocol):
 
     def evict(self, max_mb: float) -> None: ...  # noqa: D102
 
+    def take(self, part: Any) -> None: ...  # noqa: D102
+
     def release(self) -> None:
         """Free what the engine holds of it; once."""
 

@@ -4,7 +4,7 @@ import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,10 @@ class FrameStore:
     ) -> None:
         """Compute PSFs, see `PsfStore.fill`."""
         self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
+
+    def take(self, part: Any) -> None:
+        """Take what was planned ahead, see `PsfStore.take`."""
+        self.store.take(part)
 
     def evict(self, max_mb: float) -> None:
         """Evict the PSFs used longest ago, see `PsfStore.evict`."""

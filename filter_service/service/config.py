@@ -125,7 +125,7 @@ class ServiceConfig:
     store_cache_dir: str = default_cache_dir()
     store_cache_max_mb: int = 2000
     threads: int = 0
-    build_niceness: int = 0
+    build_niceness: int = 5
     cancel_grace_s: float = 3.0
     build_limit_s: float = 600.0
     alive_interval_s: float = 5.0

@@ -1,11 +1,19 @@
 """PSFs that are computed when frames need them: a frame depends on its input alone."""
 
+import pickle
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from filter_service.building.compile_builds import FEW_PSFS
+from filter_service.building.worker_handle import (
+    BuildDone,
+    BuildError,
+    BuildPart,
+    WorkerHandle,
+)
 from filter_service.errors import BuildFailed, NotPrepared, OutOfMemory
 from filter_service.planning.cost import states_of
 from filter_service.planning.plan import plan_axes, unchecked_plan
@@ -115,6 +123,53 @@ def test_nodes_do_not_depend_on_what_was_planned_before(known, streamed):
         for name in ("zernike_um", "per_dpt_um", "pupil_ellipse", "pixel_from_mrad"):
             one, other = (getattr(n.wavefronts, name) for n in (found, whole))
             np.testing.assert_array_equal(one[own], other[same])
+
+
+def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
+    streamed, views, alone, monkeypatch
+):
+    from filter_service.planning.plan import NodePlanner
+    from filter_service.rendering.native import NativeRenderer
+
+    pupil_mm, focus_dpt = STATES[0]["pupil_diameter_mm"], STATES[0]["focus_dpt"]
+    ahead = list(PsfStore(*streamed).planned_ahead(pupil_mm, focus_dpt))
+    store = PsfStore(*streamed)
+    n_pupils, n_used = store.plan.group_shape[:2]
+    assert len(ahead) == len({state for state, _ in ahead}) == n_pupils * n_used
+    frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    assert set(store._first_groups) <= {state for state, _ in ahead[:4]}
+    for part in ahead:
+        store.take(pickle.loads(pickle.dumps(part)))
+    monkeypatch.setattr(NodePlanner, "nodes", None)  # nothing is left to plan
+    assert pictures(NativeRenderer(), store, frames(views)) == alone
+    assert not store._ahead.keys() & store._first_groups.keys()
+
+
+def test_the_worker_plans_ahead_until_it_is_asked_for_something_else():
+    worker = WorkerHandle(warm_up="")
+    job = replace(FEW_PSFS, near=(4.0, 2.0))
+    try:
+        worker.start()
+        stores, parts, deadline_s = {}, [], time.monotonic() + 60.0
+        tickets = [worker.submit(job)]
+        while len(parts) < 3:
+            assert time.monotonic() < deadline_s
+            for event in worker.poll():
+                assert not isinstance(event, BuildError), event
+                if isinstance(event, BuildDone):
+                    stores[event.ticket] = event.built.store
+                elif isinstance(event, BuildPart):
+                    parts.append(event)
+            if stores and len(tickets) == 1 and parts:
+                tickets.append(worker.submit(job))
+            time.sleep(0.001)
+    finally:
+        worker.close()
+    for part in parts:
+        store = stores[part.ticket]
+        store.take(part.part)
+        store.groups_of([part.part[0]])
+        assert "_planner" not in vars(store)  # it did not plan itself
 
 
 def test_a_frame_is_the_same_on_one_thread(streamed, views, alone):
