@@ -22,6 +22,7 @@ from estimator.field.interpolation import (
     lagrange_weights,
     stretched,
 )
+from estimator.field.trace_range import share_of
 from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
 
 FIELD_RATIO = 0.7
@@ -31,6 +32,9 @@ emmetropia, 5 mm) instead of 0.95e-3, with 6 x 5 within 1.2e-3."""
 
 FEW_ACCOMMODATIONS = 3
 """Of the other colors at most; with two it is 2.1e-3 um."""
+
+FIRST_SHARE = 0.6
+"""Of the time that the first color takes."""
 
 COLOR_AXIS = {"chief_shift_mrad": 3}
 """Of a grid's array, where it is not the fifth."""
@@ -49,49 +53,59 @@ def few_colors_grid(
 ) -> AberrationGrid:
     """Return what `aberration_grid` does, in about half the time.
 
-    Where light does not pass everywhere, all is traced.
+    Where light does not pass everywhere, every color is traced at every node.
 
     Parameters
     ----------
+    h_deg, v_deg : (n_h,), (n_v,)
+        Field nodes, as `field_nodes_deg` places them.
+    accommodations_dpt : (n_accommodations,)
+    wavelengths_nm : (n_wavelengths,)
+        Ascending; the middle one is traced at every node.
     states : (n_accommodations,)
         The eye at each accommodation.
     progress : callable, optional
-        Called with a fraction; may raise to cancel.
+        Called with a fraction after each accommodation; may raise to cancel.
+    **sampling
+        Pupils and rays, see `aberration_grid`.
+
+    Raises
+    ------
+    ValueError
+        Values out of range, or an eye that cannot be traced.
     """
     nm, used_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
     place = {"h_deg": np.atleast_1d(h_deg), "v_deg": np.atleast_1d(v_deg)}
     middle = nm.size // 2
 
     def traced(
-        of_nm: NDArray, at: dict[str, NDArray], some: NDArray, done: float
+        of_nm: NDArray, at: dict[str, NDArray], some: NDArray, *shares: float
     ) -> AberrationGrid:
-        grid = aberration_grid(
+        return aberration_grid(
             eye,
             **at,
             accommodations_dpt=used_dpt[some],
             wavelengths_nm=of_nm,
             states=[states[k] for k in some.tolist()],
+            progress=share_of(progress, *shares),
             **sampling,
         )
-        if progress is not None:
-            progress(done)
-        return grid
 
     every = np.arange(used_dpt.size)
-    first = traced(nm[middle : middle + 1], place, every, 0.6)
+    first = traced(nm[middle : middle + 1], place, every, 0.0, FIRST_SHARE)
     if nm.size == 1:
         return first
-    rest_nm, rest = np.delete(nm, middle), None
+    rest_nm, rest, left = np.delete(nm, middle), None, (FIRST_SHARE, 1.0)
     if _passes(first):
         few = {
             name: fewer_field_nodes_deg(at, FIELD_RATIO) for name, at in place.items()
         }
         ends = np.linspace(0, used_dpt.size - 1, FEW_ACCOMMODATIONS)
-        coarse = traced(rest_nm, few, np.unique(ends.round().astype(int)), 1.0)
+        coarse = traced(rest_nm, few, np.unique(ends.round().astype(int)), *left)
         if _passes(coarse):
             rest = _like(first, coarse)
     if rest is None:
-        rest = traced(rest_nm, place, every, 1.0)
+        rest = traced(rest_nm, place, every, *left)
     return _joined(first, rest, middle)
 
 

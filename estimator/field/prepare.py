@@ -70,7 +70,8 @@ def prepare_eye(
         accommodation, and costs nothing.
     accuracy : {"fast", "balanced", "exact"}
         Of the traced model: the networks; a refined eye, its wavefronts from whichever
-        of the two pays; everything traced.
+        of the two pays; everything traced, most colors over the field by
+        `few_colors_grid`.
     progress : callable, optional
         Called with a fraction and a stage; may raise to cancel.
 

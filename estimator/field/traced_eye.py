@@ -326,14 +326,7 @@ class TracedEye(FocusingEye):
     def wavefronts_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., FieldWavefronts]:
-        """`wavefronts` at fixed fields and wavelengths (n,), many states of the eye.
-
-        Returns
-        -------
-        callable
-            From ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers, and
-            ``total_defocus_dpt`` (m, n) to wavefronts (m n,): in a quarter of the time.
-        """
+        """See `EyeOptics.wavefronts_at`; 4 ms a state, where `wavefronts` takes 17."""
         return partial(
             self._wavefronts_of, *self._fixed_fields(h_deg, v_deg, wavelength_nm)
         )

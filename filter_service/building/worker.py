@@ -104,8 +104,8 @@ def _build_one(
             pipe.send(("part", ticket, part))
     except OSError:
         raise ParentGone from None
-    except Exception:  # the frame that needs it will say what is wrong
-        log.debug("planning ahead ended", exc_info=True)
+    except Exception as error:  # a frame that needs it fails, and says so to its client
+        log.info("nodes ahead of frames: %s", error)
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -236,6 +237,13 @@ class PlanNodes:
     is_limited: NDArray[np.bool_]
     shrink_ratio: NDArray[np.float64]
     wavefronts: NodeWavefronts
+
+    @property
+    def arrays(self) -> list[NDArray[Any]]:
+        """All arrays, to tell their size."""
+        parts = (self, self.defocus, self.wavefronts)
+        values = [value for part in parts for value in vars(part).values()]
+        return [value for value in values if isinstance(value, np.ndarray)]
 
     @classmethod
     def joined(cls, several: Sequence[PlanNodes]) -> PlanNodes:

@@ -67,8 +67,6 @@ from filter_service.settings import TOLERANCES
 __all__ = [
     "CachePlan",
     "NodePlanner",
-    "PlanAxes",
-    "PlanNodes",
     "PlanPrediction",
     "PlanTooLarge",
     "RaggedNodes",

@@ -488,8 +488,12 @@ class PsfStore:
 
     @property
     def tables_mb(self) -> float:
-        """Size of what is known of each node."""
-        return sum(a.nbytes for a in self.tables if isinstance(a, np.ndarray)) / 1e6
+        """Size of what is known of each node, of those planned ahead, too."""
+        planned = [*self._ahead.values()]
+        if self._first_groups:
+            planned.append(self.nodes)
+        arrays = [*self.tables, *(a for nodes in planned for a in nodes.arrays)]
+        return sum(array.nbytes for array in arrays) / 1e6
 
 
 def build_psf_store(

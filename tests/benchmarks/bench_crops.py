@@ -40,8 +40,7 @@ from tests.numerical.plan_cases import traced_eye
 EYES = ("keratoconus", "post_lasik")
 PUPILS_MM = (3.0, 5.0)
 SIDE_PX, BORDER_PX, BLOCK_PX, BLOCK_STEP_PX = 64, 8, 32, 4
-PIXEL = 2.0 * np.tan(np.radians(30.0)) / 1280.0
-"""Tangent of a pixel."""
+PIXEL_TANGENT = 2.0 * np.tan(np.radians(30.0)) / 1280.0
 AWAY_DEG = 6.0
 DISTANCE_DPT, FOCUS_DPT = 1.0, 0.5
 REFERENCE = "float64 quadrature, encoded"
@@ -100,7 +99,7 @@ def crop() -> RgbdView:
             np.diff(light[c[0] : c[0] + SIDE_PX, c[1] : c[1] + SIDE_PX], axis=1)
         ).mean(),
     )
-    middle, half = np.tan(np.radians(AWAY_DEG)), PIXEL * SIDE_PX / 2.0
+    middle, half = np.tan(np.radians(AWAY_DEG)), PIXEL_TANGENT * SIDE_PX / 2.0
     return RgbdView(
         np.ascontiguousarray(color[y : y + SIDE_PX, x : x + SIDE_PX]),
         np.full((SIDE_PX, SIDE_PX), 1.0 / DISTANCE_DPT, np.float32),

@@ -311,15 +311,15 @@ def test_fields_that_light_does_not_pass_take_the_nearest_that_it_does():
 
 
 @pytest.mark.parametrize(
-    ("name", "h_deg", "allowed_um", "is_cut"),
+    ("name", "h_deg", "allowed_um", "allowed_dpt"),
     [
-        ("emmetropia", 32.0, 8e-4, False),
-        ("keratoconus", 32.0, 1.5e-3, False),
-        ("cataract", 32.0, 3e-3, False),
-        ("cataract", 50.0, 1e-7, True),  # light does not pass everywhere
+        ("emmetropia", 32.0, 8e-4, 5e-3),
+        ("keratoconus", 32.0, 1.5e-3, 5e-3),
+        ("cataract", 32.0, 3e-3, 2e-2),  # -12 dpt at the corners
+        ("cataract", 50.0, 1e-7, 1e-7),  # light does not pass everywhere
     ],
 )
-def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, is_cut):
+def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, allowed_dpt):
     source = estimated(kind="preset", name=name)
     ranges = ((-h_deg, h_deg), (-20.0, 20.0))
     axes = {
@@ -347,9 +347,8 @@ def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, is_cu
     is_middle = state["wavelength_nm"] == 536.0
     assert rms_um[is_middle].max() < 1e-7
     assert np.sqrt((rms_um**2).mean()) < allowed_um
-    assert (rms_um.max() < 1e-6) == is_cut
     dpt = [eye.total_defocus_dpt(**state) for eye in eyes]
-    assert np.abs(dpt[0] - dpt[1]).max() < 2e-2
+    assert np.abs(dpt[0] - dpt[1]).max() < allowed_dpt
     shift_mrad = [
         eye.chief_ray_shift_mrad(
             **{k: v for k, v in state.items() if k != "pupil_diameter_mm"}

@@ -147,12 +147,15 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
 
 def test_the_worker_plans_ahead_until_it_is_asked_for_something_else():
     worker = WorkerHandle(warm_up="")
-    job = replace(FEW_PSFS, near=(4.0, 2.0))
+    settings = replace(
+        FEW_PSFS.settings, pupil_range_mm=(2.0, 7.0), focus_range_dpt=(0, 4)
+    )
+    job = replace(FEW_PSFS, settings=settings, near=(4.0, 2.0))
     try:
         worker.start()
         stores, parts, deadline_s = {}, [], time.monotonic() + 60.0
         tickets = [worker.submit(job)]
-        while len(parts) < 3:
+        while len(stores) < 2 or parts[-1].ticket != tickets[1]:
             assert time.monotonic() < deadline_s
             for event in worker.poll():
                 assert not isinstance(event, BuildError), event
@@ -165,6 +168,9 @@ def test_the_worker_plans_ahead_until_it_is_asked_for_something_else():
             time.sleep(0.001)
     finally:
         worker.close()
+    n_states = len(stores[tickets[0]]._states)
+    of_first = [part for part in parts if part.ticket == tickets[0]]
+    assert 0 < len(of_first) < n_states
     for part in parts:
         store = stores[part.ticket]
         store.take(part.part)

@@ -127,4 +127,5 @@ def test_wide_primaries_cost_twice_the_time_and_no_psf_more():
         spec = spec_for(mode="dynamic", tolerance="loose", wide_primaries=wide)
         plans.append(unchecked_plan(traced_eye("myopia", spec), spec).prediction)
     assert plans[1].psf_count == plans[0].psf_count
+    # Nodes of wide primaries follow from the mean of two wavefronts, not the middle's.
     assert plans[1].build_s == pytest.approx(2.0 * plans[0].build_s, rel=1e-3)
