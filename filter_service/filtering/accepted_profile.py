@@ -36,8 +36,8 @@ class PreparedStore:
         PSFs of a first frame that are being computed.
     next_progress_s : float
         When progress may be told again.
-    n_looks : int
-        How often the PSFs of a first frame were looked for and computed.
+    n_checks : int
+        How often missing PSFs of a first frame were found and computed.
     ticket : int
         Of its build.
     """
@@ -50,7 +50,7 @@ class PreparedStore:
     used_s: float = field(default_factory=time.monotonic)
     pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     next_progress_s: float = 0.0
-    n_looks: int = 0
+    n_checks: int = 0
     ticket: int = 0
 
 

@@ -48,19 +48,21 @@ KEPT_SHARE = 0.8
 
 FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
 """Time between two frames for the first PSFs of a new eye: as long as a frame took,
-within the range.  With half of it and 0.03 s at most, beside a stream of 1280x720 that
-takes all of two cores, new eyes were seen after 1.1 to 2.5 s instead of 0.7 to 1.5."""
+within the range.  Beside a stream of 1280x720 that takes both cores, and with a worker
+of niceness 0, new eyes were shown after 0.7 to 1.5 s; with half of the time, and 0.03 s
+at most, after 1.1 to 2.5 s."""
 
 AHEAD_RANGE_S, AHEAD_SHARE = (0.004, 0.03), 0.5
-"""The same for PSFs that the next frames may need: a stream is never late by a whole
-frame for them."""
+"""The same for PSFs that the next frames may need: half of a frame's time, so that they
+never delay a stream by a whole frame."""
 
 WARM_BATCH = 256
 """PSFs per batch; the deadline is checked after each.  On two cores they take 5 ms."""
 
-LOOK_GROWTH = 4
-"""A new eye serves once what it lacked was less than `WARM_BATCH`, at the second look
-than four of these, and so on: a pupil that keeps moving needs new PSFs all the time."""
+CHECK_GROWTH = 4
+"""A new eye is ready once a check finds at most `WARM_BATCH` PSFs missing.  Each check
+allows this many times more than the last: a pupil that keeps moving needs new PSFs at
+every check."""
 
 BUSY_SHARE = 0.4
 """Of the time between two frames: a stream whose frames take longer gets no PSFs ahead.
@@ -191,7 +193,7 @@ class Workshop:
     def advance(self, *, ahead: bool = True) -> None:
         """Process the worker's events, then compute PSFs ahead for a limited time.
 
-        The limit is about a frame's time: `FIRST_SHARE`, `AHEAD_SHARE`.
+        The limits are `FIRST_SHARE` and `AHEAD_SHARE` of a frame's time.
 
         Parameters
         ----------
@@ -302,9 +304,9 @@ class Workshop:
             if n_pending:
                 store.fill(prepared.pending, until_s=until_s, batch_count=WARM_BATCH)
                 prepared.pending = prepared.pending[:0]
-                # The stream has moved on: look again, but do not follow it for ever.
-                prepared.n_looks += 1
-                if n_pending > WARM_BATCH * LOOK_GROWTH ** (prepared.n_looks - 1):
+                # Pupil and focus have changed meanwhile: check again.
+                prepared.n_checks += 1
+                if n_pending > WARM_BATCH * CHECK_GROWTH ** (prepared.n_checks - 1):
                     return False
         except NotPrepared:
             self._tell_progress(stream, eye, prepared)

@@ -171,8 +171,8 @@ class PsfStore:
     ) -> Iterator[tuple[State, PlanNodes]]:
         """Plan the nodes of states that frames may read, for an equal store's `take`.
 
-        In a process beside the one that renders: there a state takes 12 to 30 ms of
-        the first frame that reads it.
+        The worker process does so: in the process that renders, a state takes 12 to
+        30 ms of the first frame that reads it.
 
         Parameters
         ----------

@@ -303,8 +303,8 @@ def fairness_rows(n_heavy_frames: int, heavy_px: int) -> list[Row]:
         views = [heavy, heavy, *[light] * 20]
         clients = []
         for view in views:
-            # One frame each: a second one would be replaced by the next again and
-            # again, and the copies take the cores from the service.
+            # One frame in flight each: a second one is replaced by the next, again and
+            # again, and copying those takes processor time from the service.
             client = FilterClient(service.endpoint, timeout_s=120.0, max_in_flight=1)
             clients.append(closing.enter_context(client))
             client.set_profile({"kind": "prescription", "sphere_dpt": -2}, views=[view])

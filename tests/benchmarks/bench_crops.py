@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.bench_crops [--quick] [--json]
 
-The most contrasty part of a photograph that is none of ours, 64x64 pixels of 0.9 mrad
+The part of highest contrast of a photograph from scikit-image, 64x64 pixels of 0.9 mrad
 (those of 1280x720 at 60 degrees), at one distance and 6 degrees beside the axis,
 through keratoconus and a post-LASIK eye at 3 and 5 mm.  The reference gives every 4
 pixels (0.2 degrees) PSFs of their own, computed by float64 quadrature of the
@@ -85,7 +85,7 @@ class QuadratureState(EyeState):
 
 
 def crop() -> RgbdView:
-    """Return the most contrasty part of the photograph."""
+    """Return the part of the photograph with the highest contrast."""
     color, _ = motorcycle(1280, 720)
     light = color.mean(axis=2)
     corners = [
