@@ -166,7 +166,9 @@ class FrameDesk:
         held = self._render.take_back(number)
         if held is None:
             return
-        self._turns.note(held.session.key, used_s)
+        # A frame that came between the parts of another kept nobody waiting.
+        here_s = started_s if self._render.held else held.waiting.decoded_s
+        self._turns.note(held.session.key, used_s, here_s, started_s, ended_s)
         self.filtered_s += used_s
         self.load.note(used_s, ended_s)
         if isinstance(reply, Result):

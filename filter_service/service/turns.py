@@ -35,6 +35,7 @@ class Turns(Generic[Client]):
     def __init__(self) -> None:
         self._shares: dict[Client, _Share] = {}
         self._level_s = 0.0  # what the session served last had used before
+        self._free_since_s = 0.0  # when the last frame ended
 
     def arrive(self, client: Client) -> None:
         """Note that a session has a frame waiting."""
@@ -54,11 +55,25 @@ class Turns(Generic[Client]):
             share.is_waiting = False
         return chosen
 
-    def note(self, client: Client, time_s: float) -> None:
-        """Note what a session's frame has taken."""
+    def note(
+        self,
+        client: Client,
+        used_s: float,
+        here_since_s: float,
+        started_s: float,
+        ended_s: float,
+    ) -> None:
+        """Note what a session's frame has taken, and what it took to begin it.
+
+        From the end of one frame to the start of the next, nobody is served.  Frames of
+        160x90 that take 5 ms have 4 ms of that: uncounted, they left a large frame
+        beside them waiting for 1.8 times what equal shares allow.
+        """
+        idle_s = max(0.0, started_s - max(self._free_since_s, here_since_s))
+        self._free_since_s = max(self._free_since_s, ended_s)
         share = self._shares.get(client)
         if share is not None:
-            share.used_s += min(time_s, MAX_DEBT_S)
+            share.used_s += min(used_s + idle_s, MAX_DEBT_S)
 
     def forget(self, client: Client) -> None:
         """Forget a session that has ended."""
