@@ -184,7 +184,7 @@ def test_log_lines_that_repeat_are_left_out_and_counted():
 
 
 IDLE_S = 0.004
-"""From one frame to the next: of the message that ends one, and of that which begins."""
+"""From one frame to the next: of the messages that end one and begin the other."""
 
 
 def simulated(costs_s, duration_s):
