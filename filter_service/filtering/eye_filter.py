@@ -9,6 +9,7 @@ The service holds one of these for each client.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
@@ -124,6 +125,7 @@ class EyeFilter:
         self.cameras = _as_cameras(camera)
         self.settings = as_settings(settings)
         self._on_event = on_event
+        self._pid = os.getpid()
         self._shared = shared(engine) if workshop is None else None
         self._workshop: Workshop | None = workshop or shared(engine).take()
         self._eyes = StreamEyes(
@@ -154,7 +156,7 @@ class EyeFilter:
 
     def close(self) -> None:
         """Give up what the filter holds; closing twice is allowed."""
-        if self._workshop is None:
+        if self._workshop is None or self._pid != os.getpid():
             return
         self._workshop.end(self._eyes)
         if self._shared is not None:
@@ -168,10 +170,16 @@ class EyeFilter:
         Raises
         ------
         ValueError
-            The filter is closed.
+            The filter is closed, or is that of the process which this one was forked
+            from.
         """
         if self._workshop is None:
             raise ValueError("this EyeFilter is closed")
+        if self._pid != os.getpid():
+            raise ValueError(
+                f"this EyeFilter is that of process {self._pid}: "
+                "expected one that is made in the process that uses it"
+            )
         return self._workshop
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import os
 from contextlib import ExitStack
 from functools import cache
 
@@ -65,7 +66,7 @@ class _Shared:
         self._workshop: Workshop | None = None
         self._closing = ExitStack()
         self._n_users = 0
-        atexit.register(self._closing.close)
+        atexit.register(self._close)
 
     def take(self) -> Workshop:
         """Return the workshop, for one more user; the first starts it."""
@@ -86,8 +87,29 @@ class _Shared:
             self._workshop = None
             self._closing.close()
 
+    def _close(self) -> None:
+        self._closing.close()
+
+    def leave_to_parent(self) -> None:
+        """Close nothing: this process was forked, and the worker is its parent's."""
+        self._parents = self._closing.pop_all()  # kept: nothing of it is to be freed
+
+
+_opened: list[_Shared] = []
+
 
 @cache
 def shared(engine: str) -> _Shared:
     """Return what filters of an engine share."""
-    return _Shared(engine)
+    _opened.append(_Shared(engine))
+    return _opened[-1]
+
+
+def _begin_anew() -> None:
+    """Let a forked process open workshops of its own."""
+    for workshops in _opened:
+        workshops.leave_to_parent()
+    shared.cache_clear()
+
+
+os.register_at_fork(after_in_child=_begin_anew)

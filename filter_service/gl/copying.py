@@ -1,5 +1,6 @@
 """Copies of large images by several threads: one core does not fill the bus."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
@@ -38,3 +39,6 @@ def copy_bytes(target: NDArray[np.uint8], source: NDArray[np.uint8]) -> None:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="copy")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # no thread goes along

@@ -1,5 +1,6 @@
 """Computes the kernels of a store: from the wavefronts of nodes to packed PSFs."""
 
+import os
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -115,6 +116,9 @@ def generic_kernels(
 def pack_pool() -> ThreadPoolExecutor:
     """Threads that cut kernels."""
     return ThreadPoolExecutor(thread_count())
+
+
+os.register_at_fork(after_in_child=pack_pool.cache_clear)  # no thread goes along
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:

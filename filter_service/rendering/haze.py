@@ -10,6 +10,7 @@ taken to be as bright as its edge, so that an even picture stays what it is.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -78,6 +79,9 @@ def in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), thread_name_prefix="haze")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # no thread goes along
 
 
 class HazeGrid:

@@ -1,5 +1,6 @@
 """`EyeFilter`: the service's own object in this process, with doubles and for real."""
 
+import multiprocessing
 import os
 import resource
 import time
@@ -337,3 +338,40 @@ def test_a_frame_stops_computing_psfs_when_its_time_is_over(rng):
         assert seen is not None and not eye_filter.is_extending
         whole = eye_filter.filter(view, **state)
     np.testing.assert_array_equal(seen.color, whole.color)
+
+
+NARROW = Camera.from_fov(20.0, width_px=16, height_px=8)
+
+
+def seen_in_child(settings):
+    """Return what a child sees whose parent has filtered, and what the parent saw."""
+    with EyeFilter("myopia", NARROW, settings) as own:
+        picture = own.filter(COLOR, DEPTH_M, **SEE, whole=True).color
+        receiver, sender = multiprocessing.Pipe(duplex=False)
+        context = multiprocessing.get_context("fork")
+        child = context.Process(target=see, args=(sender, settings, own))
+        child.start()
+        assert receiver.poll(60.0), "the child stands still"
+        found = receiver.recv()
+        child.join(20.0)
+        assert child.exitcode == 0
+        again = own.filter(COLOR, DEPTH_M, **SEE).color  # the parent's goes on
+        np.testing.assert_array_equal(again, picture)
+    return found, picture
+
+
+def see(sender, settings, of_parent):
+    try:
+        of_parent.filter(COLOR, DEPTH_M, **SEE)
+        refusal = ""
+    except ValueError as error:
+        refusal = str(error)
+    with EyeFilter("myopia", NARROW, settings) as own:
+        sender.send((own.filter(COLOR, DEPTH_M, **SEE, whole=True).color, refusal))
+
+
+@pytest.mark.parametrize("settings", [FilterSettings(), {"mode": "on-axis"}])
+def test_a_forked_process_has_a_worker_and_threads_of_its_own(settings):
+    (picture, refusal), expected = seen_in_child(settings)
+    np.testing.assert_array_equal(picture, expected)
+    assert "expected one that is made in the process that uses it" in refusal

@@ -4,9 +4,11 @@
 #include <stdatomic.h>
 #include <stdlib.h>
 #include <time.h>
+#include <unistd.h>
 
 struct pool {
-    int n_threads;
+    pid_t owner;              /* a child that was forked has none of the threads */
+    int n_threads, n_wanted;
     pthread_t *threads;
     pthread_mutex_t lock;
     pthread_cond_t begin;
@@ -84,16 +86,17 @@ static void *serve(void *argument) {
     return NULL;
 }
 
-pool *pool_new(int n_threads) {
-    pool *p = calloc(1, sizeof *p);
-    if (p == NULL) return NULL;
-    p->threads = calloc((size_t)n_threads, sizeof *p->threads);
+static void start(pool *p) {
     pthread_mutex_init(&p->lock, NULL);
     pthread_cond_init(&p->begin, NULL);
     pthread_cond_init(&p->end, NULL);
     pthread_cond_init(&p->resume, NULL);
+    p->owner = getpid();
+    p->round = 0;
+    p->busy = 0;
+    atomic_store(&p->rests, 0);
     p->n_threads = 1;
-    for (int thread = 1; p->threads != NULL && thread < n_threads; ++thread) {
+    for (int thread = 1; p->threads != NULL && thread < p->n_wanted; ++thread) {
         seat *own = malloc(sizeof *own);
         if (own == NULL) break;
         own->p = p;
@@ -104,21 +107,32 @@ pool *pool_new(int n_threads) {
         }
         p->n_threads = thread + 1;
     }
+}
+
+pool *pool_new(int n_threads) {
+    pool *p = calloc(1, sizeof *p);
+    if (p == NULL) return NULL;
+    p->threads = calloc((size_t)n_threads, sizeof *p->threads);
+    p->n_wanted = n_threads;
+    start(p);
+    p->n_wanted = p->n_threads; /* what callers have prepared for */
     return p;
 }
 
 void pool_free(pool *p) {
     if (p == NULL) return;
-    pthread_mutex_lock(&p->lock);
-    p->stops = 1;
-    pthread_cond_broadcast(&p->begin);
-    pthread_mutex_unlock(&p->lock);
-    for (int thread = 1; thread < p->n_threads; ++thread)
-        pthread_join(p->threads[thread], NULL);
-    pthread_cond_destroy(&p->begin);
-    pthread_cond_destroy(&p->end);
-    pthread_cond_destroy(&p->resume);
-    pthread_mutex_destroy(&p->lock);
+    if (p->owner == getpid()) {
+        pthread_mutex_lock(&p->lock);
+        p->stops = 1;
+        pthread_cond_broadcast(&p->begin);
+        pthread_mutex_unlock(&p->lock);
+        for (int thread = 1; thread < p->n_threads; ++thread)
+            pthread_join(p->threads[thread], NULL);
+        pthread_cond_destroy(&p->begin);
+        pthread_cond_destroy(&p->end);
+        pthread_cond_destroy(&p->resume);
+        pthread_mutex_destroy(&p->lock);
+    }
     free(p->threads);
     free(p);
 }
@@ -132,6 +146,7 @@ void pool_set_between(pool *p, pool_between between, double interval_s) {
 int pool_size(const pool *p) { return p->n_threads; }
 
 void pool_run(pool *p, int n_items, pool_item item, void *job) {
+    if (p->owner != getpid()) start(p);
     pthread_mutex_lock(&p->lock);
     p->item = item;
     p->job = job;
