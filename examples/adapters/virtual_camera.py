@@ -1,0 +1,54 @@
+"""A virtual camera: video as a person sees it, for any program that shows a webcam.
+
+    python examples/adapters/virtual_camera.py walk.mp4 --profile cataract
+
+Reads a video in a loop, without depth at `--distance-m`, and sends each frame on as a
+camera's.  Wants `pip install av pyvirtualcam`; on Linux also the kernel module, once
+with `sudo modprobe v4l2loopback`; on Windows and macOS the virtual camera of OBS.
+"""
+
+import argparse
+import sys
+
+import av
+import numpy as np
+import pyvirtualcam
+
+from filter_service import Camera, EyeFilter
+
+parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+parser.add_argument("video")
+parser.add_argument("--profile", default="myopia")
+parser.add_argument("--fov-deg", type=float, default=50.0, help="vertical (50)")
+parser.add_argument("--distance-m", type=float, default=2.0, help="of the scene (2)")
+parser.add_argument("--pupil-mm", type=float, default=4.0)
+parser.add_argument("--focus-dpt", type=float, default=0.0)
+parser.add_argument("--frames", type=int, help="how many; endless if not given")
+options = parser.parse_args()
+
+
+def frames():
+    """Yield the video's frames, (height, width, 3), again and again."""
+    while True:
+        with av.open(options.video) as container:
+            for frame in container.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+
+
+with av.open(options.video) as container:
+    stream = container.streams.video[0]
+    size, rate_hz = (stream.width, stream.height), float(stream.average_rate or 30)
+lens = Camera.from_fov(options.fov_deg, width_px=size[0], height_px=size[1])
+depth_m = np.full(size[::-1], options.distance_m, np.float32)
+state = {"pupil_diameter_mm": options.pupil_mm, "focus_dpt": options.focus_dpt}
+try:
+    device = pyvirtualcam.Camera(*size, rate_hz)
+except RuntimeError as error:
+    sys.exit(f"virtual_camera: {' '.join(str(error).split())}")
+with device, EyeFilter(options.profile, lens) as eye:
+    print(f"{device.device}: {size[0]}x{size[1]}, {rate_hz:g} frames/s; Ctrl-C ends it")
+    for n, frame in enumerate(frames()):
+        if n == options.frames:
+            break
+        device.send(eye.filter(frame, depth_m, **state, whole=n == 0).color)
+        device.sleep_until_next_frame()

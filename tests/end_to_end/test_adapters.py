@@ -1,0 +1,184 @@
+"""The adapters of the examples, with doubles of PsychoPy and of a camera's driver.
+
+PyTorch itself is in the tests of the training.
+"""
+
+import multiprocessing
+import runpy
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from filter_service import Camera, EyeFilter, FilterSettings
+from tests.source_tree import ROOT
+
+ADAPTERS = ROOT / "examples" / "adapters"
+SIDE_PX = 48
+SETTINGS = FilterSettings(mode="on-axis", eye_model="wavefront")
+STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
+
+
+@pytest.fixture
+def color(rng):
+    return rng.integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def adapters(monkeypatch):
+    monkeypatch.syspath_prepend(str(ADAPTERS))
+
+
+def expected(color, depth_m=2.0, **state):
+    camera = Camera.from_fov(10.0, width_px=SIDE_PX, height_px=SIDE_PX)
+    depth_m = np.broadcast_to(np.float32(depth_m), color.shape[:2]).copy()
+    with EyeFilter("myopia", camera, SETTINGS) as eye:
+        return eye.filter(color, depth_m, **{**STATE, **state}, whole=True).color
+
+
+def transform(**more):
+    from ocufilter_torch import SeenThrough
+
+    angle = {"vertical_fov_deg": 10.0, "distance_m": 2.0}
+    return SeenThrough("myopia", **angle, settings=SETTINGS, **more)
+
+
+def test_a_transform_takes_arrays_and_pillows_pictures(color):
+    seen, wanted = transform(), expected(color)
+    np.testing.assert_array_equal(seen(color), wanted)
+    picture = seen(Image.fromarray(color))
+    assert isinstance(picture, Image.Image)
+    np.testing.assert_array_equal(np.asarray(picture), wanted)
+    depth_m = np.linspace(0.3, 2.0, color.shape[0])[:, None] + 0.0 * color[..., 0]
+    np.testing.assert_array_equal(
+        seen((color, depth_m)), expected(color, depth_m.astype(np.float32))
+    )
+
+
+def test_a_transform_takes_floats_as_srgb(color):
+    seen = transform()(color.astype(np.float32) / 255.0)
+    assert seen.dtype == np.float32
+    assert np.abs(255.0 * seen - expected(color)).max() < 0.51 + 1e-3
+
+
+def test_a_transform_goes_to_other_processes(color):
+    seen = transform()
+    seen(color)
+    for method in ("fork", "spawn"):
+        with multiprocessing.get_context(method).Pool(1) as pool:
+            (found,) = pool.map(seen, [color])
+        np.testing.assert_array_equal(found, expected(color))
+
+
+class ImageStim:
+    def __init__(self, win, image, **kwargs):
+        self.win, self.image, self.kwargs = win, image, kwargs
+
+    def setImage(self, image, log):
+        self.image = image
+
+
+@pytest.fixture
+def seen_stim(monkeypatch):
+    package, visual = ModuleType("psychopy"), ModuleType("psychopy.visual")
+    visual.ImageStim = ImageStim
+    monkeypatch.setitem(sys.modules, "psychopy", package)
+    monkeypatch.setitem(sys.modules, "psychopy.visual", visual)
+    monkeypatch.delitem(sys.modules, "psychopy_ocufilter", raising=False)
+    from psychopy_ocufilter import SeenImageStim
+
+    return SeenImageStim
+
+
+def test_a_stimulus_shows_what_the_eye_sees(seen_stim, color, tmp_path):
+    stimulus = seen_stim(
+        "window", color, "myopia", 10.0, distance=2.0, pupilDiameter=3.0, size=(1, 1)
+    )
+    assert (stimulus.win, stimulus.kwargs) == ("window", {"size": (1, 1)})
+    shown = [stimulus.image]
+    stimulus.setEye(pupilDiameter=5.0, focus=1.0)
+    shown.append(stimulus.image)
+    for image in shown:
+        assert image.min() >= -1.0 and image.max() <= 1.0
+    blurs = [np.abs(np.diff(image, axis=1)).mean() for image in shown]
+    assert blurs[1] < blurs[0], "a wider pupil blurs more"
+    # PsychoPy draws the first row at the bottom.
+    light = color.astype(float) / 127.5 - 1.0
+    upright = np.corrcoef(np.flipud(shown[0]).ravel(), light.ravel())[0, 1]
+    assert upright > np.abs(np.corrcoef(shown[0].ravel(), light.ravel())[0, 1])
+    Image.fromarray(color).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", np.full(color.shape[:2], 2.0, np.float32))
+    again = seen_stim(
+        *("window", tmp_path / "a.png", "myopia", 10.0),
+        depth=tmp_path / "a.npy",
+        pupilDiameter=3.0,
+    )
+    np.testing.assert_array_equal(again.image, shown[0])
+    with pytest.raises(ValueError, match="distance and depth"):
+        seen_stim("window", color, "myopia", 10.0)
+
+
+def test_the_filter_is_imported_with_the_first_stimulus():
+    source = (ADAPTERS / "psychopy_ocufilter.py").read_text(encoding="utf-8")
+    head = source.partition("class ")[0]
+    assert "filter_service" not in head.partition('"""\n\n')[2]
+
+
+@pytest.fixture
+def video(tmp_path, color):
+    import av
+
+    path = tmp_path / "walk.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=20)
+        stream.width = stream.height = SIDE_PX
+        stream.pix_fmt = "bgr0"
+        frame = av.VideoFrame.from_ndarray(color, format="rgb24")
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def camera_program(monkeypatch, camera, *arguments):
+    driver = SimpleNamespace(Camera=camera)
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", driver)
+    monkeypatch.setattr(sys, "argv", ["virtual_camera.py", *map(str, arguments)])
+    runpy.run_path(str(ADAPTERS / "virtual_camera.py"), run_name="__main__")
+
+
+def test_a_virtual_camera_is_sent_what_the_eye_sees(monkeypatch, video, color):
+    sent = []
+
+    class Device:
+        device = "/dev/video9"
+
+        def __init__(self, width, height, fps):
+            assert (width, height, fps) == (SIDE_PX, SIDE_PX, 20.0)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def send(self, frame):
+            sent.append(frame.copy())
+
+        def sleep_until_next_frame(self):
+            pass
+
+    camera_program(monkeypatch, Device, video, "--fov-deg", 10, "--frames", 3)
+    assert len(sent) == 3  # the one frame of the video, again and again
+    assert sent[0].shape == color.shape and sent[0].dtype == np.uint8
+    assert sent[0].std() < 0.9 * color.std(), "it is blurred"
+    np.testing.assert_array_equal(sent[1], sent[0])
+
+
+def test_without_a_device_the_camera_says_so_in_one_line(monkeypatch, video):
+    def camera(width, height, fps):
+        raise RuntimeError("no backend\nfound")
+
+    with pytest.raises(SystemExit, match="virtual_camera: no backend found"):
+        camera_program(monkeypatch, camera, video)
