@@ -1,16 +1,16 @@
 // Streams a few frames through a service and says as JSON what came back.
 //
-//     node check.js ENDPOINT PROFILE_JSON
+//     node check.js ENDPOINT PROFILE_JSON [LEFT_JSON RIGHT_JSON]
 //
-// Mono and stereo frames, two eyes with profiles of their own, 8 bits and linear light,
-// errors with their fields; then it says
+// Mono and stereo frames, two eyes with profiles of their own (PROFILE_JSON where none are
+// given), 8 bits and linear light, errors with their fields; then it says
 // "lost" on a line of its own, waits for a line on stdin (whoever runs it may end the
 // connection meanwhile), and filters once more.
 
 import { createInterface } from "node:readline";
 import { FilterClient } from "./filter_client.js";
 
-const [endpoint, profileText] = process.argv.slice(2);
+const [endpoint, profileText, leftText, rightText] = process.argv.slice(2);
 const widthPx = 32;
 const heightPx = 18;
 const tangents = [-0.5, 0.5, 0.28, -0.28];
@@ -34,9 +34,8 @@ const pair = [view(Uint8Array, 20), view(Uint8Array, 30)];
 const stereo = await client.filter(pair, look);
 found.stereo = stereo.colors.map((color) => color.at(-1));
 const look2 = { pupilMm: 5, focusDpt: 1, gazeDeg: [1, -2] };
-const body = JSON.parse(profileText);
-for (const [eye, mark] of [["left", 7], ["right", 8]]) {
-  await client.setProfile({ ...body, mark }, { views: [camera], eye });
+for (const [eye, text] of [["left", leftText], ["right", rightText]]) {
+  await client.setProfile(JSON.parse(text ?? profileText), { views: [camera], eye });
 }
 const pose = [0.25, 1.5, -3, 0, 0.5, 0, 0.5];
 const eyes = await client.filter(

@@ -1,18 +1,21 @@
-"""The JavaScript client against the service with the renderer double."""
+"""The JavaScript client against the service, with the renderer double and without."""
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 
 import pytest
 
-from clients.service_process import CHECKOUT
+from clients.service_process import CHECKOUT, ServiceProcess
 from tests.end_to_end.conftest import TIMEOUT_S
 from tests.end_to_end.test_lifecycle import wait_until
 
 FOLDER = CHECKOUT / "clients" / "js"
+
+PROFILE = json.dumps({"kind": "prescription", "sphere_dpt": -2})
 
 needs_node = pytest.mark.skipif(
     shutil.which("node") is None or not (FOLDER / "node_modules").is_dir(),
@@ -26,9 +29,9 @@ needs_node = pytest.mark.skipif(
 )
 def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service, name):
     service = start_service()
-    profile = json.dumps({"kind": "double", "mark": 5})
+    profiles = [json.dumps({"kind": "double", "mark": mark}) for mark in (5, 7, 8)]
     with subprocess.Popen(
-        ["node", "check.js", service.endpoint, profile],
+        ["node", "check.js", service.endpoint, *profiles],
         cwd=FOLDER,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -61,3 +64,51 @@ def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service,
     assert found["profile"] == ["profile_invalid", "kind"]
     assert found["again"] == [found["session"], 245]
     assert found["pong"] == 1
+
+
+@pytest.fixture(scope="module")
+def real_service():
+    with ServiceProcess({"engine": "native"}, start_timeout_s=120.0) as service:
+        yield service
+
+
+@needs_node
+def test_the_check_passes_with_profiles_that_the_service_knows(real_service):
+    with subprocess.Popen(
+        ["node", "check.js", real_service.endpoint, PROFILE],
+        cwd=FOLDER,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as node:
+        try:
+            printed, said = node.communicate("go on\n", timeout=3 * TIMEOUT_S)
+        finally:
+            node.kill()
+    assert not said
+    lost, found = printed.splitlines()
+    assert lost == "lost"
+    assert json.loads(found)["profile"] == ["profile_invalid", "kind"]
+
+
+@needs_node
+def test_the_example_of_its_readme_runs(real_service, tmp_path):
+    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```js\n(.*?)```", text, re.DOTALL)
+    client = (FOLDER / "filter_client.js").as_uri()
+    example = example.replace("./filter_client.js", client)
+    file = tmp_path / "example.mjs"
+    file.write_text(
+        example.replace("tcp://127.0.0.1:5577", real_service.endpoint),
+        encoding="utf-8",
+    )
+    finished = subprocess.run(
+        ["node", file],
+        cwd=FOLDER,
+        capture_output=True,
+        text=True,
+        timeout=3 * TIMEOUT_S,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.startswith("320x180, pupil 4 mm")
