@@ -218,9 +218,7 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
     allowed = "a JPEG, PNG, WebP or TIFF picture of 8 bits"
     _check_size(name, content)
     try:
-        color = read_picture_rgb(
-            content, name=name[:60], upright=True, formats=PHOTO_FORMATS
-        )
+        color = read_picture_rgb(content, name=name[:60], formats=PHOTO_FORMATS)
     except InvalidFile as error:
         if error.found.startswith("cannot be read"):
             raise InvalidFile(name[:60], "not a picture", allowed) from None

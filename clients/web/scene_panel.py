@@ -30,6 +30,8 @@ from clients.web.upload_entry import Taking, upload_entry
 KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
 FIRST = "courtyard"
+NamedFile = tuple[str, bytes]
+
 MAX_AT_ONCE = 2
 """Pictures that are made at the same time; a photo of 64 Mpx takes 0.6 GB."""
 
@@ -51,8 +53,8 @@ class ScenePanel:
         self._state, self._on_picture = state, on_picture
         self._kind = FIRST
         self._n_waiting = 0
-        self._photo: tuple[str, bytes] | None = None
-        self._depth: tuple[str, bytes] | None = None
+        self._photo: NamedFile | None = None
+        self._depth: NamedFile | None = None
         self._width_deg = 35
         with ui.element("div").classes("oc-scene"):
             ui.toggle(KINDS, value=FIRST, on_change=self._choose).props(
@@ -109,39 +111,47 @@ class ScenePanel:
         elif self._kind == "chart":
             await self._make(chart_picture, self._state.values[DISTANCE.name])
         elif self._kind == "photo":
-            await self._show_photo()
+            await self._show_again()
 
     async def _take_gltf(self, name: str, content: bytes) -> None:
         await self._make(gltf_picture, name, content)
 
     async def _take_photo(self, name: str, content: bytes) -> None:
-        self._photo = name, content
-        self._depth = None  # that of another photo
-        await self._show_photo()
+        # A depth that came first is of this photo; any other was of the last one.
+        depth = self._depth if self._photo is None else None
+        if not await self._show_photo((name, content), depth) and self._photo is None:
+            self._depth = None  # it may be what was refused
+            self._in_use()
 
     async def _take_depth(self, name: str, content: bytes) -> None:
-        self._depth = name, content
         if self._photo is None:
+            self._depth = name, content
             ui.notify("Now the photo that this is the depth of", type="info")
+            self._in_use()
             return
-        await self._show_photo()
+        await self._show_photo(self._photo, (name, content))
 
     async def _set_width(self, event: events.ValueChangeEventArguments) -> None:
         self._width_deg = event.value
-        await self._show_photo()
+        await self._show_again()
 
-    async def _show_photo(self) -> None:
-        if self._photo is None:
-            return
-        if not await self._make(
+    async def _show_again(self) -> None:
+        if self._photo is not None:
+            await self._show_photo(self._photo, self._depth)
+
+    async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> bool:
+        """Show a photo; where one of its files is refused, those of before stay."""
+        is_shown = await self._make(
             photo_picture,
-            *self._photo,
+            *photo,
             width_deg=self._width_deg,
             distance_dpt=self._state.values[DISTANCE.name],
-            depth=self._depth,
-        ):
-            self._depth = None
+            depth=depth,
+        )
+        if is_shown:
+            self._photo, self._depth = photo, depth
         self._in_use()
+        return is_shown
 
     async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
         """Show the picture that a function makes, or say why there is none."""

@@ -31,7 +31,14 @@ def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.u
         if event.file.size() > most_bytes:  # the browser was to refuse it
             refuse()
         else:
+            await take_in(event)
+
+    async def take_in(event: events.UploadEventArguments) -> None:
+        try:
             await take(plain_name(event.file.name), await event.file.read())
+        except RuntimeError:
+            if not entry.is_deleted:  # else its page was closed meanwhile
+                raise
 
     entry = ui.upload(
         auto_upload=True,

@@ -24,6 +24,8 @@ from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 20.0
+GONE_S = 6.0
+"""NiceGUI forgets a page that has been closed for 3 s."""
 
 
 class Target:
@@ -282,6 +284,38 @@ def test_a_hostile_name_is_only_shown(upload, name, shown):
 def test_a_bomb_is_refused(upload):
     assert upload(b"bomb.png", _png(9000, 8001)) == 200
     assert "allowed: at most" in _said(upload, "bomb.png.*pixels")
+
+
+def test_a_page_that_closes_during_an_upload_is_no_fault(browser):
+    """Its connection breaks, or the rest of the file comes when the page is gone."""
+    with attacked() as target:
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(target.address)
+        page.get_by_role("button", name="Photo", exact=True).first.click()
+        with page.expect_request(lambda request: "/upload/" in request.url) as sent:
+            entry = page.locator(".oc-uploads input[type=file]").first
+            picture = {"name": "a.png", "mimeType": "image/png", "buffer": b"none"}
+            entry.set_input_files(picture)
+        path = urlsplit(sent.value.url).path
+        body = b'--B\r\nContent-Disposition: form-data; name="f"; filename="a.png"\r\n'
+        body += b"Content-Type: image/png\r\n\r\n" + _png(4000, 3000) + b"\r\n--B--\r\n"
+        head = (
+            f"POST {path} HTTP/1.1\r\nHost: 127.0.0.1:{target.port}\r\n"
+            f"Cookie: {target.cookie['Cookie']}\r\n"
+            "Content-Type: multipart/form-data; boundary=B\r\n"
+            f"Content-Length: {len(body)}\r\n\r\n"
+        ).encode()
+        half = len(body) // 2
+        with target.connect() as broken, target.connect() as late:
+            for sock in (broken, late):
+                sock.sendall(head + body[:half])
+            time.sleep(0.3)
+            context.close()
+            broken.close()
+            time.sleep(GONE_S)
+            late.sendall(body[half:])
+            assert late.recv(12).startswith(b"HTTP/1.1")
 
 
 def test_uploads_that_are_none_are_refused(upload):

@@ -244,6 +244,32 @@ def test_a_portrait_is_seen_whole_and_a_file_of_another_kind_is_refused(page):
     assert box["width"] / box["height"] == pytest.approx(2 / 3, rel=0.01)
 
 
+def test_files_that_are_refused_leave_those_of_before_in_use(page):
+    photo, depth_m = io.BytesIO(), io.BytesIO()
+    Image.fromarray(np.full((120, 160, 3), 90, np.uint8)).save(photo, "png")
+    np.save(depth_m, np.full((120, 160), 2.0, np.float32))
+    page.choose("Photo")
+    uploads = page.page.locator(".oc-uploads input[type=file]")
+
+    def send(which, name, content):
+        mime = "image/png" if name.endswith("png") else ""
+        files = {"name": name, "mimeType": mime, "buffer": content}
+        uploads.nth(which).set_input_files(files)
+
+    number = page.number()
+    send(1, "depth.npy", depth_m.getvalue())  # before its photo
+    page.page.get_by_text("In use: depth.npy").wait_for()
+    send(0, "own.png", photo.getvalue())
+    page.settle(after=number)
+    page.page.get_by_text("In use: own.png, depth.npy").wait_for()
+    send(0, "broken.png", b"junk")
+    page.page.get_by_text(re.compile("broken.png.*")).first.wait_for()
+    page.page.get_by_text("In use: own.png, depth.npy").wait_for()
+    send(1, "broken.npy", b"junk")
+    page.page.get_by_text(re.compile("broken.npy.*")).first.wait_for()
+    page.page.get_by_text("In use: own.png, depth.npy").wait_for()
+
+
 def test_a_3d_file_of_ones_own_is_looked_at(page):
     trimesh = pytest.importorskip("trimesh")
     box = trimesh.creation.box((1.0, 1.0, 1.0))
