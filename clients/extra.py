@@ -11,7 +11,7 @@ def what_to_install(error: ModuleNotFoundError) -> str:
     return f"the package {error.name} is not installed; to render scenes: {INSTALL}"
 
 
-HEADSET_INSTALL = f"{sys.executable} -m pip install pyopenxr"
+HEADSET_INSTALL = f"{sys.executable} -m pip install 'ocufilter[headset]'"
 
 WEB_INSTALL = (
     "make web, in a checkout, installs what is missing; elsewhere "

@@ -282,7 +282,7 @@ class _Textures:
             return None
         if index not in self._decoded:
             content, name = self._content(index), self._name(index)
-            self._decoded[index] = read_picture_rgb(content, name=name)
+            self._decoded[index] = read_picture_rgb(content, name=name, upright=False)
         return self._decoded[index]
 
     def _image_of(self, material: dict[str, Any]) -> int | None:

@@ -104,8 +104,10 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
     )
     end = parser.add_argument_group("until when")
     end.add_argument("--frames", type=int, metavar="N", help="filtered ones")
-    end.add_argument("--seconds", type=float)
-    end.add_argument("--out", type=Path, metavar="DIR", help="for the last pictures")
+    end.add_argument("--seconds", type=float, help="from the first filtered frame on")
+    end.add_argument(
+        "--out", type=Path, metavar="DIR", help="for the last filtered pictures"
+    )
     end.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     _settle_where(parser, options)

@@ -37,7 +37,7 @@ from clients.headset.options import (
     settings_of,
 )
 from clients.headset.poses import upright
-from clients.headset.runtime import Eye, NoRuntime, Runtime
+from clients.headset.runtime import Eye, NoRuntime, Runtime, ShownView
 from clients.headset.seeing import Seeing
 from clients.headset.seeing_by_service import SeeingByService
 from clients.headset.seeing_here import SeeingHere
@@ -46,6 +46,9 @@ from filter_service import FilterSettings
 from filter_service.errors import FilterError
 
 TRACKED_RANGE_DEG = (15.0, 10.0)
+WARM_UP_S = 60.0
+"""Longest time until the first filtered frame; `--seconds` counts from that one."""
+
 CORE_VALIDATION = "XR_APILAYER_LUNARG_core_validation"
 
 
@@ -170,7 +173,10 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> float:
-    """Show until the end, or until a signal; return how long it took, in s."""
+    """Show until the end, or until a signal.
+
+    Returns how long it took from the first filtered frame on, in s.
+    """
     if sys.stdin is not None and sys.stdin.isatty():
         say(HELP)
     started_s = time.monotonic()
@@ -184,12 +190,14 @@ def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> fl
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     try:
-        viewer.run(max_frames=options.frames, limit_s=options.seconds)
+        viewer.run(
+            max_frames=options.frames, limit_s=options.seconds, warm_up_s=WARM_UP_S
+        )
     except KeyboardInterrupt:
         controls.is_over = True
     if controls.is_over:
         say("ended")
-    return time.monotonic() - started_s
+    return time.monotonic() - (viewer.log.first_filtered_s or started_s)
 
 
 def _runtime(
@@ -247,19 +255,22 @@ def _seeing(options: argparse.Namespace, settings: FilterSettings) -> Seeing:
 
 
 class _Pictures:
-    """The last pictures that were shown."""
+    """The last filtered pictures that were shown."""
 
     def __init__(self) -> None:
-        self._shown: Sequence[Any] = ()
+        self._shown: Sequence[ShownView] = ()
 
-    def keep(self, due, shown) -> None:
-        """Keep what is shown."""
-        self._shown = shown or self._shown
+    def keep(self, due: object, shown: Sequence[ShownView]) -> None:
+        """Keep what is shown, where it is filtered."""
+        if shown and all(view.plain is not None for view in shown):
+            self._shown = shown
 
     def write(self, folder: Path) -> None:
         """Write one PNG of each eye into a folder that is there."""
         from PIL import Image
 
+        if not self._shown:
+            say(f"no picture was filtered: none is written to {folder}")
         for shown in self._shown:
             path = folder / f"{shown.view.eye}.png"
             Image.fromarray(shown.color).save(path)

@@ -45,10 +45,12 @@ class ViewerLog:
     Attributes
     ----------
     shown : frames that were shown filtered, plain, or were not to be rendered
+    first_filtered_s : when the first of them was, of `time.monotonic`
     stages_ms : times of each stage of filtered frames
     """
 
     n_filtered: int = 0
+    first_filtered_s: float | None = None
     n_repeated: int = 0  # filtered pictures that were shown once more
     n_plain: int = 0
     n_hidden: int = 0
@@ -60,6 +62,8 @@ class ViewerLog:
     def add(self, **times_ms: float) -> None:
         """Note a filtered frame's times."""
         self.n_filtered += 1
+        if self.first_filtered_s is None:
+            self.first_filtered_s = time.monotonic()
         for name, value_ms in times_ms.items():
             self.stages_ms.setdefault(name, []).append(value_ms)
 
@@ -133,7 +137,13 @@ class Viewer:
         self._was_stale = False
         self.log = ViewerLog()
 
-    def run(self, *, max_frames: int | None = None, limit_s: float | None = None):
+    def run(
+        self,
+        *,
+        max_frames: int | None = None,
+        limit_s: float | None = None,
+        warm_up_s: float = 0.0,
+    ) -> ViewerLog:
         """Show frames until the user ends it; a headset that goes away is waited for.
 
         Parameters
@@ -142,13 +152,20 @@ class Viewer:
             Filtered frames after which it ends.
         limit_s : float, optional
             Time after which it ends.
+        warm_up_s : float
+            How long the first filtered frame may take; the limit counts from that
+            frame.
         """
-        end_s = None if limit_s is None else time.monotonic() + limit_s
+        started_s = time.monotonic()
+
+        def end_s(limit_s: float) -> float:
+            latest_s = started_s + warm_up_s
+            return min(self.log.first_filtered_s or latest_s, latest_s) + limit_s
 
         def is_done() -> bool:
             if max_frames is not None and self.log.n_filtered >= max_frames:
                 return True
-            if end_s is not None and time.monotonic() >= end_s:
+            if limit_s is not None and time.monotonic() >= end_s(limit_s):
                 return True
             return self._controls.is_over
 

@@ -4,10 +4,12 @@
 """
 
 import math
+import time
 
 import numpy as np
 import pytest
 
+from clients.headset import program
 from clients.headset.look import StereoLook
 from clients.headset.poses import angles_of, direction_of, matrix_of, turned, upright
 from clients.headset.runtime import (
@@ -186,6 +188,41 @@ def test_a_filter_that_is_too_late_does_not_freeze_the_picture(monkeypatch):
         last.color, wall.pictures([last.view], SIZE_PX)[0].color
     )
     assert len([line for line in said if "is late" in line]) == 1
+
+
+class Late(Inverting):
+    """Has no eye yet for a while."""
+
+    def __init__(self, ready_after_s):
+        super().__init__()
+        self.ready_s = time.monotonic() + ready_after_s
+
+    def see(self, frame):
+        return super().see(frame) if time.monotonic() >= self.ready_s else None
+
+
+def test_a_limit_of_time_counts_from_the_first_filtered_frame():
+    runtime = SimulatedRuntime(SIZE_PX, rate_hz=200.0)
+    started_s = time.monotonic()
+    log = viewer_of(runtime, Late(0.6)).run(limit_s=0.3, warm_up_s=20.0)
+    assert 0.9 <= time.monotonic() - started_s < 10.0
+    assert log.n_filtered > 1
+    runtime = SimulatedRuntime(SIZE_PX, rate_hz=200.0)
+    log = viewer_of(runtime, Late(60.0)).run(limit_s=0.2, warm_up_s=0.2)
+    assert log.n_filtered == 0, "it ends though nothing is filtered"
+
+
+def test_only_filtered_pictures_are_written(tmp_path, capsys):
+    pictures = program._Pictures()
+    for ready_after_s in (60.0, 0.0):
+        runtime = SimulatedRuntime(SIZE_PX, rate_hz=200.0, on_shown=pictures.keep)
+        viewer_of(runtime, Late(ready_after_s)).run(limit_s=0.2)
+        pictures.write(tmp_path)
+        found = {path.name for path in tmp_path.iterdir()}
+        if ready_after_s:
+            assert found == set()
+            assert "no picture was filtered" in capsys.readouterr().err
+    assert found == {"left.png", "right.png"}
 
 
 def test_keys_change_eyes_split_and_end():
