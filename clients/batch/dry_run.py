@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from clients.batch.manifest import LINES, Manifest
+from clients.batch.manifest import LINES, Manifest, Notes, add_notes, told
 from clients.batch.run import Batch, missing_units
 from clients.batch.work import Unit, UnitRunner
 
@@ -67,7 +67,8 @@ def _known(value: float, digits: int) -> float | None:
 def _measured(batch: Batch, profile: str) -> dict[str, Any]:
     """Filter the first frames through a profile, on this process's one thread."""
     frames = batch.frames[:MEASURED_FRAMES]
-    times_ms, sizes, errors, notes = [], [], [], []
+    times_ms, sizes, errors = [], [], []
+    notes: Notes = {}
     build_s = 0.0
     with tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder:
         runner = UnitRunner(batch.job, Path(folder))
@@ -81,7 +82,7 @@ def _measured(batch: Batch, profile: str) -> dict[str, Any]:
                 if not record["ok"]:
                     errors.append(record["error"])
                     continue
-                notes += record["notes"]
+                add_notes(notes, record["notes"])
                 sizes.append(record["bytes"])
                 if "build" not in record["ms"]:
                     times_ms.append(took_ms)
@@ -95,7 +96,7 @@ def _measured(batch: Batch, profile: str) -> dict[str, Any]:
         "ms_per_frame": round(float(np.median(times_ms)), 2) if times_ms else None,
         "bytes_per_frame": round(float(np.mean(sizes))) if sizes else None,
         "errors": errors,
-        "notes": list(dict.fromkeys(notes)),
+        "notes": list(notes.values()),
     }
 
 
@@ -108,15 +109,15 @@ def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[
     ]
     for one in report["profiles"]:
         took = one["ms_per_frame"]
-        told = (
+        measured = (
             "no frame measured"
             if took is None
             else f"{took:.1f} ms a frame on one core ({one['measured_frames']} "
             f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
         )
-        lines.append(f"  {one['profile']}: {told}; PSFs {one['build_s']:.1f} s")
+        lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
         lines += [f"    error: {text}" for text in one["errors"]]
-        lines += [f"    note: {text}" for text in one["notes"]]
+        lines += [f"    note: {told(note)}" for note in one["notes"]]
     if report["seconds"] is not None:
         lines.append(
             f"about {_duration(report['seconds'])} on {report['cores']} cores, "

@@ -22,6 +22,7 @@ from clients.batch.source import (
     Scaled,
     SourceFrame,
 )
+from filter_service.camera import read_intrinsics
 
 
 @dataclass(frozen=True)
@@ -156,10 +157,4 @@ def optics_of(fov_deg: float | None, intrinsics: str | None) -> Optics | None:
         return FieldOfView(fov_deg)
     if intrinsics is None:
         return None
-    try:
-        numbers = [float(part) for part in intrinsics.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 4 or min(numbers[:2]) <= 0.0:
-        raise ValueError(f"--intrinsics '{intrinsics}': allowed is FX,FY,CX,CY in px")
-    return Pinhole(*numbers)
+    return Pinhole(*read_intrinsics(intrinsics))

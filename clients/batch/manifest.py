@@ -15,7 +15,7 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,6 +30,8 @@ RESTART = "the same, another folder, or --overwrite"
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
 """Of a line: a job with states of 200,000 frames, as many as are read, takes half."""
+
+Notes = dict[str, dict[str, Any]]
 
 SYNC_S = 2.0
 """So much work may a power cut undo."""
@@ -261,7 +263,7 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
     """Return counts, failures and notes of the frames that are wanted."""
     n_done, failures = Counter[str](), []
-    notes: dict[str, dict[str, Any]] = {}  # those alike but for their numbers are one
+    notes: Notes = {}
     pixels = Counter[str]()
     for record in manifest.records():
         if (record["profile"], record["frame"]) not in wanted:
@@ -270,11 +272,7 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
             failures.append({k: record[k] for k in ("profile", "frame", "error")})
             continue
         n_done[record["profile"]] += 1
-        for note in record["notes"]:
-            of_kind = notes.setdefault(
-                _NUMBER.sub("#", note), {"frames": 0, "example": note}
-            )
-            of_kind["frames"] += 1
+        add_notes(notes, record["notes"])
         for name in ("missing_depth_count", "clamped_depth_count", "overflow_count"):
             pixels[name] += record[name]
     return {
@@ -283,3 +281,15 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
         **pixels,
         "notes": list(notes.values()),
     }
+
+
+def add_notes(notes: Notes, of_frame: Sequence[str]) -> None:
+    """Count the notes of a frame; those alike but for their numbers are one."""
+    for note in of_frame:
+        kind = _NUMBER.sub("#", note)
+        notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
+
+
+def told(note: Mapping[str, Any]) -> str:
+    """Return a note of some frames as a person reads it."""
+    return f"{note['frames']} frames, as: {note['example']}"

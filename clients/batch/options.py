@@ -74,7 +74,7 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         required=True,
         metavar="P",
-        help="a preset's name, or a .json, .abp or .csv file; again for more. "
+        help="a preset's name, a .json, .abp or .csv file, or JSON; again for more. "
         "NAME=P gives its folder another name",
     )
     _add_source(parser.add_argument_group("what is read"))
@@ -280,7 +280,11 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
         name, _, what = text.rpartition("=")
         body = profile_body(what)
         load_profile(what)  # checks its fields, and names the file
-        name = name or (what if body.get("kind") == "preset" else Path(what).stem)
+        if what.lstrip().startswith("{"):  # JSON
+            own_name = str(body.get("name", "profile"))
+        else:
+            own_name = what if body.get("kind") == "preset" else Path(what).stem
+        name = name or own_name
         name = _NAME.sub("_", name).lstrip(".")
         if not name or name in found:
             raise ValueError(

@@ -12,7 +12,7 @@ from typing import Any
 
 from clients.batch.dry_run import dry_run, lines_of
 from clients.batch.exact_filter import EngineUnusable
-from clients.batch.manifest import Manifest
+from clients.batch.manifest import Manifest, told
 from clients.batch.options import arguments_of, batch_of, workers_and_threads
 from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
 from clients.batch.run import Batch, Pool, only_one, prepare_folder, run_batch
@@ -79,15 +79,13 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
     n_all, n_failed = summary["frames"], len(summary["failures"])
     lines = [
         f"{options.out}: {n_all - n_failed} of {n_all} pictures, "
-        f"{this_run['frames']} of them in this run, in {this_run['seconds']:.1f} s"
+        f"{this_run['frames'] - this_run['failed']} of them in this run, in "
+        f"{this_run['seconds']:.1f} s"
     ]
     for kind in ("missing", "clamped"):
         if count := summary.get(f"{kind}_depth_count"):
             lines.append(f"note: {count} pixels with {kind} depth")
-    lines += [
-        f"note: {n['frames']} frames, as: {n['example']}" for n in summary["notes"]
-    ]
-    return lines
+    return lines + [f"note: {told(note)}" for note in summary["notes"]]
 
 
 def failure_lines(summary: dict[str, Any]) -> list[str]:

@@ -206,9 +206,10 @@ def run_batch(
     on_done(n_done, len(wanted))
     for profile in {unit.profile for unit in units}:
         video_of(batch, profile).unlink(missing_ok=True)  # it is to be another
-    cpu_s = 0.0
+    cpu_s, n_failed = 0.0, 0
     for record in pool.run(units):
         manifest.append(record)
+        n_failed += not record["ok"]
         cpu_s += record.get("cpu_ms", 0.0) / 1e3
         n_done += 1
         on_done(n_done, len(wanted))
@@ -221,6 +222,7 @@ def run_batch(
         **summary_of(manifest, wanted),
         "this_run": {
             "frames": n_missing,
+            "failed": n_failed,
             "seconds": round(took_s, 3),
             "core_seconds": round(cpu_s, 3),
         },

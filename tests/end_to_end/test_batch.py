@@ -261,7 +261,7 @@ def test_bad_files_are_named_and_the_rest_goes_on(tmp_path, rng):
     out = tmp_path / "out"
     common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
     told, error = run(*common, code=1)
-    assert "1 of 4 pictures" in told
+    assert "1 of 4 pictures, 1 of them in this run" in told
     assert "1.png': cannot be read" in error
     assert "no depth of the name '2'" in error
     assert "5x5 px; allowed: the size of" in error
@@ -327,6 +327,35 @@ def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
     ms = report["ms_per_picture_and_core"]
     assert report["core_hours_per_million"] == pytest.approx(ms / 3.6, rel=0.01)
     assert report["price_per_million"] == pytest.approx(ms / 7.2, rel=0.02)
+
+
+def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
+    """Six frames of the measured eye, each with a focus of its own beyond reach."""
+    lines = [f"{n:03d},4,{0.1 * n:.2f}" for n in range(COUNT)]
+    states = tmp_path / "states.csv"
+    states.write_text("\n".join(["frame,pupil_mm,focus_dpt", *lines]))
+    common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
+    told, _ = run(*common, "--states", states, "--dry-run")
+    notes = [line for line in told.splitlines() if "note:" in line]
+    assert len([note for note in notes if "far point" in note]) == 1, told
+    assert "6 frames, as: focus" in notes[0]
+
+
+def test_profiles_may_be_json_and_photographs_are_turned_upright(tmp_path, rng):
+    room = tmp_path / "room"
+    for name in ("color", "depth"):
+        (room / name).mkdir(parents=True)
+    write_frame(room, "a", rng)
+    stored = np.asarray(Image.open(room / "color/a.png"))
+    turned = Image.Exif()
+    turned[0x0112] = 3  # upside down
+    Image.fromarray(stored).save(room / "color/a.png", exif=turned)
+    body = '{"kind": "prescription", "sphere_dpt": 0, "name": "plano"}'
+    out = tmp_path / "out"
+    run(room, "-p", body, *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
+    seen = read_color(out / "plano/a.png").astype(int)
+    upright = stored[::-1, ::-1]
+    assert np.abs(seen - upright).mean() < 0.5 * np.abs(seen - stored).mean()
 
 
 @pytest.mark.parametrize(
