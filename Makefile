@@ -75,8 +75,9 @@ check: setup  ## lint, formatting, types, and every shader through glslang
 	@sh tests/gl_witness/setup.sh glslang || test $$? -eq 77
 	$(PYTHON) -m tests.shader_check
 
-clean:  ## remove what the other targets made, .venv included
-	rm -rf .venv .witness .batch_ray .examples .gl_witness .headset out build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+clean:  ## remove what the other targets made, .venv included; out/ stays
+	rm -rf .venv .witness .batch_ray .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules
+	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## this list

@@ -85,3 +85,15 @@ def test_the_makefile_makes_every_benchmark_of_the_program():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     listed = re.search(r"^BENCHES := (.*)$", makefile, re.MULTILINE)[1].split()
     assert listed == [bench.value for bench in BENCH_MODULES]
+
+
+def test_make_clean_removes_compiled_loops_and_leaves_results(tmp_path):
+    kept, removed = "out/demo/video.mp4", "filter_service/native/_loops.abi3.so"
+    cached = "estimator/__pycache__/a.nbi"
+    for name in (kept, removed, cached):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("")
+    make = ["make", "-f", ROOT / "Makefile", "clean"]
+    subprocess.run(make, cwd=tmp_path, check=True, capture_output=True)
+    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert left == {kept}
