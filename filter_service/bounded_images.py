@@ -117,7 +117,7 @@ def read_picture_rgb(
     *,
     name: str = "",
     option: str = "",
-    upright: bool = False,
+    upright: bool = True,
     formats: Sequence[str] = FORMATS,
 ) -> NDArray[np.uint8]:
     """Return a picture of 8 bits per channel as sRGB (height, width, 3).
@@ -131,7 +131,7 @@ def read_picture_rgb(
     option : str
         What asked for it, for the texts of errors.
     upright : bool
-        Whether to turn it as its EXIF data say.
+        Whether to turn it as its EXIF data say; textures are taken as stored.
     formats : sequence of str
         Pillow's names of those to read, whatever the file's name.
 
@@ -148,7 +148,7 @@ def read_picture_rgb(
 
 
 def read_picture_values(source: Source, *, name: str = "", option: str = "") -> NDArray:
-    """Return the stored values of a picture, as depth files have them.
+    """Return the stored values of a picture, upright, as depth files have them.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def read_picture_values(source: Source, *, name: str = "", option: str = "") -> 
     """
     with _opened_picture(source, name, option) as image:
         image.load()
-        return np.asarray(image)
+        return np.asarray(ImageOps.exif_transpose(image))
 
 
 def check_picture(source: Source, *, name: str = "", option: str = "") -> int:

@@ -47,6 +47,45 @@ def tangents_from_fov(
     return (-right, right, up, -up)
 
 
+def tangents_from_intrinsics(
+    focal_x_px: float,
+    focal_y_px: float,
+    center_x_px: float,
+    center_y_px: float,
+    *,
+    width_px: int,
+    height_px: int,
+) -> tuple[float, float, float, float]:
+    """Return (left, right, up, down) of a calibrated camera without distortion.
+
+    The center of pixel (0, 0) is at (0, 0), as OpenCV and ROS have it; the edges of the
+    image are half a pixel beyond the centers of its outermost pixels.
+    """
+    return (
+        -(center_x_px + 0.5) / focal_x_px,
+        (width_px - 0.5 - center_x_px) / focal_x_px,
+        (center_y_px + 0.5) / focal_y_px,
+        -(height_px - 0.5 - center_y_px) / focal_y_px,
+    )
+
+
+def read_intrinsics(text: str) -> tuple[float, float, float, float]:
+    """Return focal lengths and principal point, px, of an option ``--intrinsics``.
+
+    Raises
+    ------
+    ValueError
+        Other than four numbers, or focal lengths of zero or less; names the option.
+    """
+    try:
+        fx, fy, cx, cy = (float(part) for part in text.split(","))
+    except ValueError:
+        fx = fy = cx = cy = math.nan
+    if not (min(fx, fy) > 0.0 and all(map(math.isfinite, (fx, fy, cx, cy)))):
+        raise ValueError(f"--intrinsics '{text}': allowed is FX,FY,CX,CY in px")
+    return fx, fy, cx, cy
+
+
 @dataclass(frozen=True)
 class Camera(Record):
     """A pinhole: image size, tangents to the left, right, upper and lower edge.
@@ -95,6 +134,31 @@ class Camera(Record):
             A field of view or size that no pinhole has.
         """
         tangents = tangents_from_fov(vertical_fov_deg, width_px, height_px)
+        return cls(width_px, height_px, tangents)
+
+    @classmethod
+    def from_intrinsics(
+        cls,
+        focal_x_px: float,
+        focal_y_px: float,
+        center_x_px: float,
+        center_y_px: float,
+        *,
+        width_px: int,
+        height_px: int,
+    ) -> Camera:
+        """Return a calibrated camera; see `tangents_from_intrinsics`.
+
+        Raises
+        ------
+        BadMessage
+            A size, or edges, that no pinhole has.
+        """
+        tangents = tangents_from_intrinsics(
+            *(focal_x_px, focal_y_px, center_x_px, center_y_px),
+            width_px=width_px,
+            height_px=height_px,
+        )
         return cls(width_px, height_px, tangents)
 
     @property

@@ -17,6 +17,9 @@ from types import TracebackType
 from typing import Any, Self, TextIO
 
 INTERVAL_S = 5.0
+STAGE_NAMES = {"psfs": "PSFs"}
+"""Of stages whose names in messages are not how people write them."""
+
 SURE_AFTER_S = 2.0
 """Sooner, what is done says little of the time that is left."""
 
@@ -46,7 +49,8 @@ class Task:
     @property
     def name(self) -> str:
         """What is being done."""
-        return f"{self.title}: {self.stage}" if self.stage else self.title
+        stage = STAGE_NAMES.get(self.stage, self.stage)
+        return f"{self.title}: {stage}" if stage else self.title
 
     @property
     def count(self) -> str:

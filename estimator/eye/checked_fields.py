@@ -1,8 +1,14 @@
 """Checked reading of one field of a profile: every refusal names field and range."""
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+MAX_COMPARED = 60
+
+WHOLE = "profile"
+"""The field of an error about all of it."""
 
 
 class ProfileError(ValueError):
@@ -12,13 +18,16 @@ class ProfileError(ValueError):
     ----------
     field : str
         Dotted path of the field at fault, e.g. ``correction.axis_deg``.
+    problem : str
+        What it is.
     allowed : str
         What the field accepts.
     """
 
     def __init__(self, field: str, problem: str, allowed: str):
-        super().__init__(f"profile field '{field}': {problem}; allowed: {allowed}")
-        self.field = field
+        named = field if field == WHOLE else f"{WHOLE} field '{field}'"
+        super().__init__(f"{named}: {problem}; allowed: {allowed}")
+        self.field, self.problem = field, problem
         self.allowed = allowed
 
 
@@ -57,8 +66,18 @@ def choice(
     if value is None:
         raise ProfileError(name, "is missing", allowed)
     if not isinstance(value, str) or value not in options:
-        raise ProfileError(name, f"{value!r} is unknown", allowed)
+        meant = did_you_mean(value, options)
+        raise ProfileError(name, f"{value!r} is unknown{meant}", allowed)
     return value
+
+
+def did_you_mean(value: object, options: Sequence[str]) -> str:
+    """Return what to add to an error about a near miss; nothing where none is near."""
+    # A long text is no slip of typing, and would take long to compare.
+    if not isinstance(value, str) or len(value) > MAX_COMPARED:
+        return ""
+    near = difflib.get_close_matches(value, options, n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def mapping(data: object, name: str) -> Mapping[str, Any]:
@@ -75,4 +94,5 @@ def only_known(
     for field in data:
         if field not in known:
             allowed = "the fields " + ", ".join(known)
-            raise ProfileError(path + field, "is not a field of this kind", allowed)
+            problem = "is not a field of this kind" + did_you_mean(field, known)
+            raise ProfileError(path + field, problem, allowed)

@@ -1,4 +1,8 @@
-"""Aberration grids by network: the same grid in a tenth of the time, less exact.
+"""Aberration grids by network: less exact than traced ones, and no longer quicker.
+
+A network takes a sixth of the time of the wavefronts that it replaces, 29 ms less; the
+checks below take more: a new eye is ready 1.2 to 1.3 times as late as with everything
+traced (`ocufilter bench networks`).
 
 The network knows no vignetting and no retina but the sphere.  So a grid is only made
 where the corners of its field pass the largest pupil, which is traced; those nodes show

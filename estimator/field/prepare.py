@@ -87,7 +87,7 @@ def prepare_eye(
     if accuracy not in WAYS:
         raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(WAYS)}")
     if eye_model == "wavefront" and profile.eye is None:
-        return MeasuredWavefront.from_profile(profile), ()
+        return MeasuredWavefront.from_profile(profile), profile.notes
 
     def report(fraction: float, stage: str) -> None:
         if progress is not None:
@@ -109,7 +109,8 @@ def prepare_eye(
             ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"
         ),
     )
-    notes = eye_notes(estimated, source, network_reason=network_reason)
+    own = eye_notes(estimated, source, network_reason=network_reason)
+    notes = (*profile.notes, *own)
     if np.any(field_range_deg):
         notes = (*notes, periphery_note(eye))
     return eye, notes

@@ -33,6 +33,24 @@ def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
     return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
 
 
+def at_cornea(lens: Prescription) -> Prescription:
+    """Return a lens with the powers that it has at the cornea."""
+    other_dpt = lens.sphere_dpt + lens.cylinder_dpt
+    sphere_dpt, other_dpt = (
+        power_at_cornea_dpt(power_dpt, vertex_mm=lens.vertex_mm)
+        for power_dpt in (lens.sphere_dpt, other_dpt)
+    )
+    return Prescription(sphere_dpt, other_dpt - sphere_dpt, lens.axis_deg)
+
+
+def written(lens: Prescription) -> str:
+    """Return powers as people write them: sphere, cylinder x axis."""
+    text = f"{lens.sphere_dpt:+.2f}"
+    if abs(lens.cylinder_dpt) >= 0.005:
+        text += f" {lens.cylinder_dpt:+.2f} x {lens.axis_deg:.0f}"
+    return text
+
+
 def power_vector(
     prescription: Prescription, *, depth_mm: float = 0.0
 ) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ from estimator.bounded_files import (
     read_text,
     reason_of,
 )
+from estimator.eye.checked_fields import did_you_mean
 from estimator.profiles.parse import (
     EyeProfile,
     ProfileError,
@@ -45,11 +46,11 @@ class InvalidProfileFile(InvalidFile, ProfileError):
         found = f"{field}: {problem}" if field else problem
         InvalidFile.__init__(self, path, found, allowed)
         self.field = field
-        self._problem = problem
+        self.problem = problem
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle makes it from."""
-        return type(self), (self.path, self.field, self._problem, self.allowed)
+        return type(self), (self.path, self.field, self.problem, self.allowed)
 
 
 def load_profile(
@@ -58,12 +59,13 @@ def load_profile(
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
 ) -> EyeProfile:
-    """Load a preset by name or a profile from a ``.json``, ``.abp`` or ``.csv`` file.
+    """Load a profile: a preset by name, a file, or JSON text.
 
     Parameters
     ----------
     source : str or Path
-        A preset name (see `preset_names`) or a file.
+        A preset's name (see `preset_names`), a ``.json``, ``.abp`` or ``.csv`` file, or
+        an object as JSON, ``{"kind": "prescription", "sphere_dpt": -2}``.
     pupil_diameter_mm, wavelength_nm : float, optional
         For a CSV, which may instead carry them as ``# pupil_diameter_mm: 5`` lines.
 
@@ -83,11 +85,11 @@ def load_profile(
     except InvalidFile:
         raise
     except ProfileError as error:
-        if body == {"kind": "preset", "name": str(source)}:
+        if not _is_path(source):
             raise
-        problem = str(error).removeprefix(f"profile field '{error.field}': ")
-        problem = problem.removesuffix(f"; allowed: {error.allowed}")
-        raise InvalidProfileFile(source, error.field, problem, error.allowed) from None
+        raise InvalidProfileFile(
+            source, error.field, error.problem, error.allowed
+        ) from None
 
 
 def profile_body(
@@ -107,12 +109,18 @@ def profile_body(
     """
     if str(source) in preset_names():
         return {"kind": "preset", "name": str(source)}
+    if not _is_path(source):
+        return _inline(str(source))
     path = Path(source)
     readers = {".json": _read_json, ".abp": _read_abp, ".csv": _read_csv}
     reader = readers.get(path.suffix.lower())
-    allowed = f"a preset ({', '.join(preset_names())}) or a .json, .abp or .csv file"
+    allowed = (
+        f"a preset ({', '.join(preset_names())}), a .json, .abp or .csv file, or a "
+        "JSON object"
+    )
     if reader is None:
-        raise ProfileError("profile", f"'{source}' is not known", allowed)
+        meant = did_you_mean(str(source), preset_names())
+        raise ProfileError("profile", f"'{source}' is not known{meant}", allowed)
     try:
         is_file = path.is_file()
     except (OSError, ValueError):  # a null byte, or a name that is too long
@@ -127,6 +135,23 @@ def profile_body(
     if reader is _read_csv:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
         body.update({k: v for k, v in given.items() if v is not None})
+    return body
+
+
+def _is_path(source: str | Path) -> bool:
+    """Return whether it is neither a preset's name nor JSON."""
+    return str(source) not in preset_names() and not str(source).lstrip().startswith(
+        "{"
+    )
+
+
+def _inline(text: str) -> dict[str, Any]:
+    try:
+        data = text.encode("utf-8", "surrogateescape")
+        body: dict[str, Any] = loads_bounded(data, max_bytes=MAX_PROFILE_BYTES)
+    except ValueError as error:
+        problem = f"not JSON ({reason_of(error)})"
+        raise ProfileError("profile", problem, "one JSON object") from None
     return body
 
 

@@ -132,6 +132,8 @@ class EyeProfile:
     higher_order : {"typical", "none"}
         Aberrations to be added where an eye is traced (`typical_aberrations`); a
         prescription alone asks for any.
+    notes : tuple of str
+        Where powers count: at their distance from the cornea, and at the cornea.
     """
 
     name: str
@@ -151,6 +153,7 @@ class EyeProfile:
     straylight: Straylight | None = None
     yellowing: str | None = None
     spectacle_magnification: bool = False
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
@@ -234,6 +237,7 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
         "straylight": options.straylight(data, age_years),
         "yellowing": options.yellowing(data),
         "spectacle_magnification": options.spectacle_magnification(data),
+        "notes": worn.vertex_notes(data),
     }
 
 

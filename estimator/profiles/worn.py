@@ -49,6 +49,12 @@ DESIGNS: dict[str, tuple[str, ...]] = {
 
 RING_FIELDS = ("design_wavelength_nm", "rings_diameter_mm")
 
+AT_A_DISTANCE = ("spectacles", "progressive", "lenslets")
+ASKS_FROM_DPT = 4.0
+"""From here on 12 mm change a power by 0.2 dpt or more, which a refraction resolves."""
+
+SHOWN_DPT = 0.005
+
 CORNEA_SPHERICAL_ABERRATION_UM = 0.27
 """C(4,0) on 6 mm of the mean cornea (Holladay et al., J. Refract. Surg. 18, 2002)."""
 
@@ -124,6 +130,41 @@ def _lenslets(body: Mapping[str, Any]) -> WornLens:
         gaze_deg=(h_deg, v_deg),
     )
     return WornLens(**vars(worn), kind="lenslets", rings=lenslets)
+
+
+def vertex_notes(data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return where the powers of a profile count, and what they are at the cornea.
+
+    A prescription of spectacles that is taken for powers at the cornea is another eye:
+    -8 dpt at 12 mm are -7.30 dpt there.
+    """
+    notes = []
+    if data.get("kind") == "prescription":
+        notes.append(_vertex_note("prescription", data))
+    body = data.get("correction")
+    if body is not None and body.get("kind", "spectacles") in AT_A_DISTANCE:
+        notes.append(_vertex_note("worn spectacles", body))
+    return tuple(note for note in notes if note)
+
+
+def _vertex_note(name: str, data: Mapping[str, Any]) -> str:
+    lens = rx.Prescription(**{k: data[k] for k in SPECTACLE_FIELDS if k in data})
+    meridians_dpt = lens.sphere_dpt, lens.sphere_dpt + lens.cylinder_dpt
+    strongest_dpt = max(map(abs, meridians_dpt))
+    if strongest_dpt < SHOWN_DPT:
+        return ""
+    if lens.vertex_mm:
+        at_cornea = rx.written(rx.at_cornea(lens))
+        place = f"at {lens.vertex_mm:g} mm, {at_cornea} at the cornea"
+    else:
+        place = "at the cornea"
+    note = f"{name}: {rx.written(lens)} {place}"
+    if "vertex_mm" not in data and strongest_dpt >= ASKS_FROM_DPT:
+        note += (
+            "; vertex_mm is not given: are these powers of spectacles? Those stand "
+            "12 to 14 mm before it"
+        )
+    return note
 
 
 def prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:

@@ -25,6 +25,4 @@ def read_profile(body: dict[str, Any]) -> EyeProfile:
 
 def unknown_profile(error: ProfileError) -> UnknownProfile:
     """Take an error apart: field and limits travel in fields of their own."""
-    text = str(error).removeprefix(f"profile field '{error.field}': ")
-    text = text.removesuffix(f"; allowed: {error.allowed}")
-    return UnknownProfile(text, field=error.field, allowed=error.allowed)
+    return UnknownProfile(error.problem, field=error.field, allowed=error.allowed)

@@ -4,12 +4,13 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from filter_service.camera import tangents_from_fov
+from filter_service.camera import Camera, read_intrinsics
 from filter_service.commands.console import (
     Json,
     check_range,
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 PUPIL_LIMITS_MM = (MIN_PUPIL_MM, MAX_PUPIL_MM)
 FOCUS_LIMITS_DPT = (0.0, MAX_VERGENCE_DPT)
 FOV_LIMITS_DEG = (1.0, 150.0)
+FOCAL_LIMITS_PX = (1.0, 1e6)
+DISTANCE_LIMITS_M = (1.0 / MAX_VERGENCE_DPT, float("inf"))
 TIMEOUT_S = 600.0
 
 
@@ -55,19 +58,12 @@ def filter_image(
             "light may be above 1 and below 0.",
         ),
     ],
-    depth: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE",
-            help="Metres: .npy, 32-bit float TIFF, .exr; or a 16-bit PNG with "
-            "--depth-scale.  inf is infinity; 0, negative and NaN are missing.",
-        ),
-    ],
-    fov_deg: Annotated[float, typer.Option(help="Vertical field of view, deg.")],
     profile: Annotated[
         str,
         typer.Option(
-            metavar="P", help="A preset name, or a .json, .abp or .csv profile."
+            metavar="P",
+            help="A preset's name, a .json, .abp or .csv file, or JSON as "
+            '{"kind": "prescription", "sphere_dpt": -2}.',
         ),
     ],
     out: Annotated[
@@ -76,6 +72,28 @@ def filter_image(
             "--out", "-o", help=".png (sRGB), or .npy or .exr (linear floats)."
         ),
     ],
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Meters: .npy, 32-bit float TIFF, .exr; or a 16-bit PNG with "
+            "--depth-scale.  inf is infinity; 0, negative and NaN are missing.",
+        ),
+    ] = None,
+    distance_m: Annotated[
+        float | None,
+        typer.Option(help="Of all that is seen, without --depth; inf is infinity."),
+    ] = None,
+    fov_deg: Annotated[
+        float | None, typer.Option(help="Vertical field of view, deg.")
+    ] = None,
+    focal_px: Annotated[
+        float | None, typer.Option(help="Focal length in px, instead of --fov-deg.")
+    ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(metavar="FX,FY,CX,CY", help="Camera in px, instead of --fov-deg."),
+    ] = None,
     hidden_color: Annotated[
         Path | None,
         typer.Option(
@@ -133,10 +151,20 @@ def filter_image(
 
     ocufilter filter --color room.png --depth room.npy --fov-deg 50
     --profile myopia --pupil-mm 5 -o blurred.png
+
+    A photograph without depth stands at one distance:
+
+    ocufilter filter --color photo.jpg --distance-m 2 --fov-deg 50
+    --profile myopia -o blurred.png
     """
     check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--focus-dpt", focus_dpt, FOCUS_LIMITS_DPT)
-    check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
+    _check_one_of({"--depth": depth, "--distance-m": distance_m})
+    if distance_m is not None:
+        check_range("--distance-m", distance_m, DISTANCE_LIMITS_M)
+    _check_one_of(
+        {"--fov-deg": fov_deg, "--focal-px": focal_px, "--intrinsics": intrinsics}
+    )
     check_range("--render-tolerance", render_tolerance, (0.0, MAX_RENDER_TOLERANCE))
 
     from estimator.profiles.files import load_profile
@@ -150,7 +178,8 @@ def filter_image(
     view = _read_view(
         color,
         depth,
-        fov_deg=fov_deg,
+        distance_m=distance_m,
+        camera_of=partial(_camera, fov_deg, focal_px, intrinsics),
         depth_kind=depth_kind,
         depth_scale=depth_scale,
         hidden_paths=(hidden_color, hidden_depth),
@@ -164,7 +193,7 @@ def filter_image(
         return
     started_s = time.perf_counter()
     with (
-        progress_bar("eye", quiet=json_output) as progress,
+        progress_bar("preparing", quiet=json_output) as progress,
         ExitStack() as closing,
     ):
         filtered = _filtered(
@@ -180,12 +209,48 @@ def filter_image(
     image_files.write_image(out, filtered.seen.color)
     whole_ms = 1e3 * (time.perf_counter() - started_s)
     summary = _summary(
-        filtered, whole, out=out, eye=eye, object_dpt=object_dpt, whole_ms=whole_ms
+        filtered,
+        whole,
+        out=out,
+        eye=eye,
+        view=view,
+        object_dpt=object_dpt,
+        whole_ms=whole_ms,
     )
     if json_output:
         print_json(summary)
     else:
         _report(summary)
+
+
+def _check_one_of(options: dict[str, object]) -> None:
+    """Refuse none, and more than one, of options that say the same."""
+    given = [name for name, value in options.items() if value is not None]
+    if len(given) != 1:
+        found = " and ".join(given) if given else ", ".join(options)
+        problem = "both given" if given else "none is given"
+        raise ValueError(f"{found}: {problem}; allowed: one of {', '.join(options)}")
+
+
+def _camera(
+    fov_deg: float | None,
+    focal_px: float | None,
+    intrinsics: str | None,
+    width_px: int,
+    height_px: int,
+) -> Camera:
+    """Return the camera of an image, from the one option that is given."""
+    if fov_deg is not None:
+        check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
+        return Camera.from_fov(fov_deg, width_px=width_px, height_px=height_px)
+    if intrinsics is not None:
+        lens = read_intrinsics(intrinsics)
+    else:
+        assert focal_px is not None
+        check_range("--focal-px", focal_px, FOCAL_LIMITS_PX)
+        middle_px = (width_px - 1) / 2.0, (height_px - 1) / 2.0
+        lens = (focal_px, focal_px, *middle_px)
+    return Camera.from_intrinsics(*lens, width_px=width_px, height_px=height_px)
 
 
 def _planned(
@@ -222,12 +287,14 @@ def _filtered(
 ) -> _Filtered:
     """Filter one view as any stream does, with the eye estimated in this process."""
     from filter_service.filtering.eye_filter import EyeFilter
-    from filter_service.filtering.filtered import BuildingEye
+    from filter_service.filtering.filtered import BuildingEye, EyeReady
     from filter_service.filtering.shared_workshop import open_inline_workshop
 
     def report(event: "EyeEvent") -> None:
         if isinstance(event, BuildingEye):
             progress(event.fraction, event.stage)
+        elif isinstance(event, EyeReady):
+            progress(1.0, "frame")
 
     begin_s = time.perf_counter()
     workshop = open_inline_workshop(closing, engine=engine)
@@ -259,28 +326,33 @@ def _output(out: Path, *, half: bool) -> Output:
 
 def _read_view(
     color_path: Path,
-    depth_path: Path,
+    depth_path: Path | None,
     *,
-    fov_deg: float,
+    distance_m: float | None,
+    camera_of: Callable[[int, int], Camera],
     depth_kind: DepthKind,
     depth_scale: float | None,
     hidden_paths: tuple[Path | None, Path | None] = (None, None),
 ) -> "RgbdView":
+    import numpy as np
+
     from filter_service.image_files import read_color, read_depth
     from filter_service.rgbd_view import RgbdView
 
     color = read_color(color_path)
-    depth_m = read_depth(depth_path, depth_scale=depth_scale)
-    height_px, width_px = color.shape[:2]
-    _check_size("depth", depth_path, depth_m, color)
+    if depth_path is None:
+        depth_m = np.full(color.shape[:2], distance_m, np.float32)
+    else:
+        depth_m = read_depth(depth_path, depth_scale=depth_scale)
+        _check_size("depth", depth_path, depth_m, color)
     hidden_color, hidden_depth_m = _read_hidden(
         *hidden_paths, color=color, depth_scale=depth_scale
     )
-    tangents = tangents_from_fov(fov_deg, width_px, height_px)
+    height_px, width_px = color.shape[:2]
     return RgbdView(
         color=color,
         depth_m=depth_m,
-        tangents=tangents,
+        tangents=camera_of(width_px, height_px).tangents,
         depth_kind=depth_kind,
         hidden_color=hidden_color,
         hidden_depth_m=hidden_depth_m,
@@ -315,11 +387,15 @@ def _read_hidden(
 
 
 def _check_size(option: str, path: Path, image: "NDArray", color: "NDArray") -> None:
-    if image.shape[:2] != color.shape[:2]:
-        raise ValueError(
-            f"--{option} '{path}': {image.shape[1]}x{image.shape[0]} px; allowed: "
-            f"the size of the colour image, {color.shape[1]}x{color.shape[0]}"
-        )
+    if image.shape[:2] == color.shape[:2]:
+        return
+    text = (
+        f"--{option} '{path}': {image.shape[1]}x{image.shape[0]} px; allowed: "
+        f"the size of the color image, {color.shape[1]}x{color.shape[0]}"
+    )
+    if image.shape[:2] == color.shape[1::-1]:
+        text += " (photographs are turned upright, as their EXIF data say)"
+    raise ValueError(text)
 
 
 def _summary(
@@ -328,6 +404,7 @@ def _summary(
     *,
     out: Path,
     eye: "EyeProfile",
+    view: "RgbdView",
     object_dpt: tuple[float, float],
     whole_ms: float,
 ) -> dict:
@@ -351,6 +428,7 @@ def _summary(
         "stage_times_ms": dict(seen.stage_times_ms),
         "psf_count": filtered.psf_count,
         "object_range_dpt": list(object_dpt),
+        "depth": _depth_words(view.depth_m, seen.missing_depth_count),
         "engine": filtered.engine,
         "renderer": filtered.renderer,
         "settings": vars(settings),
@@ -358,12 +436,30 @@ def _summary(
     }
 
 
+def _depth_words(depth_m: "NDArray", missing_count: int) -> str:
+    """Return the range of depth, and how much of it was filled in."""
+    from filter_service.rgbd_view import LEAST_DEPTH_M
+
+    known_m = depth_m[depth_m >= LEAST_DEPTH_M]
+    if not known_m.size:
+        return "depth: none; all is taken to be at infinity"
+    low, high = (
+        f"{value_m:.3g} m" if value_m < float("inf") else "infinity"
+        for value_m in (known_m.min(), known_m.max())
+    )
+    words = f"depth {low} to {high}" if low != high else f"depth {low}"
+    if not missing_count:
+        return words
+    share = 100.0 * missing_count / depth_m.size
+    return f"{words}, {share:.2g} % missing, filled from neighbors"
+
+
 def _report(summary: dict) -> None:
     for note in summary["notes"]:
         say(f"note: {note}")
-    for kind in ("missing", "clamped"):
-        if count := summary[f"{kind}_depth_count"]:
-            say(f"note: {count} pixels with {kind} depth")
+    if count := summary["clamped_depth_count"]:
+        say(f"note: {count} pixels nearer or farther than the prepared distances")
+    say(summary["depth"])
     settings = summary["settings"]
     ranges = ", ".join(
         f"{name} {settings[key][0]:g} to {settings[key][1]:.3g} {unit}"

@@ -277,5 +277,6 @@ def _folder_to_start_in(module: str) -> Path | None:
     package = module.partition(".")[0]
     raise CommandFailed(
         f"this command runs a program in {package}/, which an installed package "
-        "does not hold: run it in a checkout"
+        "does not hold: run it in a checkout (git clone of the project, then make "
+        "setup-test)"
     )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -51,8 +52,27 @@ class FilteredView:
     overflow_count: int = 0
 
 
-def color_notes(bad_color_count: int) -> list[str]:
-    """Say how many pixels were taken as black."""
-    if not bad_color_count:
-        return []
-    return [f"{bad_color_count} pixels with non-finite colour taken as black"]
+SAMPLED_EVERY = 16
+"""Rows and columns looked at to tell the unit of depth: 20 us of a frame."""
+
+METERS_BELOW = 100.0
+"""Scenes with nothing nearer are rare; depth in centimeters or millimeters is not."""
+
+
+def input_notes(
+    depth_m: NDArray[np.float32], missing_depth_count: int, bad_color_count: int
+) -> list[str]:
+    """Say what was assumed of a view's depth and color.
+
+    The texts do not change from frame to frame: counts are told apart.
+    """
+    notes = []
+    if missing_depth_count == depth_m.size:
+        notes.append("no pixel has a depth: all are taken to be at infinity")
+    sampled_m = depth_m[::SAMPLED_EVERY, ::SAMPLED_EVERY]
+    known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
+    if known_m.size and known_m.min() >= METERS_BELOW:
+        notes.append(f"all depth is beyond {METERS_BELOW:g} m: is it in meters?")
+    if bad_color_count:
+        notes.append(f"{bad_color_count} pixels with non-finite color taken as black")
+    return notes

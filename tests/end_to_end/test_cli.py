@@ -190,6 +190,151 @@ def test_missing_depth_is_filled_and_counted(scene):
     assert run_json(*filter_arguments(folder))["missing_depth_count"] == 3
 
 
+def write_depth(folder, *stored_m):
+    depth_m = np.resize(np.array(stored_m, np.float32), (HEIGHT_PX, WIDTH_PX))
+    np.save(folder / "depth.npy", depth_m)
+
+
+@pytest.mark.parametrize(
+    ("stored_m", "words"),
+    [
+        ((2.0, 5.0), "depth 2 m to 5 m"),
+        ((2.5,), "depth 2.5 m"),
+        ((3.0, np.nan), "depth 3 m, 50 % missing, filled from neighbors"),
+        ((0.5, np.inf), "depth 0.5 m to infinity"),
+        ((np.nan,), "depth: none; all is taken to be at infinity"),
+        ((211.0, 502.0), "note: all depth is beyond 100 m: is it in meters?"),
+    ],
+)
+def test_what_was_read_and_assumed_of_depth_is_said(scene, stored_m, words):
+    folder, _ = scene
+    write_depth(folder, *stored_m)
+    finished = run(*filter_arguments(folder, *IDENTITY))
+    assert finished.returncode == 0, finished.stderr
+    assert words in finished.stdout.splitlines(), finished.stdout
+
+
+def test_a_photograph_without_depth_stands_at_a_distance(scene):
+    folder, _ = scene
+    write_depth(folder, 2.0)
+    source = ("filter", "--color", folder / "color.npy", "--profile", "myopia")
+    pixels = ("--fov-deg", 50, *PLAIN, "--json")
+    pictures = []
+    for name, depth in (
+        ("a.npy", ("--depth", folder / "depth.npy")),
+        ("b.npy", ("--distance-m", 2)),
+    ):
+        finished = run(*source, *depth, *pixels, "-o", folder / name)
+        assert finished.returncode == 0, finished.stderr
+        pictures.append(np.load(folder / name))
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_a_camera_is_told_by_its_angle_its_focal_length_or_its_calibration(scene):
+    folder, _ = scene
+    focal_px = HEIGHT_PX / 2 / np.tan(np.radians(25.0))
+    lens = f"{focal_px},{focal_px},{(WIDTH_PX - 1) / 2},{(HEIGHT_PX - 1) / 2}"
+    source = ("filter", "--color", folder / "color.npy", "--distance-m", 1)
+    pictures = []
+    for camera in (
+        ("--fov-deg", 50),
+        ("--focal-px", focal_px),
+        ("--intrinsics", lens),
+    ):
+        out = folder / f"{camera[0]}.npy"
+        finished = run(*source, *camera, "--profile", "myopia", *PLAIN, "-o", out)
+        assert finished.returncode == 0, finished.stderr
+        pictures.append(np.load(out))
+    for picture in pictures[1:]:
+        np.testing.assert_allclose(picture, pictures[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ((), "--depth, --distance-m: none is given"),
+        (("--distance-m", 1, "--depth", "d.npy"), "--depth and --distance-m: both"),
+        (("--distance-m", 0.001), "--distance-m 0.001: allowed is"),
+        (("--distance-m", "nan"), "--distance-m nan: allowed is"),
+        (("--distance-m", 1), "--fov-deg, --focal-px, --intrinsics: none is given"),
+        (("--distance-m", 1, "--intrinsics", "1,2"), "allowed is FX,FY,CX,CY"),
+        (("--distance-m", 1, "--focal-px", 0), "--focal-px 0: allowed is"),
+        (("--distance-m", 1, "--fov-deg", 50, "--focal-px", 9), "both given"),
+    ],
+)
+def test_contradictions_about_camera_and_distance_are_refused(scene, extra, words):
+    folder, _ = scene
+    said = refusal(
+        *("filter", "--color", folder / "color.npy", "--profile", "myopia"),
+        *("-o", folder / "out.npy", *extra),
+    )
+    assert words in said
+
+
+def test_a_photograph_is_turned_upright_and_so_is_its_depth_expected(scene, rng):
+    folder, _ = scene
+    stored = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    turned = Image.Exif()
+    turned[0x0112] = 6  # the camera was held upright
+    Image.fromarray(stored).save(folder / "phone.png", exif=turned)
+    common = ("filter", "--color", folder / "phone.png", "--profile", "emmetropia")
+    out = ("--fov-deg", 50, "-o", folder / "out.png", *IDENTITY)
+    finished = run(*common, "--distance-m", "inf", *out)
+    assert finished.returncode == 0, finished.stderr
+    seen = np.asarray(Image.open(folder / "out.png"))
+    upright = np.rot90(stored, -1)
+    assert seen.shape == upright.shape
+    assert np.abs(seen.astype(int) - upright).max() <= 1
+    said = refusal(*common, "--depth", folder / "depth.npy", *out)
+    assert "48x32 px; allowed: the size of the color image, 32x48" in said
+    assert "turned upright" in said
+
+
+def test_a_profile_may_be_json_on_the_command_line(scene):
+    folder, _ = scene
+    body = {"kind": "prescription", "sphere_dpt": -8, "vertex_mm": 12}
+    finished = run(*filter_arguments(folder, *PLAIN, profile=json.dumps(body)))
+    assert finished.returncode == 0, finished.stderr
+    note = "note: prescription: -8.00 at 12 mm, -7.30 at the cornea"
+    assert note in finished.stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("profile", "words"),
+    [
+        ('{"kind": "prescription", "sphere": -2}', "did you mean 'sphere_dpt'?"),
+        ('{"kind": "preset", "name": "myopa"}', "did you mean 'myopia'?"),
+        ("keratoconnus", "did you mean 'keratoconus'?"),
+        ('{"kind"', "profile: not JSON"),
+        ("broken.json", "profile: file 'broken.json' does not exist"),
+    ],
+)
+def test_a_wrong_profile_is_named_with_what_may_have_been_meant(scene, profile, words):
+    folder, _ = scene
+    said = refusal(*filter_arguments(folder, profile=profile))
+    assert words in said
+    assert "field 'profile'" not in said
+
+
+def test_progress_names_what_is_done(scene):
+    folder, _ = scene
+    finished = run(*filter_arguments(folder))
+    stages = [line.partition("] ")[2] for line in finished.stderr.splitlines()]
+    assert "preparing: frame, 100 %" in stages
+    assert any(stage.startswith("preparing: PSFs, ") for stage in stages)
+    assert not any("psfs" in stage for stage in stages)
+
+
+@pytest.mark.parametrize("pupil_mm", [2.90511, 3.333333])
+def test_a_pupil_is_never_outside_what_was_prepared_for_it(scene, pupil_mm):
+    folder, _ = scene
+    extra = ("--pupil-mm", pupil_mm, "--mode", "quality", "--json")
+    finished = run(*filter_arguments(folder, *extra, profile="post_lasik"))
+    assert finished.returncode == 0, finished.stderr
+    notes = json.loads(finished.stdout)["notes"]
+    assert not any("outside the prepared" in note for note in notes)
+
+
 def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
     folder, _ = scene
     wide = (*PLAIN, "--pupil-mm", 7)

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.source_tree import ROOT
 
@@ -312,3 +313,59 @@ def test_demo_and_the_round_trip_are_there(run, installed):
     assert finished.returncode == 0 and "--frames" in finished.stdout
     finished = start(installed, installed.python, "-m", "clients.latency", "--help")
     assert finished.returncode == 0 and "--rate-hz" in finished.stdout
+
+
+EXTRAS = (
+    *("pyrender", "trimesh", "networkx", "glfw", "OpenGL", "imageio", "imageio_ffmpeg"),
+    *("freetype", "pyglet", "xr", "nicegui", "fastapi", "uvicorn", "av", "ray"),
+    *("prometheus_client", "skimage"),
+)
+WITHOUT_EXTRAS = f"import sys\nsys.modules.update(dict.fromkeys({EXTRAS!r}))\n"
+
+
+@pytest.fixture(scope="module")
+def bare(installed, tmp_path_factory):
+    """The wheel with none of the packages of its extras, which come by a .pth file."""
+    (installed.site / "without_extras.py").write_text(WITHOUT_EXTRAS)
+    switch = installed.site / "without_extras.pth"
+    switch.write_text("import without_extras\n")
+    yield installed
+    switch.unlink()
+
+
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [
+        (("headset",), "ocufilter[headset]"),
+        (("demo",), "ocufilter[clients]"),
+        (("headset", "--simulated"), "ocufilter[clients]"),
+        (("web", "--no-browser"), "ocufilter[web,clients]"),
+        (
+            ("batch", "a.mp4", "-p", "myopia", "-o", "out", "--fov-deg", 50),
+            "ocufilter[batch]",
+        ),
+        (
+            ("batch", "rgbd", "-p", "myopia", "-o", "out", "--fov-deg", 50, "--ray"),
+            "ocufilter[batch-ray]",
+        ),
+        (("serve", "--config", "metrics.toml"), "ocufilter[metrics]"),
+        (("paper",), "git clone"),
+        (("bench", "psf"), "git clone"),
+    ],
+)
+def test_what_is_missing_is_said_in_one_line_with_its_command(bare, command, package):
+    (bare.cwd / "a.mp4").write_bytes(b"")
+    (bare.cwd / "metrics.toml").write_text(
+        'bind = "tcp://127.0.0.1:*"\nmetrics_port = 1'
+    )
+    for name in ("rgbd/color", "rgbd/depth"):
+        (bare.cwd / name).mkdir(parents=True, exist_ok=True)
+        image = np.full((8, 8), 1000, np.uint16)
+        Image.fromarray(image).save(bare.cwd / name / "a.png")
+    if command[-1] == "--ray":
+        command = (*command, "local")
+    finished = start(bare, bare.ocufilter, *command)
+    said = finished.stderr.strip().splitlines()
+    assert finished.returncode in (1, 2), finished.stdout
+    assert package in said[-1], finished.stderr
+    assert "Traceback" not in finished.stderr

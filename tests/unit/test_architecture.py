@@ -36,6 +36,7 @@ MAY_IMPORT = {
         "filter_service.keys",  # a client's own
         "filter_service.slots",  # memory shared with the service
         "filter_service.settings",
+        "filter_service.camera",  # and its options
         "filter_service.image_files",  # pictures and depth in files
         "filter_service.bounded_images",  # and those that were sent
         "estimator.bounded_files",  # text and JSON of files

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from estimator.field.prepare import prepare_eye
 from estimator.optics.zernike import flip_horizontal, index_from_nm
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import ProfileError, parse_profile
@@ -136,3 +137,71 @@ def test_json_file_is_the_wire_object(tmp_path):
 def test_unknown_name_lists_what_exists():
     with pytest.raises(ProfileError, match="keratoconus"):
         load_profile("kerataconus")
+
+
+STRONG = {"kind": "prescription", "sphere_dpt": -8, "cylinder_dpt": -1.25}
+ASKS = "vertex_mm is not given"
+
+
+def test_powers_are_said_where_they_count_and_at_the_cornea():
+    body = {**STRONG, "axis_deg": 80, "vertex_mm": 12}
+    # F / (1 - d F): -8 to -7.299, and -9.25 to -8.326
+    expected = "prescription: -8.00 -1.25 x 80 at 12 mm, -7.30 -1.03 x 80 at the cornea"
+    assert parse_profile(body).notes == (expected,)
+    worn = {**GOOD, "correction": {"sphere_dpt": 5, "vertex_mm": 14}}
+    # 5 to 5.376
+    expected = "worn spectacles: +5.00 at 14 mm, +5.38 at the cornea"
+    assert parse_profile(worn).notes == (expected,)
+
+
+@pytest.mark.parametrize(
+    ("body", "asks"),
+    [
+        ({**STRONG, "axis_deg": 80}, True),
+        ({**STRONG, "axis_deg": 80, "vertex_mm": 0}, False),
+        ({"kind": "prescription", "sphere_dpt": -3.75}, False),
+        ({"kind": "prescription", "sphere_dpt": 4}, True),
+        (
+            {
+                "kind": "prescription",
+                "sphere_dpt": -2,
+                "cylinder_dpt": -2,
+                "axis_deg": 5,
+            },
+            True,
+        ),
+        ({**GOOD, "correction": {"sphere_dpt": -6}}, True),
+        ({**GOOD, "correction": {"kind": "contact_lens", "sphere_dpt": -6}}, False),
+        ({"kind": "prescription", "sphere_dpt": 0}, False),
+        (GOOD, False),
+    ],
+)
+def test_a_strong_prescription_without_a_distance_asks_for_it(body, asks):
+    assert any(ASKS in note for note in parse_profile(body).notes) == asks
+
+
+@pytest.mark.parametrize("eye_model", ["traced", "wavefront"])
+def test_an_eye_is_prepared_with_the_notes_of_its_profile(eye_model):
+    profile = parse_profile({**STRONG, "axis_deg": 80})
+    _, notes = prepare_eye(profile, pupil_diameters_mm=(3.0,), eye_model=eye_model)
+    assert ASKS in notes[0]
+
+
+def test_json_text_is_a_profile_wherever_one_is_loaded():
+    text = ' {"kind": "prescription", "sphere_dpt": -2}'
+    np.testing.assert_array_equal(
+        load_profile(text).zernike_um,
+        parse_profile({"kind": "prescription", "sphere_dpt": -2}).zernike_um,
+    )
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"kind": "guess"}', '{"a": ' * 5000])
+def test_json_text_that_is_no_profile_is_refused(text):
+    with pytest.raises(ProfileError):
+        load_profile(text)
+
+
+def test_a_long_slip_is_not_compared_with_all_names():
+    with pytest.raises(ProfileError) as caught:
+        parse_profile({**GOOD, "k" * 100_000: 1})
+    assert "did you mean" not in str(caught.value)

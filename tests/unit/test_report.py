@@ -344,7 +344,7 @@ def test_the_summary_fits_on_the_first_page(corrected):
     [
         (
             ["nobody", "-o", "eye.html"],
-            "report: profile field 'profile': 'nobody' is not known",
+            "report: profile: 'nobody' is not known",
         ),
         ([], "report: the following arguments are required: profile"),
         (["myopia", "-o", "a.pdf", "--fast"], "unrecognized arguments: --fast"),

@@ -93,6 +93,11 @@ class FrameRun:
             self._fill_depth()
         self._begun = self._begin()
 
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """Depth of the view, filled where some was missing."""
+        return self._view.depth_m
+
     def finish(self) -> tuple[NDArray, Counts]:
         """Return picture and counts."""
         picture, counts = self._begun_or_whole()

@@ -11,7 +11,7 @@ from filter_service.constants import STORE_SIDE
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Pages
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.filtered_view import FilteredView, color_notes
+from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.frame_options import (
     FrameOptions,
     frame_options,
@@ -181,7 +181,8 @@ class FilterRenderer:
             self._gpu.check("render")
             stages_ms = run.timer.result_ms()
         self._lacks_depth = counts["missing_depth_count"] > 0
-        layers, bad_color_count = run.layers, counts["bad_color_count"]
+        layers = run.layers
+        noted = counts["missing_depth_count"], counts["bad_color_count"]
         return FilteredView(
             color=picture,
             stage_times_ms=stages_ms,
@@ -190,7 +191,11 @@ class FilterRenderer:
             gaze_deg=options.gaze_deg,
             **counts,
             layer_count=len(layers.layer_dpt),
-            notes=[*layers.notes, *options.gaze_notes, *color_notes(bad_color_count)],
+            notes=[
+                *layers.notes,
+                *options.gaze_notes,
+                *input_notes(run.depth_m, *noted),
+            ],
         )
 
 

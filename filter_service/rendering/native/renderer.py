@@ -16,7 +16,7 @@ from filter_service.errors import RenderFailed
 from filter_service.native.library import Library, compiled_library
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.filtered_view import FilteredView, color_notes
+from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
 from filter_service.rendering.frame_kernels import Fill
 from filter_service.rendering.frame_options import (
@@ -223,7 +223,7 @@ class NativeRenderer:
             notes=[
                 *layers.notes,
                 *options.gaze_notes,
-                *color_notes(frame.c.bad_color_count),
+                *input_notes(view.depth_m, missing_count, frame.c.bad_color_count),
             ],
         )
 
