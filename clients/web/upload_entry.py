@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import Any
 
+from fastapi import HTTPException
 from nicegui import events, ui
 
 from clients.web.file_names import plain_name
 
 Taking = Callable[[str, bytes], Awaitable[None]]
+
+
+class _Upload(ui.upload):
+    """An entry whose page may be gone by the time a file has arrived."""
+
+    async def handle_uploads(self, files: list[Any]) -> None:
+        """Hand the files on; NiceGUI's own raises what ends up in the log."""
+        if self.is_deleted:
+            raise HTTPException(410, "the page was closed")
+        await super().handle_uploads(files)
 
 
 def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.upload:
@@ -40,7 +52,7 @@ def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.u
             if not entry.is_deleted:  # else its page was closed meanwhile
                 raise
 
-    entry = ui.upload(
+    entry = _Upload(
         auto_upload=True,
         label=label,
         max_file_size=most_bytes,
