@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import root
 
 from estimator.estimate.estimation import estimate_eye
+from estimator.field.prepare import prepare_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.raytrace import trace_rays
 from estimator.optics.surfaces import media_indices, pack_eye
@@ -25,6 +26,7 @@ from tests.numerical.schematic_eyes import (
     navarro,
     reference,
 )
+from tests.source_tree import ROOT
 
 RED, GREEN, BLUE = RGB_WAVELENGTHS_NM
 
@@ -237,6 +239,22 @@ def test_red_and_blue_lie_beside_green_by_the_table(engine):
     assert red > 0.3 and blue < -0.8  # red outwards, blue towards the axis
     np.testing.assert_allclose(lateral_px[-20.0], -lateral_px[20.0], atol=0.005)
     np.testing.assert_allclose(lateral_px[0.0], 0.0, atol=0.05)
+
+
+def test_the_conventions_state_what_is_traced():
+    profile = parse_profile({"kind": "preset", "name": "emmetropia"})
+    reach_deg = ((-25.0, 25.0), (0.0, 0.0))
+    eye, _ = prepare_eye(profile, pupil_diameters_mm=(4.0,), field_range_deg=reach_deg)
+    shift_mrad = eye.chief_ray_shift_mrad(
+        h_deg=20.0,
+        v_deg=0.0,
+        accommodation_dpt=eye.accommodation_dpt(0.0, pupil_diameter_mm=4.0),
+        wavelength_nm=np.array(RGB_WAVELENGTHS_NM),
+    )[:, 0]
+    text = (ROOT / "CONVENTIONS.md").read_text(encoding="utf-8")
+    red, blue = shift_mrad[0] - shift_mrad[1], shift_mrad[1] - shift_mrad[2]
+    assert f"red ({RED:g} nm) lies {red:.2f} mrad outward" in text
+    assert f"blue ({BLUE:g} nm) {blue:.2f} mrad toward" in " ".join(text.split())
 
 
 def test_a_measured_wavefront_has_none_and_says_so(engine):
