@@ -109,11 +109,10 @@ def prepare_eye(
             ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"
         ),
     )
-    own = eye_notes(estimated, source, network_reason=network_reason)
-    notes = (*profile.notes, *own)
+    notes = eye_notes(estimated, source, network_reason=network_reason)
     if np.any(field_range_deg):
         notes = (*notes, periphery_note(eye))
-    return eye, notes
+    return eye, (*notes, *profile.notes)
 
 
 def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:

@@ -125,8 +125,9 @@ def test_exact_asks_no_network(monkeypatch):
     _, notes = prepared("exact")
     assert not any("network" in note for note in notes)
     assert "refined from a table's eye" in notes[0]
-    assert len(notes) == 4
-    assert notes[-1].startswith("periphery: ")
+    assert len(notes) == 5
+    assert notes[3].startswith("periphery: ")
+    assert notes[4] == "prescription: -2.00 at the cornea"
 
 
 @pytest.mark.parametrize("accuracy", ["fast", "balanced"])
