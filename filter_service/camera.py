@@ -47,28 +47,6 @@ def tangents_from_fov(
     return (-right, right, up, -up)
 
 
-def tangents_from_intrinsics(
-    focal_x_px: float,
-    focal_y_px: float,
-    center_x_px: float,
-    center_y_px: float,
-    *,
-    width_px: int,
-    height_px: int,
-) -> tuple[float, float, float, float]:
-    """Return (left, right, up, down) of a calibrated camera without distortion.
-
-    The center of pixel (0, 0) is at (0, 0), as OpenCV and ROS have it; the edges of the
-    image are half a pixel beyond the centers of its outermost pixels.
-    """
-    return (
-        -(center_x_px + 0.5) / focal_x_px,
-        (width_px - 0.5 - center_x_px) / focal_x_px,
-        (center_y_px + 0.5) / focal_y_px,
-        -(height_px - 0.5 - center_y_px) / focal_y_px,
-    )
-
-
 def read_intrinsics(text: str) -> tuple[float, float, float, float]:
     """Return focal lengths and principal point, px, of an option ``--intrinsics``.
 
@@ -147,17 +125,27 @@ class Camera(Record):
         width_px: int,
         height_px: int,
     ) -> Camera:
-        """Return a calibrated camera; see `tangents_from_intrinsics`.
+        """Return a calibrated camera without distortion.
+
+        Parameters
+        ----------
+        focal_x_px, focal_y_px : float
+        center_x_px, center_y_px : float
+            Principal point; the center of pixel (0, 0) is at (0, 0), as OpenCV and ROS
+            have it.  The image ends half a pixel beyond the centers of its outermost
+            pixels.
+        width_px, height_px : int
 
         Raises
         ------
         BadMessage
             A size, or edges, that no pinhole has.
         """
-        tangents = tangents_from_intrinsics(
-            *(focal_x_px, focal_y_px, center_x_px, center_y_px),
-            width_px=width_px,
-            height_px=height_px,
+        tangents = (
+            -(center_x_px + 0.5) / focal_x_px,
+            (width_px - 0.5 - center_x_px) / focal_x_px,
+            (center_y_px + 0.5) / focal_y_px,
+            -(height_px - 0.5 - center_y_px) / focal_y_px,
         )
         return cls(width_px, height_px, tangents)
 

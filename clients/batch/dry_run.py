@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from clients.batch.manifest import LINES, Manifest, Notes, add_notes, told
+from clients.batch.manifest import LINES, Manifest, Notes, add_notes, note_line
 from clients.batch.run import Batch, missing_units
 from clients.batch.work import Unit, UnitRunner
 
@@ -117,7 +117,7 @@ def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[
         )
         lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
         lines += [f"    error: {text}" for text in one["errors"]]
-        lines += [f"    note: {told(note)}" for note in one["notes"]]
+        lines += [f"    note: {note_line(note)}" for note in one["notes"]]
     if report["seconds"] is not None:
         lines.append(
             f"about {_duration(report['seconds'])} on {report['cores']} cores, "

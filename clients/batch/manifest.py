@@ -290,6 +290,6 @@ def add_notes(notes: Notes, of_frame: Sequence[str]) -> None:
         notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
 
 
-def told(note: Mapping[str, Any]) -> str:
+def note_line(note: Mapping[str, Any]) -> str:
     """Return a note of some frames as a person reads it."""
     return f"{note['frames']} frames, as: {note['example']}"

@@ -12,7 +12,7 @@ from typing import Any
 
 from clients.batch.dry_run import dry_run, lines_of
 from clients.batch.exact_filter import EngineUnusable
-from clients.batch.manifest import Manifest, told
+from clients.batch.manifest import Manifest, note_line
 from clients.batch.options import arguments_of, batch_of, workers_and_threads
 from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
 from clients.batch.run import Batch, Pool, only_one, prepare_folder, run_batch
@@ -85,7 +85,7 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
     for kind in ("missing", "clamped"):
         if count := summary.get(f"{kind}_depth_count"):
             lines.append(f"note: {count} pixels with {kind} depth")
-    return lines + [f"note: {told(note)}" for note in summary["notes"]]
+    return lines + [f"note: {note_line(note)}" for note in summary["notes"]]
 
 
 def failure_lines(summary: dict[str, Any]) -> list[str]:

@@ -13,8 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service import tangents_from_fov
-from filter_service.camera import tangents_from_intrinsics
+from filter_service import Camera, tangents_from_fov
 from filter_service.image_files import METRES_PER_INTEGER_STEP, read_depth
 
 Tangents = tuple[float, float, float, float]
@@ -65,14 +64,14 @@ class Pinhole:
                 f"{self.size_px[0]}x{self.size_px[1]}; allowed: that size, or "
                 "--intrinsics or --fov-deg"
             )
-        return tangents_from_intrinsics(
+        return Camera.from_intrinsics(
             self.focal_x_px,
             self.focal_y_px,
             self.center_x_px,
             self.center_y_px,
             width_px=width_px,
             height_px=height_px,
-        )
+        ).tangents
 
 
 class DepthForm(Protocol):

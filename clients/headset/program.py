@@ -270,7 +270,7 @@ class _Pictures:
         from PIL import Image
 
         if not self._shown:
-            say(f"no picture was filtered: none is written to {folder}")
+            say(f"no frame was filtered; nothing is written to {folder}")
         for shown in self._shown:
             path = folder / f"{shown.view.eye}.png"
             Image.fromarray(shown.color).save(path)

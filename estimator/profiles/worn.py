@@ -161,8 +161,8 @@ def _vertex_note(name: str, data: Mapping[str, Any]) -> str:
     note = f"{name}: {rx.written(lens)} {place}"
     if "vertex_mm" not in data and strongest_dpt >= ASKS_FROM_DPT:
         note += (
-            "; vertex_mm is not given: are these powers of spectacles? Those stand "
-            "12 to 14 mm before it"
+            "; vertex_mm is missing: the powers of spectacles need it, usually "
+            "12 to 14 mm"
         )
     return note
 

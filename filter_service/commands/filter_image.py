@@ -228,7 +228,7 @@ def _check_one_of(options: dict[str, object]) -> None:
     given = [name for name, value in options.items() if value is not None]
     if len(given) != 1:
         found = " and ".join(given) if given else ", ".join(options)
-        problem = "both given" if given else "none is given"
+        problem = "given together" if given else "none is given"
         raise ValueError(f"{found}: {problem}; allowed: one of {', '.join(options)}")
 
 
@@ -243,13 +243,11 @@ def _camera(
     if fov_deg is not None:
         check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
         return Camera.from_fov(fov_deg, width_px=width_px, height_px=height_px)
-    if intrinsics is not None:
-        lens = read_intrinsics(intrinsics)
-    else:
-        assert focal_px is not None
+    if focal_px is not None:
         check_range("--focal-px", focal_px, FOCAL_LIMITS_PX)
-        middle_px = (width_px - 1) / 2.0, (height_px - 1) / 2.0
-        lens = (focal_px, focal_px, *middle_px)
+        lens = (focal_px, focal_px, (width_px - 1) / 2.0, (height_px - 1) / 2.0)
+    else:
+        lens = read_intrinsics(intrinsics or "")
     return Camera.from_intrinsics(*lens, width_px=width_px, height_px=height_px)
 
 
@@ -442,7 +440,7 @@ def _depth_words(depth_m: "NDArray", missing_count: int) -> str:
 
     known_m = depth_m[depth_m >= LEAST_DEPTH_M]
     if not known_m.size:
-        return "depth: none; all is taken to be at infinity"
+        return "depth: none, infinity is assumed"
     low, high = (
         f"{value_m:.3g} m" if value_m < float("inf") else "infinity"
         for value_m in (known_m.min(), known_m.max())

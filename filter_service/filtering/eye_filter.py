@@ -177,8 +177,8 @@ class EyeFilter:
             raise ValueError("this EyeFilter is closed")
         if self._pid != os.getpid():
             raise ValueError(
-                f"this EyeFilter is that of process {self._pid}: "
-                "expected one that is made in the process that uses it"
+                f"this EyeFilter was made in process {self._pid}, whose threads and "
+                "worker it needs; expected one made in this process"
             )
         return self._workshop
 

@@ -66,7 +66,7 @@ class _Shared:
         self._workshop: Workshop | None = None
         self._closing = ExitStack()
         self._n_users = 0
-        atexit.register(self._close)
+        atexit.register(self._closing.close)
 
     def take(self) -> Workshop:
         """Return the workshop, for one more user; the first starts it."""
@@ -86,9 +86,6 @@ class _Shared:
         if self._n_users == 0:
             self._workshop = None
             self._closing.close()
-
-    def _close(self) -> None:
-        self._closing.close()
 
     def leave_to_parent(self) -> None:
         """Close nothing: this process was forked, and the worker is its parent's."""

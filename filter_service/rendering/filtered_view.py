@@ -68,7 +68,7 @@ def input_notes(
     """
     notes = []
     if missing_depth_count == depth_m.size:
-        notes.append("no pixel has a depth: all are taken to be at infinity")
+        notes.append("no pixel has depth; infinity is assumed")
     sampled_m = depth_m[::SAMPLED_EVERY, ::SAMPLED_EVERY]
     known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
     if known_m.size and known_m.min() >= METERS_BELOW:

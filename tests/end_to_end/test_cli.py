@@ -202,7 +202,7 @@ def write_depth(folder, *stored_m):
         ((2.5,), "depth 2.5 m"),
         ((3.0, np.nan), "depth 3 m, 50 % missing, filled from neighbors"),
         ((0.5, np.inf), "depth 0.5 m to infinity"),
-        ((np.nan,), "depth: none; all is taken to be at infinity"),
+        ((np.nan,), "depth: none, infinity is assumed"),
         ((211.0, 502.0), "note: all depth is beyond 100 m: is it in meters?"),
     ],
 )
@@ -253,13 +253,19 @@ def test_a_camera_is_told_by_its_angle_its_focal_length_or_its_calibration(scene
     ("extra", "words"),
     [
         ((), "--depth, --distance-m: none is given"),
-        (("--distance-m", 1, "--depth", "d.npy"), "--depth and --distance-m: both"),
+        (
+            ("--distance-m", 1, "--depth", "d.npy"),
+            "--depth and --distance-m: given together",
+        ),
         (("--distance-m", 0.001), "--distance-m 0.001: allowed is"),
         (("--distance-m", "nan"), "--distance-m nan: allowed is"),
         (("--distance-m", 1), "--fov-deg, --focal-px, --intrinsics: none is given"),
         (("--distance-m", 1, "--intrinsics", "1,2"), "allowed is FX,FY,CX,CY"),
         (("--distance-m", 1, "--focal-px", 0), "--focal-px 0: allowed is"),
-        (("--distance-m", 1, "--fov-deg", 50, "--focal-px", 9), "both given"),
+        (
+            ("--distance-m", 1, "--fov-deg", 50, "--focal-px", 9),
+            "--fov-deg and --focal-px: given together",
+        ),
     ],
 )
 def test_contradictions_about_camera_and_distance_are_refused(scene, extra, words):

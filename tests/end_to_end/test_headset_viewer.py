@@ -221,7 +221,7 @@ def test_only_filtered_pictures_are_written(tmp_path, capsys):
         found = {path.name for path in tmp_path.iterdir()}
         if ready_after_s:
             assert found == set()
-            assert "no picture was filtered" in capsys.readouterr().err
+            assert "no frame was filtered" in capsys.readouterr().err
     assert found == {"left.png", "right.png"}
 
 

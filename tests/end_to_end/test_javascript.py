@@ -23,13 +23,8 @@ needs_node = pytest.mark.skipif(
 )
 
 
-@needs_node
-@pytest.mark.parametrize(
-    "name", ["door", pytest.param("render", marks=pytest.mark.slow)]
-)
-def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service, name):
-    service = start_service()
-    profiles = [json.dumps({"kind": "double", "mark": mark}) for mark in (5, 7, 8)]
+def checked(service, *profiles, meanwhile=lambda: None):
+    """Return what `check.js` prints; something may happen in the middle of it."""
     with subprocess.Popen(
         ["node", "check.js", service.endpoint, *profiles],
         cwd=FOLDER,
@@ -40,14 +35,28 @@ def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service,
     ) as node:
         try:
             assert node.stdout.readline() == "lost\n", node.stderr.read()
-            pid = service.pids()[name]
-            os.kill(pid, signal.SIGKILL)
-            wait_until(lambda: service.pids().get(name, pid) != pid)
+            meanwhile()
             printed, said = node.communicate("go on\n", timeout=2 * TIMEOUT_S)
         finally:
             node.kill()
     assert not said
-    found = json.loads(printed)
+    return json.loads(printed)
+
+
+@needs_node
+@pytest.mark.parametrize(
+    "name", ["door", pytest.param("render", marks=pytest.mark.slow)]
+)
+def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service, name):
+    service = start_service()
+    profiles = [json.dumps({"kind": "double", "mark": mark}) for mark in (5, 7, 8)]
+
+    def kill():
+        pid = service.pids()[name]
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: service.pids().get(name, pid) != pid)
+
+    found = checked(service, *profiles, meanwhile=kill)
     pixels = 32 * 18 * 3
     assert found["mono"] == [1, pixels, 5, 245]
     assert found["stereo"] == [235, 225]
@@ -74,22 +83,8 @@ def real_service():
 
 @needs_node
 def test_the_check_passes_with_profiles_that_the_service_knows(real_service):
-    with subprocess.Popen(
-        ["node", "check.js", real_service.endpoint, PROFILE],
-        cwd=FOLDER,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as node:
-        try:
-            printed, said = node.communicate("go on\n", timeout=3 * TIMEOUT_S)
-        finally:
-            node.kill()
-    assert not said
-    lost, found = printed.splitlines()
-    assert lost == "lost"
-    assert json.loads(found)["profile"] == ["profile_invalid", "kind"]
+    found = checked(real_service, PROFILE)
+    assert found["profile"] == ["profile_invalid", "kind"]
 
 
 @needs_node

@@ -140,7 +140,7 @@ def test_unknown_name_lists_what_exists():
 
 
 STRONG = {"kind": "prescription", "sphere_dpt": -8, "cylinder_dpt": -1.25}
-ASKS = "vertex_mm is not given"
+ASKS = "vertex_mm is missing"
 
 
 def test_powers_are_said_where_they_count_and_at_the_cornea():

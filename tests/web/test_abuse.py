@@ -224,19 +224,23 @@ def test_pages_that_nobody_looks_at_are_limited(target):
 # --- what is sent from the page ------------------------------------------------
 
 
+def photo_entry(browser, target):
+    """Open a page; return it and the path that a photo is sent to."""
+    page = browser.new_context().new_page()
+    page.goto(target.address)
+    page.get_by_role("button", name="Photo", exact=True).first.click()
+    with page.expect_request(lambda request: "/upload/" in request.url) as sent:
+        entry = page.locator(".oc-uploads input[type=file]").first
+        picture = {"name": "a.png", "mimeType": "image/png", "buffer": b"none"}
+        entry.set_input_files(picture)
+    return page, urlsplit(sent.value.url).path
+
+
 @pytest.fixture(scope="module")
 def upload(browser):
     """Return how to send to the entry of a photo what no browser would send."""
     with attacked() as target:
-        context = browser.new_context()
-        page = context.new_page()
-        page.goto(target.address)
-        page.get_by_role("button", name="Photo", exact=True).first.click()
-        with page.expect_request(lambda request: "/upload/" in request.url) as sent:
-            entry = page.locator(".oc-uploads input[type=file]").first
-            picture = {"name": "a.png", "mimeType": "image/png", "buffer": b"none"}
-            entry.set_input_files(picture)
-        path = urlsplit(sent.value.url).path
+        page, path = photo_entry(browser, target)
 
         def send(name: bytes, content: bytes):
             body = b'--B\r\nContent-Disposition: form-data; name="f"; filename="'
@@ -249,7 +253,7 @@ def upload(browser):
 
         send.page, send.target, send.path = page, target, path
         yield send
-        context.close()
+        page.context.close()
 
 
 def _png(width_px, height_px):
@@ -289,15 +293,7 @@ def test_a_bomb_is_refused(upload):
 def test_a_page_that_closes_during_an_upload_is_no_fault(browser):
     """Its connection breaks, or the rest of the file comes when the page is gone."""
     with attacked() as target:
-        context = browser.new_context()
-        page = context.new_page()
-        page.goto(target.address)
-        page.get_by_role("button", name="Photo", exact=True).first.click()
-        with page.expect_request(lambda request: "/upload/" in request.url) as sent:
-            entry = page.locator(".oc-uploads input[type=file]").first
-            picture = {"name": "a.png", "mimeType": "image/png", "buffer": b"none"}
-            entry.set_input_files(picture)
-        path = urlsplit(sent.value.url).path
+        page, path = photo_entry(browser, target)
         body = b'--B\r\nContent-Disposition: form-data; name="f"; filename="a.png"\r\n'
         body += b"Content-Type: image/png\r\n\r\n" + _png(4000, 3000) + b"\r\n--B--\r\n"
         head = (
@@ -311,7 +307,7 @@ def test_a_page_that_closes_during_an_upload_is_no_fault(browser):
             for sock in (broken, late):
                 sock.sendall(head + body[:half])
             time.sleep(0.3)
-            context.close()
+            page.context.close()
             broken.close()
             time.sleep(GONE_S)
             late.sendall(body[half:])
