@@ -53,7 +53,7 @@ class FilteredView:
 
 
 SAMPLED_EVERY = 16
-"""Rows and columns looked at to tell the unit of depth: 20 us of a frame."""
+"""Rows and columns looked at to tell the unit of depth: 25 us of a frame."""
 
 METERS_BELOW = 100.0
 """Scenes with nothing nearer are rare; depth in centimeters or millimeters is not."""
