@@ -1,23 +1,23 @@
-"""The eye: what is known of it, what it is like, and what light it lets through.
+"""Eye model, wavefronts and point-spread functions.
 
 From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `compute_psfs`.
 
     optics/        light and surfaces
-    wavefront/     wavefronts of surfaces, traced
-    acuity/        what the optics leave of detail, and what is read with it
-    dynamics/      what drives an eye: light, distance, gaze
-    media/         light that is scattered or absorbed on the way
+    wavefront/     ray-traced wavefronts of surfaces
+    acuity/        image quality metrics and visual acuity
+    dynamics/      pupil, accommodation and gaze over time
+    media/         scattering and absorption in the ocular media
     psf/           point-spread functions of wavefronts
-    corrections/   what people wear to see better
-    eye/           the 45-parameter model
-    profiles/      what is known of one eye
+    corrections/   spectacles, contact lenses and intraocular lenses
+    eye/           the 45-parameter eye model
+    profiles/      descriptions of one person's eye
     networks/      the trained networks
-    periphery/     how people's wavefronts change off the axis, measured
-    estimate/      from a measurement to the eye
-    field/         an eye over its visual field
-    bounded_files  text and JSON of untrusted files within limits
-    threads        how many threads this machine gives us
-    machine_speed  how fast one of its cores is
+    periphery/     measured changes of wavefronts off the axis
+    estimate/      estimation of an eye from a measurement
+    field/         wavefronts of an eye over its visual field
+    bounded_files  size-limited reading of untrusted text and JSON
+    threads        number of threads to use
+    machine_speed  relative speed of one core
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
 """Bounded reading of untrusted files: bytes, text, JSON and TOML.
 
-Every reader of this project raises `InvalidFile` for a file that it cannot use,
-whatever the library underneath raised, and compares sizes with limits before it reads.
-Standard library only, so that any package may import it.
+Every reader in this project raises `InvalidFile` for a file that it cannot use,
+whatever the underlying library raised, and checks size limits before reading.
+This module uses the standard library only, so that any package may import it.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from pathlib import Path
 from typing import Any
 
 MAX_BITS = 64
-"""Of a JSON integer: what msgpack has, so that profiles accept the same in both."""
+"""Size limit of a JSON integer, as in msgpack: profiles accept the same in both."""
 
 MAX_DIGITS = 20
-"""Of a JSON integer without its sign; more take a time that grows with the square."""
+"""Digit limit of a JSON integer, without its sign; parsing time is quadratic."""
 
 MAX_DEPTH = 32
-"""Of JSON objects and arrays within each other.  A glTF file has 8, a profile 4."""
+"""Nesting limit of JSON objects and arrays.  A glTF file has 8, a profile 4."""
 
 MAX_ITEMS = 100_000
-"""Of JSON values.  28 coefficients at 400 field directions are 12,000."""
+"""Limit of JSON values.  28 coefficients at 400 field directions are 12,000."""
 
 MAX_TEXT_BYTES = 8_000_000
 MAX_TEXT_LINES = 200_000
-"""Of a text file, a list of frames for example: two hours at 30 Hz."""
+"""Line limit of a text file; a list of frames at 30 Hz may cover two hours."""
 
 _READ_BYTES = 1 << 20
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 class InvalidFile(ValueError):
-    """A file that cannot be used: not of its kind, damaged, or beyond a limit.
+    """A file that cannot be used: wrong type, damaged, or beyond a limit.
 
     Attributes
     ----------
     path : str
         The file, as the user named it.
     found : str
-        What is wrong with it.
+        Description of the problem.
     allowed : str
-        What would have been accepted; may be empty.
+        Accepted content; may be empty.
     option : str
-        The command's option that named the file; may be empty.
+        Command-line option that named the file; may be empty.
     """
 
     def __init__(
@@ -61,14 +61,14 @@ class InvalidFile(ValueError):
         self.option = option
 
     def __str__(self) -> str:
-        """Return one line: option, file, what was found and what is allowed."""
+        """Return one line with option, file, problem and accepted content."""
         where = f"--{self.option} '{self.path}'" if self.option else f"'{self.path}'"
         text = f"{where}: {self.found}"
         return f"{text}; allowed: {self.allowed}" if self.allowed else text
 
 
 def reason_of(error: BaseException) -> str:
-    """Return an exception as part of one line; by its kind where it has no text."""
+    """Return an exception's text as part of one line, or its type if it has none."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     text = " ".join(str(error).split())[:200]
@@ -92,7 +92,7 @@ def read_bytes(path: Path, *, max_bytes: int, option: str = "") -> bytes:
             if not stat.S_ISREG(status.st_mode):
                 raise InvalidFile(path, "not a regular file", "a file", option)
             parts, size = [], status.st_size
-            if size <= max_bytes:  # counted again: the file may grow meanwhile
+            if size <= max_bytes:  # count again: the file may grow while it is read
                 size = 0
                 while size <= max_bytes and (part := file.read(_READ_BYTES)):
                     parts.append(part)
@@ -115,7 +115,7 @@ def read_bytes(path: Path, *, max_bytes: int, option: str = "") -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Open a file; a FIFO, which would keep its reader waiting, too."""
+    """Open a file without blocking, even a FIFO that has no writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -126,7 +126,7 @@ def read_text(
     max_lines: int = MAX_TEXT_LINES,
     option: str = "",
 ) -> str:
-    """Return a UTF-8 text file of bounded size, without a byte order mark.
+    """Return the text of a UTF-8 file of bounded size, without a byte order mark.
 
     Raises
     ------
@@ -194,25 +194,25 @@ def loads_bounded(
     max_items: int = MAX_ITEMS,
     finite: bool = False,
 ) -> Any:
-    """Return the value of a JSON text, refusing what is too large before parsing it.
+    """Return the value of a JSON text; reject oversized text before parsing it.
 
     Commas and opening brackets are counted first, at the speed of `bytes.count`: each
-    value of the result needs one of them, so that they bound its memory.
+    value of the result needs one of them, so their number bounds its memory.
 
     Parameters
     ----------
     data : bytes
-        UTF-8, perhaps with a byte order mark.
+        UTF-8 text, with or without a byte order mark.
     max_bytes, max_depth, max_items : int
-        Bounds of the text, of containers within each other, and of values.
+        Limits of the text size, of nesting, and of the number of values.
     finite : bool
-        Whether NaN, infinity and numbers beyond float64 are refused.
+        Whether to reject NaN, infinity and numbers beyond float64.
 
     Raises
     ------
     ValueError
-        Beyond a bound, not JSON, a key twice in one object, an integer of more than
-        64 bits, or text with half a surrogate pair.
+        A limit is exceeded, the text is not JSON, an object repeats a key, an integer
+        has more than 64 bits, or text contains half a surrogate pair.
     """
     if len(data) > max_bytes:
         raise ValueError(f"{len(data):,} bytes; allowed: at most {max_bytes:,}")
@@ -245,14 +245,14 @@ def check_values(
     finite: bool = False,
     whole_text: bool = True,
 ) -> None:
-    """Refuse containers too deep, and integers of more than 64 bits; no recursion.
+    """Reject deep nesting and integers of more than 64 bits, without recursion.
 
     Parameters
     ----------
     finite : bool
-        Whether infinity and NaN are refused, too.
+        Whether to reject infinity and NaN as well.
     whole_text : bool
-        Whether text with half a surrogate pair, which cannot be printed, is refused.
+        Whether to reject text with half a surrogate pair, which cannot be printed.
 
     Raises
     ------
@@ -325,5 +325,5 @@ def _refuse_half_pair(text: str) -> None:
 
 
 def numbered_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a text with their numbers, from one."""
+    """Yield the lines of a text with their numbers, starting at one."""
     return enumerate(text.splitlines(), start=1)

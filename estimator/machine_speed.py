@@ -1,4 +1,4 @@
-"""How fast one core of this machine is, beside the one that costs were measured on."""
+"""Speed of one core relative to the machine on which costs were measured."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ SIDE = 192
 ROUNDS = 12
 
 MEASURED_PROBE_MS = 0.28
-"""Of the probe on the machine of the cost constants, an AMD EPYC."""
+"""Time of the probe on the machine of the cost constants, an AMD EPYC."""
 
 
 @cache
 def relative_core_time() -> float:
-    """Return the time of one core over that of the machine of the cost constants.
+    """Return the time of one core relative to the machine of the cost constants.
 
-    The least of a dozen transforms, the most common work of a PSF, on the calling
-    thread: 5 ms, once in a process.
+    The probe is the fastest of a dozen Fourier transforms, the most common work of a
+    PSF, on the calling thread.  It takes 5 ms, once per process.
     """
     samples = np.exp(1j * np.arange(SIDE * SIDE).reshape(SIDE, SIDE))
     times_ms = []

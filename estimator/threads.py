@@ -1,4 +1,4 @@
-"""How many threads this process should use."""
+"""Number of threads that this process should use."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 @cache
 def thread_count() -> int:
-    """Return the cores this process may run on, capped by a container's quota.
+    """Return the number of usable cores, capped by the container's CPU quota.
 
-    The environment variable ``OCUFILTER_THREADS`` says another number.
+    The environment variable ``OCUFILTER_THREADS`` overrides this number.
 
     Raises
     ------
     ValueError
-        The variable holds no number from 1 to 256.
+        The variable is not a number from 1 to 256.
     """
     wanted = os.environ.get(THREADS_VARIABLE, "")
     if wanted:
@@ -41,10 +41,10 @@ def _core_count() -> int:
 
 
 def _quota_cores(folder: Path) -> int:
-    """Return the cores that a control group pays for, rounded up; many without one.
+    """Return a control group's CPU quota in cores, rounded up; `MAX_THREADS` if none.
 
-    Version 2 has ``cpu.max``: quota and period in microseconds, or ``max``; version 1
-    two files, and -1 for no quota.
+    Version 2 has ``cpu.max``: quota and period in microseconds, or ``max``.  Version 1
+    has two files, with -1 for no quota.
     """
     try:
         quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()[:2]

@@ -1,37 +1,37 @@
-"""The filter: pictures through a person's eye, in process or as a service.
+"""The filter: images as a person's eye sees them, in process or as a service.
 
-Importing this loads nothing but names: clients stay light.
+Importing this package loads no submodules, which keeps clients light.
 
-    settings         every setting of a filter, once
-    displays         the wavelengths of red, green and blue
-    camera           a pinhole, and which cameras share PSFs
-    rgbd_view        colour, depth and camera of one view
-    view_state       through whose eye it is seen
-    messages         the wire protocol's types (PROTOCOL.md)
-    protocol_schema  their headers as JSON Schema
-    errors           the exceptions
-    keys             who may connect from other machines
-    slots            memory that processes share
-    log_lines        the service's log
-    checked          values against annotated types
-    progress         how far long work is, said on stderr
-    constants        numbers that Python and GLSL share
-    image_files      pictures and depth in files
-    whole_files      files that are written as a whole or not at all
-    bounded_images   the decoders, within limits of memory
-    gl_device        which device OpenGL works on, as a user names it
-    threads          numba's thread layer
-    one_blas_thread  numpy on one thread
-    gl/              the OpenGL context and its shaders
-    native/          loops in C
-    planning/        which PSFs an eye needs for a stated error
-    psfs/            the PSF cache: built, packed, kept
-    rendering/       from a frame and the cache to the picture
-    building/        the worker process that makes caches
+    settings         definition of every setting of a filter
+    displays         wavelengths of red, green and blue
+    camera           pinhole camera, and which cameras share PSFs
+    rgbd_view        color, depth and camera of one view
+    view_state       eye and state of a view
+    messages         types of the wire protocol (PROTOCOL.md)
+    protocol_schema  JSON Schema of the message headers
+    errors           exceptions
+    keys             keys of clients on other machines
+    slots            shared memory
+    log_lines        log of the service
+    checked          validation against annotated types
+    progress         progress of long tasks on stderr
+    constants        constants shared by Python and GLSL
+    image_files      color and depth files
+    whole_files      atomic file writes
+    bounded_images   image decoders with memory limits
+    gl_device        selection of the OpenGL device
+    threads          numba's threading layer
+    one_blas_thread  NumPy's BLAS on one thread
+    gl/              OpenGL context and shaders
+    native/          compiled loops in C
+    planning/        PSFs that an eye needs for a given error
+    psfs/            the PSF cache
+    rendering/       from a frame and the cache to the output image
+    building/        worker process that builds caches
     filtering/       `EyeFilter`: streams of frames through eyes
     wire/            messages, field by field
-    service/         sockets, sessions and the loop
-    commands/        the command line
+    service/         sockets, sessions and the scheduler
+    commands/        command line
 """
 
 import lazy_loader

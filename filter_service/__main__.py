@@ -1,4 +1,4 @@
-"""The `ocufilter` program: command line to function calls, errors to one line."""
+"""The `ocufilter` program: dispatch of commands, and one line for every error."""
 
 import sys
 
@@ -60,7 +60,7 @@ for program in (headset, web, batch, report):
         context_settings={
             "allow_extra_args": True,
             "ignore_unknown_options": True,
-            "help_option_names": [],  # the program's own help says more
+            "help_option_names": [],  # the program has its own help
         }
     )(program)
 app.command()(paper)
@@ -78,7 +78,7 @@ def _root(
 
 
 def main() -> None:
-    """Run the program; one line on stderr and an exit code for every error."""
+    """Run the program; errors become one line on stderr and an exit code."""
     sys.exit(_exit_code(sys.argv[1:]))
 
 
@@ -104,7 +104,7 @@ def _code_and_text(error: Exception) -> tuple[int, str]:
         return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
     if isinstance(error, CommandFailed):
         return EXIT_FAILURE, str(error)
-    if isinstance(error, ValueError):  # a caller's mistake, by the house rule
+    if isinstance(error, ValueError):  # by convention invalid input
         return EXIT_BAD_INPUT, str(error)
     if isinstance(error, OSError):
         return EXIT_FAILURE, str(error)

@@ -1,9 +1,9 @@
-"""Image files in memory, with their decoded size checked before anything is decoded.
+"""Image decoders with memory limits, checked before anything is decoded.
 
-Pillow decodes PNG, JPEG, PPM, PGM, PFM, TIFF and WebP, the OpenEXR library its own
-format; ``.npy`` files are read here, as NumPy's reader evaluates the header's text.
-The limits keep the peak memory of any file below 1 GB
-(`ocufilter bench files`).  Whatever a decoder raises becomes `InvalidFile`.
+Pillow decodes PNG, JPEG, PPM, PGM, PFM, TIFF and WebP, and the OpenEXR library decodes
+its own format; ``.npy`` files are read here, because NumPy's reader evaluates the text
+of the header.  The limits keep the peak memory of any file below 1 GB
+(`ocufilter bench files`).  Every exception of a decoder becomes `InvalidFile`.
 """
 
 from __future__ import annotations
@@ -43,44 +43,44 @@ from PIL import (
 from estimator.bounded_files import InvalidFile, reason_of
 
 MAX_PIXELS = 1 << 26
-"""8192 x 8192, four times what the service takes as a view by default.  Pillow holds
-four bytes of each, and the array beside them takes three: 0.47 GB."""
+"""8192 x 8192, four times the service's default limit of a view.  Pillow holds four
+bytes per pixel, and the array beside it takes three: 0.47 GB."""
 
 MAX_DECODED_BYTES = 4096 * 4096 * 3 * 8
 """403 MB: the service's largest default view in float64, or 100 megapixels of float32.
-Beside it stands the array in float32 that is made of it."""
+The float32 array made of it exists at the same time."""
 
 MAX_FILE_BYTES = 1 << 29
-"""More than any format needs for so many bytes: metadata may take the rest."""
+"""More than any format needs for the decoded bytes; the rest is left for metadata."""
 
 MAX_SCANNED_PIXELS = 1 << 30
-"""Of a JPEG: its pixels times its scans, each of which visits all of them.  A
-progressive camera picture has 10 scans."""
+"""Pixels of a JPEG times its scans, each of which visits all of them.  A progressive
+camera image has 10 scans."""
 
 MAX_PNG_CHUNKS = 200_000
 """Pillow takes some microseconds for each; encoders make one for 8 kB."""
 
 MAX_TIFF_VALUES = 1_000_000
-"""Of one numeric tag: they become Python numbers, 36 bytes each."""
+"""Values of one numeric tag: they become Python numbers, 36 bytes each."""
 
 MAX_SLOW_SAMPLES = 1 << 21
-"""Of a PPM or PGM in plain text or of unusual depth, which Pillow decodes in Python:
-about a microsecond each."""
+"""Samples of a PPM or PGM in plain text or of unusual depth, which Pillow decodes in
+Python: about a microsecond each."""
 
 MAX_NPY_HEADER_BYTES = 10_000
 MAX_WEBP_PIXELS = 1 << 25
-"""libwebp holds two canvases beside the picture."""
+"""libwebp holds two canvases in addition to the image."""
 
 FORMATS = (
     PngImagePlugin.PngImageFile.format,
-    JpegImagePlugin.JpegImageFile.format,  # of phones, too, which Pillow calls MPO
+    JpegImagePlugin.JpegImageFile.format,  # includes phone images (MPO in Pillow)
     PpmImagePlugin.PpmImageFile.format,
     TiffImagePlugin.TiffImageFile.format,
     WebPImagePlugin.WebPImageFile.format,
 )
 
 MAX_EXR_CHUNK_BYTES = 1 << 26
-"""Rows that are decoded at once: DWA holds them four times beside the picture."""
+"""Size of the rows decoded at once: DWA holds them four times, besides the image."""
 
 EXR_CHUNK_ROWS = {
     **dict.fromkeys(("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION"), 1),
@@ -88,10 +88,10 @@ EXR_CHUNK_ROWS = {
     **dict.fromkeys(("PIZ_COMPRESSION", "B44_COMPRESSION", "B44A_COMPRESSION"), 32),
     **dict.fromkeys(("DWAA_COMPRESSION", "HTJ2K32_COMPRESSION"), 32),
 }
-"""By compression; 256 of others."""
+"""Rows per chunk by compression; 256 for any other."""
 
 EXR_INCOMPLETE = "Exception raised reading pixel data"
-"""What the library prints where pixels are damaged, and nowhere else."""
+"""Text that the library prints if pixels are damaged, and only then."""
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 NPY_MAGIC = b"\x93NUMPY"
@@ -102,11 +102,11 @@ _NPY_FIELD = re.compile(
 
 _KEPT_BYTES = 100_000
 _WARNINGS = threading.RLock()
-"""Filters of warnings are the process's: two readers would restore each other's."""
+"""Warning filters are global to the process: two readers would restore each other's."""
 
 _PIXEL_LIMIT = f"at most {MAX_PIXELS:,} pixels, as 8192x8192"
 
-# Otherwise Python writes its records to stderr, beside the one line of the error.
+# Otherwise Python writes its records to stderr, in addition to the error's one line.
 logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 Source = Path | bytes
@@ -120,20 +120,20 @@ def read_picture_rgb(
     upright: bool = True,
     formats: Sequence[str] = FORMATS,
 ) -> NDArray[np.uint8]:
-    """Return a picture of 8 bits per channel as sRGB (height, width, 3).
+    """Return an image of 8 bits per channel as sRGB (height, width, 3).
 
     Parameters
     ----------
     source : Path or bytes
         The file, or its content.
     name : str
-        How errors name it; its path where there is none.
+        Name of the image in error messages; its path by default.
     option : str
-        What asked for it, for the texts of errors.
+        Option that requested it, for error messages.
     upright : bool
-        Whether to turn it as its EXIF data say; textures are taken as stored.
+        Whether to apply the EXIF orientation; textures are read as stored.
     formats : sequence of str
-        Pillow's names of those to read, whatever the file's name.
+        Pillow's names of the accepted formats, regardless of the file's suffix.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def read_picture_rgb(
 
 
 def read_picture_values(source: Source, *, name: str = "", option: str = "") -> NDArray:
-    """Return the stored values of a picture, upright, as depth files have them.
+    """Return the stored values of an image, upright, as needed for depth files.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def read_picture_values(source: Source, *, name: str = "", option: str = "") -> 
 
 
 def check_picture(source: Source, *, name: str = "", option: str = "") -> int:
-    """Check a picture's kind and size without decoding it; return its pixels.
+    """Check an image's format and size without decoding it; return its pixel count.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def check_picture(source: Source, *, name: str = "", option: str = "") -> int:
 
 
 class _Refused(Exception):
-    """What was found and what is allowed."""
+    """A rejected file: the value found and the allowed one."""
 
     def __init__(self, found: str, allowed: str) -> None:
         super().__init__(found, allowed)
@@ -182,10 +182,10 @@ class _Refused(Exception):
 def _opened_picture(
     source: Source, name: str, option: str, formats: Sequence[str] = FORMATS
 ) -> Iterator[Image.Image]:
-    """Open a picture that is within the limits; turn all errors into `InvalidFile`."""
+    """Open an image within the limits; convert all errors to `InvalidFile`."""
     named = name or str(source if isinstance(source, Path) else "picture")
     with _WARNINGS, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sizes, which are checked here
+        warnings.simplefilter("ignore")  # about sizes, which are checked here
         try:
             file = (
                 io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")
@@ -213,15 +213,15 @@ def _opened_picture(
 
 @contextmanager
 def _quiet_library() -> Iterator[list[str]]:
-    """Keep what a library prints, or writes to stderr; the list holds it afterwards.
+    """Capture a library's output on stdout and stderr; the list holds it afterwards.
 
-    Both streams are the process's: the lock of `_WARNINGS` is held meanwhile.
+    Both streams are global to the process, so the caller holds the lock `_WARNINGS`.
     """
     said: list[str] = []
     printed = io.StringIO()
     with tempfile.TemporaryFile() as kept, redirect_stdout(printed):
         with ExitStack() as stack:
-            with suppress(OSError):  # there may be no stderr
+            with suppress(OSError):  # stderr may not exist
                 own = os.dup(2)
                 stack.callback(os.close, own)
                 stack.callback(os.dup2, own, 2)
@@ -233,7 +233,7 @@ def _quiet_library() -> Iterator[list[str]]:
 
 
 def _text_of(error: BaseException) -> str:
-    """Return what a decoder says, without addresses of Python objects."""
+    """Return the message of a decoder, without addresses of Python objects."""
     return re.sub(r"<[^>]* at 0x[0-9a-f]+>", "it", reason_of(error))
 
 
@@ -242,7 +242,7 @@ def _refuse(named: str | Path, found: str, allowed: str, option: str) -> NoRetur
 
 
 def _rows_as_rgb(image: Image.Image) -> NDArray[np.uint8]:
-    """Convert some rows at a time: the whole in RGB would be held three times."""
+    """Convert some rows at a time; otherwise the image would be held three times."""
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     step = max(1, (1 << 22) // max(1, width))
@@ -252,7 +252,7 @@ def _rows_as_rgb(image: Image.Image) -> NDArray[np.uint8]:
     return rgb
 
 
-# --- pictures: what is checked before Pillow sees them ------------------------
+# --- images: checks before they are passed to Pillow --------------------------
 
 
 def _check_container(file: BinaryIO) -> None:
@@ -265,7 +265,7 @@ def _check_container(file: BinaryIO) -> None:
     elif head.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
         _check_tiff(file, head)
     elif head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        # Here, as Pillow makes the canvases when it opens the file.
+        # Checked here, because Pillow allocates the canvases on opening the file.
         width, height = _webp_size(head)
         if width * height > MAX_WEBP_PIXELS:
             allowed = f"at most {MAX_WEBP_PIXELS:,} pixels of a WebP"
@@ -279,13 +279,13 @@ def _size_of(file: BinaryIO) -> int:
 
 
 def _check_png(file: BinaryIO, size_bytes: int) -> None:
-    """Count the chunks by their heads alone."""
+    """Count the chunks by reading only their headers."""
     at, count = 8, 0
     while at < size_bytes:
         file.seek(at)
         head = file.read(4)
         if len(head) < 4:
-            return  # cut off: the decoder says so
+            return  # truncated: the decoder reports it
         count += 1
         if count > MAX_PNG_CHUNKS:
             raise _Refused(f"more than {count - 1:,} chunks", f"{MAX_PNG_CHUNKS:,}")
@@ -296,7 +296,7 @@ _TIFF_NUMERIC = {3, 4, 5, 6, 8, 9, 10, 11, 12, 13, 16, 17, 18}
 
 
 def _check_tiff(file: BinaryIO, head: bytes) -> None:
-    """Bound the numbers in each tag of the first image."""
+    """Limit the number of values in each tag of the first image."""
     order = "<" if head[:1] == b"I" else ">"
     is_big = b"+" in head[2:4]
     offset_at, offset, count, entry = (
@@ -315,7 +315,7 @@ def _check_tiff(file: BinaryIO, head: bytes) -> None:
             tags.iter_unpack(content[: len(content) // tags.size * tags.size])
         )
     except (struct.error, OverflowError):
-        return  # cut off: the decoder says so
+        return  # truncated: the decoder reports it
     for tag, kind, n_values in entries:
         if kind in _TIFF_NUMERIC and n_values > MAX_TIFF_VALUES:
             found = f"tag {tag} with {n_values:,} values"
@@ -323,7 +323,7 @@ def _check_tiff(file: BinaryIO, head: bytes) -> None:
 
 
 def _webp_size(head: bytes) -> tuple[int, int]:
-    """Return the canvas of a WebP, 0, 0 where the decoder will refuse it."""
+    """Return the canvas of a WebP, or (0, 0) if the decoder will reject it."""
     kind, data = head[12:16], head[20:30]
     if len(data) < 10:
         return 0, 0
@@ -340,7 +340,7 @@ def _webp_size(head: bytes) -> tuple[int, int]:
 
 
 def _check_picture(image: Image.Image, file: BinaryIO) -> None:
-    """Refuse a picture that is too large, by its header."""
+    """Reject an image that is too large according to its header."""
     width, height = image.size
     n_pixels = width * height
     if n_pixels > MAX_PIXELS:
@@ -364,7 +364,7 @@ def _check_picture(image: Image.Image, file: BinaryIO) -> None:
 
 
 def _check_tiles(image: Image.Image) -> None:
-    """Refuse tiles that are much larger than the picture: they are decoded whole."""
+    """Reject tiles that are much larger than the image: they are decoded whole."""
     tags = image.tag_v2  # type: ignore[attr-defined]
     tile_width, tile_height = (int(tags.get(tag, 0)) for tag in (322, 323))
     if tile_width * tile_height > MAX_PIXELS:
@@ -372,7 +372,7 @@ def _check_tiles(image: Image.Image) -> None:
 
 
 def _count(file: BinaryIO, marker: bytes) -> int:
-    """Count a marker of two bytes in a file, and leave the file where it is."""
+    """Count a two-byte marker in a file, and restore the file's position."""
     before = file.tell()
     file.seek(0)
     count, last = 0, b""
@@ -389,8 +389,8 @@ def _count(file: BinaryIO, marker: bytes) -> int:
 def read_npy(path: Path, *, option: str = "") -> NDArray:
     """Return the array of a ``.npy`` file of bool, integers or floats.
 
-    The shape that its header claims is compared with the file's size and the limits
-    before any memory is taken.
+    The shape in the header is compared with the file's size and the limits before any
+    memory is allocated.
 
     Raises
     ------
@@ -473,7 +473,7 @@ def read_exr_channels(
     Parameters
     ----------
     choose : callable
-        Returns which of the channels are wanted, or raises.
+        Function that returns the channels to read, or raises.
 
     Raises
     ------
@@ -498,7 +498,7 @@ def read_exr_channels(
                 wanted = choose(set(channels))
                 found = {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
         text = "".join(said)
-        if EXR_INCOMPLETE in text:  # it goes on with what it has
+        if EXR_INCOMPLETE in text:  # the library continues with the intact part
             reason = text[text.index(EXR_INCOMPLETE) :].split("\n")[0].split(" - ")[-1]
             raise _Refused(f"cannot be read ({reason:.100})", "an intact OpenEXR file")
         return found
@@ -506,13 +506,13 @@ def read_exr_channels(
         raise
     except _Refused as error:
         raise InvalidFile(path, error.found, error.allowed, option) from None
-    except Exception as error:  # bindings raise nearly anything of damaged files
+    except Exception as error:  # bindings raise nearly anything on damaged files
         found = f"cannot be read ({_text_of(error)})"
         raise InvalidFile(path, found, "an intact OpenEXR file", option) from None
 
 
 def _exr_chunk_rows(header: dict[str, Any]) -> int:
-    """Return how many rows are decoded at once, at most; those of a tile its own."""
+    """Return the largest number of rows decoded at once; for tiles, their height."""
     tiles = header.get("tiles")
     if tiles is not None:
         return max(1, int(tiles.ySize))
@@ -521,7 +521,7 @@ def _exr_chunk_rows(header: dict[str, Any]) -> int:
 
 
 def _check_exr(parts: list) -> None:
-    """Refuse what would take too much memory, by the headers of all parts."""
+    """Reject files that would need too much memory, by the headers of all parts."""
     n_bytes = 0
     if not parts:
         raise _Refused("no parts", "a part with pixels")
@@ -534,7 +534,7 @@ def _check_exr(parts: list) -> None:
             raise _Refused(f"{width}x{height} px", _PIXEL_LIMIT)
         if "deep" in str(part.header.get("type", "")):
             raise _Refused("deep pixels", "one value of each channel for a pixel")
-        # 4 bytes of each: half floats become float32
+        # 4 bytes per value: half floats become float32
         row_bytes = 4 * width * len(part.header["channels"])
         n_bytes += row_bytes * height
         chunk_bytes = row_bytes * min(height, _exr_chunk_rows(part.header))

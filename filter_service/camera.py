@@ -1,8 +1,8 @@
-"""A pinhole camera, and which cameras one PSF store serves.
+"""A pinhole camera, and which cameras can share one PSF store.
 
-An on-axis store knows nothing of a camera but the size of its pixels.  A store that
-follows the visual field holds kernels for directions in one image, mapped by its local
-scale, so it serves that image only.
+An on-axis store depends only on the size of a camera's pixels.  A store that follows
+the visual field holds kernels for directions in one image, mapped by its local scale,
+so it serves that image only.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more
 MIN_EXTENT = 1e-6
 
 SAME_RATIO = 1e-3
-"""Of a pixel pitch, and of an image's extent: a kernel of 255 px is then right to a
-quarter of a pixel, and a direction to about one."""
+"""Tolerance relative to the pixel pitch and to the image's extent: a kernel of 255 px
+is then accurate to a quarter of a pixel, and a direction to about one."""
 
 SidePx = Annotated[int, Meta(ge=1, le=MAX_SIDE_PX)]
 Tangent = Annotated[float, Meta(ge=-MAX_TANGENT, le=MAX_TANGENT)]
@@ -38,7 +38,7 @@ def tangents_from_fov(
     Raises
     ------
     ValueError
-        A field of view that no pinhole has.
+        The field of view is impossible for a pinhole.
     """
     if not 0 < vertical_fov_deg < 174:
         raise ValueError(f"vertical_fov_deg is {vertical_fov_deg}; allowed: 0 to 174")
@@ -48,12 +48,12 @@ def tangents_from_fov(
 
 
 def read_intrinsics(text: str) -> tuple[float, float, float, float]:
-    """Return focal lengths and principal point, px, of an option ``--intrinsics``.
+    """Return focal lengths and principal point, px, from an option ``--intrinsics``.
 
     Raises
     ------
     ValueError
-        Other than four numbers, or focal lengths of zero or less; names the option.
+        There are not four numbers, or a focal length is not positive; names the option.
     """
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
@@ -72,12 +72,13 @@ class Camera(Record):
     ----------
     width_px, height_px : int, 1 to 16384
     tangents : (left, right, up, down)
-        Of the angles to the image edges, left < right and down < up, within 20.
+        Tangents of the angles to the image edges, left < right and down < up, within
+        20.
 
     Raises
     ------
     BadMessage
-        A size or tangent out of range, or edges on the wrong sides.
+        A size or tangent is out of range, or edges are on the wrong sides.
     """
 
     width_px: SidePx
@@ -85,10 +86,10 @@ class Camera(Record):
     tangents: Tangents
 
     def __post_init__(self) -> None:
-        """Refuse what no pinhole has; numpy's numbers become Python's, lists tuples."""
+        """Validate the fields; convert NumPy numbers and lists to Python's types."""
         for name in ("width_px", "height_px"):
             object.__setattr__(self, name, checked(getattr(self, name), SidePx, name))
-        # An alias of a tuple is no type to mypy.
+        # mypy does not accept an alias of a tuple as a type.
         kind = cast("type[Tangents]", Tangents)
         tangents = checked(self.tangents, kind, "tangents")
         left, right, up, down = tangents
@@ -109,7 +110,7 @@ class Camera(Record):
         Raises
         ------
         ValueError
-            A field of view or size that no pinhole has.
+            The field of view or size is impossible for a pinhole.
         """
         tangents = tangents_from_fov(vertical_fov_deg, width_px, height_px)
         return cls(width_px, height_px, tangents)
@@ -131,15 +132,15 @@ class Camera(Record):
         ----------
         focal_x_px, focal_y_px : float
         center_x_px, center_y_px : float
-            Principal point; the center of pixel (0, 0) is at (0, 0), as OpenCV and ROS
-            have it.  The image ends half a pixel beyond the centers of its outermost
+            Principal point; the center of pixel (0, 0) is at (0, 0), as in OpenCV and
+            ROS.  The image ends half a pixel beyond the centers of its outermost
             pixels.
         width_px, height_px : int
 
         Raises
         ------
         BadMessage
-            A size, or edges, that no pinhole has.
+            The size or edges are impossible for a pinhole.
         """
         tangents = (
             -(center_x_px + 0.5) / focal_x_px,
@@ -177,7 +178,7 @@ def is_same_camera(first: Camera, second: Camera, *, follows_field: bool) -> boo
     Parameters
     ----------
     follows_field : bool
-        The store's kernels differ over the visual field.
+        Whether the store's kernels differ over the visual field.
     """
     pitches = zip(first.pixel_pitch_mrad, second.pixel_pitch_mrad, strict=True)
     if any(abs(a / b - 1.0) > SAME_RATIO for a, b in pitches):
@@ -199,7 +200,7 @@ def _shows_the_same(first: Camera, second: Camera) -> bool:
 def distinct_cameras(
     cameras: Sequence[Camera], *, follows_field: bool
 ) -> tuple[Camera, ...]:
-    """Return the cameras that need a store each, in order."""
+    """Return the cameras that need a store of their own, in order."""
     distinct: list[Camera] = []
     for camera in cameras:
         if not any(

@@ -1,10 +1,10 @@
-"""Numbers that Python and GLSL share; every one becomes a ``#define`` of its name."""
+"""Constants shared by Python and GLSL; each becomes a ``#define`` of the same name."""
 
 TILE_SIZE_PX = 8
-"""Edge of a screen tile and of a fragment block; 64 threads serve one."""
+"""Edge of a screen tile and of a fragment block; each has 64 threads."""
 
 THREADS = TILE_SIZE_PX * TILE_SIZE_PX
-"""Threads of a tile's work group, and fragment slots of a block."""
+"""Threads in a tile's work group, and fragment slots in a block."""
 
 QUADS_ACROSS = TILE_SIZE_PX // 2
 QUADS = QUADS_ACROSS * QUADS_ACROSS
@@ -14,27 +14,28 @@ BIN_TILES = 2
 BIN_SIZE_PX = BIN_TILES * TILE_SIZE_PX
 TILES_PER_BIN = BIN_TILES * BIN_TILES
 ALL_TILES = (1 << TILES_PER_BIN) - 1
-"""Lists are made and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An
+"""Lists are built and sorted for bins of 2 x 2 tiles and evaluated tile by tile.  An
 entry is a word: a bit for each tile of the bin that the fragment lights, and above them
 its slot, so a strip may have 2**28 slots (a storage block of 2 GiB holds 2**27).  Bins
-of 4 x 4 tiles save some more on the lists, but a tile then reads more entries for each
-that it evaluates, which costs more (measured at 320 x 180 on a software renderer)."""
+of 4 x 4 tiles save more time on the lists, but each tile then reads more entries for
+each that it evaluates, which costs more (measured at 320 x 180 on a software renderer).
+"""
 
 BATCH = 128
 HIT_WORDS = BATCH // 32
-"""Entries of a list that the splat pass looks at in one go, and words with a bit for
+"""Entries of a list that the splat pass processes at a time, and words with a bit for
 each of them."""
 
 SCAN_THREADS = 256
-"""Threads of the single group that sums the bins' counts."""
+"""Threads in the single group that sums the bins' counts."""
 
 TOTAL_ENTRIES = 0
 TOTAL_ENTRIES_FLOAT = 1
 TOTAL_LOST = 2
 TOTAL_LONGEST = 3
 TOTAL_WORDS = 4
-"""Words behind the bins' offsets: entries of all lists, the same as a float, entries
-that were not kept, length of the longest list."""
+"""Words after the bins' offsets: entries of all lists, the same as a float, dropped
+entries, length of the longest list."""
 
 STAT_MISSING = 0
 STAT_CLAMPED = 1
@@ -43,8 +44,8 @@ STAT_FRAGMENTS = 3
 STAT_MERGED = 4
 STAT_WORDS = 8
 STAT_LANES = 32
-"""What passes count of a frame: pixels without depth, at a distance that was not
-prepared, without a finite colour; fragments, and pixels merged.  In several rows, for
+"""Counters of a frame: pixels without depth, at a distance that was not prepared, and
+without a finite color; fragments, and merged pixels.  There are several rows, because
 work groups that all add to one word wait for each other."""
 
 DISPATCH_SCATTER = 0
@@ -52,18 +53,18 @@ DISPATCH_SORT = 1
 DISPATCH_SPLAT = 4
 DISPATCH_COUNT = 5
 DISPATCH_BYTES = 16
-"""Dispatches whose size a pass decides: the scatter, a sort for each of three size
-classes, the splat; each is groups along three axes, and a word that is not used."""
+"""Dispatches whose size a pass determines: the scatter, a sort for each of three size
+classes, the splat; each is group counts along three axes, and an unused word."""
 
 ENTRIES_EXACT = 2.0**31
-"""Sums of list lengths below this hold in a word."""
+"""Sums of list lengths below this fit in a word."""
 
 EXACT_FLOAT = 2.0**23
 EXACT_FLOAT_BITS = 0x4B000000
-"""From here on floats are whole numbers; and its bits."""
+"""Float from which on all floats are whole numbers, and its bits."""
 
 FLOAT_INFINITY_BITS = 0x7F800000
-"""Of a 32-bit float; larger ones, without the sign, are no numbers."""
+"""Infinity as a 32-bit float; larger bits, without the sign, are NaN."""
 
 RADIX_BITS = 4
 RADIX = 1 << RADIX_BITS
@@ -71,67 +72,67 @@ RADIX = 1 << RADIX_BITS
 
 SORT_KEY_BITS = 16
 PAPER_SORT_KEY_BITS = 20
-"""Depth steps within a bin's own depth range: dioptres / 2**16, or of the paper's
-distance, whose rule weighs every pair by its order, the float's own steps, 2**20 at
-most.  Equal keys keep the order of the list, which is scan order."""
+"""Depth steps within a bin's own depth range: diopters / 2**16; for the paper's rule,
+which weighs every pair by its order, the float steps of the distance, at most 2**20.
+Equal keys keep the order of the list, which is scan order."""
 
 SORT_INDEX_BITS = 12
 SORT_SMALL = 512
 SORT_LARGE = 2048
 SORT_CAPACITIES = (SORT_SMALL, SORT_LARGE)
 """Size classes of the sort: lists up to these lengths are sorted in shared memory, 4
-and 16 KiB, as words of depth and place in the list; longer ones through memory."""
+and 16 KiB, as words of depth and index in the list; longer ones in global memory."""
 
 NEAREST_M = 0.02
-"""Distances below count as this: 50 dpt, more than may be prepared."""
+"""Smaller distances count as this: 50 dpt, more than may be prepared."""
 
 DISCONTINUITY_PX = 0.25
-"""Blur change between neighbours above which they count as two surfaces.  Continuous
-tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %
-and are normalised away.  Where order matters, fragments whose blur differs by less are
-of one depth and share what nearer ones leave free; and what is hidden by less is not
-worth a fragment."""
+"""Blur change between neighbors above which they count as two surfaces.  Continuous
+tiles need no order: at this slope the weights of a surface still sum to 1 within 3 %,
+which is normalized away.  Where order matters, fragments whose blur differs by less are
+of one depth and share the coverage that nearer ones leave free; hidden pixels whose
+blur differs by less make no fragment."""
 
 NOTHING_DPT = -1.0
-"""Object distance of a hidden pixel that holds nothing."""
+"""Object distance of an empty hidden pixel."""
 
 MERGE_MIN_SPREAD_PX = 1.5
-"""Fragments whose kernels spread less than this stay single; twice as much for each
-further level."""
+"""Fragments whose kernels spread less than this are not merged; the limit doubles for
+each further level."""
 
 MERGE_CONTRAST = 0.03
-"""Largest colour difference within a merged 2 x 2 quad is this times spread**1.5:
-the error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
-area), so the image error stays the same at every blur: 55 dB on textured scenes.  A
-square of the next level under twice the spread is the same picture, twice as large."""
+"""The largest color difference within a merged 2 x 2 quad is this times spread**1.5.
+The error of averaging a quad under a disc of radius r falls as r**-1.5 (rim pixels over
+area), so the image error is the same at every blur: 55 dB on textured scenes.  A square
+of the next level under twice the spread is the same image, twice as large."""
 
 MERGE_CONTRAST_POWER = 1.5
 
 MERGE_MIDTONE = 0.2
 MERGE_DARKEST = 0.0155
-"""In a picture that is encoded for a screen, dark parts are seen finer: below a fifth
-of white the difference falls as the root of the light (the encoding's own power is
-0.58), and stays where sRGB is straight, at 1.55 % of that fifth."""
+"""In an image encoded for a display, dark parts need finer steps: below a fifth of
+white the allowed difference falls as the square root of the light (the power of the
+encoding is 0.58); it is constant where sRGB is linear, below 1.55 % of that fifth."""
 
 MERGE_MAX_BLUR_STEP_PX = 0.25
 """Largest blur difference within a merged quad; more where the blur is wide."""
 
 MERGE_MAX_BLUR_RATIO = 0.08
-"""The same over the spread of the kernels, which is the radius of a disc.  With the
-fixed step alone sloping surfaces no longer merge at 64 px of blur: 3.7 times the list
-entries for 65 instead of 62 dB."""
+"""The same relative to the spread of the kernels, which is the radius of a disc.  With
+the fixed step alone, sloping surfaces do not merge at 64 px of blur: 3.7 times as many
+list entries for 65 instead of 62 dB."""
 
 PAPER_TIE_BREAK_M = 0.01
 """The paper's rule sorts by distance plus this times the scan position (0..1)."""
 
 PAPER_FAR_M = 1000.0
-"""Distance that stands for infinity in the paper's sort key."""
+"""Distance that represents infinity in the paper's sort key."""
 
 MIN_COVERAGE = 1.0e-4
-"""A pixel that less light reaches keeps its own colour."""
+"""A pixel with less coverage keeps its own color."""
 
 MIN_BLUR_RANGE = 1.0e-12
-"""Smallest depth range that is divided by."""
+"""Smallest depth range used as a divisor."""
 
 QUAD = 4.0
 """Fragments that merge into one of the next level."""
@@ -147,7 +148,7 @@ BYTE_MAX = 255.0
 
 HALF_MAX = 65504.0
 HALF_DROPPED_BITS = 13
-"""Largest half float, and bits by which its mantissa is shorter than a float's."""
+"""Largest half float, and the bits by which its mantissa is shorter than a float's."""
 
 PLACE_BITS = 16
 PLACE_MASK = 0xFFFF
@@ -159,9 +160,9 @@ EDGE_BIT = 0x40000000
 
 ATLAS_WIDTH_BITS = 12
 ATLAS_WIDTH = 1 << ATLAS_WIDTH_BITS
-"""Texels of one row of the kernel atlas, a 2D texture addressed as one long line.  A
-texel fetch costs half of a storage buffer load on a software renderer, and a texture
-may be larger than a storage block."""
+"""Texels in one row of the kernel atlas, a 2D texture addressed as one line.  A texel
+fetch costs half of a storage buffer load on a software renderer, and a texture may be
+larger than a storage block."""
 
 IMAGE_ATLAS = 0
 IMAGE_NODES = 1
@@ -178,26 +179,26 @@ could hold a cache over the whole field."""
 KERNEL_WORDS = 3
 NODE_WORDS = 2
 PART_WORDS = 5
-"""uvec4 words of one record: of a frame's kernel; of a node kernel or its share."""
+"""uvec4 words of one record: a frame's kernel, a node kernel, a part of a kernel."""
 
 FIELD_CORNERS = 3
-"""Field nodes around a cell, and nodes of pupil and accommodation around a state: those
-of the triangle that it lies in.  With four each, five eyes between nodes had 45.1 to
-46.2 dB in the median against the dense reference, now 45.1 to 46.4, and a frame needed
-1.06 to 1.38 times as many PSFs."""
+"""Field nodes around a cell, and nodes of pupil and accommodation around a state: the
+corners of the surrounding triangle.  With four each, a frame needed 1.06 to 1.38 times
+as many PSFs, and five eyes between nodes had 45.1 to 46.2 dB in the median against the
+dense reference, instead of 45.1 to 46.4."""
 
 MAX_LEVEL = 3
 NO_LEVEL = 0x7FFFFFFF
-"""Fragments merge to squares of up to 2**3 pixels, a block; the offset of a level that
-a kernel is too sharp for."""
+"""Fragments merge to squares of up to 2**3 pixels, a block; NO_LEVEL is the offset of a
+level for which a kernel is too sharp."""
 
 MAX_LAYERS = 2048
-"""Layers of a frame."""
+"""Largest number of layers of a frame."""
 
 USED_PARTS = 4
-"""Of an interval between layers, noted one by one where a frame uses them: layers of
-another state lie elsewhere, and what they need is told from parts with fewer too many.
-The note of a tile is then 1 KB of shared memory."""
+"""Parts of an interval between layers that are marked separately if a frame uses them.
+Layers of another state are at other positions, and parts predict the needed intervals
+with fewer unnecessary ones.  The marks of a tile then take 1 KB of shared memory."""
 
 RECIPE_TAPS = 6
 """Cached kernels that one layer of a field node is blended from: three states, two
@@ -206,9 +207,10 @@ nodes of defocus each."""
 WEIGHT_BITS = 16
 WEIGHT_MASK = 0xFFFF
 WEIGHT_MAX = 65535.0
-"""A kernel texel holds the weights of both ends of its interval, 16 bits each of the
-interval's largest weight: one fetch for what would be two, 1.4 times the evaluations
-per second on a software renderer, and finer than half floats near the peak."""
+"""A kernel texel holds the weights of both ends of its interval, in 16 bits each
+relative to the interval's largest weight: one fetch instead of two, 1.4 times the
+evaluations per second on a software renderer, and finer than half floats near the
+peak."""
 
 RECIPE_WORDS = 3 * RECIPE_TAPS
 """Words of one blending recipe: offsets, reaches, weights."""
@@ -221,7 +223,7 @@ BYTE_MASK = 0xFF
 RGB = 3
 
 ENGINES = ("auto", "gl", "native")
-"""What may filter frames: by what there is, compute shaders, or compiled loops."""
+"""Frame engines: automatic choice, compute shaders, or compiled loops."""
 
 BINDINGS = {
     "BINDING_COLOR_IN": 0,
@@ -240,8 +242,8 @@ BINDINGS = {
     "BINDING_LAYER_DPT": 13,
     "BINDING_USED": 14,
     "BINDING_COLOR_OUT": 15,
-    # The passes that make lists have no use for the input's colour, those before them
-    # none for the output's, and the sum of the lists none for fragments.
+    # The passes that build lists do not use the input color, those before them do not
+    # use the output color, and the scan does not use fragments.
     "BINDING_WINDOWS": 0,
     "BINDING_STATS": 15,
     "BINDING_DISPATCHES": 5,
@@ -253,5 +255,5 @@ BINDINGS = {
     "BINDING_ATLAS": 13,
     "BINDING_NODE_ATLAS": 14,
 }
-"""Storage buffer bindings; the reference software renderer allows 16 per stage.  Those
-of the blending passes take numbers of the frame's again."""
+"""Storage buffer bindings; the reference software renderer allows 16 per stage.  The
+blending passes reuse numbers of the frame's bindings."""

@@ -1,13 +1,13 @@
-"""What light a display makes of red, green and blue: one or two wavelengths for each.
+"""Wavelengths of a display's red, green and blue: one or two for each primary.
 
-The eye blurs every wavelength in its own way.  A primary's PSF is that of the one
-wavelength which stands best for its spectrum, in the light that people see of it.  Of
-six measured displays, a white point through 5 mm, against 31 wavelengths with the
-colour-matching functions of CIE 1931: 51 to 58 dB in linear light and 47.6 to 49.8 dB
-as encoded by "common", 54 to 58 and 48.3 to 49.8 dB by a display's own; 41 to 54 and
-43 to 48 dB by the three that the paper takes.  Two wavelengths a primary, one standard
-deviation of its light to both sides, reach 50.1 to 52.1 dB as encoded by "common" and
-51.2 to 53.4 by a display's own (tests/benchmarks/bench_displays.py).
+The eye blurs every wavelength differently.  A primary's PSF is that of the single
+wavelength that best represents its spectrum, weighted by what people see of it.
+Accuracy for a white point through 5 mm on six measured displays, against 31 wavelengths
+with the color-matching functions of CIE 1931: with "common" 51 to 58 dB in linear light
+and 47.6 to 49.8 dB encoded, with a display's own wavelengths 54 to 58 and 48.3 to 49.8
+dB, with those of the paper 41 to 54 and 43 to 48 dB.  Two wavelengths per primary, one
+standard deviation of its light to both sides, reach 50.1 to 52.1 dB encoded with
+"common" and 51.2 to 53.4 with a display's own (tests/benchmarks/bench_displays.py).
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ DISPLAYS = {
     "paper": (612.0, 549.0, 464.0),
 }
 """Wavelengths of red, green and blue, nm: the best single choice for common displays;
-an LCD with white LEDs; an OLED; phosphors; those of Csoba & Kunkli 2023."""
+an LCD with white LEDs; an OLED; CRT phosphors; those of Csoba & Kunkli 2023."""
 
 WIDTHS_NM = {
     "common": (13.0, 19.0, 13.0),
@@ -32,7 +32,7 @@ WIDTHS_NM = {
     "crt": (6.5, 20.5, 15.5),
     "paper": (13.0, 19.0, 13.0),
 }
-"""Standard deviations of the light of red, green and blue."""
+"""Standard deviations of the spectra of red, green and blue, nm."""
 
 LIMITS_NM = (380.0, 780.0)
 MAX_WIDTH_NM = 40.0
@@ -46,18 +46,18 @@ Triple = tuple[float, float, float]
 
 
 def display_wavelengths_nm(display: str) -> Triple:
-    """Return the wavelengths of red, green and blue of a display by name, or as given.
+    """Return the wavelengths of red, green and blue of a display, by name or explicit.
 
     Raises
     ------
     BadMessage
-        An unknown name, or wavelengths that nobody sees.
+        The name is unknown, or wavelengths are out of range.
     """
     return DISPLAYS[display] if display in DISPLAYS else _given_nm(display)[0]
 
 
 def display_widths_nm(display: str) -> Triple:
-    """Return the standard deviations of the same; the usual ones where none is given.
+    """Return the standard deviations of the primaries; those of "common" by default.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def display_widths_nm(display: str) -> Triple:
 
 
 def _given_nm(display: str) -> tuple[Triple, Triple]:
-    """Return wavelengths and standard deviations as given in numbers."""
+    """Return wavelengths and standard deviations given as numbers."""
     try:
         parts = [[float(n) for n in part.split(":")] for part in display.split(",")]
     except ValueError:
@@ -93,16 +93,16 @@ def _refused(display: str) -> BadMessage:
 def primaries_of_spectra(
     wavelengths_nm: ArrayLike, spectra: ArrayLike
 ) -> tuple[Triple, Triple]:
-    """Return what stands best for the measured primaries of a display.
+    """Return the wavelengths and widths that best represent measured primaries.
 
-    The centroid and standard deviation of each primary's spectrum, weighted by how much
-    of each wavelength ends up in that primary again when the display's own primaries
-    are matched to it.
+    They are the centroid and standard deviation of each primary's spectrum, weighted by
+    the share of each wavelength that is matched by the same primary when the display's
+    primaries are matched to it.
 
     Parameters
     ----------
     wavelengths_nm : (n,)
-        Evenly spaced.
+        Evenly spaced wavelengths.
     spectra : (n, 3)
         Power of red, green and blue, in any unit.
 
@@ -113,7 +113,7 @@ def primaries_of_spectra(
     Raises
     ------
     ValueError
-        Shapes that do not fit, or spectra that are not three colours.
+        Shapes do not match, or the spectra are not three independent colors.
     """
     at_nm = np.asarray(wavelengths_nm, dtype=np.float64)
     power = np.asarray(spectra, dtype=np.float64)
@@ -136,9 +136,9 @@ def primaries_of_spectra(
 def primary_shares(
     wavelengths_nm: NDArray[np.float64], spectra: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Share (3, 3, n) of a wavelength of primary k that is seen as primary j.
+    """Return the share (3, 3, n) of a wavelength of primary k seen as primary j.
 
-    Summed over the wavelengths that is the identity.
+    The sum over wavelengths is the identity.
     """
     matching = matching_functions(wavelengths_nm)
     from_xyz = np.linalg.inv(matching.T @ spectra)
@@ -147,7 +147,12 @@ def primary_shares(
 
 
 def matching_functions(wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """CIE 1931 x, y and z (n, 3): the fit of Wyman, Sloan & Shirley 2013, JCGT 2(2)."""
+    """Return CIE 1931 x, y and z (n, 3).
+
+    References
+    ----------
+    Fit of Wyman, Sloan & Shirley 2013, JCGT 2(2).
+    """
 
     def lobe(centre_nm: float, below_nm: float, above_nm: float) -> NDArray:
         width_nm = np.where(wavelengths_nm < centre_nm, below_nm, above_nm)

@@ -1,52 +1,52 @@
-"""The exceptions of the service, of its protocol and of its clients.
+"""The exceptions of the service, its protocol and its clients.
 
     FilterError
-    ├── ProtocolError            the message itself is wrong
+    ├── ProtocolError            invalid message
     │   ├── BadMessage           a part, a field or an argument is missing, malformed or
-    │   │                        out of range; a ValueError, too
-    │   ├── UnknownType          the header names a message type nobody knows
-    │   ├── VersionMismatch      the two sides speak different protocol versions
+    │   │                        out of range; also a ValueError
+    │   ├── UnknownType          unknown message type in the header
+    │   ├── VersionMismatch      client and service use different protocol versions
     │   └── CreditExceeded       more unanswered frames than the service granted
-    ├── SessionError             the message is fine, this session cannot do it
-    │   ├── NoSession            anything before hello, or after the service restarted
-    │   ├── TooManySessions      the service serves as many clients as it may
+    ├── SessionError             valid message that this session cannot process
+    │   ├── NoSession            message before hello, or after the service restarted
+    │   ├── TooManySessions      the service has reached its limit of clients
     │   ├── NotAllowed           the client's key is not on the service's list
-    │   ├── NoProfile            a frame before any profile
-    │   ├── UnknownProfile       the profile's body is wrong or incomplete
+    │   ├── NoProfile            frame before any profile
+    │   ├── UnknownProfile       the profile's body is invalid or incomplete
     │   ├── GridTooLarge         the profile needs more PSFs than the service allows
     │   ├── BuildFailed          the PSFs of a profile could not be computed
-    │   ├── BuildCancelled       a newer profile took this one's place
+    │   ├── BuildCancelled       a newer profile replaced this one
     │   └── WorkerCrashed        the process that computes PSFs died
     ├── RenderError              a frame could not be filtered
     │   ├── ShaderError          GLSL did not compile or link
     │   ├── CameraMismatch       the frame's pixel pitch is not the PSF store's
-    │   ├── OutOfGpuMemory       a buffer or texture could not be made
+    │   ├── OutOfGpuMemory       a buffer or texture could not be allocated
     │   ├── OutOfMemory          the service has no memory left for its images
-    │   └── RenderFailed         anything else that went wrong while filtering
+    │   └── RenderFailed         any other failure while filtering
     └── TransportError           raised by the client library only
-        ├── ServiceTimeout       an answer did not come in time
+        ├── ServiceTimeout       no reply arrived in time
         ├── AuthenticationFailed service and client do not know each other's keys
-        └── ConnectionLost       the connection broke while an answer was awaited
+        └── ConnectionLost       the connection broke while waiting for a reply
 
-Each class has a ``code``, the word that travels in an ``error`` message; the client
-library turns an ``error`` back into the same class.  A message that raises one of
-these never ends the service: the client is told, and the loop goes on.
+Each class has a ``code``, which is sent in an ``error`` message; the client library
+converts an ``error`` back to the same class.  A message that raises one of these never
+stops the service: it replies with the error and continues.
 """
 
 from __future__ import annotations
 
 
 class FilterError(Exception):
-    """Root of all errors of the service.
+    """Base class of all errors of the service.
 
     Parameters
     ----------
     message : str
         One sentence with the offending value.
     field : str, optional
-        Path of the message or profile field at fault, as in ``views[0].width_px``.
+        Path of the invalid message or profile field, as in ``views[0].width_px``.
     allowed : str, optional
-        What would have been accepted.
+        Values that would have been accepted.
     """
 
     code = "filter_error"
@@ -60,13 +60,13 @@ class FilterError(Exception):
         self.allowed = allowed
 
     def __str__(self) -> str:
-        """Return one line: field, message and what is allowed."""
+        """Return one line: field, message and allowed values."""
         text = self.message if self.field is None else f"{self.field}: {self.message}"
         return text if self.allowed is None else f"{text} (allowed: {self.allowed})"
 
 
 class ProtocolError(FilterError):
-    """The message breaks the protocol."""
+    """The message violates the protocol."""
 
     code = "protocol_error"
 
@@ -84,7 +84,7 @@ class UnknownType(ProtocolError):
 
 
 class VersionMismatch(ProtocolError):
-    """The two sides speak different protocol versions."""
+    """Client and service use different protocol versions."""
 
     code = "version_mismatch"
 
@@ -96,19 +96,19 @@ class CreditExceeded(ProtocolError):
 
 
 class SessionError(FilterError):
-    """The message is well formed, but this session cannot do it."""
+    """The message is well formed, but this session cannot process it."""
 
     code = "session_error"
 
 
 class NoSession(SessionError):
-    """The client has not said hello, or the service has restarted since."""
+    """The client has not sent hello, or the service has restarted since."""
 
     code = "no_session"
 
 
 class TooManySessions(SessionError):
-    """The service already serves as many clients as it may."""
+    """The service has reached its limit of clients."""
 
     code = "too_many_sessions"
 
@@ -120,13 +120,13 @@ class NotAllowed(SessionError):
 
 
 class NoProfile(SessionError):
-    """A frame came before any profile."""
+    """A frame arrived before any profile."""
 
     code = "no_profile"
 
 
 class UnknownProfile(SessionError):
-    """The profile's body is wrong or incomplete."""
+    """The profile's body is invalid or incomplete."""
 
     code = "profile_invalid"
 
@@ -144,19 +144,19 @@ class BuildFailed(SessionError):
 
 
 class BuildCancelled(SessionError):
-    """A newer profile took this one's place before it was ready."""
+    """A newer profile replaced this one before it was ready."""
 
     code = "build_cancelled"
 
 
 class WorkerCrashed(SessionError):
-    """The process that computes PSFs died; it has been started again."""
+    """The process that computes PSFs died; it has been restarted."""
 
     code = "worker_crashed"
 
 
 class NotPrepared(Exception):
-    """PSFs that a frame needs were not computed within its time; never sent."""
+    """PSFs that a frame needs were not computed before its deadline; never sent."""
 
 
 class RenderError(FilterError):
@@ -178,7 +178,7 @@ class CameraMismatch(RenderError):
 
 
 class OutOfGpuMemory(RenderError):
-    """A buffer or a texture could not be made."""
+    """A buffer or a texture could not be allocated."""
 
     code = "out_of_gpu_memory"
 
@@ -190,7 +190,7 @@ class OutOfMemory(RenderError):
 
 
 class RenderFailed(RenderError):
-    """Anything else that went wrong while a frame was filtered."""
+    """Any other failure while a frame was filtered."""
 
     code = "render_failed"
 
@@ -202,7 +202,7 @@ class TransportError(FilterError):
 
 
 class ServiceTimeout(TransportError):
-    """An answer of the service did not come in time."""
+    """No reply of the service arrived in time."""
 
     code = "service_timeout"
 
@@ -214,7 +214,7 @@ class AuthenticationFailed(TransportError):
 
 
 class ConnectionLost(TransportError):
-    """The connection broke while an answer was awaited."""
+    """The connection broke while waiting for a reply."""
 
     code = "connection_lost"
 
@@ -234,7 +234,7 @@ ERROR_CLASSES: dict[str, type[FilterError]] = {
 def error_from_code(
     code: str, message: str, *, field: str | None = None, allowed: str | None = None
 ) -> FilterError:
-    """Return the exception that an error code names; FilterError for unknown codes."""
+    """Return the exception of an error code; FilterError for unknown codes."""
     error_class = ERROR_CLASSES.get(code)
     if error_class is None:
         return FilterError(f"{code}: {message}", field=field, allowed=allowed)

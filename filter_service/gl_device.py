@@ -1,7 +1,7 @@
-"""Which EGL device OpenGL works on, as a user names it.
+"""Selection of the EGL device for OpenGL.
 
-The setting ``gl_device`` of the service reaches the processes that it starts through
-the environment, where every command reads it too.
+The service passes its setting ``gl_device`` to its child processes through the
+environment, where every command reads it too.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 
 GL_DEVICE_VARIABLE = "OCUFILTER_GL_DEVICE"
 BACKEND_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
-"""What the package that opens contexts reads by itself."""
+"""Variable read by the package that opens contexts."""
 
 AUTO = "auto"
 
@@ -21,7 +21,7 @@ def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
     Raises
     ------
     ValueError
-        It is neither.
+        The value is neither.
     """
     if wanted == AUTO or (wanted.isascii() and wanted.isdecimal()):
         return wanted
@@ -32,17 +32,17 @@ def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
 
 
 def is_device_named() -> bool:
-    """Return whether the environment names one device, which asks for OpenGL."""
+    """Return whether the environment names one device, which implies OpenGL."""
     return wanted_gl_device() != AUTO and bool(os.environ.get(GL_DEVICE_VARIABLE))
 
 
 def wanted_gl_device() -> str:
-    """Return what the environment asks for.
+    """Return the device that the environment selects.
 
     Raises
     ------
     ValueError
-        The variable holds neither ``auto`` nor an index.
+        The variable is neither ``auto`` nor an index.
     """
     for variable in (GL_DEVICE_VARIABLE, BACKEND_VARIABLE):
         wanted = os.environ.get(variable, "")

@@ -1,9 +1,9 @@
-"""Colour and depth files in, filtered images out, for commands and clients.
+"""Reading of color and depth files, and writing of filtered images.
 
-Colour is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float linear (``.npy``, ``.exr``),
-of which what is negative or not finite is left to the filter's own rule.  OpenEXR is
-the reference library of the format, kept by its foundation, and comes as a wheel;
-Pillow reads and writes the rest, 32-bit float TIFF and PFM included.
+Color is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float linear (``.npy``, ``.exr``);
+negative and non-finite values are passed on to the filter.  OpenEXR is the reference
+library of the format, maintained by its foundation, and is available as a wheel; Pillow
+reads and writes the rest, including 32-bit float TIFF and PFM.
 """
 
 import math
@@ -28,19 +28,19 @@ OUTPUT_SUFFIXES = (".png", ".npy", ".exr")
 LINEAR_SUFFIXES = (".npy", ".exr")
 
 METRES_PER_INTEGER_STEP = 0.001
-"""Depth scale of integer files when none is given: millimetres, as depth cameras."""
+"""Default depth scale of integer files: millimeters, as from depth cameras."""
 
 ROW_VALUES = 1 << 20
-"""Converted at a time: all of a large image in float64 would be held beside it."""
+"""Values converted at a time, so that no float64 copy of a large image is held."""
 
 
 def read_color(path: Path, *, option: str = "color") -> NDArray:
-    """Read a colour image.
+    """Read a color image.
 
     Parameters
     ----------
     option : str
-        What asked for it, for the texts of errors; empty where none did.
+        Option that requested it, for error messages; empty if there is none.
 
     Returns
     -------
@@ -50,8 +50,8 @@ def read_color(path: Path, *, option: str = "color") -> NDArray:
     Raises
     ------
     InvalidFile
-        The file is missing, not of a known kind, damaged, too large, or its pixels are
-        unfit.
+        The file is missing, of unknown format, damaged or too large, or its pixels are
+        unsuitable.
     """
     suffix = _known_suffix(option, path, COLOR_SUFFIXES)
     if suffix == ".exr":
@@ -66,15 +66,15 @@ def read_color(path: Path, *, option: str = "color") -> NDArray:
 def read_depth(
     path: Path, *, depth_scale: float | None = None, option: str = "depth"
 ) -> NDArray[np.float32]:
-    """Read a depth image in metres.
+    """Read a depth image in meters.
 
     Parameters
     ----------
     depth_scale : float, optional
-        Metres per stored unit; without it 0.001 for integers and 1 for floats.
-        8 bits want it: they are a picture of depth, seldom millimetres.
+        Meters per stored unit; by default 0.001 for integers and 1 for floats.
+        Required for 8 bits, which are an image of depth and seldom millimeters.
     option : str
-        What asked for it, for the texts of errors; empty where none did.
+        Option that requested it, for error messages; empty if there is none.
 
     Returns
     -------
@@ -84,8 +84,8 @@ def read_depth(
     Raises
     ------
     InvalidFile
-        The file is missing, not of a known kind, damaged, too large, not one channel,
-        or of 8 bits without a scale.
+        The file is missing, of unknown format, damaged or too large, has several
+        channels, or has 8 bits and no scale is given.
     ValueError
         The scale is not positive.
     """
@@ -114,7 +114,7 @@ def read_depth(
 def _scaled(stored: NDArray, depth_scale: float) -> NDArray[np.float32]:
     """Return stored values times the scale, multiplied in float64, some rows at a time.
 
-    What float32 cannot hold is infinitely far.
+    Values beyond float32 become infinity.
     """
     depth_m = np.empty(stored.shape, np.float32)
     step = max(1, ROW_VALUES // stored.shape[1])
@@ -126,12 +126,12 @@ def _scaled(stored: NDArray, depth_scale: float) -> NDArray[np.float32]:
 
 
 def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> None:
-    """Refuse an output that cannot be written, before any work is done.
+    """Reject an output path that cannot be written, before any work is done.
 
     Raises
     ------
     ValueError
-        Unknown kind of file, or a folder that does not exist.
+        The format is unknown, or the folder does not exist.
     """
     if path.suffix.lower() not in suffixes:
         found = f"'{path.suffix}' is not a kind of output"
@@ -146,13 +146,13 @@ def write_image(path: Path, image: NDArray, *, png_level: int = 6) -> None:
     Parameters
     ----------
     png_level : int, 0 to 9
-        How hard a PNG is packed: 1 takes a quarter of the time of 6 and a fifth more
-        room.
+        Compression level of a PNG: 1 takes a quarter of the time of 6, and a fifth more
+        space.
 
     Raises
     ------
     ValueError
-        Neither float32 nor float16 for the latter.
+        The dtype does not match the format.
     """
     suffix = path.suffix.lower()
     is_linear = suffix in LINEAR_SUFFIXES
@@ -168,7 +168,7 @@ def write_image(path: Path, image: NDArray, *, png_level: int = 6) -> None:
         Image.fromarray(image).save(path, compress_level=png_level)
 
 
-# --- kinds of files ----------------------------------------------------------
+# --- file formats ------------------------------------------------------------
 
 
 def _refuse(field: str, path: Path, found: str, allowed: str) -> NoReturn:
@@ -239,5 +239,5 @@ def _checked_color(pixels: NDArray, path: Path, option: str) -> NDArray:
         _refuse(option, path, f"type {pixels.dtype}", "uint8 sRGB or float linear")
     if pixels.dtype == np.float16:
         return pixels
-    with np.errstate(over="ignore"):  # infinity is dealt with as such
+    with np.errstate(over="ignore"):  # infinity is handled by the filter
         return pixels.astype(np.float32, copy=False)

@@ -1,8 +1,8 @@
-"""Keys for a service that other machines reach: ZeroMQ's CURVE, with a list of clients.
+"""Keys for clients on other machines: ZeroMQ's CURVE, with a list of allowed clients.
 
-A folder, 0700, holds ``server.toml``, the service's pair, and in ``clients/`` the
-public key of everyone who may connect.  A client's own file, 0600, has its pair and the
-service's public key; the service keeps no copy of the secret.
+A folder, 0700, holds ``server.toml``, the service's key pair, and in ``clients/`` the
+public key of every client that may connect.  A client's own file, 0600, has its pair
+and the service's public key; the service keeps no copy of the secret.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from filter_service.log_lines import ONCE_A_SECOND
 from filter_service.whole_files import write_atomically
 
 MAX_FILE_BYTES = 4096
-"""Of a key file; ours have 300."""
+"""Largest size of a key file; those of `KeyRing` have 300 bytes."""
 
 MAX_CLIENTS = 10_000
 RESCAN_S = 1.0
-"""How often the clients' files are looked at one by one; one that comes or goes is
-noticed at once, by the time stamp of the folder."""
+"""Interval at which the clients' files are checked one by one; added and removed files
+are detected at once, by the modification time of the folder."""
 
 RETRY_S = 0.1
 
@@ -54,26 +54,26 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class ClientKey:
-    """What a client needs: its own pair, and the key by which it knows the service."""
+    """Keys of a client: its own pair, and the service's public key."""
 
     name: str
     pair: KeyPair
     server: str
 
     def use_on(self, socket: Any) -> None:
-        """Have a ZeroMQ socket connect with this key."""
+        """Set this key on a ZeroMQ socket."""
         socket.curve_serverkey = self.server.encode()
         socket.curve_publickey = self.pair.public.encode()
         socket.curve_secretkey = self.pair.secret.encode()
 
 
 def load_client_key(path: Path | str) -> ClientKey:
-    """Read the file that `KeyRing.add` has written.
+    """Read a client's key file, written by `KeyRing.add`.
 
     Raises
     ------
     ValueError
-        It is no such file; says what is missing.
+        The file is not a valid key file; the message says what is wrong.
     OSError
     """
     values = _read(Path(path), ("public", "secret", "server"))
@@ -99,7 +99,7 @@ class KeyRing:
 
     @property
     def server(self) -> KeyPair:
-        """Return the service's pair.
+        """Return the service's key pair.
 
         Raises
         ------
@@ -109,13 +109,13 @@ class KeyRing:
         return KeyPair(values["public"], values["secret"])
 
     def check(self) -> None:
-        """Check what a service needs before it starts: rights, and a pair that fits.
+        """Check the permissions and the key pair before a service starts.
 
         Raises
         ------
         ValueError, OSError
-            Others may write to the folder or read the service's key, or its public key
-            does not belong to its secret one.
+            Other users may write to the folder or read the service's key, or the public
+            key does not match the secret one.
         """
         for path, bad_bits, what in (
             (self.folder, 0o022, "other users may change it"),
@@ -136,26 +136,26 @@ class KeyRing:
             )
 
     def create(self) -> KeyPair:
-        """Make the folder and the service's pair, unless it is there; return it."""
+        """Create the folder and the service's key pair if missing; return the pair."""
         self._clients.mkdir(parents=True, exist_ok=True)
         self.folder.chmod(0o700)
         file = self.folder / "server.toml"
         if not file.exists():
             pair = _new_pair()
             values = {"public": pair.public, "secret": pair.secret}
-            with suppress(FileExistsError):  # made by another process meanwhile
+            with suppress(FileExistsError):  # created by another process meanwhile
                 _write(file, values)
         return self.server
 
     def add(self, name: str, client_file: Path) -> ClientKey:
-        """Let a new client in; write the file that it is to be given.
+        """Allow a new client; write the key file to hand to it.
 
         Raises
         ------
         ValueError
-            A name that is no file's, or of a client that is there already.
+            The name is not a valid file name, or the client already exists.
         OSError
-            Also where the file is there already.
+            The file cannot be written, or already exists.
         """
         file = self._file_of(name)
         if file.exists():
@@ -174,12 +174,12 @@ class KeyRing:
         return key
 
     def remove(self, name: str) -> None:
-        """Let a client in no more; a running service notices.
+        """Remove a client; a running service detects it.
 
         Raises
         ------
         ValueError
-            There is none of that name.
+            There is no client of that name.
         """
         file = self._file_of(name)
         if not file.exists():
@@ -192,10 +192,10 @@ class KeyRing:
         return sorted(file.stem for file in self._clients.glob("*.toml"))
 
     def allowed(self) -> frozenset[str]:
-        """Return the public keys of all clients, read again where the folder changes.
+        """Return the public keys of all clients, read again if the folder has changed.
 
-        A file that is no key is skipped and named once in the log; where the folder
-        cannot be read, the last keys stay allowed.
+        An invalid key file is skipped and logged once; if the folder cannot be read,
+        the last keys remain allowed.
         """
         now_s = time.monotonic()
         if now_s < self._retry_s:
@@ -215,7 +215,7 @@ class KeyRing:
         return self._allowed
 
     def _scan(self) -> None:
-        """Read the files that are new or have changed."""
+        """Read the new and changed files."""
         found: dict[str, tuple[tuple[int, ...], str | None]] = {}
         with os.scandir(self._clients) as entries:
             names = sorted(e.name for e in entries if e.name.endswith(".toml"))
@@ -235,7 +235,7 @@ class KeyRing:
                 if isinstance(error, OSError) and error.errno in OUT_OF_DESCRIPTORS:
                     raise
                 if isinstance(error, FileNotFoundError) and not path.is_symlink():
-                    continue  # taken out meanwhile
+                    continue  # removed meanwhile
                 if (self._keys.get(name) or (None,))[0] != (identity := _stamp(path)):
                     log.warning("a key file is skipped: %s", error)
                 found[name] = identity, None
@@ -266,13 +266,13 @@ def _public_of(secret: str) -> str:
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
-    """Return what changes with a file, of a link that leads nowhere too."""
+    """Return values that change with a file; also works for a dangling link."""
     status = path.lstat()
     return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
-    """Read a key file, whatever lies there: no wait for a pipe, nothing large."""
+    """Read a key file safely: without blocking on a pipe, and with a size limit."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -295,6 +295,6 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
 
 
 def _write(path: Path, values: dict[str, str]) -> None:
-    """Write a new file of its owner alone, as a whole or not at all."""
+    """Write a new file atomically, accessible to its owner only."""
     text = HEAD + "".join(f"{name} = '{value}'\n" for name, value in values.items())
     write_atomically(path, text, is_new=True)

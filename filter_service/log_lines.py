@@ -1,4 +1,4 @@
-"""The service's log: a line an event, for people or, as JSON, for programs."""
+"""Log of the service: one line per event, as text or as JSON."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ LOG_FORMATS = ("text", "json")
 TEXT = "%(asctime)s ocufilter {name} %(levelname)s: %(message)s"
 
 MAX_REPEATS = 10
-"""Lines with the same wording within a second; a hostile client causes thousands."""
+"""Limit of lines with the same text per second; a hostile client causes thousands."""
 
 ONCE_A_SECOND = {"max_repeats": 1}
-"""`extra` of a log call whose line shall appear at most once a second."""
+"""`extra` of a log call whose line appears at most once a second."""
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line: time, process, level, message, maybe a traceback."""
+    """One JSON object per line: time, process, level, message, optional traceback."""
 
     def __init__(self, process_name: str) -> None:
         super().__init__()
         self._process_name = process_name
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
+        """Return a record as one line of JSON."""
         moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         line = {
             "time": f"{moment}.{int(record.msecs):03d}Z",
@@ -41,7 +41,7 @@ class JsonLines(logging.Formatter):
 
 
 class RepeatFilter(logging.Filter):
-    """Leaves out lines that repeat too often; the next one says how many."""
+    """Drops lines that repeat too often; the next one reports how many."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class RepeatFilter(logging.Filter):
 
 
 def start_log(process_name: str) -> None:
-    """Log to the standard error stream, in the format that the environment names."""
+    """Log to stderr, in the format that the environment selects."""
     handler = logging.StreamHandler()
     if os.environ.get(FORMAT_VARIABLE) == "json":
         handler.setFormatter(JsonLines(process_name))

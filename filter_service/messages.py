@@ -1,11 +1,12 @@
-"""The wire types of protocol version 1, and how they become message parts and back.
+"""Message types of protocol version 1, and their encoding and decoding.
 
-The types live in `wire.requests` and `wire.replies`, images in `wire.images`; settings
-and camera belong to the filter and are here for those who only speak the protocol.
-PROTOCOL.md is the authority; `protocol_schema` writes the headers as JSON Schema.
+The types are defined in `wire.requests` and `wire.replies`, images in `wire.images`;
+settings and camera belong to the filter and are exported here for clients that only use
+the protocol.  PROTOCOL.md is authoritative; `protocol_schema` writes the headers as
+JSON Schema.
 
-A message is a list of parts: ``[header, part, part, ...]``.  Nothing here touches a
-socket, and nothing is copied: decoded images are read-only views of the parts.
+A message is a list of parts: ``[header, part, part, ...]``.  This module does not use
+sockets and does not copy: decoded images are read-only views of the parts.
 """
 
 from __future__ import annotations
@@ -168,13 +169,13 @@ REPLIES: dict[str, type[Message]] = {
 def encode(message: Message) -> list[Any]:
     """Return the parts of a message: the header's bytes, then its images or body.
 
-    Images are handed out as they are (made contiguous where they are not), so a
-    caller that sends without copying must leave them alone until they are sent.
+    Images are not copied (unless they are not contiguous), so a caller that sends
+    without copying must not modify them until they are sent.
 
     Raises
     ------
     ValueError
-        The header would be too long, or an image does not fit its description.
+        The header would be too long, or an image does not match its description.
     """
     header = {"type": message.type_name, "version": PROTOCOL_VERSION}
     packed = msgpack.packb(header | message.fields())
@@ -187,7 +188,7 @@ def encode(message: Message) -> list[Any]:
 
 
 def is_bye(parts: Sequence[Part]) -> bool:
-    """Return whether a message says that its client is leaving."""
+    """Return whether a message is a `Bye`."""
     try:
         return bool(parts) and unpack_header(parts[0]).get("type") == Bye.type_name
     except BadMessage:
@@ -195,12 +196,12 @@ def is_bye(parts: Sequence[Part]) -> bool:
 
 
 def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Message:
-    """Return what a client sent, checked field by field.
+    """Return a client's message, validated field by field.
 
     Raises
     ------
     BadMessage, UnknownType, VersionMismatch
-        With the field at fault and what is allowed.
+        The message is invalid; names the field and the allowed values.
     """
     limits = limits or Limits()
     try:
@@ -210,7 +211,7 @@ def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Messa
 
 
 def decode_reply(parts: Sequence[Part]) -> Message:
-    """Return what the service sent; raises like decode_request."""
+    """Return a message of the service; raises like `decode_request`."""
     return _decoded(parts, REPLIES, Limits())
 
 
@@ -235,9 +236,9 @@ def _decoded(
 
 
 def peek_ids(parts: Sequence[Part]) -> tuple[int | None, int | None]:
-    """Return (frame_id, profile_id) of a message that may be broken otherwise.
+    """Return (frame_id, profile_id) of a message that may otherwise be invalid.
 
-    An error can then still name the frame it answers.
+    An error reply can then still name its frame.
     """
     try:
         header = unpack_header(parts[0])

@@ -1,7 +1,7 @@
-"""Import before numpy: its matrix products stay on the calling thread.
+"""Import before NumPy to keep its matrix products on the calling thread.
 
-Ours are small.  Shared among threads, each waits in a loop for cores that frames are
-rendered on: planning a grid beside a stream took four times the processor time.
+They are small.  With several threads, each one spins while waiting for cores that are
+rendering frames: planning a grid during a stream took four times the processor time.
 """
 
 import os

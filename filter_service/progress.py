@@ -1,11 +1,11 @@
-"""How far long work is: bars for a person, plain lines where output goes to a file.
+"""Progress of long tasks: bars on a terminal, plain lines in a file.
 
     with Progress() as progress:
         task = progress.task("Rendering", total=60)
         task.advance()
 
-Lines come when a task begins or its stage changes, and every few seconds besides,
-whether or not the work has moved: who reads a log sees that it is alive.
+Lines are written when a task begins or its stage changes, and every few seconds, even
+without progress, so that a log shows that the program is alive.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any, Self, TextIO
 
 INTERVAL_S = 5.0
 STAGE_NAMES = {"psfs": "PSFs"}
-"""Of stages whose names in messages are not how people write them."""
+"""Display names of stages, where they differ from the names in messages."""
 
 SURE_AFTER_S = 2.0
-"""Sooner, what is done says little of the time that is left."""
+"""Time before which the remaining time is not estimated."""
 
 
 class Task:
-    """One piece of work with a count; made by `Progress.task`."""
+    """A task with a count; created by `Progress.task`."""
 
     def __init__(self, progress: Progress, title: str, total: float, unit: str) -> None:
         self.title, self.total, self.unit = title, total, unit
@@ -39,7 +39,7 @@ class Task:
         self.update(self.done + 1.0)
 
     def update(self, done: float, stage: str | None = None) -> None:
-        """Say what is done of the total, and what is being done."""
+        """Set the completed part of the total, and the current stage."""
         is_new_stage = stage is not None and stage != self.stage
         if self._first is None or is_new_stage:
             self._first = (done, time.monotonic())
@@ -48,13 +48,13 @@ class Task:
 
     @property
     def name(self) -> str:
-        """What is being done."""
+        """Title and stage."""
         stage = STAGE_NAMES.get(self.stage, self.stage)
         return f"{self.title}: {stage}" if stage else self.title
 
     @property
     def count(self) -> str:
-        """How much of it is done, and the time that the rest will take."""
+        """Completed part and estimated remaining time, as text."""
         if not self.total:
             return ""
         if self.unit == "%":
@@ -62,7 +62,7 @@ class Task:
         return f"{self.done:.0f}/{self.total:.0f} {self.unit}{self._time_left()}"
 
     def _time_left(self) -> str:
-        """From the pace since the first count: what precedes it is preparation."""
+        """Estimate from the rate since the first update, excluding preparation."""
         if self._first is None:
             return ""
         done, spent_s = self.done - self._first[0], time.monotonic() - self._first[1]
@@ -72,20 +72,20 @@ class Task:
 
 
 class Progress:
-    """Says how far tasks are, one after the other, on stderr.
+    """Reports the progress of successive tasks on stderr.
 
     Parameters
     ----------
     name : str
-        What lines begin with: the program.
+        Prefix of lines: the name of the program.
     quiet : bool
-        Nothing is said.
+        Whether to write nothing.
     as_lines : bool
-        Lines on a terminal too: others write there as well.
+        Whether to write lines on a terminal too, if others also write there.
     stream : file, optional
-        In the place of stderr.
+        Stream in place of stderr.
     interval_s : float
-        Longest silence between lines.
+        Longest time between lines.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Progress:
         self._ended = threading.Event()
 
     def __enter__(self) -> Self:
-        """Return this, with its bars on the screen or its lines on their way."""
+        """Start the bars or lines, and return this."""
         if self._has_bars:
             self._bars = _Bars(self._stream)
         elif not self._is_quiet:
@@ -122,7 +122,7 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End it; the last task's count is said once more, if it has changed."""
+        """Stop; write the last task's count once more if it has changed."""
         self._ended.set()
         if self._bars is not None:
             self._bars.close()
@@ -130,12 +130,12 @@ class Progress:
             self._say(self._task)
 
     def task(self, title: str, *, total: float = 0.0, unit: str = "frames") -> Task:
-        """Begin a task; without a total there is nothing to count.
+        """Begin a task; without a total nothing is counted.
 
         Parameters
         ----------
         unit : str
-            What is counted; of "%" the total counts as a hundred.
+            Unit of the count; "%" shows a percentage of the total.
         """
         if self._task is not None and self._bars is None:
             self._say(self._task)
@@ -153,7 +153,7 @@ class Progress:
             self._say(task)
 
     def _repeat(self) -> None:
-        """Say where the task is when nothing has been said for a while."""
+        """Write a line whenever none has been written for the interval."""
         while not self._ended.wait(self._interval_s / 10.0):
             task, silent_s = self._task, time.monotonic() - self._last[1]
             if task is not None and silent_s >= self._interval_s:
@@ -174,7 +174,7 @@ class Progress:
 
 
 class _Bars:
-    """Bars of rich, which takes 0.1 s to import and is needed by persons only."""
+    """Bars of rich, which takes 0.1 s to import and is needed on terminals only."""
 
     def __init__(self, stream: TextIO) -> None:
         from rich.console import Console
@@ -192,13 +192,13 @@ class _Bars:
         self._bars.start()
 
     def add(self, task: Task) -> None:
-        """Draw one more bar, which moves to and fro where nothing is counted."""
+        """Draw one more bar; without a count it moves to and fro."""
         total = task.total or None
         self._numbers[task] = self._bars.add_task(task.title, total=total, count="")
         self.show(task)
 
     def show(self, task: Task) -> None:
-        """Bring a bar up to date."""
+        """Update a bar."""
         self._bars.update(
             self._numbers[task],
             completed=task.done,
@@ -207,5 +207,5 @@ class _Bars:
         )
 
     def close(self) -> None:
-        """Leave the bars as they are."""
+        """Stop updating the bars and leave them on the screen."""
         self._bars.stop()

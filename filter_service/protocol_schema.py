@@ -2,8 +2,8 @@
 
     python -m filter_service.protocol_schema
 
-writes ``filter_service/protocol.schema.json``.  What a schema cannot say (an edge on
-the wrong side, the size of a part) is in PROTOCOL.md.
+writes ``filter_service/protocol.schema.json``.  Rules that a schema cannot express (an
+edge on the wrong side, the size of a part) are in PROTOCOL.md.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from filter_service.messages import PROTOCOL_VERSION, REPLIES, REQUESTS
 
 SCHEMA_FILE = Path(__file__).resolve().parent / "protocol.schema.json"
 SECTION = re.compile(r"\n\n\w+\n-{3,}\n")
-"""Where a docstring turns to what concerns Python alone: its attributes and errors."""
+"""Start of a docstring's numpydoc sections, which concern Python only."""
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def protocol_schema() -> dict[str, Any]:
-    """Return one schema: a header is one of the messages, told apart by ``type``."""
+    """Return the schema of a header: one of the messages, distinguished by ``type``."""
     kinds = [*REQUESTS.values(), *REPLIES.values()]
     _, parts = msgspec.json.schema_components(kinds, ref_template="#/$defs/{name}")
     for kind in kinds:
@@ -51,7 +51,7 @@ def protocol_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """Return the schema as it is kept."""
+    """Return the schema as the text of its file."""
     return json.dumps(protocol_schema(), indent=1, ensure_ascii=False) + "\n"
 
 

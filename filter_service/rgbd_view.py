@@ -1,7 +1,7 @@
-"""One view of a scene: colour, depth and camera, for clients and engines alike.
+"""One view of a scene: color, depth and camera, for clients and engines.
 
-A view may have a second, hidden layer: what the camera would see if what it sees were
-away.  Blurred edges let light of it pass.
+A view may have a second, hidden layer: what the camera would see with the visible
+surface removed.  Its light passes blurred edges.
 """
 
 from __future__ import annotations
@@ -21,34 +21,35 @@ ColorImage = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
 """(height, width, 3): 8-bit sRGB, or linear light."""
 
 LEAST_DEPTH_M = 1e-6
-"""Depth that is less is missing: a micrometre is nearer than any surface can be, and
-the reciprocals of much smaller numbers are beyond float32."""
+"""Smaller depth is missing: no surface can be nearer than a micrometer, and the
+reciprocals of much smaller numbers are beyond float32."""
 
 COLOR_DTYPES = (np.uint8, np.float32, np.float16)
 
 
 @dataclass(frozen=True)
 class RgbdView:
-    """Colour, depth and camera of one view.
+    """Color, depth and camera of one view.
 
     Attributes
     ----------
     color : (height, width, 3)
-        uint8 sRGB; or float32 or float16 linear light, above 1 and below 0 too.
+        uint8 sRGB; or float32 or float16 linear light, including values above 1 and
+        below 0.
     depth_m : (height, width), float32
         +inf is infinity; NaN and less than `LEAST_DEPTH_M` are missing.
     tangents : (left, right, up, down)
-        Of the angles to the image edges, left < right and down < up.
+        Tangents of the angles to the image edges, left < right and down < up.
     depth_kind : "planar" or "radial"
         View-space z, or distance from the eye.
     hidden_color, hidden_depth_m : like color and depth_m, optional
-        What is behind: both or neither.  Depth of 0, negative or NaN: nothing is hidden
-        here, and nothing is filled in.
+        Hidden layer: both or neither.  Where depth is 0, negative or NaN, nothing is
+        hidden and nothing is filled in.
 
     Raises
     ------
     BadMessage
-        Arrays that are no RGB-D image; a ValueError, too.
+        The arrays are not a valid RGB-D image; also a ValueError.
     """
 
     color: ColorImage
@@ -59,7 +60,7 @@ class RgbdView:
     hidden_depth_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse arrays that are no RGB-D image."""
+        """Validate the arrays."""
         color, depth_m = self.color, self.depth_m
         if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
             raise BadMessage(
@@ -90,7 +91,7 @@ class RgbdView:
         object.__setattr__(self, "tangents", self.camera.tangents)
 
     def _check_hidden(self) -> None:
-        """Refuse a hidden layer that is not of the kind of what is seen."""
+        """Reject a hidden layer whose types or shapes differ from the visible one's."""
         for field, image, seen in (
             ("hidden_color", self.hidden_color, self.color),
             ("hidden_depth", self.hidden_depth_m, self.depth_m),
@@ -124,7 +125,7 @@ class RgbdView:
 
     @property
     def surface_colors(self) -> tuple[Any, ...]:
-        """Return the colour of each surface."""
+        """Return the color of each surface."""
         return (self.color, self.hidden_color)[: self.surface_count]
 
     @property
@@ -134,7 +135,7 @@ class RgbdView:
 
     @property
     def images(self) -> tuple[NDArray[Any], ...]:
-        """Return colour and depth, and those of the hidden layer if there is one."""
+        """Return color and depth, and those of the hidden layer if there is one."""
         surfaces = zip(self.surface_colors, self.surface_depths_m, strict=True)
         return tuple(image for surface in surfaces for image in surface)
 
@@ -144,13 +145,13 @@ def as_views(
     depth_m: NDArray[np.float32] | None,
     camera: Camera | None,
 ) -> tuple[RgbdView, ...]:
-    """Return the views of a frame: given as such, or as arrays seen by a camera.
+    """Return the views of a frame, given as views or as arrays and a camera.
 
     Raises
     ------
     BadMessage
-        Arrays without depth or without a camera, views with depth beside them, or
-        something else.
+        Arrays come without depth or camera, views come with separate depth, or the
+        input is something else.
     """
     if isinstance(color, np.ndarray):
         if depth_m is None:

@@ -1,7 +1,7 @@
-"""The settings of a filter: each stands here once, with range, default and meaning.
+"""The settings of a filter: each is defined once, with range, default and meaning.
 
-Commands, wire, planner and store read the same object.  A new setting is a line here
-and a line in PROTOCOL.md, beside what reads it.
+Commands, protocol, planner and store read the same object.  A new setting needs a line
+here and a line in PROTOCOL.md, besides the code that reads it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_VERGENCE_DPT = 20.0
 MAX_RENDER_TOLERANCE = 8.0
 MAX_PLANES = 4
 PLANE_ROOM_DPT = 0.005
-"""A plane is taken as so thick to both sides: a tenth of a pixel of blur at most."""
+"""Half thickness assumed for a plane: at most a tenth of a pixel of blur."""
 MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 
 PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]
@@ -63,7 +63,7 @@ class FilterSettings(Record):
     Raises
     ------
     BadMessage
-        A value out of its range; names the setting.
+        A value is out of range; names the setting.
     """
 
     mode: Annotated[
@@ -172,7 +172,7 @@ class FilterSettings(Record):
     ] = None
 
     def __post_init__(self) -> None:
-        """Refuse what is out of range; lists become tuples, integers floats."""
+        """Validate the values; convert lists to tuples, and integers to floats."""
         for name, kind in setting_types().items():
             value = checked(getattr(self, name), kind, name)
             check_rising(value, kind, name)
@@ -191,7 +191,7 @@ class FilterSettings(Record):
         foci_dpt: tuple[float, ...] = (),
         objects_dpt: tuple[float, ...] = (),
     ) -> FilterSettings:
-        """Return settings whose ranges hold these values, too."""
+        """Return settings whose ranges also include these values."""
 
         def widened(
             span: tuple[float, float], values: tuple[float, ...]
@@ -205,7 +205,7 @@ class FilterSettings(Record):
         )
 
     def changed(self, **changes: Any) -> FilterSettings:
-        """Return settings of which some are others."""
+        """Return a copy with some settings changed."""
         return replace(self, **changes)
 
 
@@ -217,12 +217,12 @@ def setting_types() -> dict[str, Any]:
 
 
 def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
-    """Return settings, which may be given as a mapping of some by name.
+    """Return settings, which may be given as a mapping of some of them by name.
 
     Raises
     ------
     BadMessage
-        Something else, a name that there is not, or a value out of range.
+        The type is wrong, a name is unknown, or a value is out of range.
     """
     if isinstance(settings, FilterSettings):
         return settings
@@ -243,7 +243,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
 
 
 def setting_help(name: str) -> str:
-    """Return what a setting means, in a sentence."""
+    """Return the description of a setting."""
     metas = [m for m in setting_types()[name].__metadata__ if isinstance(m, Meta)]
     return str(metas[0].description)
 

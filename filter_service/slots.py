@@ -1,8 +1,8 @@
-"""Memory that two processes share: images go through it, never over a pipe.
+"""Shared memory for images between two processes.
 
-A slot is an anonymous file in memory.  All its pages are there from the start and its
-size is sealed, so that neither a full machine nor the other process can turn an access
-into a bus error; and it is gone with the last process that holds it, however that ends.
+A slot is an anonymous file in memory.  All its pages are allocated from the start and
+its size is sealed, so that neither low memory nor the other process can turn an access
+into a bus error.  It is freed with the last process that holds it, however that ends.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from filter_service.errors import OutOfMemory
 
 PAGE_BYTES = mmap.PAGESIZE
 KEPT_RATIO = 4
-"""A slot is not used for what fills less than a quarter of it."""
+"""Largest ratio of a slot's size to the requested one for reuse."""
 
 
 ALIGNMENT_BYTES = 64
-"""Of each image in a slot."""
+"""Alignment of each image in a slot."""
 
 
 def starts_of(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Return where each image starts, and the size of all."""
+    """Return the start of each image, and the total size."""
     starts, end = [], 0
     for size in sizes:
         starts.append(end)
@@ -43,10 +43,10 @@ class Slot:
     Attributes
     ----------
     number : int
-        Both processes know it by that.
+        Number by which both processes identify it.
     size_bytes : int
     descriptor : int
-        Of the file.
+        File descriptor.
     """
 
     def __init__(self, number: int, size_bytes: int, descriptor: int) -> None:
@@ -62,7 +62,7 @@ class Slot:
         Raises
         ------
         OutOfMemory
-            The system does not give that much.
+            The system cannot allocate that much.
         """
         size_bytes = -(-max(size_bytes, 1) // PAGE_BYTES) * PAGE_BYTES
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
@@ -86,17 +86,17 @@ class Slot:
 
     @property
     def path(self) -> str:
-        """Return where another process of the same user finds the file (Linux)."""
+        """Return the path of the file for another process of the same user (Linux)."""
         return f"/proc/{os.getpid()}/fd/{self.descriptor}"
 
     @classmethod
     def received(cls, number: int, size_bytes: int, descriptor: int) -> Slot:
-        """Return a slot that another process has made.
+        """Return a slot that another process has created.
 
         Raises
         ------
         ValueError
-            The file is no sealed slot of that size.
+            The file is not a sealed slot of that size.
         """
         seals = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS)
         if not seals & fcntl.F_SEAL_SHRINK:
@@ -111,7 +111,7 @@ class Slot:
         Raises
         ------
         ValueError
-            It reaches beyond the slot.
+            The part extends beyond the slot.
         """
         if not 0 <= start <= start + size_bytes <= self.size_bytes:
             raise ValueError(
@@ -128,30 +128,30 @@ class Slot:
         return np.frombuffer(part, dtype=dtype).reshape(shape)
 
     def put(self, images: Sequence[NDArray[Any]], starts: Sequence[int]) -> None:
-        """Copy images to their places."""
+        """Copy images to their positions."""
         for start, image in zip(starts, images, strict=True):
             place = self.array(start, image.shape, image.dtype)
-            if place.ctypes.data != image.ctypes.data:  # else it lies there
+            if place.ctypes.data != image.ctypes.data:  # unless already in place
                 np.copyto(place, image)
 
     def close(self) -> None:
-        """Give up the file; the memory goes when nobody has a part of it any more."""
+        """Close the file; the memory is freed with the last reference to a part."""
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1
 
 
 class SlotPool:
-    """Slots that are taken and given back.
+    """Pool of reusable slots.
 
     Parameters
     ----------
     max_bytes : int
-        Of all slots together.
+        Largest total size of all slots.
     max_count : int
-        Of slots: each takes a file descriptor.
+        Largest number of slots; each takes a file descriptor.
     reserve : callable, optional
-        Returns a context in which this process may open descriptors.
+        Function that returns a context in which this process may open descriptors.
     """
 
     def __init__(
@@ -168,11 +168,11 @@ class SlotPool:
 
     @property
     def held_bytes(self) -> int:
-        """Return the size of all slots."""
+        """Return the total size of all slots."""
         return sum(slot.size_bytes for slot in self._slots.values())
 
     def take(self, size_bytes: int) -> tuple[Slot, bool]:
-        """Return a slot with so much room, and whether it is new.
+        """Return a slot of at least this size, and whether it is new.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class SlotPool:
         return self.create(size_bytes), True
 
     def create(self, size_bytes: int) -> Slot:
-        """Return a slot that nobody had before.
+        """Return a newly created slot.
 
         Raises
         ------
@@ -214,21 +214,21 @@ class SlotPool:
         return slot
 
     def give_back(self, slot: Slot) -> None:
-        """Take a slot back."""
+        """Return a slot to the pool."""
         self._free.append(slot)
 
     def drop(self, slot: Slot) -> None:
-        """Give up a slot for good."""
+        """Remove a slot from the pool and close it."""
         del self._slots[slot.number]
         slot.close()
 
     def trim(self) -> list[Slot]:
-        """Give up and return all slots that are free."""
+        """Close and return all free slots."""
         dropped, self._free = self._free, []
         for slot in dropped:
             self.drop(slot)
         return dropped
 
     def __iter__(self) -> Iterator[Slot]:
-        """Go through all slots."""
+        """Iterate over all slots."""
         return iter(list(self._slots.values()))

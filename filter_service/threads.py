@@ -1,7 +1,7 @@
-"""Refuse numba's unsafe thread layer before it can kill the service.
+"""Check of numba's threading layer, which can terminate the service if it is unsafe.
 
-Without OpenMP (libgomp1) or TBB numba falls back to its work queue, which ends the
-process when two threads start parallel kernels at once.
+Without OpenMP (libgomp1) or TBB, numba falls back to its work queue, which terminates
+the process when two threads start parallel kernels at once.
 """
 
 import numba
@@ -21,12 +21,12 @@ def _count(n: int) -> int:
 
 
 def require_safe_threading_layer() -> str:
-    """Start numba's threads and return the layer that carries them.
+    """Start numba's threads and return the name of the threading layer.
 
     Raises
     ------
     RenderFailed
-        Only the work queue is to be had; names what to install.
+        Only the work queue is available; names what to install.
     """
     numba.config.THREADING_LAYER = "threadsafe"
     try:

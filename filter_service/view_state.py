@@ -1,4 +1,4 @@
-"""Through whose eye a view is seen, and in which state that eye is."""
+"""The eye through which a view is seen, and its state."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from filter_service.settings import GazeDeg, PupilMm, VergenceDpt
 
 EyeName = Literal["both", "left", "right"]
 EYE_NAMES: tuple[EyeName, ...] = get_args(EyeName)
-"""`both` is one eye for all views; `left` and `right` have profiles of their own."""
+"""`both` is one eye for all views; `left` and `right` have separate profiles."""
 
 
 def body_of_eye(body: Mapping[str, Any], eye: EyeName) -> dict[str, Any]:
-    """Return a profile's body for an eye: that of the left one is of a left eye.
+    """Return a profile's body for an eye.
 
-    Unless it says otherwise itself.
+    The body of the left one gets ``eye_side`` "OS", unless it sets the side itself.
     """
     return ({"eye_side": "OS"} if eye == "left" else {}) | dict(body)
 
@@ -35,23 +35,23 @@ Pose = tuple[
     PoseNumber,
     PoseNumber,
 ]
-"""Position x, y, z in metres and orientation x, y, z, w, as OpenXR has them."""
+"""Position x, y, z in meters and orientation x, y, z, w, as in OpenXR."""
 
 
 @dataclass(frozen=True)
 class ViewState(Record):
-    """How one view of a frame differs from the others.
+    """Per-view state: eye, pupil, focus, gaze and pose.
 
     Attributes
     ----------
     eye : "both", "left" or "right"
-        Whose profile it is seen through.
+        Eye whose profile applies to the view.
     pupil_diameter_mm, focus_dpt : float, optional
-        Of that eye: the same for all its views; as the frame's where it is None.
+        State of that eye, the same for all its views; the frame's by default.
     gaze_deg : (h, v), optional
-        Where the eye looks in this view; as the frame's where it is None.
+        Gaze in this view; the frame's by default.
     pose : seven floats, optional
-        Of the camera: it comes back with the picture.
+        Pose of the camera, which is returned with the output image.
     """
 
     eye: EyeName = "both"
@@ -64,18 +64,19 @@ class ViewState(Record):
 def check_states(
     states: Sequence[ViewState], pupil_diameter_mm: float, focus_dpt: float
 ) -> None:
-    """Refuse two pupils, or two focuses, for one eye, and what is no state.
+    """Reject different pupils or focuses for one eye, and invalid states.
 
     Parameters
     ----------
-    states : of the views of a frame
+    states : sequence of ViewState
+        States of the views of a frame.
     pupil_diameter_mm, focus_dpt : float
-        Of the frame, for views that have none of their own.
+        State of the frame, for views that have none of their own.
 
     Raises
     ------
     BadMessage
-        Names the view.
+        A state is invalid; names the view.
     """
     usual = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
     first_of: dict[EyeName, ViewState] = {}

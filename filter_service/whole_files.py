@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic file writes: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, text: str, *, is_new: bool = False) -> None:
-    """Write a text file of its owner alone, under another name first.
+    """Write a text file for its owner only, atomically through a temporary file.
 
-    That name is new and nobody can guess it, so a link that somebody has laid there is
-    never followed.
+    The temporary name is new and unpredictable, so that a link planted there is never
+    followed.
 
     Parameters
     ----------
     is_new : bool
-        Refuse to replace a file.
+        Whether to refuse to replace an existing file.
 
     Raises
     ------
     FileExistsError
-        There is a file of that name, and `is_new`.
+        The file exists, and `is_new` is set.
     OSError
     """
     descriptor, unfinished = tempfile.mkstemp(

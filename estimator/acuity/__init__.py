@@ -1,9 +1,9 @@
-"""What an eye's optics leave of detail, and what a person would read with it.
+"""Transfer functions of an eye's optics and predicted visual acuity.
 
-transfer     transfer functions of wavefronts
-sensitivity  contrast that people see, with and without their optics
+transfer     optical transfer functions of wavefronts
+sensitivity  contrast sensitivity of people, with and without their optics
 predict      visual Strehl ratio and acuity
-retina       how fine the retina samples
+retina       sampling density of the retina
 curves       acuity through focus and over the field
 """
 

@@ -15,14 +15,14 @@ from estimator.optics.units import SPHERE_PER_C20
 
 @dataclass(frozen=True)
 class FieldAcuity:
-    """What a person may read in some directions.
+    """Acuity in several directions.
 
     Attributes
     ----------
     optics_log_mar : (n,)
-        By the optics, if the nerves there were those of the fovea.
+        Limit by the optics, with the neural sensitivity of the fovea.
     retina_log_mar : (n,)
-        By the retina's sampling, if the optics were perfect.
+        Limit by the retina's sampling, with perfect optics.
     visual_strehl_ratio : (n,)
     """
 
@@ -32,7 +32,7 @@ class FieldAcuity:
 
     @property
     def log_mar(self) -> NDArray[np.float64]:
-        """Return the worse (n,) of both."""
+        """Worse of both limits, (n,)."""
         return np.maximum(self.optics_log_mar, self.retina_log_mar)
 
 
@@ -51,10 +51,10 @@ def acuity_through_focus(
     Parameters
     ----------
     zernike_um : (28,)
-        Of the eye as it is focused, for an object at infinity.
+        Wavefront of the eye in its state of focus, for an object at infinity.
     object_dpt : (n,)
-        Distances from the entrance pupil; negative ones lie behind the eye, as a plus
-        lens puts them.
+        Distances from the entrance pupil; negative ones lie behind the eye, as with a
+        plus lens.
     pupil_ellipse : (5,), optional
     pupil_screen : PupilScreen, optional
         See `optical_transfer`.
@@ -69,7 +69,7 @@ def acuity_through_focus(
     found = np.empty((2, distances_dpt.size))
     for k, distance_dpt in enumerate(distances_dpt):
         seen_um = np.array(zernike_um, dtype=np.float64)
-        # As M = -SPHERE_PER_C20 C(2,0) / r²: a near object asks for more power.
+        # M = -SPHERE_PER_C20 C(2,0) / r²: a near object requires more power.
         seen_um[C20] -= per_dpt_um * distance_dpt
         acuity = predict_acuity(
             seen_um,
@@ -96,7 +96,7 @@ def acuity_over_field(
     wavelength_nm: float = 555.0,
     progress: Callable[[float], None] | None = None,
 ) -> FieldAcuity:
-    """Return what wavefronts and ellipses of directions, as of a field table, let read.
+    """Return acuity by direction from wavefronts and ellipses, as of a field table.
 
     Parameters
     ----------

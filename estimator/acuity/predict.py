@@ -1,12 +1,12 @@
 """Visual Strehl ratio and acuity of a wavefront.
 
-Acuity is predicted as Watson & Ahumada do (J. Vision 8(4):17, 2008): the optotype, as
-the optics and then the nerves pass it, is compared under noise with how each of them
-looks to the mean eye, and the most alike is the answer.  The optotype is the Landolt
-ring of ISO 8596 in its eight directions; the noise is such that the mean eye reads what
-young adults do.  An observer who knew their own blur would read 0.3 to 0.4 logMAR
-better out of focus than people do (Smith, Optom. Vis. Sci. 68, 1991), one who needs
-detail in phase up to the limit 0.3 worse.
+Acuity is predicted by the method of Watson & Ahumada (J. Vision 8(4):17, 2008): the
+optotype, filtered by the optics and then by the nerves, is compared under noise with
+each optotype as the mean eye sees it, and the most similar one is the answer.  The
+optotype is the Landolt ring of ISO 8596 in its eight directions; the noise is chosen so
+that the mean eye has the acuity of young adults.  An observer who knew their own blur
+would read 0.3 to 0.4 logMAR better out of focus than people do (Smith, Optom. Vis. Sci.
+68, 1991), one who needs detail in phase up to the limit 0.3 worse.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,17 @@ from estimator.optics.pupil_screen import PupilScreen
 TILTS = slice(1, 3)
 
 RING_GAPS = 5.0
-"""Diameter of the ring in gaps; its stroke is one."""
+"""Diameter of the ring in gaps; its stroke is one gap."""
 
 DIRECTIONS = 8
 MOST_CYCLES = 3.0
-"""Per gap, of the ring's spectrum."""
+"""Highest frequency of the ring's spectrum, cycles per gap."""
 
 CYCLES_PER_STEP = 1.0 / 24.0
 RASTER_PER_GAP = 16
 
 CORRECT_RATIO = 0.5625
-"""Of answers at the limit: half way from chance to certainty."""
+"""Share of correct answers at the limit: halfway from chance to certainty."""
 
 YOUNG_LOG_MAR, YOUNG_PUPIL_MM = -0.13, 4.0
 """Best corrected acuity at 18 to 24 years (Elliott, Yang & Whitaker 1995)."""
@@ -41,19 +41,19 @@ YOUNG_LOG_MAR, YOUNG_PUPIL_MM = -0.13, 4.0
 LOG_MAR_LIMITS = (-0.7, 2.5)
 TRIALS, SEED = 4000, 7
 HIGHEST_CPD = 60.0
-"""Beyond which receptors of the fovea do not sample."""
+"""Highest frequency that receptors of the fovea sample."""
 
 
 @dataclass(frozen=True)
 class Acuity:
-    """What an eye's optics let a person read.
+    """Acuity as limited by an eye's optics.
 
     Attributes
     ----------
     log_mar : float
-        Logarithm of the smallest gap that is read, minutes of arc; 0 is 20/20.
+        Logarithm of the smallest legible gap, minutes of arc; 0 is 20/20.
     visual_strehl_ratio : float
-        Transfer weighted by the nerves' sensitivity over that of a perfect pupil
+        Transfer weighted by neural sensitivity over that of a perfect pupil
         (VSOTF, the same as VSX; Thibos et al., J. Vision 4(4), 2004).
     """
 
@@ -69,12 +69,12 @@ def predict_acuity(
     pupil_ellipse: NDArray[np.float64] | None = None,
     pupil_screen: PupilScreen | None = None,
 ) -> Acuity:
-    """Return the acuity of a wavefront, as far as the optics decide it.
+    """Return the acuity of a wavefront, as far as the optics determine it.
 
     Parameters
     ----------
     zernike_um : (28,)
-        Object distance included: of an eye out of focus its C(2,0).
+        Wavefront with the object distance included: the C(2,0) of an eye out of focus.
     pupil_ellipse : (5,), optional
     pupil_screen : PupilScreen, optional
         See `optical_transfer`.
@@ -89,7 +89,7 @@ def predict_acuity(
         "wavelength_nm": wavelength_nm,
         "pupil_ellipse": pupil_ellipse,
     }
-    # Where the picture lies on the retina does not matter.
+    # The position of the image on the retina does not matter.
     zernike_um = np.array(zernike_um, dtype=np.float64)
     zernike_um[TILTS] = 0.0
     seen = optical_transfer(zernike_um, **pupil, pupil_screen=pupil_screen)
@@ -116,7 +116,7 @@ def log_mar_of(transfer: Transfer) -> float:
 
 @cache
 def _noise() -> float:
-    """Noise at which the mean eye reads what young adults do."""
+    """Return the noise at which the mean eye has the acuity of young adults."""
 
     def modulation(x_cpd: NDArray, y_cpd: NDArray) -> NDArray[np.float64]:
         radial_cpd = np.hypot(x_cpd, y_cpd)
@@ -133,7 +133,7 @@ def _noise() -> float:
 
 
 def _limit(modulation, noise: float) -> float:
-    """Logarithm of the smallest gap, minutes of arc, that is read often enough."""
+    """Return the logarithm of the smallest gap, minutes of arc, read often enough."""
     low, high = LOG_MAR_LIMITS
     for _ in range(14):
         middle = 0.5 * (low + high)
@@ -145,7 +145,7 @@ def _limit(modulation, noise: float) -> float:
 
 
 def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
-    """Share of right answers for rings with a gap of so many minutes of arc."""
+    """Return the share of correct answers for rings with the given gap."""
     x, y, spectra = _rings()
     per_degree = 60.0 / gap_arcmin
     x_cpd, y_cpd = x * per_degree, y * per_degree
@@ -154,7 +154,7 @@ def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
     usual = mean_eye_transfer(radial_cpd, pupil_diameter_mm=YOUNG_PUPIL_MM)
     known = (spectra * usual * nerves).reshape(DIRECTIONS, -1)
     seen = (spectra * modulation(x_cpd, y_cpd) * nerves).reshape(DIRECTIONS, -1)
-    # Of light per solid angle: a spectrum grows as the area, its grid's cell shrinks.
+    # Per solid angle: a spectrum grows with the area, and its grid cell shrinks.
     answers_of = (seen @ known.conj().T).real * gap_arcmin**2
     products = (known @ known.conj().T).real * gap_arcmin**2
     scores = np.sqrt(noise) * _trials() @ _root(products).T
@@ -166,7 +166,7 @@ def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
 
 
 def _root(products: NDArray) -> NDArray[np.float64]:
-    """Matrix whose square is that of products of the rings."""
+    """Return a matrix whose square is the products of the rings."""
     values, vectors = np.linalg.eigh(products)
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
@@ -178,7 +178,7 @@ def _trials() -> NDArray[np.float64]:
 
 @cache
 def _rings() -> tuple[NDArray, NDArray, NDArray]:
-    """Frequencies in cycles per gap, and spectra (8, n, n) of the rings."""
+    """Return frequencies in cycles per gap, and spectra (8, n, n) of the rings."""
     count = int(RASTER_PER_GAP * (RING_GAPS + 1))
     along = (np.arange(count) + 0.5) / RASTER_PER_GAP - 0.5 * (RING_GAPS + 1)
     x, y = np.meshgrid(along, along)
@@ -200,7 +200,7 @@ def _rings() -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _weighted(transfer: Transfer) -> float:
-    """Return the integral of the real transfer, as far as anybody sees detail."""
+    """Return the integral of the real transfer, weighted by neural sensitivity."""
     radial_cpd = transfer.radial_cpd
     step_cpd = transfer.frequency_cpd[1] - transfer.frequency_cpd[0]
     weight = np.where(radial_cpd <= HIGHEST_CPD, neural_sensitivity(radial_cpd), 0.0)

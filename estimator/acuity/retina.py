@@ -1,20 +1,20 @@
-"""How fine the retina samples, by direction: what limits acuity off the axis.
+"""Sampling density of the retina by direction, which limits acuity off the axis.
 
 Detail finer than the spacing of midget ganglion cells of one kind (on or off) is not
-seen as it is, however sharp the optics.
+resolved, however sharp the optics.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 PEAK_PER_DEG2 = 33163.2
-"""Receptive fields of all ganglion cells at the fovea: two midget cells a cone."""
+"""Receptive fields of all ganglion cells at the fovea: two midget cells per cone."""
 
 FOVEAL_MIDGET_RATIO = 1.0 / 1.12
 MIDGET_SCALE_DEG = 41.03
 
 MERIDIANS = {
-    # of the visual field: share, and scales of both falls, deg
+    # of the visual field: share, and scales of both decays, deg
     "temporal": (0.9851, 1.058, 22.14),
     "superior": (0.9935, 1.035, 16.35),
     "nasal": (0.9729, 1.084, 7.633),
@@ -27,7 +27,7 @@ ARCMIN_PER_DEG = 60.0
 def midget_density_per_deg2(
     eccentricity_deg: ArrayLike, meridian: str
 ) -> NDArray[np.float64]:
-    """Return receptive fields (...) of midget ganglion cells, on and off together.
+    """Return the density (...) of midget receptive fields, on and off together.
 
     References
     ----------
@@ -56,8 +56,8 @@ def retina_nyquist_cpd(
 
     Notes
     -----
-    Between the meridians the spacing goes along an ellipse (Watson 2014, equation 10);
-    the blind spot is not left out.
+    Between the meridians the spacing follows an ellipse (Watson 2014, equation 10);
+    the blind spot is not excluded.
     """
     h, v = np.broadcast_arrays(
         np.asarray(h_deg, dtype=np.float64), np.asarray(v_deg, dtype=np.float64)
@@ -84,7 +84,7 @@ def retina_nyquist_cpd(
 def retina_log_mar(
     h_deg: ArrayLike, v_deg: ArrayLike, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Return the acuity (...) of perfect optics: a gap of half a cycle at that limit.
+    """Return the acuity (...) with perfect optics: a gap of half a cycle at Nyquist.
 
     The arguments are those of `retina_nyquist_cpd`.
     """
@@ -93,6 +93,6 @@ def retina_log_mar(
 
 
 def _spacing_deg(eccentricity_deg: ArrayLike, meridian: str) -> NDArray[np.float64]:
-    """Spacing of neighbours of one kind in a hexagonal lattice."""
+    """Return the spacing of neighbors of one kind in a hexagonal lattice."""
     one_kind = midget_density_per_deg2(eccentricity_deg, meridian) / 2.0
     return np.sqrt(2.0 / (np.sqrt(3.0) * one_kind))

@@ -1,4 +1,4 @@
-"""Contrast that people see: whole, by their optics, and what is left to their nerves.
+"""Contrast sensitivity of people: total, optical and neural.
 
 The Standard Spatial Observer's contrast sensitivity is that of many people with their
 natural optics; divided by the mean eye's modulation transfer it is that of the retina
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 OBSERVER_PUPIL_MM = 4.0
-"""Natural pupils of those who looked at the displays of ModelFest (30 cd/m²)."""
+"""Natural pupils of the observers of the ModelFest displays (30 cd/m²)."""
 
 MEAN_EYE_NM = 555.0
 
@@ -57,7 +57,7 @@ def mean_eye_transfer(
 
 
 def neural_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
-    """Return the contrast sensitivity (...) of retina and brain, past the optics."""
+    """Return the contrast sensitivity (...) of retina and brain without the optics."""
     cpd = np.asarray(frequency_cpd, dtype=np.float64)
     optics = mean_eye_transfer(cpd, pupil_diameter_mm=OBSERVER_PUPIL_MM)
     return contrast_sensitivity(cpd) / np.maximum(optics, 1e-3)

@@ -16,10 +16,10 @@ from estimator.optics.zernike import (
 )
 
 LEAST_SAMPLES, MOST_SAMPLES = 128, 1024
-"""Across the pupil's circle."""
+"""Number of samples across the pupil's circle."""
 
 FREQUENCY_STEP_CPD = 0.3
-"""Largest step of the grid: out of focus, all that is seen lies below 2 cpd."""
+"""Largest step of the grid; out of focus, all visible detail lies below 2 cpd."""
 
 STEP_WAVES = 0.25
 """Largest step of the wavefront from one sample to the next."""
@@ -35,9 +35,9 @@ class Transfer:
     Attributes
     ----------
     frequency_cpd : (n,)
-        Along either axis, cycles per degree, ascending, 0 in the middle.
+        Frequencies along either axis, cycles per degree, ascending, 0 in the middle.
     transfer_ratio : (n, n), complex
-        y, then x; 1 at frequency 0.
+        Values by y, then x; 1 at frequency 0.
     """
 
     frequency_cpd: NDArray[np.float64]
@@ -45,7 +45,7 @@ class Transfer:
 
     @property
     def radial_cpd(self) -> NDArray[np.float64]:
-        """Return the frequency (n, n) of each value."""
+        """Radial frequency (n, n) of each value."""
         return np.hypot(self.frequency_cpd[:, None], self.frequency_cpd)
 
     def modulation(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
@@ -55,12 +55,12 @@ class Transfer:
     def in_phase(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
         """Return the mean of the real part over all directions.
 
-        Detail that is shifted in phase is seen where it is not, or reversed.
+        Detail with a phase shift appears displaced or reversed.
         """
         return self._mean(self.transfer_ratio.real, at_cpd)
 
     def _mean(self, values: NDArray, at_cpd: ArrayLike) -> NDArray[np.float64]:
-        """Mean (m,) of values (n, n) over all directions.
+        """Return the mean (m,) of values (n, n) over all directions.
 
         Parameters
         ----------
@@ -96,10 +96,10 @@ def optical_transfer(
     ----------
     zernike_um : (28,)
     pupil_ellipse : (5,), optional
-        Centre x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
-        the whole circle if not given.
+        Center x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
+        default: the whole circle.
     pupil_screen : PupilScreen, optional
-        Rings of a lens with several foci, as an eye's ``rings`` are.
+        Rings of a lens with several foci, such as an eye's ``rings``.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def optical_transfer(
 
 
 def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
-    """Wavefront (n, n), y then x, at places (n,) of the unit circle's square."""
+    """Return the wavefront (n, n), y then x, on coordinates (n,) of the unit square."""
     by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
     by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)
     powers = along[:, None] ** np.arange(MAX_RADIAL_ORDER + 1)
@@ -153,10 +153,10 @@ def _samples(
     screen: PupilScreen | None,
     radius_mm: float,
 ) -> int:
-    """Return samples across the circle that follow the steepest part of its rim.
+    """Return the number of samples across the circle that resolves its steepest rim.
 
-    As many as there may be for what rings add: beyond their foci there is little light,
-    and of that the rim alone is told wrongly.
+    The increase for rings is capped at `MOST_SAMPLES`: beyond their foci there is
+    little light, and only that of the rim is then wrong.
     """
     angles = 2.0 * np.pi * np.arange(72) / 72
     slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
@@ -181,7 +181,7 @@ def _samples(
 
 
 def _inside(x_mm, y_mm, radius_mm, ellipse, step_mm) -> NDArray[np.float64]:
-    """Part of each sample that is within the pupil; its edge is a sample wide."""
+    """Return the part of each sample within the pupil; its edge is a sample wide."""
     circle = np.hypot(x_mm, y_mm) / radius_mm
     found = np.clip(0.5 + (1.0 - circle) * radius_mm / step_mm, 0.0, 1.0)
     if ellipse is None:

@@ -1,12 +1,12 @@
-"""What people wear to see better, as what it does to light in the entrance pupil.
+"""Corrections of the eye, by their effect on light in the entrance pupil.
 
-worn_lens         a lens on or in the eye: power, its own aberration, where it sits
-rings             several foci at once: diffractive rings, refractive zones
+worn_lens         lens on or in the eye: power, own aberration, position
+rings             simultaneous foci: diffractive rings, refractive zones
 kinoform          light in the orders of a diffractive profile, by scalar theory
-lens_plane        where on a spectacle lens one looks through
-lenslets          spectacles with lenslets around a clear middle
+lens_plane        point of a spectacle lens that the line of sight crosses
+lenslets          spectacles with lenslets around a clear center
 progressive       spectacles whose power changes with the direction of gaze
-intraocular       from the plane of an intraocular lens to that of the pupil
+intraocular       conversion from the plane of an intraocular lens to the pupil
 """
 
 import lazy_loader

@@ -1,9 +1,9 @@
-"""How a diffractive lens shares light among its orders: scalar theory.
+"""Distribution of light over the orders of a diffractive lens, by scalar theory.
 
-Its zones have equal areas, so that its profile repeats in r².  Order k has the Fourier
-integral of the phase over a period; a sawtooth of h waves gives it sinc²(h - k), 40.5 %
-to each of two for half a wave.  What the steps shade, and how the refractive index of
-their material changes over the visible, is left out.
+The zones have equal areas, so the profile is periodic in r².  The amplitude of order k
+is the Fourier integral of the phase over a period; a sawtooth of h waves gives it
+sinc²(h - k), 40.5 % to each of two for half a wave.  Shading by the steps and the
+dispersion of their material are not modeled.
 """
 
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 N_SAMPLES = 1024
-"""Of a period; shares of light are right to 1e-5."""
+"""Samples per period; shares of light are accurate to 1e-5."""
 
 N_ITERATIONS = 400
-"""Of the search for a profile: shares are then within 0.01 of what can be had."""
+"""Iterations of the profile search; shares are then within 0.01 of the attainable."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Kinoform:
     Attributes
     ----------
     path_ratio : tuple of float
-        By how far light is ahead, over the design wavelength, at `N_SAMPLES` places
-        evenly over a period in r².
+        Phase advance over the design wavelength, at `N_SAMPLES` points evenly spaced
+        in r² over a period.
     """
 
     path_ratio: tuple[float, ...]
@@ -38,10 +38,10 @@ class Kinoform:
 
     @classmethod
     def two_combs(cls, coarse_waves: float, fine_waves: float) -> "Kinoform":
-        """Return a sawtooth and one of half its period, one on the other.
+        """Return a sawtooth superposed with one of half its period.
 
-        The fine one has its first order where the coarse one has its second, so that
-        there are three foci (Gatinel et al., J. Refract. Surg. 27, 2011).
+        The first order of the fine one coincides with the second of the coarse one,
+        which makes three foci (Gatinel et al., J. Refract. Surg. 27, 2011).
         """
         x = _places()
         waves = coarse_waves * x + fine_waves * (2.0 * x % 1.0)
@@ -49,16 +49,16 @@ class Kinoform:
 
     @classmethod
     def with_light(cls, light: dict[int, float]) -> "Kinoform":
-        """Return a profile that gives orders their shares of the light.
+        """Return a profile with the given shares of light by order.
 
-        Makers state shares and keep profiles.  Found as holograms are: the orders'
-        amplitudes are set to those wanted, the profile to a pure phase, in turns
-        (Gerchberg and Saxton, Optik 35, 1972).
+        Manufacturers publish shares but not profiles.  The search is that of holograms:
+        set the orders' amplitudes to the wanted ones and the profile to a pure phase,
+        alternately (Gerchberg and Saxton, Optik 35, 1972).
         """
         orders = np.array(list(light))
         wanted = np.sqrt(np.array(list(light.values())))
         spectrum = np.zeros(N_SAMPLES, complex)
-        # Phases that keep the sum of the orders even over the period.
+        # Phases that keep the sum of the orders uniform over the period.
         spectrum[orders] = wanted * np.exp(1j * np.pi * orders**2 / (orders.max() + 1))
         for _ in range(N_ITERATIONS):
             phase = np.angle(np.fft.ifft(spectrum))
@@ -71,7 +71,7 @@ class Kinoform:
     def amplitudes(
         self, orders: NDArray[np.int64], *, color_ratio: float = 1.0
     ) -> NDArray[np.complex128]:
-        """Amplitudes (K,) of orders (K,); their squares are shares of the light.
+        """Return amplitudes (K,) of orders (K,); their squares are shares of the light.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Kinoform:
             Design wavelength over that of the light.
         """
         field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
-        middle = np.exp(-1j * np.pi * orders / N_SAMPLES)  # samples lie half-way
+        middle = np.exp(-1j * np.pi * orders / N_SAMPLES)  # samples at half steps
         return (np.fft.fft(field) / N_SAMPLES)[orders % N_SAMPLES] * middle
 
 

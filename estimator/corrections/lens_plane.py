@@ -1,4 +1,4 @@
-"""Where on a spectacle lens one looks through, by gaze and by field."""
+"""Point of a spectacle lens that the line of sight crosses, by gaze and by field."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 
 ROTATION_CENTRE_MM = 13.5
-"""About which the eye turns, behind the cornea."""
+"""Depth of the eye's center of rotation behind the cornea."""
 
 
 def lens_point_mm(
@@ -16,10 +16,10 @@ def lens_point_mm(
     vertex_mm: float,
     gaze_deg: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where light from field directions crosses a lens, x and y (...).
+    """Return x and y (...) where light from field directions crosses a lens.
 
-    From the point before the pupil of an eye that looks straight ahead: by gaze about
-    the centre of rotation, and from there by field about the entrance pupil.
+    The origin is in front of the pupil of an eye that looks straight ahead.  Gaze
+    rotates about the center of rotation, field directions about the entrance pupil.
     """
     by_gaze_mm = vertex_mm + ROTATION_CENTRE_MM
     by_field_mm = vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM

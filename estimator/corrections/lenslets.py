@@ -1,10 +1,10 @@
-"""Spectacles with lenslets around a clear middle, as they are worn against myopia.
+"""Spectacles with lenslets around a clear center, worn for myopia control.
 
-Each lenslet passes its own part of the light, and sends it on undeviated through its
-middle: together they make a disc as wide as power times diameter on the retina, 12
-arcmin for 3.5 dpt and 1.03 mm, whatever the pupil.  Which of them the pupil sees
-depends on gaze and field.  The phase of the lens is taken straight on into the plane of
-the pupil; `bench corrections` has what that leaves out on the 15 mm between.
+Each lenslet passes its own part of the light, undeviated through its center.  Together
+they make a disc as wide as power times diameter on the retina, 12 arcmin for 3.5 dpt
+and 1.03 mm, for any pupil.  Which lenslets the pupil sees depends on gaze and field.
+The phase of the lens is applied unchanged in the plane of the pupil; `bench
+corrections` measures the error of ignoring the 15 mm between.
 """
 
 from dataclasses import dataclass, replace
@@ -16,28 +16,28 @@ from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics.units import NM_PER_UM
 
 EDGE_ORDERS = 4.0
-"""Light that the edges of lenslets send aside is followed so far, in lambda over their
-diameter."""
+"""Limit up to which light deflected by the edges of lenslets is included, in lambda
+over their diameter."""
 
 
 @dataclass(frozen=True)
 class Lenslets:
-    """A honeycomb of lenslets between two circles about the middle of a lens.
+    """A honeycomb of lenslets between two circles about the center of a lens.
 
     Attributes
     ----------
     power_dpt : float
-        That each adds.
+        Added power of each lenslet.
     diameter_mm, pitch_mm : float
-        Of one, and from one to the next.
+        Diameter of a lenslet, and distance to the next.
     inner_mm, outer_mm : float
-        Radii between which their middles lie.
+        Radii between which the lenslets' centers lie.
     vertex_mm : float
-        The lens before the cornea.
+        Distance from lens to cornea.
     gaze_deg : (h, v)
-        Where the eye looks, from straight ahead of the head.
+        Gaze relative to straight ahead of the head.
     centre_mm : (2,) or (P, 2)
-        Middle of the lens from that of the pupil, x and y.
+        Center of the lens from that of the pupil, x and y.
     """
 
     power_dpt: float
@@ -51,33 +51,33 @@ class Lenslets:
 
     @property
     def lattice_mm(self) -> tuple[float, float, float]:
-        """Pitch, inner and outer radius."""
+        """Pitch, inner and outer radius of the honeycomb."""
         return self.pitch_mm, self.inner_mm, self.outer_mm
 
     def looking(self, gaze_deg: tuple[float, float]) -> "Lenslets":
-        """Return the lens for an eye that looks so much farther aside and up."""
+        """Return the lens for a gaze rotated by (h, v) from the present one."""
         h_deg, v_deg = (
             own + more for own, more in zip(self.gaze_deg, gaze_deg, strict=True)
         )
         return replace(self, gaze_deg=(h_deg, v_deg))
 
     def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "Lenslets":
-        """Return the lens as it lies before the pupil at field directions (P,)."""
+        """Return the lens as seen from the pupil at field directions (P,)."""
         x, y = lens_point_mm(
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
         return replace(self, centre_mm=-np.stack([x, y], axis=-1))
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Powers at which something is sharp: lenslets make no focus of their own."""
+        """Return the powers of sharp foci; lenslets make no focus of their own."""
         return np.zeros(1)
 
     def main_light_ratio(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
-        """Share (1, ...) of a pupil's light there; of the lenslets' some is, too."""
+        """Return the share (1, ...) of a pupil's light there, lenslets' included."""
         return np.ones((1, *np.shape(radius_mm)))
 
     def reach_mrad(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
-        """How far light goes aside, by the lenslets and by their edges."""
+        """Return the largest deflection of light by the lenslets and their edges."""
         by_lens = abs(self.power_dpt) * self.diameter_mm / 2.0
         by_edge = EDGE_ORDERS * wavelength_nm / NM_PER_UM / self.diameter_mm
         return np.full(np.shape(radius_mm), by_lens + by_edge)
@@ -85,7 +85,7 @@ class Lenslets:
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Complex amplitude at squared distances from the middle of a lenslet."""
+        """Return the complex amplitude at squared distances from a lenslet's center."""
         square = np.asarray(square_mm2, dtype=np.float64)
         path_um = np.where(
             square <= (self.diameter_mm / 2.0) ** 2, self.power_dpt / 2.0 * square, 0.0

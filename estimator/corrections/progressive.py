@@ -1,15 +1,16 @@
 """A progressive lens: spectacles whose power changes with the direction of gaze.
 
-No maker publishes a surface.  This one is U(y) with U'' = F, along the corridor x = 0,
-smoothed upwards and downwards by a normal distribution as wide as |x|.  On the corridor
-it has the power F(y) in every meridian, from far to the addition; beside it the
-astigmatism 2 |F'(y)| x with an oblique axis that no smooth surface can be without
-(Minkwitz, Optica Acta 10, 1963), which levels off at 0.8 of the addition.  F is the
+No manufacturer publishes a surface.  This one is U(y) with U'' = F, along the corridor
+x = 0, smoothed vertically by a normal distribution as wide as |x|.  On the corridor it
+has the power F(y) in every meridian, from far to the addition.  Beside the corridor it
+has the astigmatism 2 |F'(y)| x with an oblique axis, which no smooth surface can avoid
+(Minkwitz, Optica Acta 10, 1963) and which levels off at 0.8 of the addition.  F is the
 normal distribution itself, a quarter of the corridor wide.
 
-Power changes over the pupil too, which makes coma and trefoil: 0.07 um through 4 mm in
-the middle of a corridor of 14 mm to 2 dpt.  With the surface's third derivatives 0.005
-um of the wavefront are left out there, and 0.02 um at the corridor's ends.
+Power changes over the pupil too, which causes coma and trefoil: 0.07 um through 4 mm in
+the middle of a corridor of 14 mm to 2 dpt.  They are modeled by the surface's third
+derivatives, which omit 0.005 um of the wavefront there, and 0.02 um at the corridor's
+ends.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,23 +25,23 @@ from estimator.optics.zernike import EXPONENTS, N_TERMS
 from estimator.wavefront.field_wavefronts import polynomial_in_mm
 
 CUBES = [EXPONENTS.tolist().index([a, 3 - a]) for a in (3, 2, 1, 0)]
-"""Places of the monomials x³, x²y, xy² and y³."""
+"""Indices of the monomials x³, x²y, xy² and y³."""
 
 
 @dataclass(frozen=True)
 class ProgressiveLens(rx.Prescription):
-    """A progressive lens; as a `Prescription` it is what the fovea sees through.
+    """A progressive lens; as a `Prescription` it has the power seen by the fovea.
 
     Attributes
     ----------
     distance : Prescription
-        That for far.
+        Prescription for far.
     add_dpt : float
     corridor_mm : float
-        From the fitting cross, before the pupil of an eye that looks straight ahead,
-        where 2 % of the addition are, down to where 98 % are.
+        Length from the fitting cross, in front of the pupil of an eye that looks
+        straight ahead and with 2 % of the addition, down to 98 % of the addition.
     gaze_deg : (h, v)
-        Where the eye looks, from straight ahead of the head.
+        Gaze relative to straight ahead of the head.
     """
 
     distance: rx.Prescription = field(default_factory=lambda: rx.Prescription(0.0))
@@ -57,7 +58,7 @@ class ProgressiveLens(rx.Prescription):
         corridor_mm: float,
         gaze_deg: tuple[float, float] = (0.0, 0.0),
     ) -> "ProgressiveLens":
-        """Return the lens as it is seen through in a direction of gaze."""
+        """Return the lens for a direction of gaze."""
         lens = cls(
             **vars(distance),
             distance=distance,
@@ -73,7 +74,7 @@ class ProgressiveLens(rx.Prescription):
         return replace(lens, **vars(seen))
 
     def looking(self, gaze_deg: tuple[float, float]) -> "ProgressiveLens":
-        """Return the lens for an eye that looks so much farther aside and up."""
+        """Return the lens for a gaze rotated by (h, v) from the present one."""
         h_deg, v_deg = (
             own + more for own, more in zip(self.gaze_deg, gaze_deg, strict=True)
         )
@@ -87,17 +88,17 @@ class ProgressiveLens(rx.Prescription):
     def lens_point_mm(
         self, h_deg: ArrayLike, v_deg: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where light from field directions crosses the lens, x and y (...).
+        """Return x and y (...) where light from field directions crosses the lens.
 
-        From the fitting cross, see `lens_plane`.
+        The origin is the fitting cross, see `lens_plane`.
         """
         return lens_point_mm(
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
 
     def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
-        """Power (..., 2, 2) at points of the lens, x to the person's right, y up."""
-        # A service is ready before it loads scipy.
+        """Return the power (..., 2, 2) at points of the lens, x to the right, y up."""
+        # Imported here so that the service starts without loading scipy.
         from scipy.special import ndtr
 
         z, aside, _ = self._places(x_mm, y_mm)
@@ -111,9 +112,9 @@ class ProgressiveLens(rx.Prescription):
         return found + np.array([[m + j0, j45], [j45, m - j0]])
 
     def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
-        """Monomials (..., 28) that it takes off as its power changes over the pupil.
+        """Return monomials (..., 28) subtracted by the power's change over the pupil.
 
-        By the third derivatives of its surface at the point that is looked through.
+        Uses the third derivatives of the surface at the point on the line of sight.
         """
         z, aside, wide_mm = self._places(x_mm, y_mm)
         slope_dpt_mm = self.add_dpt * _bell(z) / wide_mm
@@ -129,7 +130,7 @@ class ProgressiveLens(rx.Prescription):
         return found
 
     def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray, ...]:
-        """How far along the corridor and beside it, over how wide it is smoothed."""
+        """Return positions along and beside the corridor over its width; the width."""
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
         wide_mm = np.hypot(self.corridor_mm / 4.0, x)
         return (-y - self.corridor_mm / 2.0) / wide_mm, x / wide_mm, wide_mm
@@ -142,10 +143,10 @@ def progressive_polynomial(
     *,
     entrance_pupil_mm: float,
 ) -> NDArray[np.float64]:
-    """Monomials (..., 28) that a lens takes off at field directions (...).
+    """Return monomials (..., 28) that a lens subtracts at field directions (...).
 
-    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1, and by how power
-    changes over the pupil.
+    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1, plus the change of
+    power over the pupil.
     """
     place_mm = lens.lens_point_mm(h_deg, v_deg)
     power = lens.power_matrices_dpt(*place_mm)

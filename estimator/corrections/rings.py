@@ -1,7 +1,7 @@
-"""Lenses with several foci at once, as what their rings do to light in the pupil.
+"""Lenses with simultaneous foci, by the effect of their rings on light in the pupil.
 
-Foci are not added up as if each had an eye of its own: through 2 to 3 mm their light
-interferes, which is what extends the depth of focus of weak additions.
+Foci are not summed incoherently: through 2 to 3 mm their light interferes, which
+extends the depth of focus of weak additions.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from estimator.corrections.lenslets import Lenslets
 from estimator.optics.units import NM_PER_UM
 
 LOWEST_ORDER, HIGHEST_ORDER = -3, 3
-"""Orders that are followed, below the lowest and above the highest with much light.
-What is left, some per cent still farther out of focus, is given to the two ends."""
+"""Orders included below the lowest and above the highest design order.  The remaining
+light, a few percent still farther out of focus, is assigned to the two end orders."""
 
 MAIN_SHARE = 0.1
-"""Share of the light from which on a focus is looked at for itself."""
+"""Least share of the light for which a focus is treated on its own."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class DiffractiveRings:
         and all are in proportion to the wavelength.
     kinoform : Kinoform
     orders : (lowest, highest)
-        Those that the design is for.
+        Orders of the design.
     far_order : int
-        The one that is in focus for far; its power at ``design_nm`` is in the eye's.
+        Order that is in focus for far; its power at ``design_nm`` is part of the eye's.
     design_nm : float
     diameter_mm : float
-        Of the rings; beyond them all light is for far.
+        Diameter of the rings; beyond them all light goes to the far focus.
     centre_mm : (x, y)
     """
 
@@ -51,12 +51,12 @@ class DiffractiveRings:
 
     @property
     def followed_orders(self) -> NDArray[np.int64]:
-        """Orders (K,) beside which nothing is left over."""
+        """Orders (K,) that are included."""
         lowest, highest = self.orders
         return np.arange(lowest + LOWEST_ORDER, highest + HIGHEST_ORDER + 1)
 
     def amplitudes(self, wavelength_nm: float) -> NDArray[np.complex128]:
-        """Amplitudes (K,) of the orders that are followed; squares sum to 1."""
+        """Return amplitudes (K,) of the included orders; their squares sum to 1."""
         found = self.kinoform.amplitudes(
             self.followed_orders, color_ratio=self.design_nm / wavelength_nm
         )
@@ -68,26 +68,26 @@ class DiffractiveRings:
         return found
 
     def added_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Power (K,) of each order beyond that for which the eye is in focus."""
+        """Return the power (K,) of each order relative to the far focus."""
         colour = wavelength_nm / self.design_nm
         return self.spacing_dpt * (self.followed_orders * colour - self.far_order)
 
     @property
     def lattice_mm(self) -> None:
-        """Rings have one centre."""
+        """Lattice: none, because rings have one center."""
 
     def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "DiffractiveRings":
-        """Return the lens from field directions: it is in the pupil, the same."""
+        """Return the lens unchanged: in the pupil it is the same for all fields."""
         return self
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Power (n,) of those that have much of the light."""
+        """Return the power (n,) of orders with at least `MAIN_SHARE` of the light."""
         return self.added_dpt(wavelength_nm)[self._is_main(wavelength_nm)]
 
     def main_light_ratio(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """Share (n, ...) of a pupil's light in each of those."""
+        """Return the share (n, ...) of a pupil's light in each of those orders."""
         is_main = self._is_main(wavelength_nm)
         light = np.abs(self.amplitudes(wavelength_nm)[is_main]) ** 2
         is_far = self.followed_orders[is_main] == self.far_order
@@ -102,13 +102,13 @@ class DiffractiveRings:
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """How far light goes aside, at distances from the centre."""
+        """Return the largest deflection of light at distances from the center."""
         return np.abs(self.added_dpt(wavelength_nm)).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Complex amplitude behind the lens at squared distances from its centre."""
+        """Return the complex amplitude behind the lens at squared distances (...)."""
         square = np.asarray(square_mm2, dtype=np.float64)
         inside = np.minimum(square, (self.diameter_mm / 2.0) ** 2)
         turns_um = NM_PER_UM / wavelength_nm
@@ -127,9 +127,9 @@ class RefractiveZones:
     Attributes
     ----------
     outer_mm : tuple of float
-        Outer radius of each ring, ascending; the last goes on.
+        Outer radius of each ring, ascending; the last ring has no outer limit.
     powers_dpt : tuple of float
-        Power of each beyond that for far.
+        Power of each ring relative to far.
     centre_mm : (x, y)
     """
 
@@ -139,20 +139,20 @@ class RefractiveZones:
 
     @property
     def lattice_mm(self) -> None:
-        """Rings have one centre."""
+        """Lattice: none, because rings have one center."""
 
     def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "RefractiveZones":
-        """Return the lens from field directions: it is in the pupil, the same."""
+        """Return the lens unchanged: in the pupil it is the same for all fields."""
         return self
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Power (n,) of all rings."""
+        """Return the power (n,) of all rings."""
         return np.unique(self.powers_dpt)
 
     def main_light_ratio(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """Share (n, ...) of a pupil's light in each of those: of its area."""
+        """Return the share (n, ...) of a pupil's light, by area, at each power."""
         square = np.square(np.asarray(radius_mm, dtype=np.float64))
         ends = np.square([0.0, *self.outer_mm[:-1], np.inf])
         within = np.diff(np.minimum(square[..., None], ends)) / square[..., None]
@@ -162,13 +162,13 @@ class RefractiveZones:
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """How far light goes aside, at distances from the centre."""
+        """Return the largest deflection of light at distances from the center."""
         return np.abs(self.powers_dpt).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Complex amplitude behind the lens; its surface has no steps."""
+        """Return the complex amplitude behind the lens; its surface has no steps."""
         square = np.asarray(square_mm2, dtype=np.float64)
         ends = np.square(self.outer_mm)
         path_um, before = np.zeros(square.shape), 0.0

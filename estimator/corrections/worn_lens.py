@@ -1,4 +1,4 @@
-"""A lens on or in the eye: a prescription, its own aberration, and where it sits."""
+"""A lens on or in the eye: prescription, own aberration and position."""
 
 from dataclasses import dataclass, replace
 
@@ -20,35 +20,37 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 ABERRATION_PUPIL_MM = 6.0
-"""Pupil for which a lens's spherical aberration is stated."""
+"""Pupil diameter for which a lens's spherical aberration is stated."""
 
 POWER_PUPIL_MM = 4.0
-"""Pupil through which its power is the stated one, as an eye's refraction is."""
+"""Pupil diameter for which its power is stated, as for an eye's refraction."""
 
 C40 = index_from_nm(4, 0)
 
 
 @dataclass(frozen=True)
 class WornLens(rx.Prescription):
-    """A lens that is more than its powers, as it acts in the entrance pupil.
+    """A lens with properties beyond its powers, as it acts in the entrance pupil.
 
     Attributes
     ----------
     sphere_dpt, cylinder_dpt, axis_deg, vertex_mm : float
-        See `Prescription`; a lens in the pupil's own plane has minus its depth.
+        See `Prescription`; for a lens in the plane of the pupil, ``vertex_mm`` is minus
+        the pupil's depth.
     kind : {"contact_lens", "iol", "lenslets"}
     spherical_aberration_um : float
-        C(4,0) on 6 mm that it adds; its power through 4 mm stays.
+        Added C(4,0) on 6 mm; the power through 4 mm stays the same.
     centre_mm : (x, y)
-        In the entrance pupil, x to the person's right, y up.
+        Center in the entrance pupil, x to the person's right, y up.
     rings : Rings or None
-        Where it has several foci.
+        Rings of a lens with several foci.
     replaces_lens : bool
-        Whether the eye's own lens is gone, and accommodation with it.
+        Whether the eye's own lens, and with it accommodation, is gone.
     design : str
-        What an intraocular lens is sold as.
+        Design name of an intraocular lens.
     depth_mm : float
-        Of such a lens behind the cornea; its powers here are those in the pupil.
+        Depth of an intraocular lens behind the cornea; the powers here are those in
+        the pupil.
     """
 
     kind: str = "contact_lens"
@@ -60,39 +62,39 @@ class WornLens(rx.Prescription):
     depth_mm: float = 0.0
 
     def at_lens_dpt(self, power_dpt: float) -> float:
-        """Power of the lens itself that acts as this in the pupil's plane."""
+        """Return the power in the lens's own plane of a power in the pupil's plane."""
         return power_dpt / height_ratio(self.depth_mm) ** 2
 
     def looking(self, gaze_deg: tuple[float, float]) -> "WornLens":
-        """Return the lens for an eye that looks so much farther aside and up."""
+        """Return the lens for a gaze rotated by (h, v) from the present one."""
         if not isinstance(self.rings, Lenslets):
             return self
         return replace(self, rings=self.rings.looking(gaze_deg))
 
 
 def turns_with_gaze(correction: rx.Prescription | None) -> bool:
-    """Return whether another gaze looks through another part of it."""
+    """Return whether a correction depends on the direction of gaze."""
     return isinstance(correction, ProgressiveLens) or isinstance(
         rings_of(correction), Lenslets
     )
 
 
 def rings_of(correction: rx.Prescription | None) -> Rings | None:
-    """Return what makes several foci of a worn correction; None where it has one."""
+    """Return the rings of a correction with several foci, or None."""
     return correction.rings if isinstance(correction, WornLens) else None
 
 
 def replaces_lens(correction: rx.Prescription | None) -> bool:
-    """Return whether a correction takes the place of the eye's own lens."""
+    """Return whether a correction replaces the eye's own lens."""
     return isinstance(correction, WornLens) and correction.replaces_lens
 
 
 def worn_polynomial(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> NDArray[np.float64]:
-    """Monomials (28,), um/mm^degree, that a correction takes off in the pupil's plane.
+    """Return monomials (28,), um/mm^degree, that a correction subtracts in the pupil.
 
-    Its power as `correction_polynomial` has it, less its own aberration.
+    The power of `correction_polynomial` minus the correction's own aberration.
     """
     taken_um = correction_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
     if isinstance(correction, ProgressiveLens):
@@ -106,7 +108,7 @@ def worn_polynomial(
 def worn_refraction(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> tuple[float, float]:
-    """M, dpt, that it takes off through a pinhole, and more for each mm² of radius²."""
+    """Return M, dpt, subtracted through a pinhole, and its change per radius², mm²."""
     if correction is None:
         return 0.0, 0.0
     taken_um = worn_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
@@ -118,10 +120,10 @@ def worn_refraction(
 
 
 def own_polynomial(lens: WornLens) -> NDArray[np.float64]:
-    """Monomials (28,) of a lens's own aberration, about the pupil's centre.
+    """Return monomials (28,) of a lens's own aberration, about the pupil's center.
 
-    Off its centre a lens has coma too, and astigmatism; the tilt is that of the chief
-    ray, which has none.
+    A decentered lens has coma and astigmatism too; tilt is removed, because the chief
+    ray has none.
     """
     zernike_um = np.zeros(N_TERMS)
     zernike_um[C40] = lens.spherical_aberration_um
@@ -137,7 +139,7 @@ def own_polynomial(lens: WornLens) -> NDArray[np.float64]:
 def shifted_polynomial(
     polynomial_um: NDArray[np.float64], centre_mm: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Monomials (28,) of p(u - centre)."""
+    """Return monomials (28,) of p(u - center)."""
     if not any(centre_mm):
         return polynomial_um
     place = {tuple(e): k for k, e in enumerate(EXPONENTS.astype(int).tolist())}

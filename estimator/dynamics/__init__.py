@@ -1,10 +1,10 @@
-"""What drives an eye from moment to moment: light, distance, gaze.
+"""Dynamics of the eye: pupil, accommodation and gaze.
 
-accommodation_response  focus that follows what is looked at
-pupil_size              the pupil that steady light leaves
-pupil_reflex            and how it follows light
-gaze                    a tracker's gaze, smoothed, and what is done without
-delayed_approach        a value that follows its target after a latency
+accommodation_response  accommodation over time
+pupil_size              pupil diameter in steady light
+pupil_reflex            pupil diameter over time
+gaze                    smoothed gaze of a tracker, with a fallback
+delayed_approach        value that follows its target after a latency
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""A value that follows its target after a latency, and exponentially."""
+"""A value that approaches its target exponentially after a latency."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from collections.abc import Callable
 
 
 class DelayedApproach:
-    """Follows targets exactly, however often it is asked.
+    """Delayed exponential approach, independent of the sampling rate.
 
     Parameters
     ----------
     value : float
-        At the beginning.
+        Initial value.
     latency_s : float
-        From a change of the target until anything moves.
+        Delay from a change of the target to the start of a movement.
     time_constant_s : callable
-        ``time_constant_s(value, target)`` of a movement, taken when it begins.
+        ``time_constant_s(value, target)`` of a movement, called when it begins.
     """
 
     def __init__(
@@ -30,21 +30,21 @@ class DelayedApproach:
         self._latency_s = latency_s
         self._time_constant_s = time_constant_s
         self._target, self._tau_s = value, 1.0
-        self._coming: deque[tuple[float, float]] = deque()  # when it acts, target
+        self._coming: deque[tuple[float, float]] = deque()  # start time, target
 
     def follow(
         self, target: float, at_s: float, latency_s: float | None = None
     ) -> float:
-        """Note what the target is from now on; return the value now.
+        """Set the target from now on; return the current value.
 
-        Times do not run backwards: one before the last is taken as the last, and no
-        target overtakes one before it.
+        Time does not run backward: an earlier time counts as the last one, and no
+        target takes effect before an earlier one.
 
         Parameters
         ----------
         target, at_s : float
         latency_s : float, optional
-            Of this change, where it differs.
+            Latency of this change, if different.
         """
         if not math.isfinite(target) or not math.isfinite(at_s):
             raise ValueError(f"target {target} at {at_s} s; allowed: finite numbers")
@@ -56,7 +56,7 @@ class DelayedApproach:
             if self._coming:
                 acts_s = max(acts_s, self._coming[-1][0])
             self._coming.append((acts_s, target))
-            value = self.value_at(at_s)  # where there is no latency
+            value = self.value_at(at_s)  # in case of zero latency
         return value
 
     def value_at(self, at_s: float) -> float:
@@ -70,9 +70,9 @@ class DelayedApproach:
         return self._value
 
     def hold(self, low: float, high: float) -> None:
-        """Keep the value within limits that it has come to; targets stay.
+        """Clamp the current value to limits; targets are unchanged.
 
-        From a limit that moves away a movement to the target begins.
+        A clamped value starts a new movement to the target.
         """
         held = min(max(self._value, low), high)
         if held != self._value:

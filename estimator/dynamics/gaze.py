@@ -1,4 +1,4 @@
-"""Gaze from a tracker: smoothed, its age bounded, straight ahead where it is lost."""
+"""Gaze from a tracker: smoothed, limited in age, straight ahead when lost."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from dataclasses import dataclass
 
 MIN_CUTOFF_HZ = 2.0
 SPEED_WEIGHT = 0.1
-"""Of the filter, in Hz per deg/s: at rest noise above 2 Hz goes, and in a saccade of
-300 deg/s nothing is held back for longer than 5 ms."""
+"""Speed weight of the filter, in Hz per deg/s: at rest it removes noise above 2 Hz, and
+in a saccade of 300 deg/s the delay is at most 5 ms."""
 
 SPEED_CUTOFF_HZ = 1.0
 BLINK_S = 0.4
-"""A gaze that is not seen for so long is held: a blink takes 0.1 to 0.4 s."""
+"""Time for which a lost gaze is held: a blink takes 0.1 to 0.4 s."""
 
 STRAIGHT_AHEAD_DEG = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Gaze:
-    """Where an eye looks, to the right and up from the camera's axis.
+    """Gaze direction of an eye, to the right and up from the camera's axis.
 
     Attributes
     ----------
     h_deg, v_deg : float
     is_tracked : bool
-        False: nobody knows, and it is straight ahead.
+        Whether the gaze is known; otherwise it is straight ahead.
     age_s : float
-        Of the last sample; infinite before the first.
+        Age of the last sample; infinite before the first.
     """
 
     h_deg: float
@@ -37,19 +37,19 @@ class Gaze:
 
 
 class GazeFollower:
-    """Smooths gaze with the 1 euro filter.
+    """Smoothing of gaze with the 1 euro filter.
 
-    Casiez, Roussel & Vogel, CHI 2012: a low pass whose cut-off rises with speed, so
-    that a resting eye does not tremble and a saccade is not held back.
+    Casiez, Roussel & Vogel, CHI 2012: a low-pass filter whose cutoff rises with speed,
+    so that a resting eye does not jitter and a saccade is not delayed.
 
     Parameters
     ----------
     min_cutoff_hz : float
-        Of the low pass at rest.
+        Cutoff of the low-pass filter at rest.
     speed_weight : float
-        By how many Hz it rises with each deg/s.
+        Increase of the cutoff, Hz per deg/s.
     max_age_s : float
-        Older samples count as lost.
+        Age above which a sample counts as lost.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class GazeFollower:
         self._at_s = -math.inf
 
     def see(self, h_deg: float, v_deg: float, at_s: float) -> None:
-        """Take in a sample; one that is no number, or not newer, is left out."""
+        """Add a sample; ignore one that is not finite or not newer."""
         if not all(map(math.isfinite, (h_deg, v_deg, at_s))) or at_s <= self._at_s:
             return
         step_s = at_s - self._at_s
@@ -88,7 +88,7 @@ class GazeFollower:
             _blend(self._speed_deg_s[0], (h_deg - before_deg[0]) / step_s, share),
             _blend(self._speed_deg_s[1], (v_deg - before_deg[1]) / step_s, share),
         )
-        # One cut-off for both: else an oblique saccade would take a curved way.
+        # One cutoff for both axes: otherwise an oblique saccade would be curved.
         cutoff_hz = self._min_cutoff_hz + self._speed_weight * math.hypot(
             *self._speed_deg_s
         )
@@ -107,7 +107,7 @@ class GazeFollower:
 
 
 def _share(cutoff_hz: float, step_s: float) -> float:
-    """Return how much of a new sample a low pass takes."""
+    """Return the weight of a new sample in a low-pass filter."""
     return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff_hz * step_s))
 
 

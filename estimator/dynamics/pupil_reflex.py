@@ -1,4 +1,4 @@
-"""How the pupil follows the light, in time."""
+"""Response of the pupil to light over time."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ is that of Link & Stark's formula for a single step."""
 FAST_SHARE = 0.4
 CONSTRICTING_S = (0.28, 0.28)
 DILATING_S = (0.9, 2.9)
-"""Of the fast part and the slow one: redilation has both.  Fitted, to 0.14 mm, to
-pulses of 1 s at five powers of light (recorded by Martin, Pinto, Bulte & Spitschan,
-2021)."""
+"""Time constants of the fast and the slow part: redilation has both.  They are fitted,
+to 0.14 mm, to pulses of 1 s at five powers of light (recorded by Martin, Pinto, Bulte &
+Spitschan, 2021)."""
 
 
 def reflex_latency_s(luminance_cd_m2: float) -> float:
-    """Return how long the pupil takes to begin, in this light."""
+    """Return the latency of the pupil at a luminance."""
     log_light = math.log10(max(luminance_cd_m2, 1e-9))
     latency_s = LATENCY_AT_1_CD_M2_S - LATENCY_PER_LOG_UNIT_S * log_light
     return min(max(latency_s, LATENCY_RANGE_S[0]), LATENCY_RANGE_S[1])
 
 
 class PupilReflex:
-    """Follows the light of what is seen.
+    """Pupil that follows the luminance of the scene.
 
     Parameters
     ----------
     age_years, field_area_deg2, n_eyes
-        As of `steady_pupil_mm`, where the pupil goes.
+        Parameters of `steady_pupil_mm`, which the pupil approaches.
     luminance_cd_m2 : float
-        At the beginning, in which the pupil is steady.
+        Initial luminance, at which the pupil is steady.
     latency_s : float, optional
-        As measured of this person; else as the light has it, `reflex_latency_s`.
+        Measured latency of this person; `reflex_latency_s` by default.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class PupilReflex:
         )
 
     def follow(self, luminance_cd_m2: float, at_s: float) -> float:
-        """See this light from now on; return the pupil's diameter now, mm."""
+        """Set the luminance from now on; return the current pupil diameter, mm."""
         target_mm = self._steady_mm(luminance_cd_m2)
         latency_s = self._latency_s
         if latency_s is None:

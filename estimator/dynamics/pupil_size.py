@@ -1,4 +1,4 @@
-"""The pupil that steady light leaves."""
+"""Pupil diameter in steady light."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def steady_pupil_mm(
     Parameters
     ----------
     luminance_cd_m2 : float, 0 or more
-        Mean of the adapting field.
+        Mean luminance of the adapting field.
     field_area_deg2 : float, above 0
-        Its area: a disc of 60 deg has 2827 deg².
+        Area of the field: a disk of 60 deg has 2827 deg².
     age_years : float
-        Clamped to 20 to 83, for which the formula was made.
+        Age, clamped to the formula's range of 20 to 83.
     n_eyes : 1 or 2
         Eyes that see the light; one alone counts a tenth.
 

@@ -1,17 +1,17 @@
-"""From a measurement to the eye behind it.
+"""Estimation of an eye from a measurement.
 
-estimation      the entry: refined, by network, or searched
-problem         what is compared, and the model that answers
-prior           eyes as people have them, by their refraction
-bounded_fit     least squares within bounds
-plausible       what of the eye would be unusual in a person
-measured_rest   what the eye leaves of its measurement: a phase
-table           eyes at which fits start
-make_table      the program that makes them
-eye_table.json  what it wrote
-network_guess   the eye network's start
-pattern_search  the search of the earlier work
-plot            a picture of an estimated eye
+estimation      entry point: refined, by network, or by pattern search
+problem         compared coefficients and the model of them
+prior           prior distribution of eyes, by refraction
+bounded_fit     least squares with bounds
+plausible       properties of an eye that are unusual in people
+measured_rest   residual of the estimate, kept as a phase
+table           start eyes of a fit
+make_table      program that computes the table
+eye_table.json  the table
+network_guess   start eye from the eye network
+pattern_search  pattern search of the earlier work
+plot            plot of an estimated eye
 """
 
 import lazy_loader

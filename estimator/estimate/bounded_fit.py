@@ -1,9 +1,9 @@
 """Least squares with bounds and a unit prior, for a model that is cheap in batches.
 
-Gauss-Newton in a trust region: the Jacobian's finite differences are one batch, and
-each linear step is solved exactly within the bounds.  scipy's own `least_squares` calls
-its model once per parameter and keeps off the bounds; here a bound is reached and stays
-known as such.
+This is Gauss-Newton in a trust region: the Jacobian's finite differences are one batch,
+and each linear step is solved exactly within the bounds.  SciPy's `least_squares` calls
+its model once per parameter and stays off the bounds; here a parameter can reach its
+bound, and is reported as being on it.
 """
 
 from collections.abc import Callable
@@ -15,33 +15,34 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 DIFFERENCE_STEP = 1e-4
-"""Of the Jacobian, in prior deviations; the model is smooth to 1e-9 of its values."""
+"""Finite difference of the Jacobian, in prior deviations; the model is smooth to 1e-9
+of its values."""
 
 FIRST_REACH, SMALLEST_REACH, LARGEST_REACH = 8.0, 1e-4, 20.0
 """Longest step of any one parameter, in prior deviations (a box trust region)."""
 
 SMALLEST_DECREASE = 0.1
-"""Relative decrease of the cost by one Jacobian below which the fit has ended."""
+"""Relative decrease of the cost by one Jacobian below which the fit ends."""
 
 MET_UM = 1e-3
-"""Misfit of every coefficient at which the fit has ended: a tenth of what instruments
-repeat to."""
+"""Misfit of every coefficient at which the fit ends: a tenth of the repeatability of
+instruments."""
 
 BOX_TOLERANCE = 1e-10
-"""Of the linear problem in a box, in prior deviations."""
+"""Tolerance of the linear problem in a box, in prior deviations."""
 
 MAX_PASSES = 200
 MAX_STEPS_PER_JACOBIAN = 4
 GOOD_SHARE = 0.5
-"""A step that leaves more of the cost than this asks for a new Jacobian."""
+"""Fraction of the cost; a step that leaves more than this requires a new Jacobian."""
 
 Model = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""(P, N) unit parameters to (P, K) values; NaN rows where there is no answer."""
+"""Function from (P, N) unit parameters to (P, K) values; NaN rows where undefined."""
 
 
 @dataclass(frozen=True)
 class BoundedFit:
-    """Where the fit ended.
+    """Result of a fit.
 
     ``position_ratio`` (N,) is in prior deviations, ``values_um`` (K,) the model there.
     """
@@ -54,7 +55,7 @@ class BoundedFit:
 
 
 class FitFailed(ValueError):
-    """The model has no answer at the start."""
+    """The model is undefined at the start."""
 
 
 class _State(NamedTuple):
@@ -70,10 +71,10 @@ def difference_jacobian_um(
     *,
     high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Jacobian (K, N) at ``position`` (N,), where the model is ``value_um``; one batch.
+    """Return the Jacobian (K, N) at ``position`` (N,), computed in one batch.
 
-    Differences go inwards at the upper bounds ``high``: beyond, the model may have no
-    answer.
+    The model is ``value_um`` there.  Differences point inward at the upper bounds
+    ``high``: beyond them the model may be undefined.
     """
     inwards = position + DIFFERENCE_STEP > high
     steps = np.where(inwards, -DIFFERENCE_STEP, DIFFERENCE_STEP)
@@ -83,7 +84,7 @@ def difference_jacobian_um(
 
 
 class _Descent:
-    """One fit under way: where it stands, its Jacobian and its trust region."""
+    """State of one fit: position, Jacobian and trust region."""
 
     def __init__(self, model: Model, target_um, bounds, noise_um: float):
         self.model, self.target_um, self.noise_um = model, target_um, noise_um
@@ -117,7 +118,7 @@ class _Descent:
         )
 
     def learn(self, old, new) -> None:
-        """Broyden's update: what a step showed, the Jacobian now says."""
+        """Update the Jacobian with the result of a step (Broyden)."""
         step = new.position - old.position
         length = step @ step
         if np.isfinite(new.cost) and length > 0.0:
@@ -126,7 +127,7 @@ class _Descent:
             self.jacobian_um = self.jacobian_um + np.outer(surprise_um, step / length)
 
     def linear_step(self, state):
-        """Step of the linearised problem in bounds and reach; the cost promised."""
+        """Return the linearized problem's step in bounds and reach, and its cost."""
         scaled = self.jacobian_um / self.noise_um
         misfit = (state.value_um - self.target_um) / self.noise_um
         hessian = scaled.T @ scaled + np.eye(state.position.size)
@@ -140,9 +141,9 @@ class _Descent:
         return step, float(left @ left)
 
     def advance(self) -> bool:
-        """Try one step, and a second that takes its curvature back out.
+        """Try one step, and a second one that corrects for its curvature.
 
-        Returns whether the Jacobian served well enough to be used again.
+        Returns whether the Jacobian is good enough to be used again.
         """
         before = self.state
         step, promised = self.linear_step(before)
@@ -175,15 +176,15 @@ def fit_bounded(
     noise_um: float,
     max_iterations: int = 25,
 ) -> BoundedFit:
-    """Minimise |(model(q) - target) / noise|² + |q|² over low <= q <= high.
+    """Minimize |(model(q) - target) / noise|² + |q|² over low <= q <= high.
 
-    An iteration is one Jacobian and as many steps as it serves well: a step costs one
-    evaluation or two, a Jacobian N of them.
+    An iteration is one Jacobian and as many steps as it is good for: a step costs one
+    or two evaluations, a Jacobian N of them.
 
     Raises
     ------
     FitFailed
-        The model has no answer at the start.
+        The model is undefined at the start.
     """
     descent = _Descent(model, target_um, bounds, noise_um)
     descent.start(start)
@@ -214,9 +215,9 @@ def box_minimum(
     downhill: NDArray[np.float64],
     room: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Minimise x H x / 2 - g x over a box: active set (BVLS, Stark & Parker 1995).
+    """Minimize x H x / 2 - g x over a box: active set (BVLS, Stark & Parker 1995).
 
-    Works on the 45 x 45 Hessian with Cholesky solves, a tenth of the time of
+    It works on the 45 x 45 Hessian with Cholesky solves, in a tenth of the time of
     `scipy.optimize.lsq_linear`, which decomposes the whole matrix on every pass.
     """
     low, high = room
@@ -225,7 +226,7 @@ def box_minimum(
     if not side.any():
         return step
     step = np.clip(step, low, high)
-    pull = BOX_TOLERANCE * np.diag(hessian)  # what moves an unknown by the tolerance
+    pull = BOX_TOLERANCE * np.diag(hessian)  # gradient that moves x by the tolerance
     for _ in range(MAX_PASSES):
         step, side = _descend_free(hessian, downhill, step, side, room)
         held_back = -side * (downhill - hessian @ step) / pull
@@ -237,7 +238,7 @@ def box_minimum(
 
 
 def _descend_free(hessian, downhill, step, side, room):
-    """Go to the minimum over the free unknowns, tying each that meets a wall."""
+    """Go to the minimum over the free unknowns, fixing each that reaches a bound."""
     low, high = room
     while True:
         free = np.flatnonzero(side == 0)

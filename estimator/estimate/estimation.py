@@ -1,9 +1,9 @@
-"""Which eye has this wavefront: 45 parameters from one or several measurements.
+"""Estimation of an eye's 45 parameters from one or several measured wavefronts.
 
 ``refined``: bounded least squares on exactly ray-traced coefficients, with a weak prior
-towards the mean eye of the measured refraction, from the nearest of a table of eyes and
-the eye network's guess.  ``network``: that guess alone, judged by one trace.
-``search``: the pattern search of the earlier work.
+toward the mean eye of the measured refraction.  It starts from the nearest of a table
+of eyes and the eye network's guess.  ``network``: that guess alone, checked by one
+trace.  ``search``: the pattern search of the earlier work.
 """
 
 import time
@@ -44,50 +44,51 @@ from estimator.profiles.typical_aberrations import (
 
 METHODS = ("network", "refined", "search")
 STARTS = ("table", "network")
-"""Where ``refined`` may start: the built-in eyes, the network's guess."""
+"""Start eyes of ``refined``: the built-in table or the network's guess."""
 
 GOOD_FIT_UM = 5e-4
-"""Mean error above which a fit that began at one kind of start is tried from another:
-from the network's eye, keratoconus ends at 7e-3 um, from the table's at 3e-5."""
+"""Mean error above which a fit is repeated from the other kind of start: from the
+network's eye, keratoconus ends at 7e-3 um, from the table's at 3e-5."""
 
 POOR_FIT_UM = 0.01
-"""Mean error above which the answer says that the model does not reach the data."""
+"""Mean error above which a note says that the model does not match the data."""
 
 SEARCH_TIME_S = 60.0
-"""Time given to the pattern search; the published runs took one to three hours."""
+"""Time limit of the pattern search; the published runs took one to three hours."""
 
 
 @dataclass(frozen=True)
 class EstimatedEye:
-    """An eye that reproduces a measurement, and how well.
+    """An eye that reproduces a measurement, with the quality of the fit.
 
     Attributes
     ----------
     name : str
-        Of the profile.
+        Name of the profile.
     parameters : EyeParameters
-        The relaxed eye.
+        Parameters of the relaxed eye.
     profile : EyeProfile
-        What it was estimated from, typical aberrations included.
+        Profile that was fitted, typical aberrations included.
     zernike_um, residual_um : (28,), um
-        Of the eye, and of the eye less the measurement, on the measured circle
-        (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements, the
-        first.  The residual's tilt is against the measurement shifted to zero central
-        slope.
+        Coefficients of the eye, and of the eye minus the measurement, on the measured
+        circle (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements,
+        of the first.  The residual's tilt is relative to the measurement shifted to
+        zero central slope.
     mean_abs_error_um : float
-        Over the 25 terms without piston and tilt, and over all measurements.
+        Mean absolute error over the 25 terms without piston and tilt, and over all
+        measurements.
     method : str
-        How the eye was found in the end: ``network`` falls back to ``refined``.
+        Method that was finally used: ``network`` falls back to ``refined``.
     start : str
-        Where ``refined`` started, of `STARTS` or ``given``; empty for other methods.
+        Start of ``refined``, one of `STARTS` or ``given``; empty for other methods.
     network_reason : str
-        Why the network did not answer where it was asked; empty where it did.
+        Reason for a fallback from the network; empty without one.
     time_ms, n_iterations, n_evaluations : float, int, int
-        What the search took; an evaluation traces one eye.
+        Cost of the estimation; an evaluation traces one eye.
     on_bound : tuple of str
-        Parameters that sit on a bound of their allowed range.
+        Parameters on a bound of their allowed range.
     notes : tuple of str
-        What the user should know, in sentences.
+        Notes for the user, in sentences.
     """
 
     name: str
@@ -116,8 +117,8 @@ class EstimatedEye:
     def determined_ratio(self) -> dict[str, float]:
         """Return how well each parameter is determined; costs one Jacobian.
 
-        The share of the prior variance that a measurement with 0.01 um noise per
-        coefficient takes away: 0 is the prior alone, 1 is known.
+        This is the fraction of the prior variance that a measurement with 0.01 um noise
+        per coefficient removes: 0 is the prior alone, 1 is known.
         """
         if self.profile.eye is not None:
             return dict.fromkeys(PARAMETER_NAMES, 1.0)
@@ -125,19 +126,19 @@ class EstimatedEye:
         return problem.determined_ratio(self.parameters.to_vector())
 
     def rest(self, wavelengths_nm: ArrayLike) -> MeasuredRest:
-        """Return what of the measurement this eye does not show, at wavelengths."""
+        """Return the residual of the measurement and this eye, at wavelengths."""
         return MeasuredRest.of(
             self.parameters, self.profile, wavelengths_nm=wavelengths_nm
         )
 
     @cached_property
     def accommodating(self) -> AccommodatingEye:
-        """Return the eye as one that can be asked to focus, correction worn."""
+        """Return the eye as one that can focus, with its correction."""
         return accommodating_eye(self.parameters, self.profile)
 
     @property
     def refraction_dpt(self) -> float:
-        """Return M at 555 nm and the measured pupil, through the worn correction."""
+        """Return M at 555 nm and the measured pupil, through the correction."""
         return self.accommodating.refraction_dpt
 
     @property
@@ -148,12 +149,13 @@ class EstimatedEye:
     def focused(
         self, focus_dpt: float = 0.0, *, pupil_diameter_mm: float | None = None
     ) -> FocusedEye:
-        """Return the eye focused as near to ``focus_dpt`` as it can.
+        """Return the eye focused as near to ``focus_dpt`` as possible.
 
         Parameters
         ----------
         pupil_diameter_mm : float, optional
-            Through which that distance is sharpest; the measured pupil if not given.
+            Pupil through which that distance is sharpest; the measured pupil by
+            default.
         """
         return self.accommodating.focused(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
@@ -195,27 +197,28 @@ def estimate_eye(
     Parameters
     ----------
     profile : EyeProfile
-        A profile that is an eye already is returned as it is, with method ``given``.
-        A prescription gets typical higher-order aberrations first, with a note, unless
-        its ``higher_order`` is ``none``.
+        Profile.  An eye is returned as given, with method ``given``.  A prescription
+        gets typical higher-order aberrations first, with a note, unless its
+        ``higher_order`` is ``none``.
     method : {"network", "refined", "search"}
-        Where the wavefront is out of the network's training ranges, or light does not
-        pass its eye, ``network`` becomes ``refined`` from the table, with a note.
+        Method.  If the wavefront is outside the network's training ranges, or light
+        does not pass its eye, ``network`` falls back to ``refined`` from the table,
+        with a note.
     max_time_s : float
-        For ``search`` only.
+        Time limit of ``search``.
     starts : of {"table", "network"}
-        Eyes of which ``refined`` starts at the one whose traced wavefront is nearest.
-        A network that cannot answer is left out.  Where a fit ends above
-        `GOOD_FIT_UM`, the other kind is tried, too.
+        Candidate eyes; ``refined`` starts at the one whose traced wavefront is nearest.
+        An unavailable network is skipped.  If a fit ends above `GOOD_FIT_UM`, the other
+        kind is tried as well.
     start_vectors : (P, 45), optional
-        Instead of those.
+        Candidate eyes that replace those.
 
     Raises
     ------
     ValueError
-        An unknown method or start.
+        The method or a start is unknown.
     WeightsMissing, DamagedWeights
-        For ``network``.
+        The weights of ``network`` are missing or damaged.
     """
     if method not in METHODS:
         raise ValueError(f"method '{method}': allowed are {', '.join(METHODS)}")
@@ -268,7 +271,7 @@ def _answer(
 ) -> EstimatedEye:
     error_um = float(np.mean(np.abs(values_um - problem.target_um)))
     on_bound = problem.on_bound(vector)
-    vector = np.clip(vector, *allowed_ranges().T)  # rounding may overstep a bound
+    vector = np.clip(vector, *allowed_ranges().T)  # rounding may exceed a bound
     zernike_um = problem.zernike_of(problem.measurements[0])(vector[None])[0]
     zernike_um[0] = 0.0
     measured_um = remove_central_tilt(problem.profile.zernike_um)
@@ -313,7 +316,7 @@ def _unusual(parameters: EyeParameters, profile: EyeProfile) -> tuple[str, ...]:
 def _start_vectors(
     profile: EyeProfile, starts: tuple[str, ...]
 ) -> tuple[NDArray[np.float64], tuple[str, ...], str]:
-    """Eyes (P, 45), where each comes from, and why the network has none."""
+    """Return eyes (P, 45), their origins, and why the network has none."""
     vectors, labels, reason = np.empty((0, len(PARAMETER_NAMES))), (), ""
     if "network" in starts:
         try:
@@ -350,7 +353,7 @@ def _refined(
 def _best_fit(
     problem: EstimationProblem, vectors: NDArray[np.float64], labels: NDArray
 ) -> tuple[BoundedFit, str]:
-    """Fit from the nearest start; where that ends poorly, from the next kind of start.
+    """Fit from the nearest start, and from the other kind of start if that fits poorly.
 
     The counts are those of both.
     """
@@ -374,12 +377,12 @@ def _best_fit(
 
 
 def _guessed(problem: EstimationProblem, start_s: float) -> EstimatedEye:
-    """Give the network's eye, with the error that tracing it shows.
+    """Return the network's eye, with its traced error.
 
     Raises
     ------
     NetworkUnavailable
-        The network's, or light does not pass its eye.
+        The network is unavailable, or light does not pass its eye.
     """
     vector = network_guess(problem.profile)
     values_um = problem.compared_um(vector[None])[0]

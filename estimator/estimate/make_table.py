@@ -1,9 +1,9 @@
-"""Makes the table of eyes at which fits start; a program.
+"""Program that computes the table of start eyes.
 
     python -m estimator.estimate.make_table
 
 writes ``eye_table.json``: the eyes that the estimator itself finds, from the mean eye,
-for a spread of plain refractions and aberrations.
+for a range of refractions and aberrations.
 """
 
 import json
@@ -33,7 +33,7 @@ ABERRATED_REFRACTION_DPT = -3.0
 
 
 def _wanted_bodies() -> list[dict]:
-    """Profiles of the eyes in the table."""
+    """Return the profiles of the eyes in the table."""
 
     def body(m_dpt, j0_dpt=0.0, j45_dpt=0.0, extra=None) -> dict:
         zernike_um = zernike_from_power_vector(

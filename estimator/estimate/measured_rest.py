@@ -1,9 +1,10 @@
-"""What of a measurement the estimated eye does not show; it travels along as a phase.
+"""Residual of the estimate: a phase that the estimated eye does not reproduce.
 
-45 parameters in human ranges do not reach every wavefront, and the eye's media do not
-scatter colours quite as measured eyes do.  On the axis the eye with its rest is the
-measurement, exactly.  Away from it the rest fades: of eyes that were made at random,
-seen on the axis alone and estimated, it is right within some 10 deg and no help beyond.
+45 parameters in human ranges do not reproduce every wavefront, and the dispersion of
+the eye's media differs a little from that of measured eyes.  On the axis the eye with
+its residual is exactly the measurement.  Off the axis the residual fades: for random
+eyes, estimated from their axis alone, it is right within some 10 deg and no help
+beyond.
 """
 
 from dataclasses import dataclass
@@ -30,26 +31,26 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 FADE_DEG = 15.0
-"""Angle from the axis at which 1/e of the rest is left."""
+"""Angle from the axis at which 1/e of the residual is left."""
 
 _BOWL = np.where((EXPONENTS == [2, 0]).all(1) | (EXPONENTS == [0, 2]).all(1), -0.5, 0.0)
-"""(28,): what a dioptre of refraction is in monomials, um."""
+"""(28,): monomials of one diopter of refraction, um."""
 
 
 @dataclass(frozen=True)
 class MeasuredRest:
-    """Phase beside that of the ray-traced eye, in the plane of its entrance pupil.
+    """Phase added to that of the ray-traced eye, in the plane of its entrance pupil.
 
     Attributes
     ----------
     residue_um : (28,), um/mm^degree
-        The measurement less the eye at the measured wavelength.
+        Measurement minus the eye, at the measured wavelength.
     radius_mm : float
-        Of the measured pupil.  A wider one is filled by the stretched residue:
-        polynomials go anywhere beyond what was measured.
+        Radius of the measured pupil.  In a wider one the residual is stretched:
+        polynomials diverge beyond the measured pupil.
     wavelengths_nm, color_dpt : (n,)
-        Refraction that makes the eye's longitudinal colour, from the measured
-        wavelength, that of measured eyes (`chromatic`).
+        Refraction that corrects the eye's longitudinal color, relative to the measured
+        wavelength, to that of measured eyes (`chromatic`).
     """
 
     residue_um: NDArray[np.float64]
@@ -65,7 +66,7 @@ class MeasuredRest:
         *,
         wavelengths_nm: ArrayLike,
     ) -> "MeasuredRest":
-        """Return what an estimated eye leaves; nothing for an eye that was given."""
+        """Return the residual of an estimated eye; zero for a given eye."""
         wavelengths_nm = np.unique(wavelengths_nm)
         radius_mm, measured_nm = profile.pupil_diameter_mm / 2.0, profile.wavelength_nm
         if profile.eye is not None:
@@ -89,30 +90,30 @@ class MeasuredRest:
 
     @property
     def rms_um(self) -> float:
-        """Root mean square of the residue over the measured pupil."""
+        """Root mean square of the residual over the measured pupil."""
         zernike_um = zernike_from_polynomial(self.residue_um, self.radius_mm)
         return float(np.sqrt(np.sum(zernike_um[3:] ** 2)))
 
     def color_um(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Monomials (n, 28) that mend the colour of wavelengths (n,) it is made for."""
+        """Return monomials (n, 28) that correct the color of its wavelengths (n,)."""
         place = np.searchsorted(self.wavelengths_nm, wavelength_nm)
         return self.color_dpt[place][..., None] * _BOWL
 
     def residues_um(
         self, radius_mm: NDArray[np.float64], share: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Monomials (n, 28) of the residue in pupils (n,), as much as is left (n,)."""
+        """Return monomials (n, 28) of the residual in pupils (n,), scaled by shares."""
         stretch = np.minimum(self.radius_mm / radius_mm, 1.0)[..., None]
         return share[..., None] * self.residue_um * stretch**DEGREE
 
     @staticmethod
     def left_share(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
-        """How much of the residue is left (n,) at fields."""
+        """Return the fraction (n,) of the residual that is left at fields."""
         squared = np.square(h_deg) + np.square(v_deg)
         return np.exp(-squared / FADE_DEG**2)
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Monomials (n, 28) at 555 nm on the axis, in pupils (n,)."""
+        """Return monomials (n, 28) at 555 nm on the axis, in pupils (n,)."""
         radius_mm = np.atleast_1d(np.asarray(pupil_diameter_mm, dtype=np.float64)) / 2
         color_um = self.color_um(np.full(radius_mm.size, REFERENCE_WAVELENGTH_NM))
         return self.residues_um(radius_mm, np.ones(radius_mm.size)) + color_um
@@ -121,7 +122,7 @@ class MeasuredRest:
 def _traced_um(
     parameters: EyeParameters, profile: EyeProfile, wavelengths_nm: NDArray
 ) -> tuple[NDArray[np.float64], float]:
-    """Monomials (n, 28) of the eye in the measured pupil, and how deep its plane is."""
+    """Return the eye's monomials (n, 28) in the measured pupil, and its depth."""
     surfaces = eye_surfaces(parameters, retina=profile.retina)
     depth_mm = entrance_pupil_mm(surfaces, wavelength_nm=REFERENCE_WAVELENGTH_NM)
     found = wavefront_grid(

@@ -1,4 +1,4 @@
-"""The eye network's answer to a profile: an eye of about the measured wavefront."""
+"""Guess of the eye network: an eye with about the measured wavefront."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,14 +9,14 @@ from estimator.profiles.parse import EyeProfile
 
 
 def network_guess(profile: EyeProfile) -> NDArray[np.float64]:
-    """Parameters (45,) within their allowed ranges.
+    """Return parameters (45,) within their allowed ranges.
 
-    Of several measurements the profile's leading one is used, which is on the axis.
+    Only the profile's leading measurement is used, which is on the axis.
 
     Raises
     ------
     NetworkUnavailable
-        No weights, or a wavefront out of the training ranges.
+        No weights, or a wavefront outside the training ranges.
     """
     vector = network_eye(
         profile.zernike_um,

@@ -1,9 +1,9 @@
 """Pattern search over the 45 parameters: the baseline of the earlier work.
 
-Generalised pattern search as published (Csoba & Kunkli 2023): squared error
+This is the published generalized pattern search (Csoba & Kunkli 2023): squared error
 with weights by radial order and a penalty on wrong signs, parameters scaled to their
-ranges, mesh factors 1/2 and 2.  It asks for no derivative and pays for that in time;
-`estimation.py` has the method to use.
+ranges, mesh factors 1/2 and 2.  It needs no derivatives, at the cost of time; the
+recommended method is in `estimation.py`.
 """
 
 import time
@@ -52,15 +52,15 @@ POPULATION = {
     "lens_tilt_about_y_deg": (0.0, 0.0, 7.0),
     "lens_tilt_about_x_deg": (0.0, 0.0, 7.0),
 }
-"""The published search's own table; where our cornea is written differently (ratios
-instead of radii) the widths are carried over."""
+"""Table of the published search; where our cornea has another parameter (ratios instead
+of radii), the widths are converted."""
 
 OFFSET_HALF_RANGE_MM = {1: 0.10, 2: 0.10, 3: 0.06, 4: 0.06, 5: 0.03, 6: 0.03}
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Best eye found and what it took."""
+    """Best eye found, and the cost of the search."""
 
     parameters: EyeParameters
     loss_ratio: float
@@ -79,7 +79,7 @@ def _table() -> NDArray[np.float64]:
 
 
 def search_weights() -> NDArray[np.float64]:
-    """Weights (28,) of the coefficients; piston has none."""
+    """Return the weights (28,) of the coefficients; piston has none."""
     orders = [nm_from_index(j)[0] for j in range(N_TERMS)]
     return np.array([WEIGHT_BY_ORDER.get(n, 0.0) for n in orders])
 
@@ -87,9 +87,9 @@ def search_weights() -> NDArray[np.float64]:
 def search_loss(
     zernike_um: NDArray[np.float64], target_um: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weighted squared error (P,) of coefficient sets (P, 28); infinite where NaN."""
-    # a zero up to rounding, as in the symmetric start, has not the right sign: else its
-    # rounding alone would decide between losses a factor of ten apart
+    """Return the weighted squared error (P,) of sets (P, 28); infinite where NaN."""
+    # A zero up to rounding, as in the symmetric start, counts as the wrong sign:
+    # otherwise rounding would decide between losses a factor of ten apart.
     wrong_sign = zernike_um * np.sign(target_um) < RIGHT_SIGN_UM
     wrong_sign &= target_um != 0.0
     weight = search_weights() * np.where(wrong_sign, WRONG_SIGN_WEIGHT, 1.0)
@@ -111,10 +111,11 @@ def pattern_search(
     Parameters
     ----------
     zernike_of : callable
-        (P, 45) parameter vectors to (P, 28) um, NaN rows where light does not pass.
+        Function from (P, 45) parameter vectors to (P, 28) um, with NaN rows where
+        light does not pass.
     target_um : (28,)
     max_time_s : float
-        The published runs took one to three hours; they may be cut short here.
+        Time limit; the published runs took one to three hours.
 
     Notes
     -----

@@ -1,10 +1,10 @@
-"""What of an estimated eye would be unusual in a person.
+"""Properties of an estimated eye that would be unusual in a person.
 
-Soft limits: the prior draws an eye to what is usual, but a wavefront may ask for more.
-Lengths are three deviations about the means of 19,500 to 90,800 eyes of ten countries
-(axial length 23.49 ± 1.35 mm, corneal radius 7.69 ± 0.28 mm, chamber depth with the
-cornea 3.10 ± 0.47 mm: "Global metrics on ocular biometry", Eye 2022), the cornea's
-power what its radii make of it; the lens has 22.6 ± 2.1 dpt (Rozema 2012).
+These limits are soft: the prior draws an eye toward usual values, but a wavefront may
+require others.  Lengths are three deviations about the means of 19,500 to 90,800 eyes
+of ten countries (axial length 23.49 ± 1.35 mm, corneal radius 7.69 ± 0.28 mm, chamber
+depth with the cornea 3.10 ± 0.47 mm: "Global metrics on ocular biometry", Eye 2022).
+The cornea's power follows from its radii; the lens has 22.6 ± 2.1 dpt (Rozema 2012).
 """
 
 from estimator.eye.assembly import eye_surfaces
@@ -23,7 +23,7 @@ USUAL = {
 def unusual(
     parameters: EyeParameters, *, retina: RetinaShape | None = None
 ) -> tuple[str, ...]:
-    """Name what lies outside of the usual ranges, with its value and the range."""
+    """Return the properties outside their usual ranges, with value and range."""
     points = cardinal_points(
         eye_surfaces(parameters, retina=retina), wavelength_nm=REFERENCE_WAVELENGTH_NM
     )

@@ -1,4 +1,4 @@
-"""Cross-section of an estimated eye with traced rays, as a picture."""
+"""Plot of an estimated eye's cross-section with traced rays."""
 
 import math
 from pathlib import Path
@@ -12,20 +12,20 @@ from estimator.optics.surfaces import EyeSurfaces, Surface, rotation_matrix
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 
 HALF_HEIGHTS_MM = (5.5, 5.2, 4.5, 4.5)
-"""How far from its axis each surface is drawn."""
+"""Height above the axis up to which each surface is drawn."""
 
 N_POINTS = 201
 N_RAYS = 11
 OBJECT_SIDE_MM = 5.0
-"""How far before the cornea rays are drawn."""
+"""Distance in front of the cornea from which rays are drawn."""
 
 
 def surface_line_mm(
     surface: Surface, *, half_height_mm: float, n_points: int = N_POINTS
 ) -> NDArray[np.float64]:
-    """Points (n, 2) of a surface in the plane x = 0 of its own axes, as (z, y).
+    """Return points (n, 2) of a surface in the plane x = 0 of its own axes, as (z, y).
 
-    Points beyond a closed conic's rim are left out.
+    Points beyond a closed conic's rim are omitted.
     """
     y_mm = np.linspace(-half_height_mm, half_height_mm, n_points)
     x_mm = np.zeros_like(y_mm)
@@ -61,7 +61,7 @@ def _offset_mm(surface: Surface, y_mm: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None:
-    """Draw the eye's vertical section, rays from infinity, and its coefficients.
+    """Plot the eye's vertical section, rays from infinity, and its coefficients.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def draw_section(axes, eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
     Parameters
     ----------
     pupil_diameter_mm : float
-        Of the bundle of rays before the cornea.
+        Diameter of the ray bundle in front of the cornea.
     """
     for surface, half_height_mm in zip(eye.surfaces, HALF_HEIGHTS_MM, strict=True):
         line = surface_line_mm(surface, half_height_mm=half_height_mm)
@@ -139,9 +139,9 @@ def _draw_coefficients(axes, found: EstimatedEye) -> None:
 def ray_paths_mm(
     eye: EyeSurfaces, *, pupil_diameter_mm: float, n_rays: int = N_RAYS
 ) -> list[NDArray[np.float64]]:
-    """Paths (n_points, 3) of rays from infinity in the plane x = 0, to the retina.
+    """Return paths (n_points, 3) of rays from infinity to the retina, plane x = 0.
 
-    Rays that do not get through are left out.
+    Rays that do not pass are omitted.
     """
     heights_mm = np.linspace(-0.5, 0.5, n_rays) * pupil_diameter_mm
     start_mm = np.zeros((n_rays, 3))

@@ -1,7 +1,7 @@
-"""What is known of an eye before its wavefront is: the prior of estimation.
+"""Prior of the estimation.
 
-27 coefficients cannot fix 45 parameters; among the eyes that fit, the prior picks the
-one nearest to what eyes of that refraction are like.
+27 coefficients do not determine 45 parameters; among the eyes that fit, the prior
+selects the one nearest to the mean eye of that refraction.
 """
 
 from dataclasses import dataclass
@@ -23,34 +23,34 @@ RADIUS_PER_DPT_MM = 0.022
 spherical refraction (Atchison 2006)."""
 
 REFRACTION_LIMITS_DPT = (-12.0, 6.0)
-"""Refractions that the two lines above are used for."""
+"""Range of refractions in which the two slopes above apply."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Independent normal prior in table order; each number in its parameter's unit."""
+    """Independent normal prior in table order, in the units of the parameters."""
 
     _mean: NDArray[np.float64]
     _deviation: NDArray[np.float64]
 
     def to_unit(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Parameters (..., 45) in deviations from the mean."""
+        """Return parameters (..., 45) in deviations from the mean."""
         return (vectors - self._mean) / self._deviation
 
     def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Inverse of `to_unit`."""
+        """Return parameters from deviations, the inverse of `to_unit`."""
         return self._mean + unit * self._deviation
 
     def unit_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Give the allowed ranges in deviations from the mean."""
+        """Return the allowed ranges in deviations from the mean."""
         low, high = allowed_ranges().T
         return self.to_unit(low), self.to_unit(high)
 
 
 def mean_eyes(refraction_dpt: ArrayLike) -> NDArray[np.float64]:
-    """Vectors (..., 45) of the mean eyes of spherical refractions (...), dpt.
+    """Return vectors (..., 45) of the mean eyes of spherical refractions (...), dpt.
 
-    Refractions count within `REFRACTION_LIMITS_DPT`.
+    Refractions are clamped to `REFRACTION_LIMITS_DPT`.
     """
     clipped_dpt = np.clip(refraction_dpt, *REFRACTION_LIMITS_DPT)
     eyes = np.broadcast_to(mean_vector(), (*np.shape(clipped_dpt), N_PARAMETERS)).copy()
@@ -60,10 +60,10 @@ def mean_eyes(refraction_dpt: ArrayLike) -> NDArray[np.float64]:
 
 
 def deviations() -> NDArray[np.float64]:
-    """Give standard deviations (45,) about a mean eye, each in its own unit."""
+    """Return standard deviations (45,) about a mean eye, each in its own unit."""
     return np.array([row.deviation for row in PARAMETERS])
 
 
 def prior_for_refraction(refraction_dpt: float) -> Prior:
-    """Prior around the mean eye of this spherical refraction M, dpt."""
+    """Return the prior around the mean eye of a spherical refraction M, dpt."""
     return Prior(mean_eyes(refraction_dpt), deviations())

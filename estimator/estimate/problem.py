@@ -1,8 +1,8 @@
-"""What an estimation compares: the measurements of one profile, and a model of them.
+"""Estimation problem: the measurements of one profile, and a model of them.
 
 Coefficients are compared on the measured circle, with the model's entrance pupil equal
 to the measured pupil, without piston and tilt: the chief ray's zero slope ties tilt to
-coma, so a measured tilt says nothing of the eye.
+coma, so a measured tilt contains no information about the eye.
 """
 
 from collections.abc import Callable
@@ -23,28 +23,28 @@ from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile, Measurement
 
 FIRST_COMPARED = 3
-"""Index of the first coefficient that is compared: no piston, no tilt."""
+"""Index of the first compared coefficient, after piston and tilt."""
 
 FIT_NOISE_UM = 1e-3
-"""Weight of a coefficient against the prior: a tenth of what instruments repeat to.
-What is left travels along as a phase (`measured_rest`), so that an eye need not leave
-human ranges for the last nanometres: with 1e-4 an eye of 8 dpt of cylinder got a
+"""Weight of a coefficient against the prior: a tenth of the repeatability of
+instruments.  The residual is kept as a phase (`measured_rest`), so that an eye need not
+leave human ranges for the last nanometers: with 1e-4 an eye of 8 dpt of cylinder got a
 chamber 4.6 mm deep."""
 
 INSTRUMENT_NOISE_UM = 0.01
-"""Repeatability of an aberrometer's coefficient, for how well determined an eye is."""
+"""Repeatability of an aberrometer's coefficient, used by `determined_ratio`."""
 
 ON_BOUND_RATIO = 1e-6
 """Distance from a bound, in prior deviations, that counts as on it."""
 
 
 def compared_terms(zernike_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (..., 25) that an estimation compares."""
+    """Return the coefficients (..., 25) that an estimation compares."""
     return zernike_um[..., FIRST_COMPARED:]
 
 
 class EstimationProblem:
-    """Measurements of one profile, and the model that answers for many eyes."""
+    """Measurements of one profile, and a model of them for many eyes."""
 
     def __init__(self, profile: EyeProfile):
         self.profile = profile
@@ -62,7 +62,7 @@ class EstimationProblem:
         self.prior: Prior = prior_for_refraction(refraction_dpt)
 
     def zernike_of(self, measurement: Measurement) -> Callable:
-        """Return what gives vectors (P, 45) their coefficients (P, 28) as measured."""
+        """Return a function from vectors (P, 45) to a measurement's coefficients."""
 
         def coefficients(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
             return zernike_of_vectors(
@@ -84,7 +84,7 @@ class EstimationProblem:
         )
 
     def nearest(self, vectors: NDArray[np.float64]) -> int:
-        """Return the number of the eye whose coefficients lie nearest."""
+        """Return the index of the eye with the nearest coefficients."""
         misfit_um = self.compared_um(vectors) - self.target_um
         distance = np.sum(misfit_um**2, axis=-1)
         if np.all(np.isnan(distance)):
@@ -95,7 +95,7 @@ class EstimationProblem:
         return self.compared_um(self.prior.from_unit(units))
 
     def jacobian_um(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return their change (K, 45) with each parameter, per prior deviation."""
+        """Return the Jacobian (K, 45) of the coefficients, per prior deviation."""
         value_um = self._model(unit[None])[0]
         return difference_jacobian_um(
             self._model, unit, value_um, high=self.prior.unit_bounds()[1]
@@ -116,7 +116,7 @@ class EstimationProblem:
         return float(np.mean(np.abs(fit.values_um - self.target_um)))
 
     def determined_ratio(self, vector: NDArray[np.float64]) -> dict[str, float]:
-        """Tell which share of each parameter's prior variance the measurement takes."""
+        """Return the fraction of each prior variance that the measurement removes."""
         jacobian_um = self.jacobian_um(self.prior.to_unit(vector))
         n = jacobian_um.shape[1]
         information = jacobian_um.T @ jacobian_um / INSTRUMENT_NOISE_UM**2 + np.eye(n)
@@ -124,7 +124,7 @@ class EstimationProblem:
         return dict(zip(PARAMETER_NAMES, (1.0 - left).tolist(), strict=True))
 
     def on_bound(self, vector: NDArray[np.float64]) -> tuple[str, ...]:
-        """Name the parameters that sit on a bound of their range."""
+        """Return the names of the parameters on a bound of their range."""
         unit = self.prior.to_unit(vector)
         low, high = self.prior.unit_bounds()
         room = np.minimum(unit - low, high - unit)

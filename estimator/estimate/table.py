@@ -1,6 +1,6 @@
-"""A small table of eyes, one of which is near any measured one: where fits start.
+"""Small table of start eyes for fits; one of them is near any measured eye.
 
-`make_table` makes ``eye_table.json`` anew.
+`make_table` regenerates ``eye_table.json``.
 """
 
 import json
@@ -17,7 +17,7 @@ TABLE_FILE = Path(__file__).parent / "eye_table.json"
 
 @cache
 def table_vectors() -> NDArray[np.float64]:
-    """Vectors (P, 45) of the table; the mean eye is the first."""
+    """Return the vectors (P, 45) of the table; the first is the mean eye."""
     rows = json.loads(TABLE_FILE.read_text(encoding="utf-8"))["eyes"]
     vectors = [[row[name] for name in PARAMETER_NAMES] for row in rows]
     vectors = np.array([mean_vector().tolist(), *vectors])

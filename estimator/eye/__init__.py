@@ -1,15 +1,15 @@
-"""The model eye: 45 parameters, its surfaces, its focus.
+"""The eye model: 45 parameters, surfaces and accommodation.
 
-checked_fields  reading one field of a profile, every refusal with its range
+checked_fields  validation of single profile fields, errors with allowed ranges
 parameters      the 45 parameters by name, as vectors, with their ranges
-lens_shape      the lens at constant volume
-lens_change     the lens at other diameters, and the chamber before it
-assembly        from parameters to surfaces, one eye or many
+lens_shape      shape of the lens at constant volume
+lens_change     lens diameter and chamber depth in accommodation
+assembly        conversion of parameters to surfaces, for one eye or many
 explicit        an eye given surface by surface
 tracing         coefficients and refractions of many eyes
-focusing        far point, near point, and what is said where they end
-focus_table     refraction over pupil and accommodation, and back
-accommodation   the lens that focuses an eye at a distance
+focusing        far point, near point, and notes on unreachable focus
+focus_table     refraction over pupil and accommodation, and its inverse
+accommodation   the lens state that focuses an eye at a distance
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
 """Accommodation: the lens diameter and chamber depth that focus an eye at a distance.
 
-How the lens changes stands in `lens_change`.  The eye is focused at f dpt when its
+`lens_change` describes the change of the lens.  The eye is focused at f dpt when its
 ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm, is -f.
 """
 
@@ -44,7 +44,7 @@ N_TABLE = 10
 """Lens diameters at which the refraction is traced before the root is refined."""
 
 N_FOCUS = 6
-"""Of those that are traced at other pupils as well."""
+"""Number of these diameters that are traced at other pupils as well."""
 
 REFRACTION_TOLERANCE_DPT = 1e-6
 MAX_REFINEMENTS = 6
@@ -54,8 +54,8 @@ MAX_REFINEMENTS = 6
 class FocusedEye:
     """One eye at one focus.
 
-    ``focus_dpt`` is where it is really focused; ``notes`` say where that differs from
-    what was asked.
+    ``focus_dpt`` is the focus actually reached; ``notes`` report a difference from the
+    requested one.
     """
 
     parameters: EyeParameters
@@ -68,14 +68,14 @@ class FocusedEye:
 
 
 class Rest(Protocol):
-    """Phase beside that of the traced eye, see `estimate.measured_rest`."""
+    """Phase added to that of the traced eye, see `estimate.measured_rest`."""
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
+        """Return monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
 
 
 def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
-    """How many of these, from the first on, are finite and fall."""
+    """Return how many leading refractions are finite and decreasing."""
     usable = np.isfinite(refractions_dpt)
     usable[1:] &= np.diff(refractions_dpt) < 0.0
     usable[0] = True
@@ -83,29 +83,30 @@ def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
 
 
 class AccommodatingEye(Focusing):
-    """An eye that can be asked to focus, at any pupil.
+    """An eye that can focus, at any pupil.
 
-    *Accommodation* names states of the lens: by how much they change the refraction at
-    ``pupil_diameter_mm``.  Through another pupil the change is another.
+    *Accommodation* identifies a state of the lens by the change of refraction at
+    ``pupil_diameter_mm``.  Through another pupil the change differs.
 
     Attributes
     ----------
     refraction_dpt : float
-        M of the relaxed eye at the cornea, 555 nm and ``pupil_diameter_mm``, as seen
-        through the worn correction.
+        M of the relaxed eye at the cornea, 555 nm and ``pupil_diameter_mm``, through
+        the correction.
     bare_refraction_dpt : float
-        The same without the correction.
+        M without the correction.
     entrance_pupil_mm : float
-        Of the relaxed eye, behind the corneal apex.
+        Depth of the relaxed eye's entrance pupil behind the corneal apex.
     lens_range_dpt : float
-        Accommodation that the lens model itself can reach.
+        Largest accommodation of the lens model.
     amplitude_dpt : float
-        The smaller of that and the amplitude given (by age), at that pupil.
+        The smaller of ``lens_range_dpt`` and the given amplitude (by age), at that
+        pupil.
 
     Parameters
     ----------
     rest : Rest, optional
-        What is seen beside the traced eye.
+        Phase added to the traced eye.
     """
 
     def __init__(
@@ -151,7 +152,7 @@ class AccommodatingEye(Focusing):
         self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
 
     def _rest_dpt(self, pupil_diameter_mm: float) -> NDArray[np.float64]:
-        """M of the rest on a round pupil."""
+        """Return M of the residual on a round pupil."""
         if self._rest is None:
             return np.zeros(())
         radius_mm = pupil_diameter_mm / 2.0
@@ -161,16 +162,16 @@ class AccommodatingEye(Focusing):
 
     @property
     def _focus_table(self) -> FocusTable:
-        """Refraction without correction over pupil and accommodation, made when asked.
+        """Refraction without correction over pupil and accommodation, traced lazily.
 
-        No cached property: whoever stores the eye stores the table with it.
+        It is not a cached property, so that storing an eye stores the table too.
         """
         if self._table is None:
             self._table = self._new_focus_table()
         return self._table
 
     def _new_focus_table(self) -> FocusTable:
-        """Trace it; pupils that light does not fill in every state are left out."""
+        """Trace the table; omit pupils that light does not fill in every state."""
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
         some = np.unique(
             np.linspace(0, self._diameters_mm.size - 1, N_FOCUS).astype(int)
@@ -195,28 +196,28 @@ class AccommodatingEye(Focusing):
     def accommodation_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
     ) -> float:
-        """Accommodation for the sharpest distance, by default at its own pupil."""
+        """Return the accommodation for a focus, by default at the eye's own pupil."""
         pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
         return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
 
     def refraction_at_dpt(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> float:
-        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
         bare_dpt = self._focus_table.refraction_dpt(
             pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
         )
         return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
 
     def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
-        """M of the worn correction through a pupil."""
+        """Return M of the correction through a pupil."""
         at_centre_dpt, per_mm2 = self._correction_dpt
         return at_centre_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
 
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
+        """Return the accommodation in reach whose M at a pupil is nearest to this."""
         relaxed_dpt = self.refraction_at_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
         )
@@ -228,17 +229,18 @@ class AccommodatingEye(Focusing):
         )
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
-        """Accommodation at which the nearest distance is seen through a pupil."""
+        """Return the accommodation for the near point through a pupil."""
         return self.accommodation_for_dpt(
             -math.inf, pupil_diameter_mm=pupil_diameter_mm
         )
 
     def _cornea_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Accommodations of the table, and M at the cornea of the traced eye alone.
+        """Return accommodations of the table, and M at the cornea of the traced eye.
 
-        Through its own pupil: what the networks know.  As far as light passes there and
-        M falls: at the cornea a pupil is wider than in its own plane, and a strongly
-        bent lens lets less of it through.
+        M is that of the eye alone, through its own pupil, as the networks use it.  The
+        table ends where light no longer passes or M no longer falls: at the cornea a
+        pupil is wider than in its own plane, and a strongly curved lens passes less of
+        it.
         """
         refractions_dpt = refraction_of_vectors(
             accommodated_vectors(self._vector, lens_diameter_mm=self._diameters_mm),
@@ -254,9 +256,10 @@ class AccommodatingEye(Focusing):
         return self._accommodations_dpt[:count], refractions_dpt[:count]
 
     def at_cornea_dpt(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
-        """M at the cornea (n,) of the traced eye alone, at accommodations (n,).
+        """Return M at the cornea (n,) of the traced eye alone, at accommodations (n,).
 
-        Beyond what light passes at the cornea, at the last that does.
+        Accommodations at which light does not pass are clamped to the last at which it
+        does.
         """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, refractions_dpt = self._cornea_table()
@@ -267,7 +270,7 @@ class AccommodatingEye(Focusing):
     def accommodations_at_cornea_dpt(
         self, refractions_dpt: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Accommodations (n,) within the amplitude for M at the cornea (n,)."""
+        """Return accommodations (n,) within the amplitude for M at the cornea (n,)."""
         known_dpt, at_cornea_dpt = self._cornea_table()
         if known_dpt.size == 1:
             return np.zeros(np.shape(refractions_dpt))
@@ -276,7 +279,7 @@ class AccommodatingEye(Focusing):
         return np.clip(used_dpt, 0.0, self.amplitude_dpt)
 
     def _refraction_table(self):
-        """Lens diameters, falling, and the refraction at each, as far as it falls."""
+        """Return falling lens diameters and refractions, as far as those fall."""
         relaxed_mm = self._vector[DIAMETER]
         smallest_mm = smallest_diameter_mm(self._vector)
         diameters_mm = np.linspace(relaxed_mm, smallest_mm, N_TABLE)
@@ -299,10 +302,10 @@ class AccommodatingEye(Focusing):
         )
 
     def lens_diameters_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
-        """Lens diameters (P,) for accommodations (P,) within the amplitude.
+        """Return lens diameters (P,) for accommodations (P,) within the amplitude.
 
-        Inverse interpolation in the table by one polynomial, then secant steps, all in
-        batches, until the traced refraction is met to `REFRACTION_TOLERANCE_DPT`.
+        One polynomial inverts the table; secant steps, all in batches, then refine the
+        result until the traced refraction is met to `REFRACTION_TOLERANCE_DPT`.
         """
         wanted_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, known_mm = self._accommodations_dpt, self._diameters_mm
@@ -325,7 +328,7 @@ class AccommodatingEye(Focusing):
         return diameters_mm
 
     def changes_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
-        """Change (P, 2) of lens diameter and aqueous thickness for accommodations."""
+        """Return changes (P, 2) of lens diameter and aqueous thickness."""
         vectors = accommodated_vectors(
             self._vector, lens_diameter_mm=self.lens_diameters_mm(accommodations_dpt)
         )
@@ -334,7 +337,7 @@ class AccommodatingEye(Focusing):
     def focused(
         self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
     ) -> FocusedEye:
-        """Eye focused as near to ``focus_dpt`` as it can, see `focused_at`."""
+        """Return the eye focused as near to ``focus_dpt`` as possible."""
         return self.focused_at([focus_dpt], pupil_diameter_mm=pupil_diameter_mm)[0]
 
     def focused_at(
@@ -345,12 +348,12 @@ class AccommodatingEye(Focusing):
         Parameters
         ----------
         pupil_diameter_mm : float, optional
-            Through which they are sharpest; the eye's own where it is None.
+            Pupil through which they are sharpest; the eye's own if None.
 
         Raises
         ------
         ValueError
-            A distance that is not finite.
+            A distance is not finite.
         """
         focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
         if not np.all(np.isfinite(focuses_dpt)):
@@ -374,7 +377,7 @@ class AccommodatingEye(Focusing):
         ]
 
     def states_at(self, accommodations_dpt: ArrayLike) -> list[FocusedEye]:
-        """States (P,) at accommodations within the amplitude, in one batch of traces.
+        """Return states (P,) at accommodations within the amplitude, traced in a batch.
 
         Their ``focus_dpt`` is that of the eye's own pupil.
         """
@@ -384,7 +387,7 @@ class AccommodatingEye(Focusing):
     def with_diameters(
         self, accommodations_dpt: ArrayLike, diameters_mm: ArrayLike
     ) -> list[FocusedEye]:
-        """States (P,) whose lens diameters are known."""
+        """Return states (P,) with known lens diameters."""
         states = zip(*map(np.ravel, (accommodations_dpt, diameters_mm)), strict=True)
         return [self._state(*map(float, state)) for state in states]
 

@@ -1,4 +1,4 @@
-"""From the 45 parameters to surfaces, one eye at a time or packed in batches."""
+"""Conversion of the 45 parameters to surfaces, for one eye or packed batches."""
 
 import math
 
@@ -26,26 +26,27 @@ def eye_surfaces(
     retina: RetinaShape | None = None,
     lens_rule: str = "C",
 ) -> EyeSurfaces:
-    """Surfaces of one eye.
+    """Return the surfaces of one eye.
 
     Parameters
     ----------
     parameters : EyeParameters
-        Relaxed, or with the lens diameter and aqueous of an accommodated state.
+        Relaxed eye, or one with the lens diameter and aqueous of an accommodated state.
     retina : RetinaShape, optional
-        Instead of the sphere of radius eye length / 2.
+        Shape of the retina; by default a sphere of radius eye length / 2.
     lens_rule : {"C", "compat"}
-        ``compat`` is the rule of the published data sets (rule A of `lens_shape`).
+        Rule of the lens shape; ``compat`` is the rule of the published data sets
+        (rule A of `lens_shape`).
 
     Raises
     ------
     ValueError
-        An unknown lens rule.
+        The lens rule is unknown.
 
     Notes
     -----
-    The stop is the plane of the lens' undisplaced anterior pole and stays centred; the
-    lens is decentred and tilted as one body about its anterior vertex.
+    The stop is the plane of the lens's undisplaced anterior pole and stays centered;
+    the lens is decentered and tilted as one body about its anterior vertex.
     """
     p = parameters
     anterior_mm = p.cornea_anterior_radius_mm
@@ -136,7 +137,7 @@ def pack_eyes(
     Returns
     -------
     packed : (P, 5, 48)
-        As `estimator.optics.surfaces.pack_eye` lays them out.
+        Surfaces in the layout of `estimator.optics.surfaces.pack_eye`.
     """
 
     def given(name: str) -> NDArray[np.float64]:
@@ -194,7 +195,7 @@ def _set_offsets(rows, offsets_mm):
 
 
 def _turn_about_z(angles_deg):
-    """Row-major rotation matrices (P, 9)."""
+    """Return row-major rotation matrices (P, 9)."""
     cosine, sine = np.cos(np.radians(angles_deg)), np.sin(np.radians(angles_deg))
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
     rows = (cosine, -sine, zero, sine, cosine, zero, zero, zero, one)
@@ -202,7 +203,7 @@ def _turn_about_z(angles_deg):
 
 
 def _lens_turns(about_x_deg, about_y_deg):
-    """Row-major matrices (P, 9) of a turn about x, then about y."""
+    """Return row-major matrices (P, 9) of a rotation about x, then about y."""
     cx, sx = np.cos(np.radians(about_x_deg)), np.sin(np.radians(about_x_deg))
     cy, sy = np.cos(np.radians(about_y_deg)), np.sin(np.radians(about_y_deg))
     zero = np.zeros_like(cx)

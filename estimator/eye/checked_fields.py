@@ -1,4 +1,4 @@
-"""Checked reading of one field of a profile: every refusal names field and range."""
+"""Validation of single profile fields; errors name the field and its range."""
 
 import difflib
 import math
@@ -8,7 +8,7 @@ from typing import Any
 MAX_COMPARED = 60
 
 WHOLE = "profile"
-"""The field of an error about all of it."""
+"""Field name of an error that concerns the whole profile."""
 
 
 class ProfileError(ValueError):
@@ -19,9 +19,9 @@ class ProfileError(ValueError):
     field : str
         Dotted path of the field at fault, e.g. ``correction.axis_deg``.
     problem : str
-        What it is.
+        Description of the problem.
     allowed : str
-        What the field accepts.
+        Accepted values of the field.
     """
 
     def __init__(self, field: str, problem: str, allowed: str):
@@ -40,7 +40,7 @@ def number(
     default: float | None = None,
     path: str = "",
 ) -> float:
-    """Finite number in [low, high]; ``default`` where the field is absent."""
+    """Return a finite number in [low, high]; ``default`` if the field is absent."""
     name, allowed = path + field, f"a number from {low:g} to {high:g}"
     value = data.get(field, default)
     if value is None:
@@ -60,7 +60,7 @@ def choice(
     default: str | None = None,
     path: str = "",
 ) -> str:
-    """One of ``options``; ``default`` where the field is absent."""
+    """Return one of ``options``; ``default`` if the field is absent."""
     name, allowed = path + field, "one of " + ", ".join(options)
     value = data.get(field, default)
     if value is None:
@@ -72,8 +72,8 @@ def choice(
 
 
 def did_you_mean(value: object, options: Sequence[str]) -> str:
-    """Return what to add to an error about a near miss; nothing where none is near."""
-    # A long text is no slip of typing, and would take long to compare.
+    """Return a suggestion for an error message, or "" if no option is similar."""
+    # A long text is no typing error, and would take long to compare.
     if not isinstance(value, str) or len(value) > MAX_COMPARED:
         return ""
     near = difflib.get_close_matches(value, options, n=1)
@@ -90,7 +90,7 @@ def mapping(data: object, name: str) -> Mapping[str, Any]:
 def only_known(
     data: Mapping[str, Any], known: Sequence[str], *, path: str = ""
 ) -> None:
-    """Refuse a field that nobody reads: a typing slip must not pass silently."""
+    """Reject unknown fields, so that a typing error does not pass silently."""
     for field in data:
         if field not in known:
             allowed = "the fields " + ", ".join(known)

@@ -1,4 +1,4 @@
-"""An eye given surface by surface, as JSON: a schematic eye or a user's own.
+"""An eye given surface by surface in JSON, such as a schematic eye.
 
     {"surfaces": [{"radius_mm": 7.72 | [Rx, Ry] | null (plane), "conic_constant": -0.26,
                    "z_mm": 0, "medium_after": "cornea",
@@ -9,8 +9,8 @@
      "retina": {"radius_mm": 12, "conic_constant": 0, "z_mm": 24},
      "indices": {"cornea": 1.376, ...} or null}
 
-27 offset terms are j = 1 to 27, 28 are j = 0 to 27.  Without ``indices`` the media
-disperse by Herzberger's formula (`media`).
+27 offset terms are j = 1 to 27, 28 are j = 0 to 27.  Without ``indices`` the dispersion
+of the media follows Herzberger's formula (`media`).
 """
 
 import math
@@ -56,17 +56,17 @@ OFFSET_LIMIT_MM = 2.0
 
 
 def is_explicit_eye(data: object) -> bool:
-    """Tell an eye given by surfaces from other kinds of profiles."""
+    """Return whether a profile describes an eye by its surfaces."""
     return isinstance(data, Mapping) and "surfaces" in data
 
 
 def parse_explicit_eye(data: object) -> EyeSurfaces:
-    """Read the object above.
+    """Parse an eye in the format of this module.
 
     Raises
     ------
     ProfileError
-        Names the field at fault and the allowed range.
+        A field is invalid; the error names it and the allowed range.
     """
     data = fields.mapping(data, "eye")
     fields.only_known(data, EYE_FIELDS)
@@ -131,7 +131,7 @@ def _surface(data: object, name: str, media: Sequence[str]) -> Surface:
 
 
 def _radius(value: object, name: str) -> float:
-    """Radius of curvature; null, "inf" and Infinity are planes."""
+    """Return a radius of curvature; null, "inf" and Infinity are planes."""
     low, high = RADIUS_LIMITS_MM
     if value is None or value in ("inf", "Infinity", math.inf, -math.inf):
         return math.inf

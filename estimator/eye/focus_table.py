@@ -1,7 +1,8 @@
-"""Refraction of one eye over pupil and accommodation, and back to accommodation.
+"""Refraction of one eye over pupil and accommodation, and its inverse.
 
-Along the accommodation a polynomial through traced states of the lens; along the pupil
-one in its square, in which a wavefront's spherical terms are a short series.
+Over accommodation the table is interpolated by a polynomial through traced states of
+the lens; over the pupil by a polynomial in its square, in which a wavefront's spherical
+terms are a short series.
 """
 
 import numpy as np
@@ -9,17 +10,17 @@ from numpy.typing import NDArray
 
 STANDARD_PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 NEAREST_PUPIL_MM = 0.6
-"""Standard pupils nearer than this to the eye's own are left out."""
+"""Standard pupils nearer than this to the eye's own are omitted."""
 
 
 def table_pupils_mm(own_mm: float) -> list[float]:
-    """Pupils of a table, ascending: the eye's own and standard ones."""
+    """Return the pupils of a table, ascending: the eye's own and standard ones."""
     others = [p for p in STANDARD_PUPILS_MM if abs(p - own_mm) >= NEAREST_PUPIL_MM]
     return sorted([own_mm, *others])
 
 
 class FocusTable:
-    """Traced refractions, and what lies between.
+    """Traced refractions and their interpolation.
 
     Parameters
     ----------
@@ -27,7 +28,8 @@ class FocusTable:
     accommodations_dpt : (m,)
         Ascending from 0.
     refractions_dpt : (n, m)
-        Least-squares M at 555 nm; where it no longer falls, the reach of a pupil ends.
+        Least-squares M at 555 nm; accommodation through a pupil ends where M no longer
+        falls.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class FocusTable:
         self._last: tuple[float, NDArray] = (0.0, np.zeros(0))
 
     def _at_pupil(self, pupil_mm: float) -> NDArray[np.float64]:
-        """Refractions (m,) at a pupil; of the last, which is asked of again, kept."""
+        """Return refractions (m,) at a pupil; cache those of the last pupil."""
         last = self._last
         if last[0] != pupil_mm:
             nodes, values = self._squares_mm2, self._refractions_dpt
@@ -50,7 +52,7 @@ class FocusTable:
         return last[1]
 
     def refraction_dpt(self, *, pupil_mm: float, accommodation_dpt: float) -> float:
-        """Refraction through a pupil at an accommodation."""
+        """Return the refraction through a pupil at an accommodation."""
         return float(
             _through(
                 self._accommodations_dpt,
@@ -61,7 +63,7 @@ class FocusTable:
         )
 
     def accommodation_dpt(self, *, pupil_mm: float, refraction_dpt: float) -> float:
-        """Accommodation within the table whose refraction is nearest to one."""
+        """Return the accommodation in the table with the nearest refraction."""
         found_dpt, used_dpt = self._falling(pupil_mm)
         wanted_dpt = min(max(refraction_dpt, found_dpt[-1]), found_dpt[0])
         shares = _barycentric_shares(found_dpt)
@@ -69,7 +71,7 @@ class FocusTable:
         return float(np.clip(inverse, used_dpt[0], used_dpt[-1]))
 
     def _falling(self, pupil_mm: float) -> tuple[NDArray, NDArray]:
-        """Refractions at a pupil as far as they fall, and their accommodations."""
+        """Return refractions at a pupil while they fall, and their accommodations."""
         found_dpt = self._at_pupil(pupil_mm)
         rises = np.flatnonzero(np.diff(found_dpt) >= 0.0)
         count = int(rises[0]) + 1 if rises.size else found_dpt.size
@@ -77,7 +79,7 @@ class FocusTable:
 
 
 def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
-    """Weights (n,) of the barycentric formula for nodes (n,)."""
+    """Return weights (n,) of the barycentric formula for nodes (n,)."""
     span = np.ptp(nodes) or 1.0  # so that many nodes do not overflow
     away = (nodes[:, None] - nodes[None]) * (4.0 / span)
     np.fill_diagonal(away, 1.0)
@@ -85,7 +87,7 @@ def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
 
 
 def _through(nodes: NDArray, values: NDArray, shares: NDArray, at: float):
-    """Value at a place of the polynomial through values (n, ...) at nodes (n,)."""
+    """Evaluate the polynomial through values (n, ...) at nodes (n,)."""
     away = at - nodes
     is_hit = np.abs(away) < 1e-12
     if is_hit.any():

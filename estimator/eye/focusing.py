@@ -1,8 +1,8 @@
-"""What any eye answers about focus and pupil: its reach, and what it cannot meet.
+"""Focus of any eye: accommodation, far and near point, and notes on their limits.
 
-Distances and refraction are counted in the plane of the entrance pupil.  Focus is a
-matter of the pupil too: spherical aberration moves the sharpest distance as the pupil
-opens, so every question names the pupil that it is asked at.
+Distances and refraction refer to the plane of the entrance pupil.  Focus depends on the
+pupil too: spherical aberration moves the sharpest distance as the pupil opens, so every
+method takes the pupil.
 """
 
 from abc import ABC, abstractmethod
@@ -13,29 +13,29 @@ from estimator.corrections.rings import Rings
 from estimator.optics.vergence import ObjectVergence
 
 OUT_OF_REACH_DPT = 0.01
-"""A request farther than this from what the eye can do is said to be out of reach.
+"""Distance from the eye's range beyond which a focus is reported as out of reach.
 
-As near as a traced eye comes to its prescription; nobody sees it, for through 6 mm it
-moves rays by 0.1 arcmin to either side.
+A traced eye matches its prescription to this.  It is invisible: through 6 mm it moves
+rays by 0.1 arcmin to either side.
 """
 
 RANGE_PUPIL_COUNT = 5
-"""Pupils of a range at which the accommodation for a focus is looked at: it changes
-slowly and smoothly with the pupil."""
+"""Number of pupils in a range at which the accommodation for a focus is evaluated: it
+changes slowly and smoothly with the pupil."""
 
 
 class Focusing(ABC):
-    """Accommodation of an eye, whatever its wavefronts come from.
+    """Accommodation of an eye, independent of the source of its wavefronts.
 
     Attributes
     ----------
     refraction_dpt : float
         Least-squares M at the cornea and 555 nm of the relaxed eye at the measured
-        pupil, through the worn correction: what one tells a person.
+        pupil, through the correction: the clinical refraction.
     amplitude_dpt : float
         Largest accommodation.
     vergence : ObjectVergence
-        From distances to vergences, through the worn correction.
+        Conversion of distances to vergences through the correction.
     """
 
     refraction_dpt: float
@@ -46,20 +46,20 @@ class Focusing(ABC):
     def refraction_at_dpt(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> float:
-        """Least-squares M at 555 nm in the plane of a pupil, at an accommodation."""
+        """Return least-squares M at 555 nm in a pupil's plane, at an accommodation."""
 
     @abstractmethod
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
+        """Return the accommodation in reach whose M at a pupil is nearest to this."""
 
     @abstractmethod
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
-        """Accommodation at which the nearest distance is seen through a pupil."""
+        """Return the accommodation for the near point through a pupil."""
 
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
-        """Accommodation at which a distance is sharpest through a pupil, in reach."""
+        """Return the accommodation in reach that makes a distance sharpest."""
         return self.accommodation_for_dpt(
             -self.vergence.vergence_dpt(focus_dpt),
             pupil_diameter_mm=pupil_diameter_mm,
@@ -68,7 +68,7 @@ class Focusing(ABC):
     def sharpest_dpt(
         self, accommodation_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Distance that is sharpest at an accommodation, through a pupil."""
+        """Return the sharpest distance at an accommodation, through a pupil."""
         return self.vergence.object_dpt(
             -self.refraction_at_dpt(
                 pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
@@ -78,14 +78,14 @@ class Focusing(ABC):
     def reachable_focus_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Distance, dpt, that is really sharpest when this one is asked for."""
+        """Return the reachable distance, dpt, nearest to the requested focus."""
         used_dpt = self.accommodation_dpt(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
         return self.sharpest_dpt(used_dpt, pupil_diameter_mm=pupil_diameter_mm)
 
     def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
-        """Far point and near point through a pupil, dpt."""
+        """Return far point and near point through a pupil, dpt."""
         largest_dpt = self.largest_accommodation_dpt(pupil_diameter_mm)
         far_dpt, near_dpt = (
             self.sharpest_dpt(used_dpt, pupil_diameter_mm=pupil_diameter_mm)
@@ -99,7 +99,7 @@ class Focusing(ABC):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> tuple[float, float]:
-        """Smallest and largest accommodation for ranges of focus and pupil."""
+        """Return smallest and largest accommodation for ranges of focus and pupil."""
         used_dpt = [
             self.accommodation_dpt(focus_dpt, pupil_diameter_mm=float(pupil_mm))
             for pupil_mm in np.linspace(*pupil_range_mm, RANGE_PUPIL_COUNT)
@@ -110,7 +110,7 @@ class Focusing(ABC):
     def focus_notes(
         self, focus_dpt: float, *, pupil_diameter_mm: float
     ) -> tuple[str, ...]:
-        """Say in words what of a focus distance this eye cannot meet."""
+        """Return notes on a focus distance that this eye cannot reach."""
         far_dpt, near_dpt = self.focus_limits_dpt(pupil_diameter_mm)
         if focus_dpt < far_dpt - OUT_OF_REACH_DPT:
             return (
@@ -134,16 +134,16 @@ class Focusing(ABC):
 
 
 class FocusingEye(Focusing):
-    """The same of an eye that knows its wavefronts up to some pupil.
+    """A `Focusing` eye whose wavefronts are known up to some pupil.
 
     Attributes
     ----------
     max_pupil_diameter_mm : float
-        Above it the pupil is capped.
+        Largest pupil; wider ones are capped.
     pupil_limit : str
-        What that pupil is: "measured" or "traced".
+        Origin of that limit: "measured" or "traced".
     rings : Rings or None
-        What makes several foci of it, where a worn lens does.
+        Rings of a multifocal correction, if one is worn.
     """
 
     max_pupil_diameter_mm: float
@@ -151,11 +151,11 @@ class FocusingEye(Focusing):
     rings: Rings | None = None
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Pupil asked for, capped where the eye knows no more."""
+        """Return the requested pupil, capped at the largest known one."""
         return min(pupil_diameter_mm, self.max_pupil_diameter_mm)
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say in words what of the request this eye cannot meet."""
+        """Return notes on parts of a request that this eye cannot meet."""
         usable_mm = self.usable_pupil_mm(pupil_diameter_mm)
         notes = self.focus_notes(focus_dpt, pupil_diameter_mm=usable_mm)
         if pupil_diameter_mm <= self.max_pupil_diameter_mm + 1e-9:

@@ -1,8 +1,8 @@
-"""The accommodating lens: other diameters of one lens at constant volume.
+"""The accommodating lens: changes of diameter at constant volume.
 
-The lens shrinks at constant volume, which steepens both surfaces (rule C); its anterior
-pole, and the stop with it, moves forward by the growth of the thickness before the
-equator, so the aqueous thins; the eye's length stays.
+The lens shrinks at constant volume, which steepens both surfaces (rule C).  Its
+anterior pole, and the stop with it, moves forward by the growth of the thickness before
+the equator, so the aqueous thins.  The eye length stays.
 """
 
 import math
@@ -19,7 +19,7 @@ from estimator.eye.lens_shape import (
 from estimator.eye.parameters import EyeParameters, column
 
 SMALLEST_DIAMETER_RATIO = 0.84
-"""Smallest lens diameter over the relaxed one.  The search of Csoba & Kunkli
+"""Ratio of the smallest lens diameter to the relaxed one.  The search of Csoba & Kunkli
 2023 stopped at 0.91, where most of its published targets lie."""
 
 SMALLEST_AQUEOUS_MM = 1.0
@@ -33,7 +33,7 @@ AQUEOUS = column("aqueous_thickness_mm")
 def accommodated_vectors(
     vector: NDArray[np.float64], *, lens_diameter_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Vectors (P, 45) of one relaxed eye with these lens diameters (P,)."""
+    """Return vectors (P, 45) of one relaxed eye with lens diameters (P,)."""
     lens_diameter_mm = np.atleast_1d(np.asarray(lens_diameter_mm, dtype=np.float64))
     vectors = np.repeat(vector[None], lens_diameter_mm.size, axis=0)
     return accommodated_eyes(vectors, lens_diameter_mm)
@@ -42,7 +42,7 @@ def accommodated_vectors(
 def accommodated_eyes(
     vectors: NDArray[np.float64], lens_diameter_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Relaxed eyes (P, 45) with other lens diameters (P,), their volumes kept."""
+    """Return eyes (P, 45) with other lens diameters (P,) at constant volume."""
     volume_mm3 = vectors[:, VOLUME]
     relaxed = lens_shape(diameter_mm=vectors[:, DIAMETER], volume_mm3=volume_mm3)
     shape = lens_shape(diameter_mm=lens_diameter_mm, volume_mm3=volume_mm3)
@@ -53,12 +53,12 @@ def accommodated_eyes(
 
 
 def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
-    """Return the same eye with another lens diameter, its volume kept.
+    """Return the same eye with another lens diameter at constant volume.
 
     Raises
     ------
     ValueError
-        A diameter that is not positive.
+        The diameter is not positive.
     """
     vectors = accommodated_vectors(
         parameters.to_vector(), lens_diameter_mm=lens_diameter_mm
@@ -71,11 +71,11 @@ def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
 
 
 def smallest_diameter_mm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lens diameters (...) to which relaxed eyes (..., 45) can shrink their lens.
+    """Return the smallest lens diameters (...) of relaxed eyes (..., 45).
 
-    `SMALLEST_DIAMETER_RATIO` of the relaxed one, or where the chamber is
-    `SMALLEST_AQUEOUS_MM` deep: the lens thickens before its equator by
-    c (1/D² - 1/D0²), c = 8 eta V tau / (pi (1 + tau)), see `lens_shape`.
+    The limit is `SMALLEST_DIAMETER_RATIO` of the relaxed diameter, or the diameter that
+    leaves the chamber `SMALLEST_AQUEOUS_MM` deep: the lens thickens before its equator
+    by c (1/D² - 1/D0²), c = 8 eta V tau / (pi (1 + tau)), see `lens_shape`.
     """
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     room_mm = np.maximum(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, 0.0)

@@ -1,7 +1,7 @@
 """Shape of the lens from its diameter and volume.
 
-Two conic caps that meet at the equator cannot hold a real lens: it has a thick rounded
-rim.  Both rules give the caps a share of the volume and the rim a thickness.
+Two conic caps that meet at the equator cannot represent a real lens, which has a thick
+rounded rim.  Both rules give the caps part of the volume and the rim a thickness.
 """
 
 import math
@@ -12,22 +12,22 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 HEIGHT_RATIO = 0.60
-"""Height of the anterior cap over that of the posterior one."""
+"""Ratio of the anterior cap's height to the posterior cap's."""
 
 CAP_VOLUME_RATIO = 0.677
-"""Share of the volume held by the two caps (rule C)."""
+"""Fraction of the volume in the two caps (rule C)."""
 
 RIM_THICKNESS_MM = 1.0
-"""Thickness between the two caps (rule C); with the above it gives Navarro's lens for
-a diameter of 9.5 mm and 157.5 mm³."""
+"""Thickness between the two caps (rule C); with the constants above it gives Navarro's
+lens for a diameter of 9.5 mm and 157.5 mm³."""
 
 ANTERIOR_THICKNESS_RATIO = HEIGHT_RATIO / (1.0 + HEIGHT_RATIO)
-"""Share of the thickness, rim included, that lies before the equator."""
+"""Fraction of the thickness, rim included, that lies before the equator."""
 
 
 @dataclass(frozen=True)
 class LensShape:
-    """Vertex radii and central thickness; arrays where the input was arrays."""
+    """Vertex radii and central thickness; arrays if the inputs were arrays."""
 
     anterior_radius_mm: float | NDArray[np.float64]
     posterior_radius_mm: float | NDArray[np.float64]
@@ -40,15 +40,16 @@ class LensShape:
 
 
 def lens_shape(*, diameter_mm: ArrayLike, volume_mm3: ArrayLike) -> LensShape:
-    """Rule C: paraboloid-equivalent volume; the conic constants only shape surfaces.
+    """Return the lens shape by rule C, the paraboloid-equivalent volume.
 
     h_A + h_P = 8 eta V / (pi D²), R_P = -pi D⁴ (1 + tau) / (64 eta V), R_A = -R_P / tau
-    with tau = h_A / h_P.  Always feasible and monotone in D.
+    with tau = h_A / h_P.  It is always feasible and monotonic in D.  The conic
+    constants shape only the surfaces.
 
     Raises
     ------
     ValueError
-        A diameter or volume that is not positive.
+        A diameter or volume is not positive.
     """
     diameter_mm = np.asarray(diameter_mm, dtype=np.float64)[()]
     volume_mm3 = np.asarray(volume_mm3, dtype=np.float64)[()]
@@ -76,9 +77,9 @@ def compat_lens_shape(
     anterior_conic_constant: float,
     posterior_conic_constant: float,
 ) -> LensShape:
-    """Rule A, of the published data sets: for comparison with their tables only.
+    """Return the lens shape by rule A, for comparison with published tables only.
 
-    Its cap volume has a sign slip for hyperboloids, kept here on purpose.
+    Its cap volume has a sign error for hyperboloids, kept here on purpose.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def compat_lens_shape(
 def _compat_cap_height_mm(
     volume_mm3: float, *, conic_constant: float, diameter_mm: float
 ) -> float:
-    """Height h of a cap with V = (pi/8) D² h (5 b h² + .75 D²)/(6 b h² + .75 D²)."""
+    """Solve V = (pi/8) D² h (5 b h² + .75 D²)/(6 b h² + .75 D²) for the height h."""
     b = 1.0 + conic_constant
     square = 0.75 * diameter_mm**2
 

@@ -1,8 +1,8 @@
-"""The 45 parameters of the eye: names, order, ranges, and the population behind them.
+"""The 45 parameters of the eye: names, order, ranges and population statistics.
 
-Order and ranges are those of the paper's networks (Csoba & Kunkli 2023, Table 2): any
-array of 45 in this project is in this order.  Axes are the project's: x to the person's
-right, y up, z into the eye; the paper's y and z are our x and y.
+Order and ranges are those of the paper's networks (Csoba & Kunkli 2023, Table 2); every
+array of 45 parameters in this project has this order.  Axes are the project's: x to the
+person's right, y up, z into the eye; the paper's y and z are our x and y.
 """
 
 from collections.abc import Mapping
@@ -20,30 +20,30 @@ from estimator.optics.zernike import N_TERMS, nm_from_index
 N_PARAMETERS = 45
 
 OFFSET_RADIUS_MM = 6.2
-"""Radius of the disc on which the corneal offset terms are defined."""
+"""Radius of the disk on which the corneal offset terms are defined."""
 
 
 class Parameter(NamedTuple):
-    """One row of the table; every number is in the unit that ends ``name``."""
+    """One row of the table; every number has the unit that ends ``name``."""
 
     name: str
     sampled: tuple[float, float]
-    """Range random eyes are drawn from (the paper's Table 2)."""
+    """Range from which random eyes are drawn (the paper's Table 2)."""
     allowed: tuple[float, float]
-    """Range a profile may give and estimation stays in."""
+    """Allowed range of profiles and of the estimation."""
     mean: float
-    """Of the population, after Csoba & Kunkli 2023."""
+    """Population mean, after Csoba & Kunkli 2023."""
     deviation: float
     """Standard deviation of the prior: the earlier work's dead zone, or the spread of
-    eyes where that is wider; small for the corneal rotations, which the offsets can
-    stand in for, so that no eye is turned far without need."""
+    eyes where that is wider.  It is small for the corneal rotations, which the offsets
+    can replace, so that no eye is rotated far without need."""
     means: str
 
 
 _OFFSETS_BY_ORDER = {
     # order: (sampled, allowed, deviation), mm.  Deviations are a third of the range.
     # Measured high orders come from the middle 3 to 5 mm of the cornea, so on the wide
-    # disc of the offsets they need more room than the published sampling gives them.
+    # disk of the offsets they need a larger range than the published sampling.
     1: (0.10, 0.12, 0.033),
     2: (0.10, 0.12, 0.033),
     3: (0.06, 0.10, 0.020),
@@ -54,7 +54,7 @@ _OFFSETS_BY_ORDER = {
 
 
 def offset_name(index: int) -> str:
-    """Name of the corneal offset with OSA index ``index`` (1 to 27)."""
+    """Return the name of the corneal offset with OSA index ``index`` (1 to 27)."""
     return f"cornea_offset_j{index}_mm"
 
 
@@ -116,7 +116,7 @@ PARAMETERS: tuple[Parameter, ...] = (
 
 PARAMETER_NAMES = tuple(row.name for row in PARAMETERS)
 OFFSET_SLICE = slice(9, 36)
-"""Where the 27 offsets lie in the vector."""
+"""Slice of the 27 offsets in the vector."""
 
 
 @cache
@@ -125,30 +125,30 @@ def _columns() -> dict[str, int]:
 
 
 def column(name: str) -> int:
-    """Position of a parameter in the vector."""
+    """Return the position of a parameter in the vector."""
     if name not in _columns():
         raise ValueError(f"eye parameter '{name}': allowed are {PARAMETER_NAMES}")
     return _columns()[name]
 
 
 def sampled_ranges() -> NDArray[np.float64]:
-    """Ranges of the paper's Table 2, (45, 2)."""
+    """Return the ranges of the paper's Table 2, (45, 2)."""
     return np.array([row.sampled for row in PARAMETERS])
 
 
 def allowed_ranges() -> NDArray[np.float64]:
-    """Ranges that profiles and estimation keep to, (45, 2)."""
+    """Return the allowed ranges of profiles and estimation, (45, 2)."""
     return np.array([row.allowed for row in PARAMETERS])
 
 
 def mean_vector() -> NDArray[np.float64]:
-    """Vector of the mean eye, (45,)."""
+    """Return the vector of the mean eye, (45,)."""
     return np.array([row.mean for row in PARAMETERS])
 
 
 @dataclass(frozen=True, eq=False)
 class EyeParameters:
-    """One relaxed eye; see `PARAMETERS` for what each number is.
+    """Parameters of one relaxed eye, described in `PARAMETERS`.
 
     ``cornea_offset_mm`` (28,) holds the offset of OSA index j at j; its element 0, the
     corneal apex itself, is zero.
@@ -181,7 +181,7 @@ class EyeParameters:
         Raises
         ------
         ValueError
-            Not 45 finite numbers.
+            The vector is not 45 finite numbers.
         """
         vector = np.asarray(vector, dtype=np.float64)
         if vector.shape != (N_PARAMETERS,) or not np.all(np.isfinite(vector)):
@@ -195,7 +195,7 @@ class EyeParameters:
 
     @classmethod
     def mean_eye(cls) -> "EyeParameters":
-        """Mean of the population, without any offset."""
+        """Return the population's mean eye, without any offset."""
         return cls.from_vector(mean_vector())
 
     def to_vector(self) -> NDArray[np.float64]:
@@ -215,12 +215,12 @@ class EyeParameters:
 
 
 def parse_parameters(data: object, *, path: str = "parameters.") -> EyeParameters:
-    """Read parameters by name; offsets that are left out are zero.
+    """Parse parameters by name; omitted offsets are zero.
 
     Raises
     ------
     ProfileError
-        Names the parameter, the bad value and its allowed range.
+        A parameter is invalid; the error names it, its value and the allowed range.
     """
     data = profile_fields.mapping(data, path.rstrip("."))
     for name in data:
@@ -242,14 +242,14 @@ def parse_parameters(data: object, *, path: str = "parameters.") -> EyeParameter
 
 
 def random_vectors(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Vectors (count, 45) drawn uniformly and independently from Table 2."""
+    """Draw vectors (count, 45) uniformly and independently from Table 2."""
     low, high = sampled_ranges().T
     return rng.uniform(low, high, size=(count, N_PARAMETERS))
 
 
 @dataclass(frozen=True)
 class RetinaShape:
-    """Conicoid instead of the sphere of radius eye length / 2, pole on the axis.
+    """Conicoid that replaces the sphere of radius eye length / 2, pole on the axis.
 
     ``radius_mm`` is the (positive) vertex radius; an ellipsoid with semi-axes a along
     the axis and b across has radius b²/a and conic constant b²/a² - 1, negative where
@@ -261,7 +261,7 @@ class RetinaShape:
 
 
 def parse_retina(data: Mapping) -> RetinaShape | None:
-    """Read the optional ``retina`` of a profile."""
+    """Parse the optional ``retina`` of a profile."""
     if data.get("retina") is None:
         return None
     body = profile_fields.mapping(data["retina"], "retina")

@@ -1,9 +1,10 @@
 """Traced coefficients and refractions of many parameter vectors at once.
 
-On axis, coefficients are those on the given circle outside the eye, filled whatever
-the stop: what an aberrometer measures.  Off axis, the model's stop is the measured
-entrance pupil over its magnification, the fit is that of the part of the circle which
-the projected pupil fills, and the set is rescaled from that circle to the measured one.
+On axis, coefficients are those on the given circle outside the eye, filled regardless
+of the stop, as an aberrometer measures them.  Off axis, the model's stop is the
+measured entrance pupil divided by its magnification, the fit covers the part of the
+circle that the projected pupil fills, and the coefficients are rescaled from that
+circle to the measured one.
 """
 
 import numpy as np
@@ -26,17 +27,17 @@ from estimator.wavefront.kernels import magnifications
 from estimator.wavefront.pupil_refraction import pupil_refraction_dpt
 
 OPEN_RATIO = 0.999
-"""Share of the stop from which a pupil counts as open."""
+"""Fraction of the stop above which a pupil counts as open."""
 
 MEDIA_INWARDS = ("air", "cornea", "aqueous", "lens", "vitreous")
 
 
 class TraceFailed(ValueError):
-    """Light does not pass this eye as asked."""
+    """Light does not pass this eye as requested."""
 
 
 def eye_indices(wavelength_nm: float) -> NDArray[np.float64]:
-    """Refractive indices (5,) from air inwards."""
+    """Return refractive indices (5,) from air inward."""
     return np.array([float(refractive_index(m, wavelength_nm)) for m in MEDIA_INWARDS])
 
 
@@ -50,11 +51,12 @@ def zernike_of_vectors(
     v_deg: float = 0.0,
     at_pupil: bool = False,
 ) -> NDArray[np.float64]:
-    """Coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
+    """Return coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
 
-    They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray;
-    object at infinity; a row is nan where light does not pass.  The circle lies at the
-    cornea, or, on axis, in the plane of each eye's own entrance pupil.
+    They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray,
+    for an object at infinity; a row is NaN where light does not pass.  The circle lies
+    at the cornea or, on axis with ``at_pupil``, in the plane of each eye's own entrance
+    pupil.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(wavelength_nm)
@@ -95,7 +97,10 @@ def refraction_of_vectors(
     retina: RetinaShape | None = None,
     at_pupil: bool = False,
 ) -> NDArray[np.float64]:
-    """Least-squares M (P,), dpt, from C(2,0) on the pupil's circle; nan as above."""
+    """Return least-squares M (P,), dpt, from C(2,0) on the pupil's circle.
+
+    It is NaN where light does not pass.
+    """
     zernike_um = zernike_of_vectors(
         vectors,
         pupil_diameter_mm=pupil_diameter_mm,
@@ -114,15 +119,15 @@ def seen_refraction_of_vectors(
     added_um: NDArray[np.float64] | float = 0.0,
     retina: RetinaShape | None = None,
 ) -> NDArray[np.float64]:
-    """M (P,), dpt, on axis and at 555 nm over the light in each eye's entrance pupil.
+    """Return M (P,), dpt, on axis at 555 nm over the light in each entrance pupil.
 
-    The circle of ``pupil_diameter_mm``, one or (P,), is circumscribed about the pupil;
-    nan where light does not pass all of that.
+    The circle of ``pupil_diameter_mm``, one or (P,), is circumscribed about the pupil.
+    M is NaN where light does not pass all of the pupil.
 
     Parameters
     ----------
     added_um : (P, 28), um/mm^degree
-        Wavefront beside that of the eye.
+        Wavefront added to that of the eye.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(REFERENCE_WAVELENGTH_NM)
@@ -149,7 +154,7 @@ def on_axis_zernike_um(
     wavelength_nm: float,
     retina: RetinaShape | None = None,
 ) -> NDArray[np.float64]:
-    """Coefficients (28,), um, of one eye on axis, on the circle of the pupil.
+    """Return coefficients (28,), um, of one eye on axis, on the circle of the pupil.
 
     Raises
     ------

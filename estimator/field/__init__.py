@@ -1,21 +1,21 @@
-"""An eye over its whole visual field, as the PSF cache asks for it.
+"""Wavefronts of an eye over its whole visual field, the input of the PSF cache.
 
-eye_optics       what the cache asks of any eye
+eye_optics       interface between the PSF cache and any eye
 aberration_grid  wavefronts traced at the nodes of a grid
-network_grid     the same by network
-few_colors       one wavelength traced, the others beside it
-grid_source      which of the two, by cost and error
-interpolation    between the nodes
-peripheral_rest  what people's periphery has beyond the model's
-trace_range      what of the field is traced
+network_grid     the same grid computed by network
+few_colors       one wavelength traced densely, the others sparsely
+grid_source      choice between tracing and network, by cost and error
+interpolation    interpolation between the nodes
+peripheral_rest  difference between people's periphery and the model's
+trace_range      traced part of the field
 traced_fields    fixed fields, changing pupil and focus
-fixed_defocus    their defocus alone
-defocus_loops    its compiled loop
+fixed_defocus    total defocus at fixed fields
+defocus_loops    compiled loop of fixed_defocus
 traced_eye       an estimated eye, ray-traced over the field
-prepare          from a profile to such an eye: the entry
-field_table      its wavefronts in many directions, as an instrument gives them
-plot             maps of them
-notes            what is said of how it was made
+prepare          entry point: from a profile to such an eye
+field_table      wavefronts in many directions, as an instrument reports them
+plot             maps of a field table
+notes            notes on how an eye was computed
 """
 
 import lazy_loader

@@ -1,8 +1,9 @@
-"""Total defocus of fixed fields, state after state: a compiled loop over them.
+"""Compiled loop for the total defocus of fixed fields, one state after the other.
 
-Only that number is asked for, once a frame whose pupil or focus has changed, so that
-of the 28 monomials three sums by degree are carried along, and rims for the circle.
-The same in numpy, of whole wavefronts, is `TracedFields.wavefronts`.
+It runs once for every frame whose pupil or focus has changed, and total defocus is all
+that it needs.  So it carries three sums by degree instead of the 28 monomials, and
+rims for the circle.  `TracedFields.wavefronts` does the same in NumPy for complete
+wavefronts.
 """
 
 import math
@@ -19,7 +20,7 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 N_DEGREES = 3
-"""Degrees 2, 4 and 6: no others have a C(2,0)."""
+"""Degrees 2, 4 and 6: no others contribute to C(2,0)."""
 
 _ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -29,7 +30,7 @@ _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @njit(**_OPTIONS)
 def weights_at(nodes, at):
-    """Weights (n,) of the polynomial through nodes (n,), as `lagrange_weights` has."""
+    """Return Lagrange weights (n,) of the polynomial through nodes (n,)."""
     weights = np.ones(nodes.size)
     for i in range(nodes.size):
         for j in range(nodes.size):
@@ -40,7 +41,7 @@ def weights_at(nodes, at):
 
 @njit(**_OPTIONS)
 def all_weights(nodes, at):
-    """Weights (n, n_nodes) at places (n,)."""
+    """Return Lagrange weights (n, n_nodes) at positions (n,)."""
     weights = np.empty((at.size, nodes.size))
     for n in range(at.size):
         weights[n] = weights_at(nodes, at[n])
@@ -49,21 +50,22 @@ def all_weights(nodes, at):
 
 @njit(**_OPTIONS)
 def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
-    """Total defocus (n,), dpt, of fields and wavelengths at one pupil and focus.
+    """Compute total defocus (n,), dpt, of fields and wavelengths in one state.
 
     Parameters
     ----------
     pupil_mm : float
     field, axis : (nodes_mm, powers, used, values)
-        Of the field's grid and of the one that holds the axis: pupils (n_pupils,),
-        powers (8,) that sums and rims go with, weights (n_accommodations,) of this
+        Grids of the field and of the axis: pupils (n_pupils,), powers (8,) of the
+        pupil by which sums and rims change, weights (n_accommodations,) of this
         focus, and values (n_fields, n_channels, n_pupils, n_accommodations, 8).
     state : (number, channel, open_mm)
-        Per field asked for: its index, its wavelength's, and the pupil that light
-        passes, mm.
+        For each requested field: its index, the index of its wavelength, and the
+        open pupil, mm.
     added : (always, fading, fading_mm, stretched, stretched_mm)
-        Sums (n, 3) that are added: as they are; where pupils are smaller than one,
-        less of it beyond; and as a phase that stops growing as a square beyond another.
+        Sums (n, 3) to add: unchanged; reduced in pupils beyond the radius
+        ``fading_mm``; and as a phase that grows only as the square beyond the radius
+        ``stretched_mm``.
     """
     number, channel, open_mm = state
     always, fading, fading_mm, stretched, stretched_mm = added
@@ -95,7 +97,7 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
 
 @njit(**_OPTIONS)
 def _scales(pupil_mm, axis):
-    """Pupil over the traced one (n_channels,), on the axis."""
+    """Return ratios (n_channels,) of the pupil to the traced one, on the axis."""
     values, share = np.empty(N_DEGREES + N_RIM), np.empty(N_DEGREES + N_RIM)
     scale = np.empty(axis[3].shape[1])
     lower = _shares(pupil_mm, axis, share)
@@ -108,7 +110,7 @@ def _scales(pupil_mm, axis):
 
 @njit(**_OPTIONS)
 def _shares(pupil_mm, grid, share):
-    """Index of the lower pupil; fills in the shares (8,) of the one above it."""
+    """Return the index of the lower pupil; fill in weights (8,) of the next one."""
     nodes_mm, powers = grid[0], grid[1]
     share[:] = 0.0
     if nodes_mm.size == 1:
@@ -125,7 +127,7 @@ def _shares(pupil_mm, grid, share):
 
 @njit(**_OPTIONS)
 def _between(number, channel, grid, lower, share, found):
-    """Fill in sums and rim (8,) between pupils and accommodations."""
+    """Interpolate sums and rim (8,) between pupils and accommodations."""
     used, values = grid[2], grid[3]
     upper = min(lower + 1, values.shape[2] - 1)
     for k in range(found.size):
@@ -138,7 +140,7 @@ def _between(number, channel, grid, lower, share, found):
 
 @njit(**_OPTIONS)
 def _scale_rim(values, pupil_mm, scale):
-    """Rims are stored over the pupil, their centre over its square."""
+    """Scale a rim, stored relative to the pupil (its center, to the square)."""
     for k in range(N_DEGREES, N_DEGREES + N_RIM):
         values[k] *= pupil_mm * scale
         if k < N_DEGREES + 2:
@@ -147,7 +149,7 @@ def _scale_rim(values, pupil_mm, scale):
 
 @njit(**_OPTIONS)
 def _circumscribed_mm(rim):
-    """Radius of the circle about the chief ray: as `circumscribed_radius_mm`."""
+    """Return the circle's radius about the chief ray, as `circumscribed_radius_mm`."""
     x, y, xx, xy, yy = rim
     sampled, angle = -1.0, 0.0
     for k in range(N_SAMPLED):

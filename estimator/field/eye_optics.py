@@ -1,4 +1,4 @@
-"""What the PSF cache asks of an eye, whether a wavefront or a ray-traced model."""
+"""Interface between the PSF cache and an eye: a wavefront or a ray-traced model."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -14,45 +14,44 @@ from estimator.wavefront.field_wavefronts import FieldWavefronts
 class EyeOptics(Protocol):
     """Wavefronts over field, pupil, accommodation, wavelength and defocus.
 
-    Wavefronts are those in the plane of the entrance pupil.  There object distance adds
+    Wavefronts are given in the plane of the entrance pupil.  There object distance adds
     its vergence to the total defocus, so a PSF depends on it through that sum alone.
 
-    Every array of states may have any shape that broadcasts with the others: fields
-    ``h_deg`` and ``v_deg``, the entrance pupil's diameter in mm, accommodation in dpt,
-    the wavelength in nm.  An eye that was traced for a range raises ValueError where a
-    state lies outside of it.
+    The arrays of a state broadcast with each other: field angles ``h_deg`` and
+    ``v_deg``, entrance pupil diameter in mm, accommodation in dpt, wavelength in nm.
+    An eye that was traced for a range raises ValueError for a state outside it.
     """
 
     @property
     def eye_side(self) -> str:
-        """OD or OS, which decides where cones see the pupil brightest."""
+        """OD or OS, which sets the center of the Stiles-Crawford effect."""
 
     @property
     def vergence(self) -> ObjectVergence:
-        """From object distances to vergences, through the worn correction."""
+        """Conversion of object distances to vergences through the correction."""
 
     @property
     def rings(self) -> Rings | None:
-        """What makes several foci of it, where a worn lens does."""
+        """Rings of a multifocal correction, if one is worn."""
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Pupil diameter asked for, mm, capped where the eye knows no more."""
+        """Return the requested pupil diameter, mm, capped at the eye's known pupil."""
 
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
-        """Accommodation at which a distance, dpt, is sharpest through a pupil."""
+        """Return the accommodation at which a distance is sharpest through a pupil."""
 
     def sharpest_dpt(
         self, accommodation_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Distance that is sharpest at an accommodation, through a pupil, dpt."""
+        """Return the sharpest distance, dpt, at an accommodation through a pupil."""
 
     def reachable_focus_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Distance that is then really sharpest, dpt: the eye's reach has ends."""
+        """Return the reachable distance, dpt, nearest to the requested focus."""
 
     def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
-        """Far point and near point through a pupil, dpt."""
+        """Return far point and near point through a pupil, dpt."""
 
     def accommodation_range_dpt(
         self,
@@ -60,10 +59,10 @@ class EyeOptics(Protocol):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> tuple[float, float]:
-        """Smallest and largest accommodation for ranges of focus and pupil."""
+        """Return smallest and largest accommodation for ranges of focus and pupil."""
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Say what of a request cannot be met, in sentences; empty where all can."""
+        """Return a sentence for each part of a request that cannot be met."""
 
     def accommodation_nodes_dpt(
         self,
@@ -71,7 +70,7 @@ class EyeOptics(Protocol):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
-        """Accommodations (n,), dpt, ascending, between which wavefronts are blended."""
+        """Return ascending accommodations (n,), dpt, between which to blend."""
 
     def total_defocus_dpt(
         self,
@@ -82,32 +81,33 @@ class EyeOptics(Protocol):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Least-squares refraction for an object at infinity, dpt, broadcast shape.
+        """Return the least-squares refraction, dpt, for an object at infinity.
 
-        On the circle about the pupil, worn correction included.
+        It has the broadcast shape and holds on the circle about the pupil, correction
+        included.
 
         Raises
         ------
         ValueError
-            A state outside of what is known of the eye.
+            A state is outside the eye's known range.
         """
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., NDArray[np.float64]]:
-        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+        """Return `total_defocus_dpt` at fixed fields as a function of the eye's state.
 
         Returns
         -------
         callable
-            From ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers, to dpt
-            in the broadcast shape of the fields and wavelengths.
+            Function of ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers,
+            that returns dpt in the broadcast shape of the fields and wavelengths.
 
         Raises
         ------
         ValueError
-            A field or wavelength outside of what is known; the callable, for a pupil or
-            accommodation.
+            A field or wavelength is outside the known range; the callable raises it
+            for a pupil or accommodation.
         """
 
     def chief_ray_shift_mrad(
@@ -118,12 +118,12 @@ class EyeOptics(Protocol):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Lateral colour against 555 nm along the pupil axes, (..., 2), mrad.
+        """Return the lateral color against 555 nm along the pupil axes, (..., 2), mrad.
 
         Raises
         ------
         ValueError
-            A state outside of what is known of the eye.
+            A state is outside the eye's known range.
         """
 
     def wavefronts(
@@ -136,33 +136,33 @@ class EyeOptics(Protocol):
         wavelength_nm: ArrayLike,
         total_defocus_dpt: ArrayLike,
     ) -> FieldWavefronts:
-        """Wavefronts (P,) with the given total defocus, in C order of the broadcast.
+        """Return wavefronts (P,) with the given total defocus, in C order of states.
 
         Parameters
         ----------
         total_defocus_dpt : array
-            Of eye and object together; it replaces the eye's own.
+            Defocus of eye and object together; it replaces the eye's own.
 
         Raises
         ------
         ValueError
-            A state outside of what is known of the eye.
+            A state is outside the eye's known range.
         """
 
     def wavefronts_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., FieldWavefronts]:
-        """`wavefronts` at fixed fields and wavelengths (n,), many states of the eye.
+        """Return `wavefronts` at fixed fields (n,) as a function of the eye's state.
 
         Returns
         -------
         callable
-            From ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers, and
-            ``total_defocus_dpt`` (m, n) to wavefronts (m n,).
+            Function of ``pupil_diameter_mm`` and ``accommodation_dpt``, both numbers,
+            and ``total_defocus_dpt`` (m, n) that returns wavefronts (m n,).
 
         Raises
         ------
         ValueError
-            A field or wavelength outside of what is known; the callable, for a pupil or
-            accommodation.
+            A field or wavelength is outside the known range; the callable raises it
+            for a pupil or accommodation.
         """

@@ -1,8 +1,8 @@
-"""Wavefronts over the field of which one wavelength is traced everywhere.
+"""Wavefronts over the field, with only one wavelength traced at every node.
 
 Colors differ from each other far less than the wavefront changes over the field, and
-more smoothly.  So the others are traced at fewer fields and accommodations, and their
-difference from that one is interpolated.
+more smoothly.  So the other wavelengths are traced at fewer fields and accommodations,
+and their difference from the first one is interpolated.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from estimator.field.trace_range import share_of
 from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
 
 FIELD_RATIO = 0.7
-"""Field nodes of the other colors along each axis, of those of the first: 7 x 6 of
-10 x 8.  Wavefronts at random places are then within 0.98e-3 um of traced ones (rms,
-emmetropia, 5 mm) instead of 0.95e-3, with 6 x 5 within 1.2e-3."""
+"""Ratio of the other colors' field nodes to those of the first, along each axis:
+7 x 6 for 10 x 8.  Wavefronts at random fields are then within 0.98e-3 um of traced ones
+(RMS, emmetropia, 5 mm) instead of 0.95e-3; with 6 x 5, within 1.2e-3."""
 
 FEW_ACCOMMODATIONS = 3
-"""Of the other colors at most; with two it is 2.1e-3 um."""
+"""Largest number of accommodations of the other colors; two give 2.1e-3 um."""
 
 FIRST_SHARE = 0.6
-"""Of the time that the first color takes."""
+"""Fraction of the time that the first color takes."""
 
 COLOR_AXIS = {"chief_shift_mrad": 3}
-"""Of a grid's array, where it is not the fifth."""
+"""Color axis of a grid's array, where it is not the fifth axis."""
 
 
 def few_colors_grid(
@@ -51,9 +51,9 @@ def few_colors_grid(
     progress: Callable[[float], None] | None = None,
     **sampling: ArrayLike,
 ) -> AberrationGrid:
-    """Return what `aberration_grid` does, in about half the time.
+    """Return the grid of `aberration_grid` in about half the time.
 
-    Where light does not pass everywhere, every color is traced at every node.
+    If any node is vignetted, every color is traced at every node.
 
     Parameters
     ----------
@@ -63,16 +63,17 @@ def few_colors_grid(
     wavelengths_nm : (n_wavelengths,)
         Ascending; the middle one is traced at every node.
     states : (n_accommodations,)
-        The eye at each accommodation.
+        Eye at each accommodation.
     progress : callable, optional
-        Called with a fraction after each accommodation; may raise to cancel.
+        Callback with the completed fraction after each accommodation; may raise to
+        cancel.
     **sampling
         Pupils and rays, see `aberration_grid`.
 
     Raises
     ------
     ValueError
-        Values out of range, or an eye that cannot be traced.
+        Values are out of range, or the eye cannot be traced.
     """
     nm, used_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
     place = {"h_deg": np.atleast_1d(h_deg), "v_deg": np.atleast_1d(v_deg)}
@@ -117,7 +118,7 @@ def _passes(grid: AberrationGrid) -> bool:
 
 
 def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
-    """Other colors at the nodes of the first, from few nodes."""
+    """Interpolate the other colors from few nodes to the nodes of the first."""
     to_coarse, to_all = (
         [
             lagrange_weights(transformed(nodes), transformed(at))
@@ -149,7 +150,7 @@ def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
 def _moved(
     values: NDArray[np.float64], weights: list[NDArray[np.float64]], axis: int
 ) -> NDArray[np.float64]:
-    """Values [h, v, ...] at other nodes of field and of accommodation, an axis."""
+    """Interpolate values [h, v, ...] to other nodes of field and accommodation."""
     for along, own in zip((0, 1, axis), weights, strict=True):
         values = np.moveaxis(np.tensordot(own, values, (1, along)), 0, along)
     return values

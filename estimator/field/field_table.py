@@ -1,4 +1,4 @@
-"""The wavefronts of a profile's eye in many directions, as an instrument gives them."""
+"""Wavefronts of a profile's eye in many directions, as an instrument reports them."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 RELAXED_DPT = -60.0
-"""A distance that no eye accommodates for."""
+"""Distance at which every eye is relaxed."""
 
 LEAST_EXTENT_DEG = 1.0
-"""Half extent of the traced field about the axis, whatever is asked for."""
+"""Smallest half extent of the traced field about the axis."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,12 @@ class FieldTable:
     ----------
     h_deg, v_deg : (n,)
     zernike_um : (n, 28)
-        At the cornea, on circles about the chief ray, see ``zernike_radius_mm`` (n,).
+        Coefficients at the cornea, on circles about the chief ray of radius
+        ``zernike_radius_mm`` (n,).
     power_dpt : (n, 3)
-        M, J0 and J45 of those.
+        M, J0 and J45 of these wavefronts.
     pupil_ellipse : (n, 5)
-        Pupil within the circle: centre x, y and semi-axes, mm, and angle, rad.
+        Pupil within the circle: center x, y and semi-axes, mm, and angle, rad.
     notes : tuple of str
     """
 
@@ -61,12 +62,12 @@ def field_table(
     Parameters
     ----------
     focus_dpt : float, optional
-        Distance made sharpest; relaxed where None.
+        Sharpest distance; the eye is relaxed if None.
 
     Raises
     ------
     ValueError
-        Light does not pass the eye, or the pupil is wider than it lets through.
+        Light does not pass the eye, or not through a pupil this wide.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
@@ -91,7 +92,8 @@ def field_table(
     }
     found = eye.wavefronts(**states, total_defocus_dpt=eye.total_defocus_dpt(**states))
     radius_mm = found.circle_diameter_mm / 2.0
-    # Frames need wavefronts in the entrance pupil; instruments tell them at the cornea.
+    # Frames need wavefronts in the entrance pupil; instruments report them at the
+    # cornea.
     at_cornea_um = moved_polynomial(
         polynomial_in_mm(found.zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
     )

@@ -1,6 +1,6 @@
 """Total defocus of a traced eye at fixed fields, as pupil and focus change.
 
-What depends on field and wavelength alone is summed up once; see `defocus_loops`.
+Terms that depend only on field and wavelength are summed once; see `defocus_loops`.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from estimator.periphery.meridian import CIRCLE_MM
 from estimator.wavefront.field_wavefronts import DEGREE
 
 DEGREES = (2, 4, 6)
-"""Of monomials that have a C(2,0)."""
+"""Degrees of the monomials that contribute to C(2,0)."""
 
 
 class FixedDefocus:
@@ -24,16 +24,17 @@ class FixedDefocus:
     Parameters
     ----------
     field, on_axis : (FieldInterpolation, FieldValues)
-        Over the field, and on the axis at the same wavelengths.
+        Wavefronts over the field, and on the axis at the same wavelengths.
     rest : MeasuredRest
+        Residual of the estimated eye.
     left_share : (n,)
-        Of its residue.
+        Fraction of the residual to add.
     people_um : (n, 28), optional
-        What people's periphery adds.
+        Phase of people's periphery.
     added_um : (n, 28)
-        What is added at any pupil.
+        Phase added at any pupil.
     open_mm : (n,), optional
-        Pupils that light passes; all where it is None.
+        Open pupils; unlimited if None.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class FixedDefocus:
     def at(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> NDArray[np.float64]:
-        """Least-squares refraction (n,), dpt, on the pupil's circle."""
+        """Return the least-squares refraction (n,), dpt, on the pupil's circle."""
         from estimator.field.defocus_loops import fill_defocus
 
         found_dpt = np.empty(self._state[0].size)
@@ -77,7 +78,7 @@ class FixedDefocus:
 
 
 class _Grid:
-    """A grid's nodes, and its values as sums by degree and rims."""
+    """Nodes of a grid, and its values as sums by degree and rims."""
 
     def __init__(self, interpolation: FieldInterpolation, values: FieldValues):
         self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
@@ -89,7 +90,7 @@ class _Grid:
         self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
 
     def used_at(self, accommodation_dpt: float) -> tuple:
-        """Return what the loop takes of it, at an accommodation."""
+        """Return the loop's inputs from this grid at an accommodation."""
         from estimator.field.defocus_loops import weights_at
 
         used = weights_at(self._accommodations_dpt, float(accommodation_dpt))
@@ -97,7 +98,7 @@ class _Grid:
 
 
 def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what monomials (..., 28) of a degree add to C(2,0) on a circle of 1 mm."""
+    """Return the C(2,0) on a 1 mm circle from monomials (..., 28), by degree."""
     share = np.linalg.inv(monomial_matrix())[:, C20] * polynomial_um
     sums = [share[..., DEGREE == degree].sum(axis=-1) for degree in DEGREES]
     return np.stack(sums, axis=-1)

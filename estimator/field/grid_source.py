@@ -1,7 +1,7 @@
-"""Where an eye's aberration grids come from: ray tracing, networks, or what is best.
+"""Source of an eye's aberration grids: ray tracing, network, or the cheaper one.
 
 Tracing is exact and costs about the same for any node; a network costs next to nothing
-and has an error.  Which one pays is decided by measured costs, here and nowhere else.
+and has an error.  The choice is made here only, from measured costs.
 """
 
 import time
@@ -25,33 +25,33 @@ from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 CHOICES = ("network", "cheaper", "traced")
 
 TRACED_MS_PER_RAY = 2.4e-3
-"""Of one node on one core, for each ray through its stop: 0.082 to 0.088 ms a node over
-the field with 70 rays and two cores (emmetropia, myopia, keratoconus).  On the axis,
-with 192 rays and few nodes, 0.36 ms, half as much again.  Another machine's times are
-scaled by `machine_speed`."""
+"""Time to trace one node on one core, for each ray through its stop: 0.082 to 0.088 ms
+a node over the field with 70 rays and two cores (emmetropia, myopia, keratoconus).  On
+the axis, with 192 rays and few nodes, it is 0.36 ms, half as much again.
+`machine_speed` scales these times to other machines."""
 
 NETWORK_MS, NETWORK_MS_PER_WEIGHT = 30e-3, 3.2e-8
-"""Of one node by network, likewise: chief rays, checks and columns; and for each
-weight: with two cores the network of 1.0 million weights takes 16 us a node, a grid of
-1,920 nodes 31 us.  (With Mish of onnx's own Softplus, layers of 1.23 million took 70 us
-instead of 19.)"""
+"""Time of one node by network on one core: for chief rays, checks and columns, and for
+each weight.  With two cores the network of 1.0 million weights takes 16 us a node, a
+grid of 1,920 nodes 31 us.  (With Mish built from ONNX's own Softplus, layers of
+1.23 million weights took 70 us instead of 19.)"""
 
 LEAST_GAIN_MS = 100.0
 """Time that a network must save for a grid that need not be exact: a tenth of the
-second in which a new eye should be seen."""
+one-second target for a new eye."""
 
 LARGEST_CHEAP_UM = 0.05
 """Mean error of 27 terms, traced at the corners of the field, above which "cheaper"
-does without the network: such errors in all terms alike spread light by 69 mrad mm/um
-over the pupil's radius, 1 mrad or a pixel of a 720p image at 7 mm."""
+rejects the network.  Equal errors in all terms spread light by 69 mrad mm/um over the
+pupil's radius: 1 mrad, or a pixel of a 720p image, at 7 mm."""
 
 
 @dataclass(frozen=True)
 class GridUse:
-    """How one grid was made: by network or traced, and why not by network.
+    """Record of how one grid was computed, and why not by network.
 
-    ``checked_error_um`` is the network's at ``n_checked`` nodes that were traced, nan
-    for a traced grid.
+    ``checked_error_um`` is the network's error at ``n_checked`` traced nodes, NaN for a
+    traced grid.
     """
 
     is_field: bool
@@ -64,25 +64,25 @@ class GridUse:
 
 
 class GridSource:
-    """Fills the grids of eyes as `aberration_grid.aberration_grid` does.
+    """Factory of aberration grids with the signature of `aberration_grid`.
 
     Parameters
     ----------
     aberrations : {"network", "cheaper", "traced"}
-        "cheaper" takes the network where that saves `LEAST_GAIN_MS` and tracing finds
-        it within `LARGEST_CHEAP_UM`.
+        Source of the grids.  "cheaper" uses the network if that saves `LEAST_GAIN_MS`
+        and its traced error is within `LARGEST_CHEAP_UM`.
     focus : {"network", "traced"}
-        What focuses the eye at each accommodation.
+        Method that focuses the eye at each accommodation.
 
     Attributes
     ----------
     uses : list of GridUse
-        One for each grid, in the order they were made.
+        One record for each grid, in order of computation.
     focus_by_network : bool
-        Whether the last grid's eye was focused by network: it need not be if it only
-        ever stays relaxed.
+        Whether the last grid's eye was focused by network; false for an eye that stays
+        relaxed.
     focus_reason : str
-        Why it was not, where it should have been.
+        Reason for a fallback from the network.
     """
 
     def __init__(self, *, aberrations: str = "traced", focus: str = "traced"):
@@ -102,7 +102,7 @@ class GridSource:
         progress: Callable[[float], None] | None = None,
         **axes: ArrayLike,
     ) -> AberrationGrid:
-        """Make one grid; arguments are those of `aberration_grid`."""
+        """Compute one grid; the arguments are those of `aberration_grid`."""
         start_s = time.perf_counter()
         axes["accommodations_dpt"] = accommodations_dpt
         n_nodes = int(np.prod([np.size(axis) for axis in axes.values()]))
@@ -132,7 +132,7 @@ class GridSource:
         return grid
 
     def _focused(self, eye: EstimatedEye, used_dpt: ArrayLike) -> Sequence[FocusedEye]:
-        """Give the eye at each accommodation."""
+        """Return the eye at each accommodation."""
         self.focus_by_network, self.focus_reason = False, ""
         if self._focus == "network":
             try:
@@ -145,7 +145,7 @@ class GridSource:
         return eye.accommodating.states_at(used_dpt)
 
     def _by_network(self, eye, states, n_nodes: int, n_rays: int, axes: dict):
-        """Give the grid by network, or None and the reason where it was wanted."""
+        """Return the network's grid, or None and the reason for the fallback."""
         if self._aberrations == "traced":
             return None, ""
         try:
@@ -170,7 +170,7 @@ def _check_cheap(error_um: float) -> None:
 
 
 def network_pays(n_nodes: int, *, n_rays: int, n_weights: int) -> bool:
-    """Whether a grid by network saves enough time to do without the exact one."""
+    """Return whether a network saves enough time to give up the exact grid."""
     network_ms = NETWORK_MS + NETWORK_MS_PER_WEIGHT * n_weights
     gain_ms = n_nodes * (TRACED_MS_PER_RAY * n_rays - network_ms)
     return relative_core_time() * gain_ms / thread_count() > LEAST_GAIN_MS

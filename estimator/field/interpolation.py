@@ -1,9 +1,9 @@
-"""Traced wavefronts between the nodes of a grid over field, pupil and accommodation.
+"""Interpolation of traced wavefronts over field, pupil and accommodation.
 
-Interpolated are polynomials in mm of the pupil plane and rims as centre and matrix:
-over the field by the polynomial through Chebyshev nodes in the stretched angles of
-`stretched`, over accommodation by the one through its nodes, over the pupil by the law
-of what a sixth-order fit leaves out.
+Wavefronts are interpolated as polynomials in mm of the pupil plane, rims as center and
+matrix.  Over the field a polynomial runs through Chebyshev nodes in the stretched
+angles of `stretched`, over accommodation another one through its nodes.  Over the pupil
+the interpolation follows the terms that a sixth-order fit leaves out, see `POWER`.
 """
 
 import math
@@ -27,11 +27,10 @@ from estimator.wavefront.field_wavefronts import (
 
 NODES_PER_EXTENT = 7.7
 """Field nodes per half extent in stretched angle: 10 for 40 deg, 8 for 25 deg; fewer
-where the range does not lie about the axis."""
+for a range that is not centered on the axis."""
 
 FAR_DEG, FAR_NODES = 48.0, 9.0
-"""The same for the part of the extent beyond this angle, where wavefronts change fast.
-"""
+"""Additional nodes per extent beyond this angle, where wavefronts change fast."""
 
 STRETCH = 1.75
 
@@ -40,25 +39,26 @@ DPT_PER_NODE = 2.0
 
 _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
-"""A rim's centre goes with the square of the pupil, its axes with the pupil."""
+"""A rim's center scales with the square of the pupil, its axes with the pupil."""
 
 POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
-"""How coefficients change with the pupil A: a term of order 8 (7 for the odd) that a
-fit of order 6 leaves out adds a share that goes with A^(8 - degree) to a coefficient of
-its parity; a rim departs from its paraxial form with A² and a little A⁴."""
+"""Powers of the pupil A by which coefficients change: a term of order 8 (7 for the odd)
+that a fit of order 6 leaves out adds a part proportional to A^(8 - degree) to a
+coefficient of its parity; a rim departs from its paraxial form with A² and a little
+A⁴."""
 
 
 def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
-    """Variable in which wavefronts over the field are polynomials of low degree.
+    """Map angles to a variable in which wavefronts are low-degree polynomials.
 
-    They change slowly near the axis and ever faster outside, as cos and tan of the
-    angle do: the angle itself needs two nodes more.
+    Wavefronts change slowly near the axis and ever faster outside, as cos and tan of
+    the angle do: the angle itself needs two more nodes.
     """
     return np.arcsinh(STRETCH * np.radians(angle_deg))
 
 
 def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
-    """Chebyshev nodes in stretched angle, ascending; one for a range of one."""
+    """Return ascending Chebyshev nodes in stretched angle; one for a single angle."""
     low, high = stretched([low_deg, high_deg])
     half = 0.5 * (high - low)
     if half < 1e-9:
@@ -72,7 +72,7 @@ def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
 def fewer_field_nodes_deg(
     nodes_deg: NDArray[np.float64], ratio: float
 ) -> NDArray[np.float64]:
-    """Return fewer nodes by a ratio, over the range that nodes (n,) are for."""
+    """Return nodes reduced by a ratio, over the same range as nodes (n,)."""
     if nodes_deg.size == 1:
         return nodes_deg
     first, last = stretched(nodes_deg[[0, -1]])
@@ -81,13 +81,13 @@ def fewer_field_nodes_deg(
 
 
 def _chebyshev_deg(middle: float, half: float, count: int) -> NDArray[np.float64]:
-    """Return nodes over a range of stretched angle."""
+    """Return Chebyshev nodes over a range of stretched angle."""
     unit = -np.cos(math.pi * (np.arange(count) + 0.5) / count)
     return np.degrees(np.sinh(middle + half * unit) / STRETCH)
 
 
 def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float64]:
-    """Chebyshev-Lobatto nodes, the ends among them; one for a range of one."""
+    """Return Chebyshev-Lobatto nodes, ends included; one for a single value."""
     if high_dpt - low_dpt < 1e-9:
         return np.array([low_dpt])
     last = max(math.ceil((high_dpt - low_dpt) / DPT_PER_NODE), 2)
@@ -98,17 +98,17 @@ def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float
 def lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weights (n, n_nodes) of the polynomial through the nodes; exact at a node."""
+    """Return Lagrange weights (n, n_nodes), exact at a node."""
     return all_weights(np.asarray(nodes, np.float64), np.asarray(at, np.float64))
 
 
 def _linear(nodes: NDArray, at: NDArray) -> NDArray[np.float64]:
-    """Weights (n, n_nodes) of linear interpolation, constant beyond the ends."""
+    """Return weights (n, n_nodes) of linear interpolation, constant beyond the ends."""
     return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
 
 
 def _for_distinct(function: Callable, values: NDArray):
-    """Array or arrays (n, ...) of a function that many of the values (n,) share."""
+    """Evaluate a function at values (n,), once for each distinct value."""
     distinct, place = np.unique(values, return_inverse=True)
     found = function(distinct)
     if isinstance(found, tuple):
@@ -118,17 +118,17 @@ def _for_distinct(function: Callable, values: NDArray):
 
 @dataclass(frozen=True)
 class FieldValues:
-    """A grid's values at the fields and wavelengths of n states.
+    """Values of a grid at the fields and wavelengths of n states.
 
-    All that is left open is pupil and accommodation.
+    Pupil and accommodation are still open.
 
     Attributes
     ----------
     values : (n_fields, n_channels, n_pupils, n_accommodations, 33)
     first_pupil : int
-        Which of the grid's pupils comes first in `values`.
+        Index in the grid of the first pupil in `values`.
     field, channel : (n,)
-        Of each state.
+        Indices of each state's field and wavelength in `values`.
     """
 
     values: NDArray[np.float64]
@@ -137,23 +137,24 @@ class FieldValues:
     channel: NDArray[np.int64]
 
     def of(self, states: NDArray[np.int64]) -> "FieldValues":
-        """Values of some of the states."""
+        """Return the values of some of the states."""
         return replace(self, field=self.field[states], channel=self.channel[states])
 
 
 class FieldInterpolation:
     """Wavefronts and rims of one grid, anywhere between its nodes.
 
-    Where a pupil is not open, its wavefront is that of the next smaller open pupil,
-    continued: the fit to a part of a pupil would not join on to its neighbours.
+    Where a pupil is vignetted, the wavefront of the next smaller open pupil is
+    continued: a fit to part of a pupil would not be continuous with its neighbors.
 
     Attributes
     ----------
     grid : AberrationGrid
     passes : bool
-        Whether the smallest pupil is open at all nodes; nothing else is of use.
+        Whether the smallest pupil is open at all nodes; otherwise the grid is unusable.
     open_pupil_mm : (n_h, n_v)
-        Pupil of the area that light passes, least over those.
+        Diameter of a pupil with the area that light passes, the smallest over
+        accommodations and wavelengths.
     """
 
     def __init__(self, grid: AberrationGrid):
@@ -175,13 +176,13 @@ class FieldInterpolation:
         self.passes = bool(is_open[:, :, 0].all() and has_chief_rays)
         self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
         self.all_open = bool(is_open.all())
-        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), in one piece: it is
-        # multiplied at every call.
+        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), contiguous because
+        # every call multiplies it.
         self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
 
     @staticmethod
     def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
-        """Whether light passes the whole pupil, at all nodes of a grid."""
+        """Return whether light passes the whole pupil, for all nodes of a grid."""
         is_finite = np.isfinite(grid.zernike_um).all(axis=-1)
         is_finite &= np.isfinite(grid.ellipse_mm).all(axis=-1)
         return is_finite & (grid.open_ratio > OPEN_RATIO)
@@ -189,7 +190,7 @@ class FieldInterpolation:
     def open_pupils_mm(
         self, h_deg: NDArray, v_deg: NDArray
     ) -> NDArray[np.float64] | None:
-        """Pupils (n,) that light passes at fields; None where it passes them all."""
+        """Return the open pupils (n,) at fields, or None if all are open."""
         if self.all_open:
             return None
         return np.einsum(
@@ -208,12 +209,12 @@ class FieldInterpolation:
         accommodation_dpt: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, at states (n,).
+        """Return polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, of states.
 
         Raises
         ------
         ValueError
-            A wavelength that is not among the traced ones.
+            A wavelength was not traced.
         """
         values = self.values(
             h_deg=h_deg,
@@ -235,17 +236,17 @@ class FieldInterpolation:
         wavelength_nm: NDArray[np.float64],
         pupil_diameter_mm: NDArray[np.float64] | None = None,
     ) -> FieldValues:
-        """Values at the fields and wavelengths (n,) of states, for `between`.
+        """Return values at the fields and wavelengths (n,) of states, for `between`.
 
         Parameters
         ----------
         pupil_diameter_mm : (n,), optional
-            Pupils that will be asked for; any at all where it is None.
+            Pupils that will be requested; any pupil if None.
 
         Raises
         ------
         ValueError
-            A wavelength that is not among the traced ones.
+            A wavelength was not traced.
         """
         channels, channel = np.unique(
             self._channels(wavelength_nm), return_inverse=True
@@ -253,7 +254,7 @@ class FieldInterpolation:
         first, field = distinct_rows(h_deg, v_deg)
         pupils = slice(0, None)
         if pupil_diameter_mm is not None:
-            # Only what is asked for: few calls need all wavelengths and pupils.
+            # Select only the requested ones: few calls need all wavelengths and pupils.
             lower = self._lower_pupils(pupil_diameter_mm)
             pupils = slice(int(lower.min()), int(lower.max()) + 2)
         values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
@@ -266,7 +267,7 @@ class FieldInterpolation:
         pupil_diameter_mm: NDArray[np.float64],
         accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, at states (n,)."""
+        """Return polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, of states."""
         used = _for_distinct(
             lambda dpt: lagrange_weights(self.grid.accommodations_dpt, dpt),
             accommodation_dpt,
@@ -294,7 +295,7 @@ class FieldInterpolation:
         accommodation_dpt: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Lateral colour (n, 2) at states (n,), mrad, see `chief_rays`."""
+        """Return the lateral color (n, 2) of states (n,), mrad, see `chief_rays`."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
@@ -313,7 +314,7 @@ class FieldInterpolation:
     def _over_field(
         self, h_deg: NDArray, v_deg: NDArray, channels: NDArray, pupils: slice
     ) -> NDArray[np.float64]:
-        """Values (n, n_channels, n_pupils, n_accommodations, 33) at fields (n,)."""
+        """Return values (n, n_channels, n_pupils, n_accommodations, 33) at fields."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         weights = (over_h[:, :, None] * over_v[:, None, :]).reshape(h_deg.size, -1)
@@ -322,9 +323,9 @@ class FieldInterpolation:
         return found.reshape(h_deg.size, *values.shape[2:])
 
     def _pupil_shares(self, pupil_mm: NDArray) -> tuple[NDArray, NDArray]:
-        """Index (n,) of the lower pupil, and share (n, 33) of the one above it.
+        """Return the index (n,) of the lower pupil, and the next one's weight (n, 33).
 
-        Below the smallest traced pupil the first two are continued.
+        Below the smallest traced pupil the first two are extrapolated.
         """
         nodes_mm = self.grid.pupil_diameters_mm
         if nodes_mm.size == 1:
@@ -336,7 +337,7 @@ class FieldInterpolation:
         return lower, share
 
     def _lower_pupils(self, pupil_mm: NDArray) -> NDArray[np.int64]:
-        """Index (n,) of the traced pupil below."""
+        """Return the index (n,) of the next smaller traced pupil."""
         nodes_mm = self.grid.pupil_diameters_mm
         lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
         return np.clip(lower, 0, max(nodes_mm.size - 2, 0))

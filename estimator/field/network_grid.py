@@ -1,14 +1,15 @@
-"""Aberration grids by network: less exact than traced ones, and no longer quicker.
+"""Aberration grids by network: less exact than traced ones, and no longer faster.
 
-A network takes a sixth of the time of the wavefronts that it replaces, 29 ms less; the
-checks below take more: a new eye is ready 1.2 to 1.3 times as late as with everything
-traced (`ocufilter bench networks`).
+A network takes a sixth of the time of the wavefronts that it replaces, 29 ms less.  The
+checks below cost more than that: a new eye takes 1.2 to 1.3 times as long as with
+everything traced (`ocufilter bench networks`).
 
-The network knows no vignetting and no retina but the sphere.  So a grid is only made
-where the corners of its field pass the largest pupil, which is traced; those nodes show
-its error in this eye, too, and where that is far above the stated one the grid is
-refused.  Lateral colour is traced: chief rays cost a fortieth of whole bundles.  The
-network was trained on wavefronts at the cornea; they are carried to the entrance pupil.
+The network models neither vignetting nor any retina but the sphere.  So a grid requires
+that light passes the largest pupil at the corners of the field, which are traced.
+Those nodes also show the network's error in this eye; if it is far above the stated
+one, the grid is rejected.  Lateral color is traced: chief rays cost a fortieth of whole
+bundles.  The network was trained on wavefronts at the cornea; they are propagated to
+the entrance pupil.
 """
 
 from dataclasses import dataclass
@@ -39,16 +40,16 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial, moved_rim
 
 CHECK_RINGS, CHECK_AZIMUTHS = 5, 14
-"""Rays of a check, as over the field of a traced grid: far below the error sought."""
+"""Rays of a check, as for a traced field grid: far more exact than a network."""
 
 CORNEA_RADIUS_MM = 7.8
-"""Of the sphere that stands for the cornea where its distance from the entrance pupil
-is asked for: 0.05 mm off at 45 deg."""
+"""Radius of the sphere that represents the cornea in the distance to the entrance
+pupil, with an error of 0.05 mm at 45 deg."""
 
 
 @dataclass(frozen=True)
 class NetworkGrid:
-    """A grid by network, and its mean error (27 terms) at the corners of its field."""
+    """Grid by network, and its mean error (27 terms) at the corners of its field."""
 
     grid: AberrationGrid
     checked_error_um: float
@@ -56,15 +57,15 @@ class NetworkGrid:
 
 
 def network_focused(eye: EstimatedEye, accommodations_dpt: ArrayLike):
-    """Give the eye at accommodations (n,) within its amplitude, by the focus network.
+    """Return the eye at accommodations (n,) within its amplitude, by focus network.
 
-    The relaxed eye is known.  Of the network's two answers the lens diameter is used;
-    the chamber's depth follows from it by the rule of `accommodation`, exactly.
+    The relaxed eye is known.  Of the network's two outputs only the lens diameter is
+    used; the chamber depth follows from it exactly by the rule of `accommodation`.
 
     Returns
     -------
     states : list of FocusedEye
-        ``focus_dpt`` is the one asked for.
+        Focused eyes; ``focus_dpt`` is the requested focus.
 
     Raises
     ------
@@ -95,20 +96,20 @@ def network_grid(
     h_deg: ArrayLike = (0.0,),
     v_deg: ArrayLike = (0.0,),
 ) -> NetworkGrid:
-    """Fill a grid by the aberration network, and check it at its corners.
+    """Compute a grid with the aberration network, and check it at its corners.
 
-    ``open_ratio`` is 1, as it was found at the corners; ``rms_residual_um`` is nan: a
-    network does not know what its fit would have left.
+    ``open_ratio`` is 1, as found at the corners.  ``rms_residual_um`` is NaN: a network
+    does not predict the residual of a fit.
 
     Parameters
     ----------
     states : (n_accommodations,)
-        The eye at each accommodation.
+        Eye at each accommodation.
 
     Raises
     ------
     NetworkUnavailable
-        No weights, an input out of the training ranges, light that passes only a part
+        No weights, an input outside the training ranges, light that passes only part
         of the pupil, or an error far above the stated one.
     """
     _check_retina(eye)
@@ -156,7 +157,7 @@ def network_grid(
 
 
 def _vectors(eye: EstimatedEye, states: list[FocusedEye]) -> NDArray[np.float64]:
-    """Parameters (n, 45) of the focused eyes."""
+    """Return the parameters (n, 45) of the focused eyes."""
     diameters_mm = [state.parameters.lens_diameter_mm for state in states]
     return accommodated_vectors(
         eye.parameters.to_vector(), lens_diameter_mm=diameters_mm
@@ -166,7 +167,7 @@ def _vectors(eye: EstimatedEye, states: list[FocusedEye]) -> NDArray[np.float64]
 def _depths_mm(
     eye: EstimatedEye, h_deg: NDArray, v_deg: NDArray
 ) -> NDArray[np.float64]:
-    """From cornea to entrance pupil along chief rays (n_h, n_v)."""
+    """Return distances (n_h, n_v) from cornea to entrance pupil along chief rays."""
     cosine = np.cos(np.radians(h_deg))[:, None] * np.cos(np.radians(v_deg))
     behind_mm = CORNEA_RADIUS_MM - eye.accommodating.entrance_pupil_mm
     sine_squared = 1.0 - cosine**2
@@ -183,7 +184,7 @@ def _check_retina(eye: EstimatedEye) -> None:
 def _chief_shifts_mrad(
     states: list[FocusedEye], h_deg: NDArray, v_deg: NDArray, wavelengths_nm: NDArray
 ) -> NDArray[np.float64]:
-    """Lateral colour (n_h, n_v, n_states, n_wavelengths, 2), traced."""
+    """Trace the lateral color (n_h, n_v, n_states, n_wavelengths, 2)."""
     fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
     shifts = [
         chief_shift_mrad(
@@ -200,9 +201,9 @@ def _chief_shifts_mrad(
 def _corner_errors_um(
     grid: AberrationGrid, states: list[FocusedEye]
 ) -> NDArray[np.float64]:
-    """Mean errors (n,) of traced nodes: the field's corners at the largest pupil.
+    """Return mean errors (n,) at the field's corners, traced at the largest pupil.
 
-    At both ends of the accommodations and the shortest wavelength.
+    Both ends of the accommodations and the shortest wavelength are checked.
     """
     ends = [sorted({0, len(axis) - 1}) for axis in (grid.h_deg, grid.v_deg)]
     corners = np.array(list(product(*ends)))

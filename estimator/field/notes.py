@@ -1,6 +1,6 @@
-"""What a reply says of how its eye was made: by network, refined, traced, how exactly.
+"""Notes of a reply on how its eye was computed, and how exactly.
 
-A part that fell back from a network says which input left its training range.
+A part that fell back from a network names the input outside its training range.
 """
 
 from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye
@@ -17,12 +17,12 @@ _STARTS = {"network": "the network's guess", "table": "a table's eye"}
 def eye_notes(
     estimated: EstimatedEye, source: GridSource, *, network_reason: str = ""
 ) -> tuple[str, ...]:
-    """Say how the eye, its focus and its aberrations were found, in that order.
+    """Return notes on how the eye, its focus and its aberrations were computed.
 
     Parameters
     ----------
     network_reason : str
-        Why the eye network was not asked, where it should have been.
+        Reason for a fallback from the eye network.
     """
     reason = network_reason or estimated.network_reason
     fallen = [f"eye not by network: {reason}"] if reason else []
@@ -37,7 +37,7 @@ def eye_notes(
 
 
 def periphery_note(eye: TracedEye) -> str:
-    """Say where an eye's periphery comes from, and how well it is known."""
+    """Return a note on the source and accuracy of an eye's periphery."""
     if eye.periphery is None:
         return "periphery: the eye model's own, not that of people"
     change = eye.periphery.change
@@ -78,7 +78,7 @@ def _of_focus(source: GridSource) -> list[str]:
 
 
 def _of_aberrations(uses: list[GridUse]) -> list[str]:
-    """Say it of the last grid of the field and of the axis, or of both at once."""
+    """Return notes on the last grids of field and axis, in one if they agree."""
     last = {use.is_field: use for use in uses}
     alike = len({(use.by_network, use.reason) for use in last.values()}) == 1
     if alike:

@@ -1,12 +1,12 @@
-"""What of people's periphery an estimated eye does not show; it travels as a phase.
+"""Difference between people's periphery and an estimated eye's, kept as a phase.
 
-An eye that has a person's axis does not have their periphery: the model's lens is
-homogeneous, its retina a sphere, and the axis says nothing of either.  What measured
-people with such an axis have there (`periphery`), less what their eye model has, is
-added to the traced wavefronts.  On the axis that is nothing.
+An eye with a person's axis does not have that person's periphery: the model's lens is
+homogeneous, its retina a sphere, and the axis determines neither.  The wavefronts of
+measured people with such an axis (`periphery`), less those of their eye model, are
+added to the traced wavefronts.  On the axis the difference is zero.
 
-An eye unlike the measured people, such as one with keratoconus, gets what the nearest
-usual eye is lacking; by what it differs from that one, it is traced.
+An eye unlike the measured people, such as one with keratoconus, gets the difference of
+the nearest usual eye; its own departure from that eye is traced.
 """
 
 from dataclasses import replace
@@ -35,18 +35,18 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 WIDEST_RATIO = 1.5
-"""Pupils wider than so many times the measured one are filled by stretched terms of
-the third and fourth order: polynomials go anywhere beyond what was measured."""
+"""Ratio to the measured pupil beyond which the terms of the third and fourth order are
+stretched: polynomials diverge beyond the measured pupil."""
 
 
 class PeripheralRest:
-    """Phase (n, 28), in the plane of the entrance pupil, over a range of fields.
+    """Phase (n, 28) in the plane of the entrance pupil, over a range of fields.
 
     Parameters
     ----------
     change : PeripheralChange
     eye : EstimatedEye
-        Whose wavefronts it is added to.
+        Eye to whose wavefronts the phase is added.
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Fields that light passes.
     """
@@ -83,7 +83,7 @@ class PeripheralRest:
     def at(
         self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
+        """Return monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
         return self._difference_um(h_deg, v_deg) - self._on_axis_um
 
     def _difference_um(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
@@ -106,13 +106,13 @@ class PeripheralRest:
 
 
 def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Factors (n, 28) of the phase's monomials in pupils of radii (n,)."""
+    """Return factors (n, 28) of the phase's monomials in pupils of radii (n,)."""
     ratio = np.minimum(WIDEST_RATIO * CIRCLE_MM / radius_mm, 1.0)
     return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
 
 
 def usual_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
-    """Return the eye with the axis that a change is for; itself, where it is usual."""
+    """Return an eye with the axis of a change; ``eye`` itself if that is usual."""
     if change.is_usual:
         return eye
     zernike_um = np.zeros(N_TERMS)
@@ -135,7 +135,7 @@ def _with_axis(profile: EyeProfile, zernike_um: NDArray) -> EyeProfile:
 
 
 def _on_circle(eye: EstimatedEye) -> NDArray[np.float64]:
-    """Wavefront (28,) of an eye at the cornea, on the population's circle."""
+    """Return an eye's wavefront (28,) at the cornea, on the population's circle."""
     return on_axis_zernike_um(
         eye.parameters,
         retina=eye.retina,

@@ -1,4 +1,4 @@
-"""Maps of an eye's wavefronts over its visual field, as a picture."""
+"""Plots of an eye's wavefronts over its visual field."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +14,10 @@ COMA = [7, 8]
 
 
 def plot_field(table: "FieldTable", file: Path, *, title: str) -> None:
-    """Draw M, astigmatism, coma and blur of a table; lines, where it has one elevation.
+    """Plot maps of M, astigmatism, coma and blur, or lines for a single elevation.
 
-    Blur is the root mean square of what the wavefront's second order makes of a point
-    in the pupil's circle, in minutes of arc.
+    Blur is the root mean square extent of a point's image by the wavefront's second
+    order, over the pupil's circle, in minutes of arc.
     """
     from matplotlib.figure import Figure  # loads slowly
 
@@ -41,7 +41,7 @@ def plot_field(table: "FieldTable", file: Path, *, title: str) -> None:
 def blur_arcmin(table: "FieldTable") -> NDArray[np.float64]:
     """Return the root mean square blur (n,) of the second order, minutes of arc."""
     m_dpt, j0_dpt, j45_dpt = table.power_dpt.T
-    # A point at r mm is sent aside by r times the power, in mrad; mean r² is R² / 2.
+    # Light at r mm is deflected by r times the power, in mrad; mean r² is R² / 2.
     power_dpt = np.sqrt(m_dpt**2 + j0_dpt**2 + j45_dpt**2)
     return ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
 

@@ -1,4 +1,4 @@
-"""From a profile to the eye whose PSFs are computed: measured wavefront or traced."""
+"""Preparation of a profile's eye for PSFs: measured wavefront or traced model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from estimator.profiles.parse import EyeProfile
 EYE_MODELS = ("traced", "wavefront")
 
 ESTIMATION_SHARE = 0.5
-"""Progress at which the eye is estimated."""
+"""Progress at the end of the estimation."""
 
 
 @dataclass(frozen=True)
 class _Way:
-    """Where an accuracy takes each part from, in the words of the estimator."""
+    """Source of each part of an eye for one accuracy, in the estimator's terms."""
 
     method: str
     starts: tuple[str, ...]
@@ -39,7 +39,7 @@ WAYS = {
     "balanced": _Way("refined", ("table", "network"), "traced", "cheaper"),
     "exact": _Way("refined", ("table",), "traced", "traced"),
 }
-"""A network that cannot answer gives way to tracing, part by part, with a note."""
+"""A part whose network is unavailable is traced instead, with a note."""
 
 
 def prepare_eye(
@@ -53,32 +53,33 @@ def prepare_eye(
     accuracy: str = "exact",
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[EyeOptics, tuple[str, ...]]:
-    """Return the eye of a profile over its visual field, and what to say about it.
+    """Return the eye of a profile over its visual field, and notes about it.
 
     Parameters
     ----------
     pupil_diameters_mm : (n,)
-        Entrance pupils to trace on axis; those between follow, over the field too.
+        Entrance pupils to trace on axis; pupils between them, and those over the
+        field, are interpolated.
     focus_range_dpt : (low, high)
-        Focus distances that will be asked for.
+        Range of focus distances that will be requested.
     wavelengths_nm : (n,)
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Azimuths and elevations.
     eye_model : {"traced", "wavefront"}
         Estimate a 45-parameter eye and trace every wavefront; or use the measurement
-        by closed formulas, which knows no larger pupil and no change of shape with
-        accommodation, and costs nothing.
+        in closed form, which costs nothing but models no larger pupil and no change
+        of shape with accommodation.
     accuracy : {"fast", "balanced", "exact"}
-        Of the traced model: the networks; a refined eye, its wavefronts from whichever
-        of the two pays; everything traced, most colors over the field by
-        `few_colors_grid`.
+        Accuracy of the traced model: "fast" uses the networks; "balanced" refines the
+        eye and uses the cheaper source of wavefronts; "exact" traces everything, most
+        colors over the field by `few_colors_grid`.
     progress : callable, optional
-        Called with a fraction and a stage; may raise to cancel.
+        Callback with the completed fraction and a stage; may raise to cancel.
 
     Raises
     ------
     ValueError
-        An unknown model or accuracy, or an eye that light does not pass.
+        The model or accuracy is unknown, or light does not pass the eye.
     """
     if eye_model not in EYE_MODELS:
         raise ValueError(
@@ -116,7 +117,7 @@ def prepare_eye(
 
 
 def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:
-    """Return the eye, and why there is no network for it where one was wanted."""
+    """Return the eye, and the reason for a fallback from its network."""
     try:
         found = estimate_eye(profile, method=way.method, starts=way.starts)
         if found.method == "network":

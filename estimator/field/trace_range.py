@@ -1,4 +1,4 @@
-"""What of an eye's visual field is traced, and through which pupils."""
+"""Traced part of an eye's visual field, and the pupils traced there."""
 
 from collections.abc import Callable
 
@@ -18,26 +18,26 @@ from estimator.periphery.change import peripheral_change
 from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
 
 FIELD_PUPIL_RATIOS = (0.64, 1.0)
-"""Pupils traced over the field, of the largest one."""
+"""Pupils traced over the field, relative to the largest one."""
 
 LARGE_PUPIL_MM = 7.2
 LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
-"""The same where the largest pupil is larger than that."""
+"""Pupils traced over the field if the largest exceeds `LARGE_PUPIL_MM`."""
 
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
-"""Step by which the traced field is made smaller until light passes all of it."""
+"""Step by which the traced field shrinks until light passes all of it."""
 
 FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
 
 def largest_open_pupil_mm(grid: AberrationGrid) -> float:
-    """Largest pupil of an on-axis grid that is open at all its states.
+    """Return the largest pupil of an on-axis grid that is open in all its states.
 
     Raises
     ------
     TraceFailed
-        There is none.
+        No pupil is open.
     """
     is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
     if not is_open.any():
@@ -48,7 +48,7 @@ def largest_open_pupil_mm(grid: AberrationGrid) -> float:
 
 
 def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
-    """Pupils (n,) to trace over the field for a range of them."""
+    """Return the pupils (n,) to trace over the field for a range of pupils."""
     large = high_mm > LARGE_PUPIL_MM
     ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
     pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
@@ -62,7 +62,7 @@ def trace_field(
     make_grid: Callable[..., AberrationGrid],
     **axes,
 ) -> tuple[FieldInterpolation, FieldRange]:
-    """Trace a range of fields, drawn in towards the axis until light passes it all."""
+    """Trace a range of fields, shrunk toward the axis until light passes all of it."""
     limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
     share = 1.0
     while share > SMALLEST_SHARE:
@@ -86,9 +86,9 @@ def trace_field(
 def peripheral_rest(
     eye: EstimatedEye, field_range_deg: FieldRange
 ) -> PeripheralRest | None:
-    """Return people's periphery for an eye; None where it has its model's.
+    """Return people's periphery for an eye, or None if it has the model's.
 
-    So it has where light does not pass the usual eye over the whole range.
+    It has the model's if light does not pass the usual eye over the whole range.
     """
     if eye.profile.periphery == "model" or not np.any(field_range_deg):
         return None
@@ -99,14 +99,14 @@ def peripheral_rest(
 def share_of(
     progress: Callable[[float], None] | None, low: float, high: float
 ) -> Callable[[float], None] | None:
-    """Return progress of a part that goes from one share of the whole to another."""
+    """Return a progress callback that maps a part's fraction to [low, high]."""
     if progress is None:
         return None
     return lambda done: progress(low + (high - low) * done)
 
 
 def check_field_range(field_range_deg: FieldRange) -> None:
-    """Refuse a range that is not ascending.
+    """Reject a range that is not ascending.
 
     Raises
     ------

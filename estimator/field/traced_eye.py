@@ -1,9 +1,9 @@
-"""An estimated eye as the PSF cache asks for it: every wavefront ray-traced.
+"""Estimated eye with ray-traced wavefronts, as the PSF cache uses it.
 
-Answers the same questions as `measured_wavefront.MeasuredWavefront`, without its
-limits: pupils larger than the measured one are traced, not extrapolated, accommodation
-changes the lens and with it all aberrations, and every field has its own.  Its grids
-may be made by network instead, see `grid_source`.
+It has the interface of `measured_wavefront.MeasuredWavefront` without its limits:
+pupils larger than the measured one are traced, not extrapolated; accommodation changes
+the lens and with it all aberrations; and every field has its own wavefront.  Its grids
+may be computed by network instead, see `grid_source`.
 """
 
 from collections.abc import Callable
@@ -45,17 +45,17 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 MAX_PUPIL_MM = 8.0
-"""Largest pupil an iris opens to."""
+"""Largest diameter to which an iris opens."""
 
 ACCOMMODATION_STEP_DPT = 1.0
-"""Largest step between accommodations whose PSFs are blended; blending is at equal
+"""Largest step between accommodations whose PSFs are blended.  Blending is at equal
 defocus, so only the slow change of the other aberrations is interpolated."""
 
 TRACED_ERROR_UM = 1e-3
-"""What a reply states of them."""
+"""Error of traced aberrations that a reply states."""
 
 PREPARED_MARGIN_DPT = 0.02
-"""A focus that was not traced is met to this, or its reply says so."""
+"""Focus error beyond which a reply notes that the focus was not prepared."""
 
 AXIS_PROGRESS = 0.1
 
@@ -63,31 +63,31 @@ AXIS_PROGRESS = 0.1
 class TracedEye(FocusingEye):
     """Wavefronts of an estimated eye over a range of fields, pupils and foci.
 
-    On axis the circle circumscribed about the pupil is the pupil asked for: the traced
-    rim, up to a few per cent smaller than the paraxial entrance pupil, is scaled to it,
-    and at other fields by the same factor.  What the eye leaves of its measurement is
-    added to its wavefronts, see `measured_rest`.  The worn correction is taken off at
-    every field alike, but for a progressive lens, see `worn_lens.worn_polynomial`.
+    On axis the circle circumscribed about the pupil is the requested pupil: the traced
+    rim, up to a few percent smaller than the paraxial entrance pupil, is scaled to it,
+    and at other fields by the same factor.  The residual of the estimate is added to
+    the wavefronts, see `measured_rest`.  The correction is subtracted equally at every
+    field, except for a progressive lens, see `worn_lens.worn_polynomial`.
 
     Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
-    the rim of a pupil is cut off farther out, the eye is seen through the pupil of the
-    open area.  Fields that light does not pass answer as the nearest of the traced
-    fields, whose range is made smaller until all of its nodes pass.
+    the rim of a pupil is vignetted off axis, the pupil is reduced to one of the open
+    area.  Fields that light does not pass take the wavefront of the nearest traced
+    field; the traced range is shrunk until light passes all of its nodes.
 
     Attributes
     ----------
     grid : AberrationGrid
-        On axis.
+        Grid on the axis.
     eye_side : str
         OD or OS.
     field_range_deg : ((h_low, h_high), (v_low, v_high))
-        Fields that may be asked for.
+        Fields that may be requested.
     traced_range_deg : the same
-        Fields beyond it answer as its edge.
+        Fields that were traced; those beyond take the value at its edge.
     entrance_pupil_mm : float
-        How deep it lies behind the cornea.
+        Depth of the entrance pupil behind the cornea.
     periphery : PeripheralRest or None
-        What is added off the axis, see there; None where the eye model has its own.
+        Phase added off the axis; None if the eye model's own periphery is used.
     """
 
     pupil_limit = "traced"
@@ -135,26 +135,26 @@ class TracedEye(FocusingEye):
         make_grid: Callable[..., AberrationGrid] = aberration_grid,
         progress: Callable[[float], None] | None = None,
     ) -> "TracedEye":
-        """Trace what a range of pupils, foci and fields needs.
+        """Trace the wavefronts for a range of pupils, foci and fields.
 
         Parameters
         ----------
         pupil_diameters_mm : (n,)
-            On axis each of them is traced; elsewhere only the largest and one or two
-            smaller, from which all others follow.
+            Pupils.  On axis each of them is traced; elsewhere only the largest and one
+            or two smaller ones, from which all others are interpolated.
         field_range_deg : ((h_low, h_high), (v_low, v_high))
             Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
         make_grid : callable, optional
-            What fills the grids, where it is not tracing: a `grid_source.GridSource`.
+            Alternative source of the grids: a `grid_source.GridSource`.
         progress : callable, optional
-            Called with a fraction; may raise to cancel.
+            Callback with the completed fraction; may raise to cancel.
 
         Raises
         ------
         TraceFailed
             No light passes on axis.
         ValueError
-            A field range that is not ascending.
+            The field range is not ascending.
         """
         check_field_range(field_range_deg)
         pupils_mm = np.unique(pupil_diameters_mm)
@@ -199,7 +199,7 @@ class TracedEye(FocusingEye):
     def refraction_at_dpt(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> float:
-        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
         return self._accommodating.refraction_at_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
         )
@@ -207,7 +207,7 @@ class TracedEye(FocusingEye):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Accommodation whose M at a pupil comes nearest to this, of those traced."""
+        """Return the traced accommodation whose M at a pupil is nearest to this."""
         used_dpt = self._accommodating.accommodation_for_dpt(
             refraction_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
@@ -215,16 +215,16 @@ class TracedEye(FocusingEye):
         return min(max(used_dpt, low_dpt), high_dpt)
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
-        """Accommodation at which the nearest distance is seen through a pupil."""
+        """Return the accommodation for the near point through a pupil."""
         return self._accommodating.largest_accommodation_dpt(pupil_diameter_mm)
 
     def focus_notes(
         self, focus_dpt: float, *, pupil_diameter_mm: float
     ) -> tuple[str, ...]:
-        """Say in words what of a focus distance it cannot meet, or was not traced."""
+        """Return notes on a focus that is out of reach or was not traced."""
         notes = super().focus_notes(focus_dpt, pupil_diameter_mm=pupil_diameter_mm)
         if notes:
-            return notes  # the eye itself ends there
+            return notes  # the limit is the eye's own
         used_dpt = self.reachable_focus_dpt(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
@@ -239,7 +239,7 @@ class TracedEye(FocusingEye):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
-        """Accommodations (n,), ascending, between which PSFs may be blended."""
+        """Return ascending accommodations (n,) between which PSFs may be blended."""
         low_dpt, high_dpt = self.accommodation_range_dpt(
             focus_range_dpt, pupil_range_mm=pupil_range_mm
         )
@@ -255,9 +255,10 @@ class TracedEye(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Least-squares refraction, dpt, on the pupil's circle; object at infinity.
+        """Return least-squares refraction, dpt, on the pupil's circle; far object.
 
-        All arguments broadcast, and the result has their shape.
+        All arguments broadcast, and the result has their shape.  The object is at
+        infinity.
         """
         states = np.broadcast_arrays(
             h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
@@ -268,13 +269,13 @@ class TracedEye(FocusingEye):
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., NDArray[np.float64]]:
-        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+        """Return `total_defocus_dpt` at fixed fields as a function of the eye's state.
 
         Returns
         -------
         callable
-            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
-            arguments' broadcast shape.
+            Function of ``pupil_diameter_mm`` and ``accommodation_dpt`` that returns
+            dpt in the arguments' broadcast shape.
         """
         fields, number = self._fixed_fields(h_deg, v_deg, wavelength_nm)
         return partial(self._defocus_dpt, fields.fixed_defocus(), number)
@@ -304,12 +305,12 @@ class TracedEye(FocusingEye):
         wavelength_nm: ArrayLike,
         total_defocus_dpt: ArrayLike,
     ) -> FieldWavefronts:
-        """Wavefronts with the given total defocus; P in C order of the broadcast.
+        """Return wavefronts (P,) with the given total defocus, in C order of states.
 
         Raises
         ------
         ValueError
-            A state outside of what was traced.
+            A state is outside the traced range.
         """
         *states, total_dpt = np.broadcast_arrays(
             *(h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm),
@@ -326,7 +327,7 @@ class TracedEye(FocusingEye):
     def wavefronts_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., FieldWavefronts]:
-        """See `EyeOptics.wavefronts_at`; 4 ms a state, where `wavefronts` takes 17."""
+        """See `EyeOptics.wavefronts_at`; 4 ms per state, `wavefronts` takes 17."""
         return partial(
             self._wavefronts_of, *self._fixed_fields(h_deg, v_deg, wavelength_nm)
         )
@@ -334,7 +335,7 @@ class TracedEye(FocusingEye):
     def _fixed_fields(
         self, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> tuple[TracedFields, NDArray[np.int64]]:
-        """Distinct fields and wavelengths, and the number of each given one."""
+        """Return distinct fields and wavelengths, and the index of each given one."""
         given = np.broadcast_arrays(h_deg, v_deg, wavelength_nm)
         columns = [np.asarray(column, dtype=np.float64).ravel() for column in given]
         first, number = distinct_rows(*columns)
@@ -375,10 +376,10 @@ class TracedEye(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Lateral colour against 555 nm along the pupil axes, mrad; see `chief_rays`.
+        """Return lateral color against 555 nm along the pupil axes, mrad.
 
-        All arguments broadcast, and the result has their shape with 2 last.  What a
-        worn correction adds is not in it.
+        All arguments broadcast, and the result has their shape with 2 last.  The
+        contribution of a correction is not included.  See `chief_rays`.
         """
         states = np.broadcast_arrays(h_deg, v_deg, accommodation_dpt, wavelength_nm)
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
@@ -394,7 +395,7 @@ class TracedEye(FocusingEye):
         return found[number].reshape(*states[0].shape, 2)
 
     def _distinct(self, states: list[NDArray]) -> tuple[NDArray, ...]:
-        """Coefficients, rims and radii of distinct states, and the number of each."""
+        """Return coefficients, rims and radii of distinct states, and each's index."""
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
         h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
@@ -424,7 +425,7 @@ class TracedEye(FocusingEye):
         )
 
     def _correction_at(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
-        """Return what the worn correction takes off: (28,), or (n, 28) at fields."""
+        """Return the correction's wavefront to subtract, (28,) or (n, 28) at fields."""
         if not isinstance(self._worn, ProgressiveLens):
             return self._correction
         return progressive_polynomial(

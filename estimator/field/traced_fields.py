@@ -1,7 +1,7 @@
-"""Wavefronts of a traced eye where only its pupil and its accommodation change.
+"""Wavefronts of a traced eye at fixed fields, as pupil and accommodation change.
 
-What depends on field and wavelength alone is interpolated once, see `FieldValues`: a
-stream of frames asks for the same fields again and again.
+The interpolation over field and wavelength is done once, see `FieldValues`: a stream of
+frames requests the same fields repeatedly.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 MARGIN = 1e-3
-"""Degrees, mm or dpt beyond what was traced that are continued, not refused."""
+"""Degrees, mm or dpt beyond the traced range that are extrapolated, not rejected."""
 
 
 def check_limits(name: str, values: NDArray, low: float, high: float) -> None:
-    """Refuse values that were not traced.
+    """Reject values outside the traced range.
 
     Raises
     ------
@@ -45,18 +45,18 @@ class TracedFields:
     Parameters
     ----------
     field, on_axis : FieldInterpolation
-        That of the states, and one that holds the axis.
+        Interpolation of the states, and one that contains the axis.
     correction_um : (28,) or (n, 28), um/mm^degree
-        What a worn correction takes off.
+        Wavefront of the correction, to subtract.
     rest : MeasuredRest
-        What is added.
+        Residual of the estimate, to add.
     periphery : PeripheralRest, optional
-        What is added off the axis; the rest is then the same over the field: people's
-        wavefronts are told as changes from the axis.
+        Phase added off the axis.  The residual is then the same over the field, because
+        people's wavefronts are given as changes from the axis.
     h_deg, v_deg, wavelength_nm : (n,)
-        Within what was traced.
+        Fields and wavelengths within the traced range.
     pupil_diameter_mm : (n,), optional
-        Pupils that will be asked for; any at all where it is None.
+        Pupils that will be requested; any pupil if None.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class TracedFields:
         pupil_diameter_mm: NDArray[np.float64],
         accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients (n, 28), um, rims (n, 5), mm, and radii (n,), mm, of states.
+        """Return coefficients (n, 28), um, rims (n, 5) and radii (n,), mm, of states.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class TracedFields:
         return zernike_um, rim_mm, radius_mm
 
     def fixed_defocus(self) -> FixedDefocus:
-        """Return the total defocus alone, of states that share pupil and focus."""
+        """Return a fast form of total defocus for states that share pupil and focus."""
         return FixedDefocus(
             (self._field, self._states),
             (self._on_axis, self._axis_states),
@@ -130,7 +130,7 @@ class TracedFields:
         )
 
     def _rim_scale(self, pupil_mm: NDArray, used_dpt: NDArray) -> NDArray[np.float64]:
-        """Pupils (n,) asked for over the traced ones, on axis."""
+        """Return ratios (n,) of the requested pupils to the traced ones, on axis."""
         channel = self._axis_states.channel
         first, number = distinct_rows(channel, pupil_mm, used_dpt)
         _, rim_mm = self._on_axis.between(
@@ -142,7 +142,7 @@ class TracedFields:
         return scale[number]
 
     def _usable_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
-        """Pupils (n,), smaller at fields where light passes only a part of them."""
+        """Return pupils (n,), reduced at fields where they are vignetted."""
         if self._open_mm is None:
             return pupil_mm
         return np.minimum(pupil_mm, self._open_mm)
@@ -151,6 +151,6 @@ class TracedFields:
 def _of_distinct(
     function: Callable[..., NDArray], h_deg: NDArray, v_deg: NDArray
 ) -> NDArray[np.float64]:
-    """Return rows of a function of directions (n,), each worked out once."""
+    """Evaluate a function of directions (n,), once for each distinct direction."""
     first, number = distinct_rows(h_deg, v_deg)
     return function(h_deg[first], v_deg[first])[number]

@@ -1,7 +1,7 @@
-"""What the eye's media do to light beside bending it.
+"""Scattering and absorption in the ocular media.
 
-straylight  light that is scattered over wide angles, by age, pigment and cataract
-absorption  light that the ageing lens keeps, blue first
+straylight  scattering over wide angles, by age, pigment and cataract
+absorption  absorption by the aging lens, mostly of blue light
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Light that the eye's media absorb: the lens yellows with age, and blue is lost first.
+"""Absorption by the ocular media: the lens yellows with age, and blue is lost first.
 
 Van de Kraats & van Norren, J. Opt. Soc. Am. A 24, 1842 (2007), as in CIE 203:2012:
 density of all media for large fields, fitted to ages of 0 to 90 years.
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 REFERENCE_AGE_YEARS = 32.0
-"""Of the CIE's standard observer: pictures are made for such eyes."""
+"""Age of the CIE standard observer, for whom images are made."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of the sRGB primaries."""
+"""Luminance of the sRGB primaries."""
 
 YELLOWINGS = ("seen", "adapted")
 
@@ -43,19 +43,19 @@ def _bell(nm: NDArray, centre_nm: float, slope: float) -> NDArray[np.float64]:
 def channel_gains(
     wavelengths_nm: ArrayLike, *, age_years: float, yellowing: str
 ) -> NDArray[np.float64]:
-    """Return factors (3,) of red, green and blue against eyes of 32 years.
+    """Return gains (3,) of red, green and blue relative to eyes of 32 years.
 
     Parameters
     ----------
     wavelengths_nm : (3,)
     yellowing : {"seen", "adapted"}
-        As the light that arrives; or with the luminance of white as it was, which the
-        eye adapts to first.
+        Gains of the light that arrives; or gains that keep the luminance of white, to
+        which the eye adapts first.
 
     Raises
     ------
     ValueError
-        Another word.
+        The value of ``yellowing`` is unknown.
     """
     if yellowing not in YELLOWINGS:
         allowed = " and ".join(YELLOWINGS)

@@ -1,10 +1,10 @@
-"""Light scattered in the eye over wide angles: haze about lamps, and lost contrast.
+"""Light scattered in the eye over wide angles: haze around lamps, and lost contrast.
 
 The CIE total glare function is the point-spread function of an eye of known age and
 pigment from 0 to 100 deg (Vos & van den Berg, CIE Research Note 135/1, 1999).  Its core
-is what aberrations and diffraction make, which the filter computes for the eye at hand;
-what lies beyond is scattered here.  Clinics state it as the straylight parameter
-s = angle² x light per solid angle and incident light, deg²/sr, at 7 deg.
+is due to aberrations and diffraction, which the filter computes for the individual eye;
+the light beyond the core is scattered here.  Clinics state it as the straylight
+parameter s = angle² x light per solid angle and incident light, deg²/sr, at 7 deg.
 """
 
 import math
@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CORE_DEG = 0.5
-"""Angle about which the light beyond the core begins; at 1 deg 98 % of it is there.
-Aberrations and diffraction send hardly any light so far."""
+"""Angle around which the light beyond the core begins; at 1 deg 98 % of it is included.
+Aberrations and diffraction send hardly any light that far."""
 
 SMALLEST_DEG, LARGEST_DEG = 0.01, 90.0
 STATED_AT_DEG = 7.0
-"""Angle of the C-Quant instrument, at which log s is told."""
+"""Angle of the C-Quant instrument, at which log s is stated."""
 
 DEFAULT_AGE_YEARS = 25.0
 BROWN = 0.5
-"""Pigmentation: 0 for black eyes, 0.5 brown, 1 light blue ones of Caucasians."""
+"""Pigmentation: 0 for black eyes, 0.5 brown, 1 light blue eyes of Caucasians."""
 
 CATARACTS = {"nuclear": 1.22, "cortical": 1.26, "posterior_subcapsular": 1.48}
 """Mean log s of 592, 776 and 75 eyes before surgery (+-0.20, 0.23 and 0.34), from five
@@ -46,7 +46,7 @@ def cie_glare_per_sr(
     References
     ----------
     Vos & van den Berg 1999, equation 8.  It integrates to 1.03 at 25 years and to 1.07
-    at 70; the published normalisation is left out, as veils are stated without it.
+    at 70; the published normalization is omitted, as veils are stated without it.
     """
     square = np.square(np.asarray(angle_deg, dtype=np.float64))
     age = (age_years / 70.0) ** 4
@@ -71,9 +71,9 @@ class Straylight:
     age_years : float
     pigment_ratio : float
     log_s : float or None
-        Straylight parameter at 7 deg, where it was measured or a cataract is known by
-        its kind; that of the age where None.  What goes beyond scatters as the inverse
-        square of the angle, as cataracts do (van den Berg & Ijspeert 1995).
+        Straylight parameter at 7 deg, if measured or known from the kind of cataract;
+        that of the age if None.  The excess over the age scatters as the inverse square
+        of the angle, as cataracts do (van den Berg & Ijspeert 1995).
     """
 
     age_years: float = DEFAULT_AGE_YEARS
@@ -101,7 +101,7 @@ class Straylight:
 
     @property
     def fraction(self) -> float:
-        """Return the part of all light that is scattered."""
+        """Return the fraction of all light that is scattered."""
         angles_deg = np.geomspace(SMALLEST_DEG, LARGEST_DEG, N_ANGLES)
         ring_sr = 2.0 * np.pi * np.sin(np.radians(angles_deg))
         return float(

@@ -1,7 +1,7 @@
-"""The trained networks; torch and training live elsewhere.
+"""The trained networks; PyTorch is needed only in `training`.
 
-card       what a network's card says: columns, ranges, error
-inference  loading and asking them
+card       cards of the networks: columns, ranges, error
+inference  loading and evaluation
 weights    the files that `python -m training.export` writes
 """
 

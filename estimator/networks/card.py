@@ -1,8 +1,7 @@
-"""What a trained network is: its columns, the ranges it knows, its expected error.
+"""Card of a trained network: its columns, training ranges and expected error.
 
-Beside ``weights/<name>.onnx`` lies ``weights/<name>.json``, written by the training.
-The columns below are the contract between the two: whoever trains and whoever evaluates
-takes them from here.
+The training writes ``weights/<name>.json`` with ``weights/<name>.onnx``.  The columns
+below are the contract between training and inference: both import them from here.
 """
 
 import json
@@ -20,14 +19,14 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CARD_FORMAT = 1
 
 FIRST_TERM = 3
-"""The eye network takes coefficients from here on: a measured tilt says nothing."""
+"""First coefficient of the eye network's inputs: a measured tilt is uninformative."""
 
 ZERNIKE_NAMES = tuple(f"zernike_j{j}_um" for j in range(1, N_TERMS))
 RIM_NAMES = (
     *("ellipse_centre_x_mm", "ellipse_centre_y_mm"),
     *("ellipse_xx_mm", "ellipse_xy_mm", "ellipse_yy_mm"),
 )
-"""A pupil's rim, as `field_wavefronts.rim_from_ellipse` has it."""
+"""Columns of a pupil's rim, see `field_wavefronts.rim_from_ellipse`."""
 
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "discriminator": (*PARAMETER_NAMES, "pupil_diameter_mm", "wavelength_nm"),
@@ -50,34 +49,34 @@ OUTPUTS: Mapping[str, tuple[str, ...]] = {
 NETWORK_NAMES = tuple(INPUTS)
 
 MARGIN_RATIO = 1e-6
-"""Share of a range beyond its ends that still counts as inside: rounding."""
+"""Fraction of a range beyond its ends that still counts as inside, for rounding."""
 
 
 LARGEST_ERROR_RATIO = 3.0
-"""Error that tracing shows in one eye, over the stated 95th percentile, above which a
-network is not used for it.  Ranges of single columns do not make a domain: a wavefront
-may be like no eye's though each of its terms is small."""
+"""Ratio of the traced error in one eye to the stated 95th percentile above which a
+network is not used for that eye.  Ranges of single columns do not define a domain: a
+wavefront may resemble no eye's even if each of its terms is small."""
 
 
 class NetworkUnavailable(ValueError):
-    """A network cannot answer: no weights, or an input that it was not trained for."""
+    """A network is unavailable: no weights, or an input outside its training."""
 
 
 class WeightsMissing(NetworkUnavailable):
-    """The file of weights, or what evaluates it, is not there."""
+    """The weights file, or the package that evaluates it, is missing."""
 
 
 class DamagedWeights(NetworkUnavailable):
-    """The weights or their card are not what this version evaluates."""
+    """The weights or their card are damaged or of another version."""
 
 
 class NetworkUnfit(NetworkUnavailable):
-    """A network is not good for this eye, though its inputs are in their ranges."""
+    """A network is not accurate for this eye, though its inputs are in range."""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """One input column outside of the training range, in the column's own unit."""
+    """One input column outside its training range, in the column's own unit."""
 
     column: str
     value: float
@@ -92,12 +91,12 @@ class Excess:
 
 
 class OutOfDomain(NetworkUnavailable):
-    """An input outside of the training ranges.
+    """An input outside the training ranges.
 
     Attributes
     ----------
     excesses : tuple of Excess
-        Each column that is outside, the farthest first, as a share of its range.
+        Columns outside their ranges, the farthest first, relative to the range.
     """
 
     def __init__(self, network: str, excesses: tuple[Excess, ...]):
@@ -111,7 +110,7 @@ class OutOfDomain(NetworkUnavailable):
 class ExpectedError:
     """Mean and 95th percentile of a network's error against ray tracing.
 
-    Both in ``unit``; ``by_radial_order`` holds the mean of each order where the output
+    Both are in ``unit``; ``by_radial_order`` holds the mean of each order if the output
     is a wavefront.
     """
 
@@ -127,21 +126,21 @@ class ExpectedError:
 
 @dataclass(frozen=True)
 class Card:
-    """One network's card.
+    """Card of one network.
 
     Attributes
     ----------
     low, high : (n_inputs,)
         Training range of each input column, in its unit.
     n_parameters : int
-        Weights and biases.
+        Number of weights and biases.
     precision : str
-        Of the stored weights, ``float16`` or ``float32``.
+        Precision of the stored weights, ``float16`` or ``float32``.
     error : ExpectedError
-        Of the eyes that the service meets.
+        Error for eyes as the service sees them.
     error_by_rows : mapping
-        The same by where eyes were drawn from: ``table_2``, the box of the paper's
-        Table 2, and ``population``, the prior of the estimation.
+        Error by the distribution of eyes: ``table_2``, the box of the paper's Table 2,
+        and ``population``, the prior of the estimation.
     """
 
     network: str
@@ -154,9 +153,9 @@ class Card:
     error_by_rows: Mapping[str, ExpectedError] = field(default_factory=dict)
 
     def outside(self, features: NDArray[np.float64]) -> tuple[Excess, ...]:
-        """Columns of inputs (P, n_inputs) that leave their ranges, farthest first.
+        """Return columns of inputs (P, n_inputs) outside their ranges, farthest first.
 
-        Each is given with its value farthest out; nan is outside of every range.
+        Each has its value farthest outside; NaN is outside every range.
         """
         width = np.maximum(self.high - self.low, np.finfo(np.float64).tiny)
         beyond = np.maximum(self.low - features, features - self.high) / width
@@ -175,7 +174,7 @@ class Card:
         )
 
     def check(self, features: NDArray[np.float64]) -> None:
-        """Refuse inputs (P, n_inputs) that the network was not trained for.
+        """Reject inputs (P, n_inputs) outside the training ranges.
 
         Raises
         ------
@@ -185,7 +184,7 @@ class Card:
             raise OutOfDomain(self.network, excesses)
 
     def check_error(self, traced_error: float, where: str) -> None:
-        """Refuse what tracing has shown to be far above the expected error.
+        """Reject a traced error far above the expected error.
 
         Raises
         ------
@@ -199,22 +198,22 @@ class Card:
 
 
 def card_path(name: str) -> Path:
-    """File of a network's card."""
+    """Return the path of a network's card."""
     return WEIGHTS_FOLDER / f"{name}.json"
 
 
 def weights_path(name: str) -> Path:
-    """File of a network's weights."""
+    """Return the path of a network's weights."""
     return WEIGHTS_FOLDER / f"{name}.onnx"
 
 
 def read_card(name: str) -> Card:
-    """Read and check one network's card.
+    """Read and validate one network's card.
 
     Raises
     ------
     WeightsMissing, DamagedWeights
-        Name the file and what to do.
+        The card is missing or invalid; the error names the file and a remedy.
     """
     path = card_path(name)
     if not path.is_file():
@@ -229,7 +228,7 @@ def read_card(name: str) -> Card:
 
 
 def missing_text(path: Path) -> str:
-    """Say which file is missing and what to do."""
+    """Return a message that names a missing file and a remedy."""
     name = path.relative_to(WEIGHTS_FOLDER.parents[2]).as_posix()
     return (
         f"{name} is missing: restore it from the repository, or make it anew with "
@@ -238,12 +237,12 @@ def missing_text(path: Path) -> str:
 
 
 def parse_card(name: str, data: Mapping) -> Card:
-    """Read a card's JSON.
+    """Parse a card's JSON.
 
     Raises
     ------
     KeyError, TypeError, ValueError
-        What it lacks, or where it is of another network or version.
+        The card is incomplete, or belongs to another network or version.
     """
     columns = tuple(column["name"] for column in data["inputs"])
     for what, found, wanted in (

@@ -1,9 +1,9 @@
-"""The trained networks: what they say of an eye, in microseconds instead of a trace.
+"""Inference with the trained networks, in microseconds instead of a ray trace.
 
-Each is evaluated by onnxruntime on the processor, loaded when it is first asked, once
-in a process.  Inputs outside of the training ranges are refused, never extrapolated:
-whoever asks falls back to ray tracing.  Trained by `training`, which this knows nothing
-of but the two files of each network, see `networks.card`.
+Each network is evaluated by ONNX Runtime on the CPU and loaded on first use, once per
+process.  Inputs outside the training ranges are rejected, never extrapolated: the
+caller falls back to ray tracing.  The networks are trained by `training`; the interface
+to it is the two files of each network, see `networks.card`.
 """
 
 from dataclasses import dataclass
@@ -27,26 +27,26 @@ from estimator.optics.zernike import N_TERMS
 from estimator.threads import thread_count
 
 BATCH = 2048
-"""Rows at a time: what lies between the layers then stays in the cache."""
+"""Rows per batch, so that activations stay in the processor cache."""
 
 ERRORS_ONLY = 3
-"""onnxruntime's severity from which it logs: it warns of what does not concern us."""
+"""Lowest severity that ONNX Runtime logs; its warnings do not concern us."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """One loaded network; call it with inputs in physical units."""
+    """One loaded network, called with inputs in physical units."""
 
     card: Card
     _session: Any
 
     def __call__(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Give the outputs (P, n_outputs) of inputs (P, n_inputs).
+        """Return the outputs (P, n_outputs) for inputs (P, n_inputs).
 
         Raises
         ------
         OutOfDomain
-            An input column leaves its training range.
+            An input column is outside its training range.
         """
         self.card.check(features)
         features = np.ascontiguousarray(features, dtype=np.float32)
@@ -59,9 +59,9 @@ class Network:
 
 @dataclass(frozen=True)
 class PupilAberrations:
-    """Wavefronts with their pupils, as the aberration network gives them.
+    """Wavefronts with their pupils, as predicted by the aberration network.
 
-    ``zernike_um`` (P, 28) on the circumscribed circles ``zernike_radius_mm`` (P,),
+    ``zernike_um`` (P, 28) is on the circumscribed circles ``zernike_radius_mm`` (P,),
     piston zero; ``rim_mm`` (P, 5) as in `field_wavefronts.rim_from_ellipse`.
     """
 
@@ -72,12 +72,12 @@ class PupilAberrations:
 
 @cache
 def load_network(name: str) -> Network:
-    """Load a network and its card, or return what is loaded.
+    """Load a network and its card, or return the loaded one.
 
     Raises
     ------
     WeightsMissing
-        Names the file, or the package, that is not there.
+        A file or package is missing; the error names it.
     DamagedWeights
     """
     card = read_card(name)
@@ -94,7 +94,7 @@ def load_network(name: str) -> Network:
     options.intra_op_num_threads = thread_count()
     options.inter_op_num_threads = 1
     options.log_severity_level = ERRORS_ONLY
-    # Waiting threads would take the cores that frames are rendered on.
+    # Spinning threads would occupy the cores that render frames.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = onnxruntime.InferenceSession(
@@ -111,12 +111,12 @@ def load_network(name: str) -> Network:
 def network_eye(
     zernike_um: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Parameters (..., 45) of relaxed eyes that have about these wavefronts.
+    """Return parameters (..., 45) of relaxed eyes with about these wavefronts.
 
     Parameters
     ----------
     zernike_um : (..., 28)
-        Measured on axis, on the circle of the pupil; piston and tilt are not used.
+        Coefficients on axis, on the circle of the pupil; piston and tilt are not used.
     pupil_diameter_mm, wavelength_nm : (...)
 
     Raises
@@ -131,9 +131,9 @@ def network_eye(
 def network_zernike(
     vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Coefficients (..., 28), um, of eyes (..., 45) on axis, by the discriminator.
+    """Return coefficients (..., 28), um, of eyes (..., 45) on axis, by discriminator.
 
-    What `eye.tracing.zernike_of_vectors` traces; piston zero.
+    They approximate `eye.tracing.zernike_of_vectors`; piston is zero.
 
     Raises
     ------
@@ -146,18 +146,16 @@ def network_zernike(
 def network_focus(
     vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, focus_dpt: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give the changes (...) of lens and chamber, mm, that focus an eye.
-
-    Of the lens diameter, and of the aqueous thickness.
+    """Return changes (...) of lens diameter and aqueous thickness, mm, for a focus.
 
     Parameters
     ----------
     vectors : (..., 45)
         Relaxed eyes.
     pupil_diameter_mm : (...)
-        Pupil at which the eye is then in focus.
+        Pupil through which the eye is focused.
     focus_dpt : (...)
-        Distance, without a worn correction.
+        Focus distance, without correction.
 
     Raises
     ------
@@ -176,10 +174,10 @@ def network_aberrations(
     h_deg: ArrayLike = 0.0,
     v_deg: ArrayLike = 0.0,
 ) -> PupilAberrations:
-    """Aberrations of focused eyes (..., 45) over the field, object at infinity.
+    """Return aberrations of focused eyes (..., 45) over the field, object at infinity.
 
-    What `aberrations.wavefront_grid` traces; all arguments broadcast, and the leading
-    axes of the result are theirs.
+    They approximate `aberrations.wavefront_grid`.  All arguments broadcast, and the
+    leading axes of the result are theirs.
 
     Raises
     ------

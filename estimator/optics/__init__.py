@@ -1,6 +1,6 @@
-"""Light and surfaces: what holds for any eye and any lens.
+"""Optics common to all eyes and lenses.
 
-arrays            arrays in the one form that compiled loops take
+arrays            arrays in the form that compiled loops require
 units             unit conversions, reference wavelengths
 zernike           the polynomials, their indices, rescaling, mirrors
 media             refractive indices of the eye's media by wavelength
@@ -9,9 +9,9 @@ prescription      spectacle prescriptions, power vectors, their coefficients
 surfaces          one surface, a stack of them, and both packed for compiled loops
 raytrace          rays through a stack of surfaces, each with its status
 raytrace_kernels  its compiled loops
-paraxial          vergences and pupils near the axis
+paraxial          first-order power, cardinal points and pupils
 vergence          the plane of the entrance pupil: distances, spectacles
-pupil_screen      rings in the pupil, as wave optics asks of them
+pupil_screen      interface of rings in the pupil, for wave optics
 pinhole           directions and local scale of a pinhole image
 """
 

@@ -1,15 +1,15 @@
-"""Arrays in the one form that compiled loops are compiled for."""
+"""Arrays in the form that compiled loops require."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
 def broadcast_copy(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return values, which broadcast to ``shape``, spread over it: C order, writable.
+    """Return values broadcast to ``shape`` as a writable array in C order.
 
-    `numpy.broadcast_to` gives a read-only view, and of an array that has the shape
-    already `numpy.ascontiguousarray` keeps it so: another type, for which numba
-    compiles everything once more, some 7 s for the ray tracer.
+    `numpy.broadcast_to` returns a read-only view, and `numpy.ascontiguousarray` keeps
+    it read-only if it has the shape already.  That is a different type, for which
+    numba recompiles everything, some 7 s for the ray tracer.
 
     Raises
     ------

@@ -8,10 +8,10 @@ INDIANA_POLE_NM = 214.102
 
 
 def chromatic_refraction_dpt(wavelength_nm: ArrayLike):
-    """Refraction of the Indiana chromatic eye, dpt, zero at 589.98 nm.
+    """Return the refraction of the Indiana chromatic eye, dpt, zero at 589.98 nm.
 
     A fit to measured eyes (Thibos, Ye, Zhang & Bradley 1992), used for profiles that
-    are a wavefront and no eye: only differences between wavelengths are taken from
-    it.  Shorter wavelengths are more myopic (negative).
+    consist of a wavefront without an eye.  Only differences between wavelengths are
+    used.  Shorter wavelengths are more myopic (negative).
     """
     return INDIANA_OFFSET_DPT - INDIANA_SLOPE_DPT_NM / (wavelength_nm - INDIANA_POLE_NM)

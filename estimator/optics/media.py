@@ -40,16 +40,16 @@ def refractive_index(
     *,
     indices: Mapping[str, float] | None = None,
 ) -> NDArray[np.float64]:
-    """Refractive index of one medium.
+    """Return the refractive index of one medium.
 
     Parameters
     ----------
     medium : str
-        ``cornea``, ``aqueous``, ``lens``, ``vitreous`` or ``air``, or any name that
-        ``indices`` holds.
+        ``cornea``, ``aqueous``, ``lens``, ``vitreous`` or ``air``, or any name in
+        ``indices``.
     wavelength_nm : (...), nm
     indices : mapping, optional
-        Constant indices by medium; they take the place of the dispersion formula.
+        Constant indices by medium; they replace the dispersion formula.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """First-order optics of an eye about its axis: power, cardinal points, entrance pupil.
 
-Mean curvatures are used where a surface is astigmatic; conic constants, tilts and
-decentrations do not matter at first order, and corneal offsets enter by their mean
+Astigmatic surfaces enter by their mean curvature.  Conic constants, tilts and
+decentrations have no effect at first order, and corneal offsets enter by their mean
 curvature and height at the vertex.  Lengths are mm from the corneal apex, powers dpt.
 """
 
@@ -36,18 +36,19 @@ class CardinalPoints:
     Attributes
     ----------
     power_dpt, cornea_power_dpt, lens_power_dpt : float
-        Whole eye; the surfaces before and behind the stop, each in its own media.
+        Power of the whole eye, and of the surfaces in front of and behind the stop,
+        each in its own media.
     object_focal_length_mm, image_focal_length_mm : float
-        From the principal points; the first is negative.
+        Focal lengths from the principal points; the first is negative.
     object_focus_mm, image_focus_mm, object_principal_mm, image_principal_mm,
     object_nodal_mm, image_nodal_mm : float
         Positions on the axis.
     entrance_pupil_mm : float
-        Position of the stop's image in the air.
+        Position of the stop's image in air.
     entrance_pupil_ratio : float
         Entrance pupil over stop.
     refraction_dpt : float
-        Refraction at the cornea: vergence there of the far point; negative: myopic.
+        Refraction at the cornea: vergence of the far point there; negative if myopic.
     """
 
     power_dpt: float
@@ -67,7 +68,7 @@ class CardinalPoints:
 
 
 def _offset_part(packed: NDArray, *exponents: tuple[int, int]) -> NDArray[np.float64]:
-    """Sum of some monomial coefficients of the offsets, zero where there are none."""
+    """Sum some monomial coefficients of the offsets; zero where there are none."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
     total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
     return np.where(packed[:, FORM] == WITH_OFFSET, total, 0.0)
@@ -79,14 +80,14 @@ def _mean_curvatures(packed: NDArray) -> NDArray[np.float64]:
 
 
 def _vertices_mm(packed: NDArray) -> NDArray[np.float64]:
-    """Where the surfaces cross the axis; an offset may shift its surface there."""
+    """Return the surfaces' axial positions; an offset may shift its surface there."""
     return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
 
 
 def system_matrix(
     packed: NDArray, indices: NDArray, *, first: int, last: int
 ) -> NDArray[np.float64]:
-    """Matrix (2, 2) on (height, index times slope) over surfaces first to last - 1."""
+    """Return the matrix (2, 2) on (height, index * slope), surfaces [first, last)."""
     curvature, z_mm = _mean_curvatures(packed), _vertices_mm(packed)
     matrix = np.eye(2)
     for i in range(first, last):
@@ -101,7 +102,7 @@ def system_matrix(
 def _entrance_pupil(
     packed: NDArray, indices: NDArray, stop_z_mm: float
 ) -> tuple[float, float]:
-    """Position and magnification of the image of the stop in the air."""
+    """Return position and magnification of the stop's image in air."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     matrix = system_matrix(packed, indices, first=0, last=n_before)
     z_mm = _vertices_mm(packed)
@@ -115,7 +116,7 @@ def _entrance_pupil(
 def entrance_pupils_mm(
     packed: NDArray[np.float64], indices: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Entrance pupils (n_eyes,) on the axis of eyes that have the same surfaces.
+    """Return axial entrance pupil positions (n_eyes,) of eyes with the same surfaces.
 
     Parameters
     ----------
@@ -141,7 +142,7 @@ def entrance_pupils_mm(
 
 
 def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints:
-    """Cardinal points of an eye at one wavelength.
+    """Compute the cardinal points of an eye at one wavelength.
 
     Raises
     ------
@@ -162,7 +163,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
     object_focus, image_focus = front_mm + n_air * d / c, back_mm - n_last * a / c
     object_focal, image_focal = n_air / c, -n_last / c
     pupil_mm, ratio = _entrance_pupil(packed, indices, eye.stop_z_mm)
-    # Rays that the whole eye brings to the retina's pole: slope over height in the air.
+    # Rays that the eye focuses on the retina's pole: slope over height in air.
     reach = (retina_mm - back_mm) / n_last
     refraction = MM_PER_M * (a + c * reach) / (b + d * reach)
     return CardinalPoints(
@@ -184,11 +185,11 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
 
 
 def entrance_pupil_mm(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
-    """Position on the axis of the stop's image in the air."""
+    """Return the axial position of the stop's image in air."""
     packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
     return _entrance_pupil(packed, indices, eye.stop_z_mm)[0]
 
 
 def refraction_dpt(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
-    """Paraxial refraction at the cornea, dpt: negative where the eye is myopic."""
+    """Return the paraxial refraction at the cornea, dpt; negative if myopic."""
     return cardinal_points(eye, wavelength_nm=wavelength_nm).refraction_dpt

@@ -1,8 +1,8 @@
 """Pinhole camera in the eye's entrance pupil: directions and the image's local scale.
 
-A PSF is an angular thing.  A pinhole image magnifies it by sec² along the radius and by
-sec across it; `pixel_from_mrad` is that as a matrix, for the PSF engines to map a PSF
-by before it is integrated over pixels.
+A PSF is a function of angle.  A pinhole image magnifies it by sec² along the radius and
+by sec across it.  `pixel_from_mrad` returns this as a matrix, by which the PSF engines
+map a PSF before they integrate it over pixels.
 """
 
 import numpy as np
@@ -22,14 +22,14 @@ def _tangents(tangents: ArrayLike) -> tuple[float, float, float, float]:
 def tangents_at(
     x_px: ArrayLike, y_px: ArrayLike, *, tangents: ArrayLike, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tangents (right, up) of the direction through an image point.
+    """Return the tangents (right, up) of the direction through an image point.
 
     Parameters
     ----------
     x_px, y_px : (...)
-        Image position, y downwards; the middle of the top-left pixel is (0.5, 0.5).
+        Image position, y downward; the center of the top-left pixel is (0.5, 0.5).
     tangents : (left, right, up, down)
-        Of the angles to the image edges.
+        Tangents of the angles to the image edges.
     size_px : (width, height)
     """
     left, right, up, down = _tangents(tangents)
@@ -41,7 +41,7 @@ def tangents_at(
 def direction_deg(
     tangent_x: ArrayLike, tangent_y: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Azimuth h and elevation v in degrees of the direction (t_x, t_y, -1)."""
+    """Return azimuth h and elevation v in degrees of the direction (t_x, t_y, -1)."""
     x, y = np.asarray(tangent_x, np.float64), np.asarray(tangent_y, np.float64)
     h_deg = np.degrees(np.arctan(x))
     return h_deg, np.degrees(np.arctan2(y, np.hypot(1.0, x)))
@@ -50,26 +50,26 @@ def direction_deg(
 def pixel_from_mrad(
     h_deg: ArrayLike, v_deg: ArrayLike, *, tangents: ArrayLike, size_px: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Jacobian of a pinhole image with respect to visual angle, at a direction.
+    """Return the Jacobian of a pinhole image with respect to visual angle.
 
     Parameters
     ----------
     h_deg, v_deg : (...)
         Direction to the source; within 90 degrees of the camera's axis.
     tangents : (left, right, up, down)
-        Of the angles to the image edges.
+        Tangents of the angles to the image edges.
     size_px : (width, height)
 
     Returns
     -------
     jacobian : (..., 2, 2)
         Pixels (x right, y up) per mrad (along ex, ey): with u the unit vector to the
-        source, ex = u x y normalised and ey = ex x u.
+        source, ex = u x y normalized and ey = ex x u.
 
     Raises
     ------
     ValueError
-        A direction that no pinhole images.
+        A direction outside of any pinhole image.
     """
     left, right, up, down = _tangents(tangents)
     h, v = np.radians(np.asarray(h_deg, float)), np.radians(np.asarray(v_deg, float))

@@ -1,4 +1,4 @@
-"""Spectacle prescriptions and power vectors to and from Zernike coefficients."""
+"""Conversion of spectacle prescriptions, power vectors and Zernike coefficients."""
 
 import math
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ C2M2 = index_from_nm(2, -2)
 class Prescription:
     """Sphere and cylinder at the spectacle plane, axis in the examiner's frame.
 
-    ``vertex_mm`` is the distance from lens to cornea; 0 means powers are already
-    those at the cornea (as a contact lens, or the paper's conditions).
+    ``vertex_mm`` is the distance from lens to cornea; 0 means that the powers are
+    those at the cornea (as for a contact lens or the paper's conditions).
     """
 
     sphere_dpt: float
@@ -29,12 +29,12 @@ class Prescription:
 
 
 def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
-    """Move a thin lens power to the cornea: F / (1 - d F)."""
+    """Convert a thin lens power to the cornea: F / (1 - d F)."""
     return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
 
 
 def at_cornea(lens: Prescription) -> Prescription:
-    """Return a lens with the powers that it has at the cornea."""
+    """Return the lens with its powers at the cornea."""
     other_dpt = lens.sphere_dpt + lens.cylinder_dpt
     sphere_dpt, other_dpt = (
         power_at_cornea_dpt(power_dpt, vertex_mm=lens.vertex_mm)
@@ -44,7 +44,7 @@ def at_cornea(lens: Prescription) -> Prescription:
 
 
 def written(lens: Prescription) -> str:
-    """Return powers as people write them: sphere, cylinder x axis."""
+    """Format powers in the usual notation: sphere, cylinder x axis."""
     text = f"{lens.sphere_dpt:+.2f}"
     if abs(lens.cylinder_dpt) >= 0.005:
         text += f" {lens.cylinder_dpt:+.2f} x {lens.axis_deg:.0f}"
@@ -54,11 +54,11 @@ def written(lens: Prescription) -> str:
 def power_vector(
     prescription: Prescription, *, depth_mm: float = 0.0
 ) -> tuple[float, float, float]:
-    """M, J0 and J45 in dpt at the cornea, in the eye frame (x to the person's right).
+    """Return M, J0, J45 in dpt at the cornea, eye frame (x to the person's right).
 
-    The examiner sees the eye mirrored, so the axis A becomes 180 - A,
-    which changes the sign of J45 alone.  Thibos, Wheeler & Horner 1997.  With
-    ``depth_mm`` they are those so far behind the cornea.
+    The examiner sees the eye mirrored, so the axis A becomes 180 - A, which changes
+    only the sign of J45.  Thibos, Wheeler & Horner 1997.  With ``depth_mm`` the powers
+    are those at that depth behind the cornea.
     """
     vertex_mm = prescription.vertex_mm + depth_mm
     sphere = power_at_cornea_dpt(prescription.sphere_dpt, vertex_mm=vertex_mm)
@@ -73,7 +73,7 @@ def power_vector(
 def zernike_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float, *, zernike_radius_mm: float
 ) -> NDArray[np.float64]:
-    """Coefficients (28,), um, of a sphero-cylindrical refraction on a circle."""
+    """Return coefficients (28,), um, of a sphero-cylindrical refraction on a circle."""
     zernike_um = np.zeros(N_TERMS)
     area = zernike_radius_mm**2
     zernike_um[C20] = -m_dpt * area / SPHERE_PER_C20
@@ -85,7 +85,7 @@ def zernike_from_power_vector(
 def power_vector_from_zernike(
     zernike_um: NDArray[np.float64], *, zernike_radius_mm: float
 ) -> tuple[float, float, float]:
-    """Least-squares M, J0, J45 in dpt: from the second-order coefficients alone."""
+    """Return least-squares M, J0, J45 in dpt, from second-order coefficients only."""
     m, j0, j45 = power_vectors_dpt(np.asarray(zernike_um), zernike_radius_mm).tolist()
     return m, j0, j45
 
@@ -93,7 +93,7 @@ def power_vector_from_zernike(
 def power_vectors_dpt(
     zernike_um: NDArray[np.float64], zernike_radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return the same (..., 3) of sets (..., 28) on circles (...)."""
+    """Return least-squares M, J0, J45 (..., 3) of sets (..., 28) on circles (...)."""
     second = zernike_um[..., [C20, C22, C2M2]]
     per_um = -np.array([SPHERE_PER_C20, ASTIGMATISM_PER_C22, ASTIGMATISM_PER_C22])
     return per_um * second / np.square(zernike_radius_mm)[..., None]
@@ -102,7 +102,7 @@ def power_vectors_dpt(
 def prescription_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float
 ) -> Prescription:
-    """Minus-cylinder prescription at the cornea, axis in the examiner's frame."""
+    """Return the minus-cylinder prescription at the cornea, axis as the examiner's."""
     cylinder_dpt = -2.0 * math.hypot(j0_dpt, j45_dpt)
     axis_deg = 180.0 - math.degrees(math.atan2(j45_dpt, j0_dpt)) / 2.0
     axis_deg = axis_deg % 180.0

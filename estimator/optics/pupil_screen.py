@@ -1,4 +1,4 @@
-"""Rings in the pupil that no polynomial describes, as wave optics asks of them."""
+"""Interface of rings in the pupil that no polynomial describes, for wave optics."""
 
 from typing import Protocol
 
@@ -7,22 +7,22 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class PupilScreen(Protocol):
-    """What rings do to the light, about one centre or many."""
+    """Effect of rings on light, about one center or many."""
 
     @property
     def centre_mm(self) -> ArrayLike:
-        """Of the rings, from the pupil's centre: (2,), or (P, 2) for each pupil."""
+        """Center of the rings from the pupil's center: (2,), or (P, 2) by pupil."""
 
     @property
     def lattice_mm(self) -> tuple[float, float, float] | None:
-        """Pitch of a honeycomb of rings, and the radii between which it lies."""
+        """Pitch of a honeycomb of rings, and its inner and outer radius."""
 
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """How far light goes aside at distances from the centre."""
+        """Return the largest deflection of light at distances from the center."""
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Complex amplitude at squared distances from the centre of rings."""
+        """Return the complex amplitude at squared distances from the rings' center."""

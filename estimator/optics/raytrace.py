@@ -11,7 +11,7 @@ from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pac
 
 
 class RayStatus(IntEnum):
-    """How a ray fared; data, never an exception."""
+    """Outcome of tracing a ray; data, never an exception."""
 
     TRACED = kernels.TRACED
     MISSED = kernels.MISSED
@@ -33,12 +33,12 @@ STATUS_WORDS = {
 
 @dataclass(frozen=True)
 class TracedRays:
-    """Rays through an eye; element e counts inwards, the stop and the retina included.
+    """Rays through an eye; elements count inward and include the stop and the retina.
 
     Attributes
     ----------
     points_mm : (n_rays, n_elements, 3)
-        Where each ray met each element; nan from the first failure on.
+        Intersection of each ray with each element; nan from the first failure on.
     direction_ratio : (n_rays, n_elements, 3)
         Direction cosines behind the element, as the ray travels.
     path_mm : (n_rays, n_elements)
@@ -46,7 +46,7 @@ class TracedRays:
     status_index : (n_rays,) int
         `RayStatus`.
     stop_index : int
-        Which element the stop is.
+        Index of the stop among the elements.
     """
 
     points_mm: NDArray[np.float64]
@@ -64,28 +64,28 @@ def trace_rays(
     wavelength_nm: float,
     reverse: bool = False,
 ) -> TracedRays:
-    """Trace rays from the air to the retina, or from the retina to the air.
+    """Trace rays from air to the retina, or from the retina to air.
 
     Parameters
     ----------
     eye : EyeSurfaces
     start_mm : (n_rays, 3) or (3,)
-        Before the eye; with ``reverse``, on the retina.
+        Start points in front of the eye; with ``reverse``, on the retina.
     direction : (n_rays, 3) or (3,)
-        Need not be normalised; z positive forwards, negative in reverse.
+        Direction, not necessarily normalized; z positive forward, negative in reverse.
     wavelength_nm : float
     reverse : bool
 
     Returns
     -------
     TracedRays
-        With ``reverse`` the path counts from the retina; the order of elements stays.
+        With ``reverse`` the path starts at the retina; the order of elements stays.
 
     Raises
     ------
     ValueError
-        An eye that cannot be traced, directions along no z, or a wavelength outside
-        the range of the media.
+        An eye that cannot be traced, directions with the wrong sign of z, or a
+        wavelength outside the range of the media.
     """
     check_eye(eye)
     start_mm, direction = np.broadcast_arrays(

@@ -1,8 +1,8 @@
-"""One ray through packed surfaces, compiled: intersection, refraction, status.
+"""Compiled: one ray through packed surfaces, with intersection, refraction and status.
 
 A ray is an array of 8: position (mm), direction cosines, optical path (mm), and the
-distance since the last refracting surface (mm).  Everything is float64 and releases
-the Python lock; nothing starts threads.  The packed form is described in `surfaces.py`.
+distance since the last refracting surface (mm).  Everything is float64, releases the
+GIL and starts no threads.  The packed form is described in `surfaces.py`.
 """
 
 import math
@@ -44,9 +44,9 @@ _INFINITE = math.inf
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def put(source, to):
-    """Copy (n,) numbers: assigned as a slice they take 3 s longer to compile.
+    """Copy (n,) numbers; a slice assignment takes 3 s longer to compile.
 
-    (For the message that numba prepares in case that the shapes differ.)
+    (Numba compiles an error message in case the shapes differ.)
     """
     for i in range(to.shape[0]):
         to[i] = source[i]
@@ -54,7 +54,7 @@ def put(source, to):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sag(packed, i, x, y, out):
-    """Sag and gradient of an iterated form into ``out`` (z, zx, zy); False outside."""
+    """Write sag and gradient (z, zx, zy) of an iterated form; return False outside."""
     cx, cy, k1 = packed[i, CURVATURE_X], packed[i, CURVATURE_Y], 1.0 + packed[i, CONIC]
     radicand = 1.0 - k1 * (cx * cx * x * x + cy * cy * y * y)
     inside = radicand > 0.0
@@ -84,9 +84,9 @@ def _sag(packed, i, x, y, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _conic_distance(c, k, x, y, z, dx, dy, dz):
-    """Distance to the vertex sheet of a conic of revolution; nan where there is none.
+    """Return the distance to the vertex sheet of a conic of revolution; nan if none.
 
-    Of the two roots the one that tends to the plane's as the curvature vanishes; for a
+    Of the two roots, the one that tends to the plane's as the curvature vanishes; for a
     ray inside a closed retina it is the far one.
     """
     a = c * (1.0 + k * dz * dz)
@@ -101,7 +101,7 @@ def _conic_distance(c, k, x, y, z, dx, dy, dz):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _iterated_distance(packed, i, x, y, z, dx, dy, dz, sag):
-    """Newton to a biconic or offset surface; nan outside, inf if not converged."""
+    """Return the distance to an iterated form; nan outside, inf if not converged."""
     c = 0.5 * (packed[i, CURVATURE_X] + packed[i, CURVATURE_Y])
     t = _conic_distance(c, packed[i, CONIC], x, y, z, dx, dy, dz)
     if t != t:
@@ -119,9 +119,9 @@ def _iterated_distance(packed, i, x, y, z, dx, dy, dz, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cross_surface(packed, i, ray, n_from, n_to, sag):
-    """Carry a ray to one surface and refract it there; returns its status.
+    """Trace a ray to one surface, refract it there and return its status.
 
-    Equal indices carry it to the surface without bending.  ``sag`` is room for 3.
+    Equal indices leave its direction unchanged.  ``sag`` is a scratch array of 3.
     """
     x, y, z = (
         ray[0] - packed[i, VERTEX],
@@ -222,7 +222,7 @@ def cross_surface(packed, i, ray, n_from, n_to, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_stop(packed, ray, n):
-    """Carry a ray to the stop plane, backwards too (the plane may cut the lens)."""
+    """Trace a ray to the stop plane, also backward (the plane may cut the lens)."""
     t = (packed[-1, STOP_Z] - ray[2]) / ray[5]
     ray[0] += t * ray[3]
     ray[1] += t * ray[4]
@@ -233,7 +233,7 @@ def to_stop(packed, ray, n):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def inwards(packed, indices, ray, first, last, sag):
-    """Forward through surfaces first to last - 1; the status."""
+    """Trace a ray forward through surfaces first to last - 1; return its status."""
     for i in range(first, last):
         status = cross_surface(packed, i, ray, indices[i], indices[i + 1], sag)
         if status != TRACED:
@@ -243,7 +243,7 @@ def inwards(packed, indices, ray, first, last, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def outwards(packed, indices, ray, first, last, sag):
-    """Reverse through surfaces last - 1 down to first; the status."""
+    """Trace a ray in reverse through surfaces last - 1 to first; return its status."""
     for i in range(last - 1, first - 1, -1):
         status = cross_surface(packed, i, ray, indices[i + 1], indices[i], sag)
         if status != TRACED:
@@ -253,7 +253,7 @@ def outwards(packed, indices, ray, first, last, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_retina(packed, indices, ray, sag):
-    """Carry a ray behind the last surface to the retina, without bending."""
+    """Trace a ray from the last surface straight to the retina."""
     n = indices[packed.shape[0] - 1]
     return cross_surface(packed, packed.shape[0] - 1, ray, n, n, sag)
 
@@ -270,7 +270,7 @@ def trace_bundle(packed, indices, rays, reverse, points, directions, paths, stat
         ray[6:] = 0.0
         status[r] = TRACED
         for step in range(n_surfaces + 2):
-            # Elements in the order light meets them: surfaces, stop among them, retina.
+            # Elements in the order light meets them: surfaces and stop, then retina.
             e = n_surfaces + 1 - step if reverse else step
             if reverse and step == 0:
                 code = TRACED  # the ray starts on the retina

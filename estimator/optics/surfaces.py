@@ -1,8 +1,8 @@
 """Surfaces of an eye, and the packed float64 array that compiled code traces through.
 
-An eye is its refracting surfaces from the anterior cornea inwards, a stop plane, a
-retina and the media between them.  Its frame: origin at the corneal apex, x to the
-person's right, y up, z into the eye.
+An eye consists of refracting surfaces from the anterior cornea inward, a stop plane, a
+retina and the media between them.  Its frame has the origin at the corneal apex, x to
+the person's right, y up, z into the eye.
 """
 
 import math
@@ -35,8 +35,8 @@ FORM = 15  # 0 conic of revolution, 1 biconic, 2 with offset terms
 IS_TURNED = 16  # 1 where ROTATION is not the identity
 CLEAR_SQUARED = 17  # square of the clear radius, mm²
 OFFSET = 18  # 28 monomial coefficients, mm, in the order of `horner_order`
-STOP_Z = 46  # of the last row: the stop plane, mm
-N_BEFORE_STOP = 47  # of the last row: how many surfaces lie before the stop
+STOP_Z = 46  # last row only: the stop plane, mm
+N_BEFORE_STOP = 47  # last row only: number of surfaces in front of the stop
 N_COLUMNS = 48
 
 REVOLVED, BICONIC, WITH_OFFSET = 0, 1, 2
@@ -50,27 +50,28 @@ class Surface:
     """One refracting surface.
 
     z = (x²/Rx + y²/Ry) / (1 + sqrt(1 - (1+k)(x²/Rx² + y²/Ry²))) + offset, in axes that
-    stand at the vertex, turned by ``rotation_deg`` about the surface's own axis, then
-    by ``tilt_deg`` about the eye's x, then y axis (right-handed).
+    originate at the vertex, rotated by ``rotation_deg`` about the surface's own axis,
+    then by ``tilt_deg`` about the eye's x, then y axis (right-handed).
 
     Attributes
     ----------
     radius_mm : (Rx, Ry)
-        Positive where the centre of curvature lies towards the retina; may be inf.
+        Radii, positive where the center of curvature lies toward the retina; may be
+        inf.
     conic_constant : float
         k: 0 sphere, -1 paraboloid.
     z_mm : float
-        Vertex.
+        Position of the vertex.
     medium_after : str
         Medium behind the surface.
     rotation_deg, decentration_mm, tilt_deg
-        Position; the vertex stands at (decentration_mm, z_mm).
+        Orientation and position; the vertex is at (decentration_mm, z_mm).
     offset_mm : (28,) or None
-        Un-normalised Zernike terms (OSA order) added to the sag, mm.
+        Unnormalized Zernike terms (OSA order) added to the sag, mm.
     offset_radius_mm : float
         Circle of the offset terms.
     clear_radius_mm : float
-        Rays that meet the surface farther from its axis are clipped.
+        Distance from the surface's axis beyond which rays are clipped.
     """
 
     radius_mm: tuple[float, float]
@@ -87,10 +88,10 @@ class Surface:
 
 @dataclass(frozen=True)
 class Retina:
-    """The retina: a conic about the eye's axis, concave towards the lens.
+    """The retina: a conic about the eye's axis, concave toward the lens.
 
-    ``radius_mm`` is one radius or (Rx, Ry); its sign is not read, as no retina bulges
-    inwards.  ``z_mm`` is its pole.
+    ``radius_mm`` is one radius or (Rx, Ry); its sign is ignored, because no retina
+    bulges inward.  ``z_mm`` is the position of its pole.
     """
 
     radius_mm: float | tuple[float, float]
@@ -110,7 +111,7 @@ class EyeSurfaces:
         Plane of the iris; its opening is a circle about the z axis.
     retina : Retina
     indices : mapping or None
-        Constant refractive indices by medium; None takes the dispersion of `media`.
+        Constant refractive indices by medium; None uses the dispersion of `media`.
     """
 
     surfaces: tuple[Surface, ...]
@@ -121,7 +122,7 @@ class EyeSurfaces:
 
 @cache
 def horner_order() -> NDArray[np.int64]:
-    """Positions in ``EXPONENTS`` of the monomials in the order Horner's rule reads.
+    """Return positions in ``EXPONENTS`` of the monomials in the order of Horner's rule.
 
     Powers of y fall from 6 to 0, and within each the powers of x.
     """
@@ -145,12 +146,12 @@ def _unnormalised_monomials() -> NDArray[np.float64]:
 
 
 def offset_monomials(offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike) -> NDArray:
-    """Coefficients (..., 28) of x^a y^b, mm, in Horner's order, of offset terms.
+    """Return coefficients (..., 28) of x^a y^b, mm, in Horner's order, of offset terms.
 
     Parameters
     ----------
     offset_mm : (..., 28), mm
-        Un-normalised Zernike terms, index = j.
+        Unnormalized Zernike terms, index = j.
     offset_radius_mm : (...), mm
     """
     degree = EXPONENTS.sum(axis=1)
@@ -160,7 +161,7 @@ def offset_monomials(offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike) -> ND
 
 
 def rotation_matrix(*, rotation_deg: float, tilt_deg: tuple[float, float]) -> NDArray:
-    """(3, 3) from surface to eye axes: about z first, then x, then y."""
+    """Return the rotation (3, 3) from surface to eye axes: about z, then x, then y."""
 
     def turn(angle_deg, i, j):
         matrix = np.eye(3)
@@ -202,15 +203,15 @@ def _pack_surface(surface: Surface, row: NDArray) -> None:
 
 
 def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
-    """Geometry of an eye as one array for compiled code.
+    """Pack the geometry of an eye into one array for compiled code.
 
     Returns
     -------
     packed : (n_surfaces + 1, 48)
         One row per refracting surface, then the retina; columns as named at the top
-        of this file.  Refractive indices travel apart (`media_indices`), because one
-        geometry serves many wavelengths.  Eyes with the same number of surfaces stack
-        to (n_eyes, n_surfaces + 1, 48).
+        of this file.  Refractive indices are passed separately (`media_indices`),
+        because one geometry serves many wavelengths.  Eyes with the same number of
+        surfaces stack to (n_eyes, n_surfaces + 1, 48).
     """
     packed = np.zeros((len(eye.surfaces) + 1, N_COLUMNS))
     for surface, row in zip(eye.surfaces, packed, strict=False):
@@ -228,7 +229,7 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
 
 
 def media_indices(eye: EyeSurfaces, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
-    """Refractive indices (..., n_surfaces + 1): air first, then behind each surface."""
+    """Return indices (..., n_surfaces + 1): air first, then behind each surface."""
     wavelength_nm = np.asarray(wavelength_nm, dtype=np.float64)
     names = ["air", *(s.medium_after for s in eye.surfaces)]
     return np.stack(
@@ -238,12 +239,12 @@ def media_indices(eye: EyeSurfaces, wavelength_nm: ArrayLike) -> NDArray[np.floa
 
 
 def check_eye(eye: EyeSurfaces) -> None:
-    """Refuse an eye that cannot be traced at all.
+    """Raise if an eye cannot be traced at all.
 
     Raises
     ------
     ValueError
-        Names the surface and what is wrong with it.
+        Names the surface and the invalid value.
     """
     if not 1 <= len(eye.surfaces) <= MAX_SURFACES:
         raise ValueError(

@@ -1,8 +1,8 @@
-"""The plane of the entrance pupil: where distances, pupils and wavefronts are counted.
+"""The entrance pupil as the reference plane of distances, pupils and wavefronts.
 
-Instruments and prescriptions speak of the cornea, spectacles stand before it, but a
-person's pupil and a camera's distances are those of the entrance pupil: there light of
-any distance d fills the same pupil, and adds the vergence d to the eye's refraction.
+Instruments and prescriptions refer to the cornea, and spectacles are in front of it.
+Pupil sizes and camera distances refer to the entrance pupil: there light of any
+distance d fills the same pupil and adds the vergence d to the eye's refraction.
 """
 
 from dataclasses import dataclass
@@ -14,22 +14,22 @@ from estimator.optics.prescription import Prescription, power_at_cornea_dpt
 from estimator.optics.units import MM_PER_M
 
 TYPICAL_ENTRANCE_PUPIL_MM = 3.05
-"""Entrance pupil behind the corneal apex, of a schematic eye: what a measured wavefront
-alone does not tell."""
+"""Depth of the entrance pupil behind the corneal apex in a schematic eye, used where
+only a measured wavefront is given."""
 
 
 @dataclass(frozen=True)
 class ObjectVergence:
-    """Vergence of light from a distance less that from infinity: s d / (1 + o d).
+    """Vergence of light from a distance minus that from infinity: s d / (1 + o d).
 
-    Distances count from the entrance pupil, vergences are those in its plane.
+    Distances are from the entrance pupil, vergences are in its plane.
 
     Attributes
     ----------
     scale_ratio : float
         s, 1 without spectacles.
     offset_m : float
-        o, 0 without.
+        o, 0 without spectacles.
     """
 
     scale_ratio: float = 1.0
@@ -39,17 +39,17 @@ class ObjectVergence:
     def seen_through(
         cls, correction: Prescription | None, *, entrance_pupil_mm: float
     ) -> "ObjectVergence":
-        """Return that of an eye with its correction.
+        """Return the object vergence of an eye with its correction.
 
-        A thin lens of power F, L before the entrance pupil, turns the vergence -u of
-        light at it into (F - u) / (1 - L (F - u)) in the pupil.  Less that of u = 0
-        this is u / ((1 - L F) (1 - L F + L u)): with minus lenses near objects ask for
-        less.  The power is the mean of both meridians.
+        A thin lens of power F, at L in front of the entrance pupil, converts the
+        vergence -u of light at it to (F - u) / (1 - L (F - u)) in the pupil.  Minus
+        that of u = 0 this is u / ((1 - L F) (1 - L F + L u)): with minus lenses near
+        objects require less.  The power is the mean of both meridians.
 
         Parameters
         ----------
         entrance_pupil_mm : float
-            Behind the corneal apex.
+            Depth behind the corneal apex.
         """
         if correction is None:
             return cls()
@@ -63,7 +63,7 @@ class ObjectVergence:
     @overload
     def vergence_dpt(self, object_dpt: NDArray) -> NDArray: ...
     def vergence_dpt(self, object_dpt):
-        """Vergence of light from an object's distance."""
+        """Return the vergence of light from an object's distance."""
         return self.scale_ratio * object_dpt / (1.0 + self.offset_m * object_dpt)
 
     @overload
@@ -71,12 +71,12 @@ class ObjectVergence:
     @overload
     def object_dpt(self, vergence_dpt: NDArray) -> NDArray: ...
     def object_dpt(self, vergence_dpt):
-        """Distance whose light has a vergence."""
+        """Return the distance whose light has the given vergence."""
         return vergence_dpt / (self.scale_ratio - self.offset_m * vergence_dpt)
 
 
 def refraction_at_cornea_dpt(
     refraction_dpt: float, *, entrance_pupil_mm: float
 ) -> float:
-    """Move a refraction from the entrance pupil out to the cornea."""
+    """Convert a refraction from the entrance pupil to the cornea."""
     return power_at_cornea_dpt(refraction_dpt, vertex_mm=-entrance_pupil_mm)

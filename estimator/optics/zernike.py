@@ -1,8 +1,8 @@
-"""Zernike circle polynomials up to radial order 6, OSA/ANSI index and normalisation.
+"""Zernike circle polynomials up to radial order 6, OSA/ANSI index and normalization.
 
-Every set is an array of 28 coefficients in um, index = j, piston first, and travels
-with the radius of its circle.  Evaluation goes through monomials x^a y^b: gradients
-and pupil rescaling are then exact and share one table.
+Every set is an array of 28 coefficients in um, index = j, piston first, and is passed
+with the radius of its circle.  Evaluation uses monomials x^a y^b, so gradients and
+pupil rescaling are exact and share one table.
 """
 
 import math
@@ -21,11 +21,11 @@ EXPONENTS: NDArray[np.int64] = np.array(
         for b in range(degree + 1)
     ]
 )
-"""(28, 2): exponents (a, b) of the monomials x^a y^b, by degree."""
+"""Exponents (a, b) of the monomials x^a y^b, (28, 2), by degree."""
 
 
 def nm_from_index(index: int) -> tuple[int, int]:
-    """Radial order n and frequency m of OSA/ANSI index j (j = 0 is piston)."""
+    """Return radial order n and frequency m of OSA/ANSI index j (j = 0 is piston)."""
     if index < 0:
         raise ValueError(f"Zernike index {index}: must be 0 or more")
     n = math.ceil((-3.0 + math.sqrt(9.0 + 8.0 * index)) / 2.0)
@@ -33,14 +33,14 @@ def nm_from_index(index: int) -> tuple[int, int]:
 
 
 def index_from_nm(n: int, m: int) -> int:
-    """OSA/ANSI index j = (n(n+2)+m)/2; n >= |m| with n - |m| even."""
+    """Return the OSA/ANSI index j = (n(n+2)+m)/2; n >= |m| with n - |m| even."""
     if n < 0 or abs(m) > n or (n - abs(m)) % 2:
         raise ValueError(f"Zernike term ({n},{m}): needs n >= |m| >= 0, n - |m| even")
     return (n * (n + 2) + m) // 2
 
 
 def _solid_harmonic(m: int) -> tuple[dict, dict]:
-    """Real and imaginary part of (x + iy)^m as {(a, b): coefficient}."""
+    """Return real and imaginary part of (x + iy)^m as {(a, b): coefficient}."""
     real, imaginary = {}, {}
     for k in range(m + 1):
         sign = (1, 1, -1, -1)[k % 4]
@@ -50,7 +50,7 @@ def _solid_harmonic(m: int) -> tuple[dict, dict]:
 
 
 def _radial_coefficients(n: int, m: int) -> list[tuple[int, float]]:
-    """R_n^m / rho^m as [(power of rho², coefficient)]."""
+    """Return R_n^m / rho^m as [(power of rho², coefficient)]."""
     half_sum, half_difference = (n + m) // 2, (n - m) // 2
     return [
         (
@@ -69,7 +69,7 @@ def _radial_coefficients(n: int, m: int) -> list[tuple[int, float]]:
 
 @cache
 def monomial_matrix() -> NDArray[np.float64]:
-    """Coefficients of every Zernike polynomial in the monomial basis.
+    """Return the coefficients of every Zernike polynomial in the monomial basis.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def monomial_matrix() -> NDArray[np.float64]:
 
 
 def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Monomial coefficients (..., 28) of W = sum C_j Z_j on the unit circle, um."""
+    """Return monomial coefficients (..., 28), um, of W = sum C_j Z_j, unit circle."""
     return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
 
 
@@ -103,7 +103,7 @@ def _powers(x: NDArray, highest: int) -> NDArray:
 
 
 def zernike_values(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-    """Values of the 28 polynomials.
+    """Return the values of the 28 polynomials.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def zernike_values(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
 
 
 def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-    """Gradients of the 28 polynomials, per unit of the normalised pupil.
+    """Return the gradients of the 28 polynomials, per unit of the normalized pupil.
 
     Returns
     -------
@@ -139,13 +139,13 @@ def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
 
 
 def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray:
-    """Coefficients of the same wavefront on a concentric circle of another radius.
+    """Return coefficients of the same wavefront on a concentric circle.
 
     Parameters
     ----------
     zernike_um : (..., 28), um
     radius_ratio : (...)
-        New radius over old.  Exact for any ratio as polynomial algebra; above 1 it
+        New radius over old.  The algebra is exact for any ratio; above 1 it
         extrapolates a measurement, which callers must not do silently.
 
     Returns
@@ -177,7 +177,7 @@ def flip_horizontal(zernike_um: ArrayLike) -> NDArray[np.float64]:
 
 
 def remove_central_tilt(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Set C(1,±1) so that the slope at the pupil centre is zero."""
+    """Set C(1,±1) so that the slope at the pupil center is zero."""
     zernike_um = np.array(zernike_um, dtype=np.float64)
     slope = zernike_gradient(0.0, 0.0)
     for row, j in ((0, index_from_nm(1, 1)), (1, index_from_nm(1, -1))):

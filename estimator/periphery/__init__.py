@@ -1,10 +1,10 @@
-"""How people's wavefronts change from the axis to the periphery, measured.
+"""Measured changes of people's wavefronts from the axis to the periphery.
 
-meridian         the visual field from the horizontal meridian
+meridian         extension of the horizontal meridian to the visual field
 people           measured people, all as right eyes
 population       their mean and covariance
-change           what one eye is like, by its axis and what else was measured
-make_population  makes ``population.json`` anew
+change           change of one eye, conditioned on its axis and other measurements
+make_population  regenerates ``population.json``
 """
 
 import lazy_loader

@@ -1,9 +1,9 @@
-"""How the wavefront of one eye changes from its axis to the periphery.
+"""Change of one eye's wavefront from its axis to the periphery.
 
-The normal distribution of measured people (`population`) under what is known of this
-eye: its axis, and other directions where they were measured.  What an eye measured off
-the horizontal meridian shows beyond `meridian`'s forms is kept by a smooth field that
-is nothing on the meridian.
+The normal distribution of measured people (`population`) is conditioned on this eye's
+axis, and on other directions if they were measured.  Measurements off the horizontal
+meridian may depart from `meridian`'s forms; a smooth field, zero on the meridian,
+represents this departure.
 """
 
 import math
@@ -29,15 +29,15 @@ from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import EyeProfile, Measurement
 
 NOISE_UM = 0.02
-"""Of a coefficient that was measured, on the population's circle: what instruments
-repeat to, and what a spline between knots leaves."""
+"""Noise of a measured coefficient on the population's circle: the repeatability of
+instruments, and the residual of a spline between knots."""
 
 SECOND_ORDER = (3, 4, 5)
-"""What a prescription says of the axis."""
+"""Terms of the axis that a prescription determines."""
 
 USUAL_DISTANCE = 4.6
-"""Mahalanobis distance on the axis within which 95 % of people lie (twelve terms).  The
-periphery of an eye beyond is that of the eye on this border, see `usual_axis_um`."""
+"""Mahalanobis distance on the axis within which 95 % of people lie (twelve terms).  An
+eye beyond has the periphery of the eye on this border, see `usual_axis_um`."""
 
 FREE_UM = dict(
     zip(
@@ -46,37 +46,38 @@ FREE_UM = dict(
         strict=True,
     )
 )
-"""Root mean square by which five measured people (Polans 2015) depart from what their
-axis tells by `meridian`'s forms, at 25 deg up and down and within 30 deg aside."""
+"""Root mean square departure of five measured people (Polans 2015) from the prediction
+of their axis by `meridian`'s forms, at 25 deg up and down and within 30 deg to the
+sides."""
 
 FREE_AT_DEG, FREE_REACH_DEG = 25.0, 20.0
 
 DISAGREES_UM = 0.1
-"""Root mean square by which measurements may miss what a smooth field makes of them."""
+"""Allowed root mean square difference between measurements and the smooth field."""
 
 
 @dataclass(frozen=True, eq=False)
 class PeripheralChange:
-    """Change of terms 3 to 14 over the field of one eye, and how well it is known.
+    """Change of terms 3 to 14 over the field of one eye, with its uncertainty.
 
     Attributes
     ----------
     eye_side : str
         OD or OS.
     axis_um : (12,)
-        Wavefront of a right eye's axis that this is for, on the circle of `meridian`.
+        Wavefront on the axis, as a right eye's, on the circle of `meridian`.
     is_usual : bool
         Whether that is the eye's own axis.
     knots_um : (96,)
-        Change at the knots, of a right eye.
+        Change at the knots, as a right eye's.
     sphere_deviation_dpt : (8,)
-        Of the change of M at the knots: how well it is known.
+        Standard deviation of the change of M at the knots.
     free_h_deg, free_v_deg : (m,)
-        Directions that were measured, of a right eye.
+        Measured directions, as a right eye's.
     free_um : (m, 12)
-        Weights of the smooth field that is nothing on the meridian.
+        Weights of the smooth field that is zero on the meridian.
     miss_um : float
-        Root mean square by which what was measured is missed; 0 where nothing was.
+        Root mean square misfit of the measurements; 0 without any.
     """
 
     eye_side: str
@@ -91,11 +92,11 @@ class PeripheralChange:
 
     @property
     def measured_count(self) -> int:
-        """Directions beside the axis that were measured."""
+        """Number of measured directions other than the axis."""
         return self.free_h_deg.size
 
     def zernike_um(self, h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
-        """Change (n, 28) at directions (n,), on a circle of 2 mm radius."""
+        """Return the change (n, 28) at directions (n,), on a circle of 2 mm radius."""
         h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
         h_deg = h_deg if self.eye_side == "OD" else -h_deg
         knots_um = self.knots_um.reshape(len(TERMS), -1)
@@ -116,7 +117,7 @@ def peripheral_change(
     Parameters
     ----------
     population : Population, optional
-        Measured people's if not given.
+        Population; that of measured people by default.
     """
     population = population or measured_population()
     axis_um, noise_um = _axis(profile)
@@ -134,9 +135,10 @@ def peripheral_change(
 def usual_axis_um(
     axis_um: NDArray, noise_um: NDArray, population: Population
 ) -> NDArray[np.float64]:
-    """Wavefront (12,) on the axis, drawn towards the mean as far as people go.
+    """Return the wavefront (12,) on the axis, limited to the range of measured people.
 
-    What nobody was measured for is not continued: it would grow without bound.
+    Beyond that range it is moved toward the mean: an extrapolated change would grow
+    without bound.
     """
     mean_um, covariance_um2 = _axis_distribution(population)
     away = axis_um - mean_um
@@ -148,7 +150,7 @@ def usual_axis_um(
 
 
 def _axis_distribution(population: Population) -> tuple[NDArray, NDArray]:
-    """Mean (12,) and covariance (12, 12) on the axis."""
+    """Return mean (12,) and covariance (12, 12) on the axis."""
     deviation_um = population.deviation_um
     places = deviation_um.shape[1]
     correlation = population.correlation_ratio[::places, ::places]
@@ -157,7 +159,7 @@ def _axis_distribution(population: Population) -> tuple[NDArray, NDArray]:
 
 
 def _axis(profile: EyeProfile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Terms (12,) of the axis as a right eye's, and how well each is known (12,)."""
+    """Return terms (12,) of the axis as a right eye's, and their noise (12,)."""
     first = Measurement(
         profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
     )
@@ -171,7 +173,7 @@ def _axis(profile: EyeProfile) -> tuple[NDArray[np.float64], NDArray[np.float64]
 def _as_right_eye(
     measurement: Measurement, eye_side: str
 ) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
-    """Direction, terms (12,) and their noise (12,) on the population's circle."""
+    """Return direction, terms (12,) and noise (12,) on the population's circle."""
     zernike_um, h_deg = measurement.zernike_um, measurement.h_deg
     if eye_side == "OS":
         zernike_um, h_deg = flip_horizontal(zernike_um), -h_deg
@@ -185,7 +187,7 @@ def _as_right_eye(
 def _conditioned(
     population: Population, eye_side: str, *, axis, others, measured_axis_um
 ) -> PeripheralChange:
-    """Gaussian conditioning: the axis and all other directions at once."""
+    """Condition the population on the axis and all other directions at once."""
     axis_um, axis_noise_um = axis
     mean_um = population.mean_um
     places = mean_um.shape[1]
@@ -226,18 +228,18 @@ def _conditioned(
 
 
 def _sphere_deviation_dpt(variances_um2: NDArray) -> NDArray[np.float64]:
-    """Deviation (8,) of M from variances (96,) at the knots."""
+    """Return the deviation (8,) of M from variances (96,) at the knots."""
     sphere_um2 = variances_um2.reshape(len(TERMS), -1)[TERMS.index(4)]
     return SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
 
 
 def _free_variances() -> NDArray[np.float64]:
-    """Variance (12,) of the smooth field at `FREE_AT_DEG`."""
+    """Return the variance (12,) of the smooth field at `FREE_AT_DEG`."""
     return np.square(list(FREE_UM.values()))
 
 
 def _free_products(at_deg: tuple, measured_deg: tuple) -> NDArray[np.float64]:
-    """Covariance (n, m) of the smooth field between directions, of unit variance."""
+    """Return the smooth field's covariance (n, m) between directions, unit variance."""
     (h, v), (h0, v0) = at_deg, measured_deg
     square = (h[:, None] - h0) ** 2 + (v[:, None] - v0) ** 2
     near = np.exp(-0.5 * square / FREE_REACH_DEG**2)

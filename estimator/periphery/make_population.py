@@ -1,4 +1,4 @@
-"""Make ``population.json`` anew from measured people.
+"""Regenerate ``population.json`` from measured people.
 
 python -m estimator.periphery.make_population tests/data/peripheral_wavefronts.npz
 """
@@ -19,7 +19,7 @@ SOURCE = (
 
 
 def main() -> None:
-    """Fit the population and write it."""
+    """Fit the population and write the file."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("people", type=Path, help="peripheral_wavefronts.npz")
     people = load_people(parser.parse_args().people)

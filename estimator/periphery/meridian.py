@@ -1,13 +1,13 @@
-"""From wavefronts along the horizontal meridian to the whole visual field.
+"""Extension of wavefronts along the horizontal meridian to the whole visual field.
 
-People were measured along the horizontal meridian.  A nearly round eye seen along an
-axis of its own (angle alpha) has aberrations whose form around that axis is known
-(nodal theory: Thompson, JOSA A 22, 2005): defocus goes with |H|², astigmatism with the
-complex H², coma with H, H = h + iv; a shifted axis adds H to the first two.  So what is
-even along the meridian turns with one multiple of the azimuth, what is odd with
-another.  Judged by five people measured over +-40 x 25 deg (Polans 2015), it comes as
-near as the mean of the other four, and vertical terms of its own, fitted to those four,
-bring nothing.
+People were measured along the horizontal meridian.  A nearly rotationally symmetric eye
+seen along its own axis (angle alpha) has aberrations whose form around that axis is
+known (nodal theory: Thompson, JOSA A 22, 2005): defocus is proportional to |H|²,
+astigmatism to the complex H², coma to H, with H = h + iv; a shifted axis adds H to the
+first two.  So terms even along the meridian rotate with one multiple of the azimuth,
+odd ones with another.  For five people measured over +-40 x 25 deg (Polans 2015), this
+is as accurate as the mean of the other four; separate vertical terms, fitted to those
+four, bring no improvement.
 """
 
 from functools import cache
@@ -17,21 +17,21 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 TERMS = tuple(range(3, 15))
-"""OSA indices of what was measured: orders 2 to 4."""
+"""OSA indices of the measured terms: orders 2 to 4."""
 
 CIRCLE_MM = 2.0
-"""Radius of the circle that they are on."""
+"""Radius of the circle on which they are given."""
 
 KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
-"""Azimuths h at which a right eye's change from the axis is held."""
+"""Azimuths h of the knots at which a right eye's change from the axis is stored."""
 
 MEASURED_DEG = 40.0
-"""Farther out nothing was measured: the slope there fades away."""
+"""Largest measured angle; the slope there fades beyond it."""
 
 FADE_DEG = 15.0
 
 _SPINS = (
-    # cosine and sine term, turns of what is even and of what is odd along the meridian
+    # cosine and sine term, multiples of the azimuth of the parts even and odd along it
     (4, None, 0, 1),
     (5, 3, 2, 1),
     (8, 7, 0, 1),
@@ -43,7 +43,7 @@ _SPINS = (
 
 
 def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
-    """Weights (..., 8) of the knots at azimuths (...): a spline, 0 on the axis."""
+    """Return spline weights (..., 8) of the knots at azimuths (...), 0 on the axis."""
     h_deg = np.asarray(h_deg, dtype=np.float64)
     spline = _spline()
     inside = np.clip(h_deg, -MEASURED_DEG, MEASURED_DEG)
@@ -62,10 +62,10 @@ def _spline() -> CubicSpline:
 def field_terms(
     h_deg: ArrayLike, v_deg: ArrayLike, knots: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Terms (n, 12) at directions (n,) from those at the knots (12, 8).
+    """Return terms (n, 12) at directions (n,) from those at the knots (12, 8).
 
-    The product of `field_matrix` and the knots in a tenth of its time, most of which
-    would go into zeros.
+    This is the product of `field_matrix` and the knots, in a tenth of the time: most of
+    the matrix is zero.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
@@ -85,7 +85,7 @@ def field_terms(
 
 
 def field_matrix(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
-    """Matrix (n, 12, 12, 8): terms at directions (n,) from terms at the knots."""
+    """Return the matrix (n, 12, 12, 8) from terms at the knots to directions (n,)."""
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
     right, left = meridian_weights(angle_deg), meridian_weights(-angle_deg)

@@ -1,9 +1,9 @@
 """Measured people, all as right eyes in the project's frame.
 
 Jaeken & Artal, IOVS 53(7), 2012: 65 people, both eyes, horizontal meridian, 4 mm, as
-distributed with ISETBio (MIT licence).  A right eye's temporal retina, positive in the
-file, sees what lies to the person's left: h = -angle; coefficients stand in our frame,
-as coma's sign shows.  Left eyes are mirrored.
+distributed with ISETBio (MIT license).  A right eye's temporal retina, positive in the
+file, sees the person's left: h = -angle.  Coefficients are in our frame, as the sign of
+coma shows.  Left eyes are mirrored.
 """
 
 from pathlib import Path
@@ -16,8 +16,8 @@ from estimator.optics.zernike import N_TERMS, flip_horizontal
 from estimator.periphery.meridian import KNOTS_DEG, TERMS
 
 SMOOTHING_RATIO = 0.15
-"""Deviation of the Gaussian about a knot, under which a parabola is laid, of the knot's
-own angle: changes are small near the axis, and no window reaches past it."""
+"""Ratio to a knot's angle of the deviation of the Gaussian about it, with which a
+parabola is fitted: changes are small near the axis, and no window extends past it."""
 
 LEAST_POINTS = 2
 
@@ -28,11 +28,11 @@ class People(NamedTuple):
     Attributes
     ----------
     person : (n,)
-        Whose eye it is.
+        Index of the eye's owner.
     h_deg : (n_directions,)
-        Ascending.
+        Ascending azimuths.
     zernike_um : (n, n_directions, 12)
-        `TERMS`; nan where an eye was not measured.
+        Coefficients of `TERMS`; NaN where an eye was not measured.
     """
 
     person: NDArray[np.int64]
@@ -46,7 +46,7 @@ class People(NamedTuple):
 
     @property
     def change_um(self) -> NDArray[np.float64]:
-        """Return terms less those on the axis, (n, n_directions, 12)."""
+        """Return terms minus those on the axis, (n, n_directions, 12)."""
         return self.zernike_um - self.axis_um[:, None]
 
     def of(self, eyes: NDArray[np.bool_]) -> "People":
@@ -86,7 +86,7 @@ def load_over_field(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def knots_um(people: People) -> NDArray[np.float64]:
-    """Return smoothed changes (n, 12, 8) at the knots; nan where not measured."""
+    """Return smoothed changes (n, 12, 8) at the knots; NaN where not measured."""
     change_um, h_deg = people.change_um, people.h_deg
     found = np.full((len(change_um), len(TERMS), len(KNOTS_DEG)), np.nan)
     for eye, rows_um in enumerate(change_um):

@@ -1,10 +1,10 @@
 """Mean and covariance of people's wavefronts, on the axis and along the meridian.
 
-Few people, many numbers.  What the axis says of the periphery is a ridge regression:
-the sphere counts for more than other terms, and each place's answer is shrunk by how
-much of it chance explains (James and Stein).  What is left is a covariance of which a
-share is believed.  The strengths are those at which people left out are told best, at
-no angle worse than by their sphere alone.
+There are few people and many variables.  The periphery is predicted from the axis by
+ridge regression, with a smaller penalty on the sphere than on other terms, and each
+prediction is shrunk by the fraction that chance explains (James and Stein).  The
+residual has a covariance, which is shrunk as well.  The penalties and shrinkages are
+those that best predict people left out, at no angle worse than their sphere alone.
 """
 
 import json
@@ -21,17 +21,17 @@ from estimator.periphery.people import People, knots_um
 POPULATION_FILE = Path(__file__).parent / "population.json"
 
 PLACES = 1 + len(KNOTS_DEG)
-"""The axis and the knots: what is known of each term."""
+"""Number of places of each term: the axis and the knots."""
 
 SPHERE_RIDGE, OTHER_RIDGE = 20.0, 400.0
-"""Penalties of the regression on standardised terms of the axis."""
+"""Penalties of the regression on standardized terms of the axis."""
 
 SAME_SHARE, OTHER_SHARE = 0.95, 0.5
-"""Of covariances between angles of one term, and between terms, that are believed; on
+"""Shrinkage factors of covariances between angles of one term, and between terms; on
 the axis all terms count as one."""
 
 ROUNDS = 15
-"""Of expectation and maximisation: some people were not measured everywhere."""
+"""Rounds of expectation and maximization: some people were not measured everywhere."""
 
 RIDGE = 1e-4
 
@@ -44,7 +44,7 @@ class Population:
     ----------
     mean_um, deviation_um : (12, 9)
     correlation_ratio : (108, 108)
-        In C order of terms and places.
+        Correlations, in C order of terms and places.
     """
 
     mean_um: NDArray[np.float64]
@@ -53,7 +53,7 @@ class Population:
 
     @classmethod
     def of(cls, people: People) -> "Population":
-        """Fit that of measured people; those without an axis are left out."""
+        """Fit the population of measured people; omit those without an axis."""
         people = people.of(np.isfinite(people.axis_um).all(axis=-1))
         axis_um = people.axis_um
         away_um = axis_um - axis_um.mean(axis=0)
@@ -80,7 +80,7 @@ class Population:
         )
 
     def to_json(self) -> dict:
-        """Return the content of a file."""
+        """Return the content of ``population.json``."""
         rows = [row[: k + 1] for k, row in enumerate(self.correlation_ratio)]
         return {
             "terms": list(TERMS),
@@ -92,7 +92,7 @@ class Population:
 
     @classmethod
     def from_json(cls, data: dict) -> "Population":
-        """Read what `to_json` returned."""
+        """Build from the result of `to_json`."""
         size = len(TERMS) * PLACES
         correlation = np.zeros((size, size))
         for k, row in enumerate(data["correlation"]):
@@ -114,7 +114,7 @@ def _rounded(values: NDArray[np.float64]) -> list:
 
 
 def _by_terms() -> NDArray[np.int64]:
-    """Where the values (108,) of terms and places stand: the axis first, then knots."""
+    """Return indices (108,) that sort axis and knots by terms and places."""
     axis = np.arange(len(TERMS))[:, None]
     knots = len(TERMS) + np.arange(len(TERMS) * len(KNOTS_DEG))
     return np.concatenate([axis, knots.reshape(len(TERMS), -1)], axis=1).ravel()
@@ -123,7 +123,7 @@ def _by_terms() -> NDArray[np.int64]:
 def _regressed(
     axis_um: NDArray[np.float64], changes_um: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes (96, 12) over the axis less its mean (n, 12), and values (96,) at that."""
+    """Return slopes (96, 12) over the centered axis (n, 12), and values (96,) there."""
     deviation_um = axis_um.std(axis=0)
     penalty = np.full(len(TERMS), OTHER_RIDGE)
     penalty[TERMS.index(4)] = SPHERE_RIDGE
@@ -146,14 +146,14 @@ def _regressed(
 
 
 def _rest_um2(rest_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance (96, 96) of what the axis does not tell, (n, 96) with gaps."""
+    """Return the covariance (96, 96) of regression residuals (n, 96) with gaps."""
     deviation_um = np.nanstd(rest_um, axis=0)
     covariance = _fitted(rest_um / deviation_um)
     return covariance * np.outer(deviation_um, deviation_um)
 
 
 def _fitted(units: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance (96, 96) of rows with gaps about 0, shrunk."""
+    """Return the shrunk covariance (96, 96) about 0 of rows with gaps."""
     covariance, share = np.eye(units.shape[1]), _believed()
     for _ in range(ROUNDS):
         filled, spread = _expected(units, covariance)
@@ -163,7 +163,7 @@ def _fitted(units: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _expected(units: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
-    """Rows with their gaps filled in, and the covariance of what was filled in."""
+    """Return rows with their gaps filled in, and the filled values' covariance."""
     filled, spread = units.copy(), np.zeros_like(covariance)
     for row in filled:
         gap = np.isnan(row)
@@ -181,7 +181,7 @@ def _expected(units: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _believed() -> NDArray[np.float64]:
-    """Share (96, 96) of each sample covariance; no covariance loses its sign by it."""
+    """Return the shrinkage (96, 96) of sample covariances, which keeps their signs."""
     term = np.repeat(np.arange(len(TERMS)), len(KNOTS_DEG))
     share = np.where(term[:, None] == term, SAME_SHARE, OTHER_SHARE)
     np.fill_diagonal(share, 1.0)

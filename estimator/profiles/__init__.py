@@ -1,12 +1,12 @@
-"""What is known of one eye: a prescription, a measurement, an eye.
+"""Eye profiles: prescriptions, measurements and eye models.
 
-parse                a profile's object, checked, as an `EyeProfile`
-worn                 what it says is worn
-options              what any profile may ask for besides
+parse                validation of a profile object, returned as an `EyeProfile`
+worn                 the correction in a profile
+options              options of any kind of profile
 files                .json, .abp and .csv profiles, and presets by name
 presets.json         the six presets
-measured_wavefront   a profile as the measurement by formula, without a model eye
-typical_aberrations  what people have beside their prescription, by age
+measured_wavefront   a measurement used in closed form, without an eye model
+typical_aberrations  higher-order aberrations added to a prescription, by age
 """
 
 import lazy_loader

@@ -20,10 +20,12 @@ from estimator.profiles.parse import (
 )
 
 MAX_PROFILE_BYTES = 2_000_000
-"""Of a profile file: 28 coefficients at 400 field directions take 0.3 MB as JSON."""
+"""Size limit of a profile file: 28 coefficients at 400 field directions take 0.3 MB of
+JSON."""
 
 MAX_PROFILE_LINES = 20_000
-"""Of an .abp or .csv file, which has a line for each of at most 28 coefficients."""
+"""Line limit of an .abp or .csv file, which has one line for each of at most 28
+coefficients."""
 
 _ABP_SETTING = re.compile(r"(Ap|Wa)\s*=\s*(\S+)")
 _ABP_TERM = re.compile(r"Z\s*\[\s*(-?\d+)\s*,\s*(-?\d+)\s*\]\s*=\s*(\S+)")
@@ -37,7 +39,7 @@ class InvalidProfileFile(InvalidFile, ProfileError):
     Attributes
     ----------
     field : str
-        The line, or the dotted path of the field at fault; may be empty.
+        Line or dotted path of the field at fault; may be empty.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class InvalidProfileFile(InvalidFile, ProfileError):
         self.problem = problem
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle makes it from."""
+        """Return the constructor arguments for pickle."""
         return type(self), (self.path, self.field, self.problem, self.allowed)
 
 
@@ -64,18 +66,19 @@ def load_profile(
     Parameters
     ----------
     source : str or Path
-        A preset's name (see `preset_names`), a ``.json``, ``.abp`` or ``.csv`` file, or
-        an object as JSON, ``{"kind": "prescription", "sphere_dpt": -2}``.
+        Name of a preset (see `preset_names`), a ``.json``, ``.abp`` or ``.csv`` file,
+        or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
     pupil_diameter_mm, wavelength_nm : float, optional
-        For a CSV, which may instead carry them as ``# pupil_diameter_mm: 5`` lines.
+        Pupil and wavelength of a CSV file, which may instead contain them as
+        ``# pupil_diameter_mm: 5`` lines.
 
     Raises
     ------
     ProfileError
-        Unknown name or file kind.
+        The name or file type is unknown.
     InvalidFile
-        The file, with the line or field at fault; both a `ProfileError`, too, where it
-        could be read.
+        The file is invalid; the error names the line or field.  If the file could be
+        read, the error is a `ProfileError` too.
     """
     body = profile_body(
         source, pupil_diameter_mm=pupil_diameter_mm, wavelength_nm=wavelength_nm
@@ -98,14 +101,14 @@ def profile_body(
     pupil_diameter_mm: float | None = None,
     wavelength_nm: float | None = None,
 ) -> dict[str, Any]:
-    """Return the profile as the plain object that also travels over the wire.
+    """Return the profile as the plain object that the wire protocol uses.
 
     Raises
     ------
     ProfileError
-        Unknown name or file kind.
+        The name or file type is unknown.
     InvalidFile
-        A file that cannot be read as such; its fields are not checked here.
+        The file cannot be parsed; its fields are not validated here.
     """
     if str(source) in preset_names():
         return {"kind": "preset", "name": str(source)}
@@ -139,7 +142,7 @@ def profile_body(
 
 
 def _is_path(source: str | Path) -> bool:
-    """Return whether it is neither a preset's name nor JSON."""
+    """Return whether a source is neither a preset's name nor JSON."""
     return str(source) not in preset_names() and not str(source).lstrip().startswith(
         "{"
     )
@@ -170,7 +173,7 @@ def _read_json(text: str, path: Path) -> dict[str, Any]:
 def _set_once(
     body: dict[str, Any], key: str, value: object, *, path: Path, where: str
 ) -> None:
-    """Set a field that must not be there yet: of two values neither can be trusted."""
+    """Set a field; reject a duplicate, because neither value can be trusted."""
     if key in body:
         problem = f"'{key}' is given twice"
         raise InvalidProfileFile(path, where, problem, "each field once")
@@ -186,10 +189,10 @@ def _value(text: str, *, path: Path, where: str) -> float:
 
 
 def _read_abp(text: str, path: Path) -> dict[str, Any]:
-    """Lines ``Ap = 5.0`` (mm), ``Wa = 587.56`` (nm), ``Z[n, m] = um``, ``#`` comments.
+    """Parse ``Ap = 5.0`` (mm), ``Wa = 587.56`` (nm), ``Z[n, m] = um``, ``#`` comments.
 
-    Missing terms are zero; a missing Ap or Wa is an error here (the framework falls
-    back to defaults in silence).
+    Missing terms are zero.  A missing Ap or Wa is an error here; the framework silently
+    falls back to defaults.
     """
     body: dict[str, Any] = {
         "kind": "zernike",
@@ -240,7 +243,7 @@ def _read_csv(text: str, path: Path) -> dict[str, Any]:
 
 
 def _index_key(n: str, m: str, *, path: Path, where: str) -> str:
-    """Return the key of a term; its order and frequency have few digits."""
+    """Return the key of a term; its order and frequency have at most four digits."""
     if not (_WHOLE.fullmatch(n) and _WHOLE.fullmatch(m)):
         problem = f"'{n:.30},{m:.30}' is not a term"
         raise InvalidProfileFile(path, where, problem, "n,m as whole numbers")

@@ -1,8 +1,8 @@
-"""A profile used as the measured wavefront: the light option, with no eye model.
+"""Measured wavefront used directly: the lightweight option, without an eye model.
 
-Pupil, object, focus and wavelength act on the measurement by closed formulas:
-coefficients rescale downwards, defocus shifts by vergence,
-accommodation and chromatic difference.  It knows one field, and takes it for all.
+Pupil, object, focus and wavelength act on the measurement in closed form: coefficients
+rescale to smaller pupils, defocus shifts by vergence, accommodation and chromatic
+difference.  The one measured field is used for all fields.
 """
 
 import math
@@ -42,11 +42,12 @@ DEFAULT_AMPLITUDE_DPT = 10.0
 def accommodation_amplitude_dpt(
     *, age_years: float | None, add_dpt: float = 0.0
 ) -> float:
-    """Largest accommodation in dpt.
+    """Return the largest accommodation in dpt.
 
-    By age: objective amplitude 7.33 - 0.0035 (age - 3)² (Anderson et al. 2008), zero
-    from 49 years on.  A near addition says that half the amplitude and the addition
-    make up the 2.5 dpt of a reading distance.  The smaller of the two holds.
+    The objective amplitude by age is 7.33 - 0.0035 (age - 3)² (Anderson et al. 2008),
+    zero from 49 years on.  A near addition implies that half the amplitude and the
+    addition together give the 2.5 dpt of a reading distance.  The smaller of the two
+    applies.
     """
     amplitude_dpt = DEFAULT_AMPLITUDE_DPT
     if age_years is not None:
@@ -57,7 +58,7 @@ def accommodation_amplitude_dpt(
 
 
 def profile_amplitude_dpt(profile: EyeProfile) -> float:
-    """Largest accommodation of a profile's eye, dpt: none with an intraocular lens."""
+    """Return a profile's largest accommodation, dpt; 0 with an intraocular lens."""
     if replaces_lens(profile.correction):
         return 0.0
     return accommodation_amplitude_dpt(
@@ -69,8 +70,8 @@ def profile_amplitude_dpt(profile: EyeProfile) -> float:
 class WavefrontState:
     """Wavefront of the eye at one pupil, object, focus and wavelength.
 
-    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm``; ``notes`` say what
-    could not be met as asked.
+    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm``; ``notes`` list
+    requests that could not be met.
     """
 
     zernike_um: NDArray[np.float64]
@@ -79,14 +80,14 @@ class WavefrontState:
 
 
 class MeasuredWavefront(FocusingEye):
-    """Wavefront-only eye: measured coefficients plus defocus by formula.
+    """Wavefront-only eye: measured coefficients plus defocus in closed form.
 
     Attributes
     ----------
     eye_side : str
         OD or OS.
     zernike_um : (28,)
-        In the plane of a typical entrance pupil, worn correction taken off.
+        Coefficients in the plane of a typical entrance pupil, correction subtracted.
     refraction_dpt : float
         M at the cornea and 555 nm at the measured pupil, through the correction.
     """
@@ -112,7 +113,7 @@ class MeasuredWavefront(FocusingEye):
         self.vergence = ObjectVergence.seen_through(
             profile.correction, entrance_pupil_mm=depth_mm
         )
-        # of the last pupil: a frame asks for its refraction five times
+        # of the last pupil: each frame requests its refraction five times
         self._relaxed: tuple[float, float] | None = None
         self.eye_side = profile.eye_side
         self.zernike_um = zernike_um
@@ -133,7 +134,7 @@ class MeasuredWavefront(FocusingEye):
     def refraction_at_dpt(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float = 0.0
     ) -> float:
-        """Least-squares M at 555 nm through a pupil, at an accommodation."""
+        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
         if self._relaxed is None or self._relaxed[0] != pupil_diameter_mm:
             self._relaxed = pupil_diameter_mm, self._relaxed_dpt(pupil_diameter_mm)
         return self._relaxed[1] - accommodation_dpt
@@ -151,16 +152,16 @@ class MeasuredWavefront(FocusingEye):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Accommodation (0 to the largest) whose M at a pupil comes nearest to this."""
+        """Return the accommodation in reach whose M at a pupil is nearest to this."""
         relaxed_dpt = self.refraction_at_dpt(pupil_diameter_mm=pupil_diameter_mm)
         return min(max(relaxed_dpt - refraction_dpt, 0.0), self.amplitude_dpt)
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
-        """Accommodation at which the nearest distance is seen: the amplitude."""
+        """Return the accommodation for the near point: the amplitude."""
         return self.amplitude_dpt
 
     def chromatic_shift_dpt(self, wavelength_nm: float) -> float:
-        """Refraction at this wavelength less that at the measured one, dpt."""
+        """Return the refraction at this wavelength minus the measured one's, dpt."""
         return float(
             chromatic_refraction_dpt(wavelength_nm)
             - chromatic_refraction_dpt(self.wavelength_nm)
@@ -169,7 +170,7 @@ class MeasuredWavefront(FocusingEye):
     def zernike_with_defocus(
         self, *, pupil_diameter_mm: float, added_defocus_dpt: float
     ) -> NDArray[np.float64]:
-        """Coefficients (28,), um, on a pupil with vergence added to the relaxed eye.
+        """Return coefficients (28,), um, with vergence added to the relaxed eye.
 
         ``added_defocus_dpt`` is object vergence minus accommodation plus chromatic
         shift; C(2,0) changes by -added r²/(4 sqrt 3), everything else is the
@@ -180,10 +181,10 @@ class MeasuredWavefront(FocusingEye):
             self.zernike_um, radius_ratio=radius_mm / self.zernike_radius_mm
         )
         zernike_um[rx.C20] -= added_defocus_dpt * radius_mm**2 / SPHERE_PER_C20
-        zernike_um[0] = 0.0  # rescaling makes piston, which no image shows
+        zernike_um[0] = 0.0  # rescaling adds piston, which no image shows
         return zernike_um
 
-    # ----- what the PSF cache asks of any eye (also estimator/field/traced_eye.py)
+    # ----- interface to the PSF cache (also in estimator/field/traced_eye.py)
 
     def accommodation_nodes_dpt(
         self,
@@ -191,7 +192,7 @@ class MeasuredWavefront(FocusingEye):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
-        """Accommodations whose shape of the wavefront differs: here a single one."""
+        """Return the single accommodation: the wavefront's shape does not change."""
         return np.zeros(1)
 
     def total_defocus_dpt(
@@ -203,9 +204,10 @@ class MeasuredWavefront(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Least-squares refraction, dpt, on the pupil itself; object at infinity.
+        """Return least-squares refraction, dpt, on the pupil itself; far object.
 
-        All arguments broadcast, and the result has their shape.
+        All arguments broadcast, and the result has their shape.  The object is at
+        infinity.
         """
         _, _, pupil_mm, used_dpt, wavelength_nm = np.broadcast_arrays(
             h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
@@ -220,13 +222,13 @@ class MeasuredWavefront(FocusingEye):
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., NDArray[np.float64]]:
-        """`total_defocus_dpt` at fixed fields and wavelengths, many states of the eye.
+        """Return `total_defocus_dpt` at fixed fields as a function of the eye's state.
 
         Returns
         -------
         callable
-            From ``pupil_diameter_mm`` and ``accommodation_dpt`` to dpt in the
-            arguments' broadcast shape.
+            Function of ``pupil_diameter_mm`` and ``accommodation_dpt`` that returns
+            dpt in the arguments' broadcast shape.
         """
         shape = np.broadcast_shapes(*map(np.shape, (h_deg, v_deg, wavelength_nm)))
         return partial(self._defocus_dpt, wavelength_nm, shape)
@@ -245,7 +247,7 @@ class MeasuredWavefront(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Lateral colour (..., 2), mrad: none, a measurement at one colour has none."""
+        """Return zero lateral color (..., 2), mrad: one wavelength does not give it."""
         states = np.broadcast_shapes(
             *map(np.shape, (h_deg, v_deg, accommodation_dpt, wavelength_nm))
         )
@@ -261,12 +263,12 @@ class MeasuredWavefront(FocusingEye):
         wavelength_nm: ArrayLike,
         total_defocus_dpt: ArrayLike,
     ) -> FieldWavefronts:
-        """Wavefronts with the given total defocus; P in C order of the broadcast.
+        """Return wavefronts (P,) with the given total defocus, in C order of states.
 
         Raises
         ------
         ValueError
-            A pupil larger than the measured one.
+            A pupil is larger than the measured one.
         """
         _, _, pupil_mm, _, _, total_dpt = np.broadcast_arrays(
             h_deg,
@@ -286,18 +288,18 @@ class MeasuredWavefront(FocusingEye):
     def wavefronts_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., FieldWavefronts]:
-        """`wavefronts` at fixed fields and wavelengths, many states of the eye."""
+        """Return `wavefronts` at fixed fields as a function of the eye's state."""
         return partial(
             self.wavefronts, h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm
         )
 
     def _on_circles(self, radius_mm: NDArray) -> NDArray[np.float64]:
-        """Measured coefficients (P, 28) on circles (P,); piston zero."""
+        """Return measured coefficients (P, 28) on circles (P,), piston zero."""
         polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)
         return zernike_from_polynomial(polynomial_um, radius_mm)
 
     def _radius_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
-        """Half of pupils, flat; refuses those that are larger than the measured one."""
+        """Return flat pupil radii; reject pupils larger than the measured one."""
         largest_mm = self.max_pupil_diameter_mm
         if pupil_mm.size and not (
             pupil_mm.min() > 0.0 and pupil_mm.max() <= largest_mm + 1e-6
@@ -316,12 +318,12 @@ class MeasuredWavefront(FocusingEye):
         focus_dpt: float,
         wavelength_nm: float,
     ) -> WavefrontState:
-        """Wavefront for one pupil, object distance, focus and wavelength.
+        """Return the wavefront for one pupil, object distance, focus and wavelength.
 
         Raises
         ------
         ValueError
-            A pupil that is not positive, or values that are not finite.
+            The pupil is not positive, or a value is not finite.
         """
         values = (pupil_diameter_mm, object_dpt, focus_dpt, wavelength_nm)
         if not all(math.isfinite(v) for v in values) or pupil_diameter_mm <= 0:

@@ -1,7 +1,7 @@
-"""What any profile may ask for: whose periphery, haze, yellowing, spectacles' size.
+"""Options of any profile: periphery, straylight, yellowing, spectacle magnification.
 
-Each function reads its field of a profile's object and raises `ProfileError` with the
-field, the bad value and what is allowed.
+Each function parses its field of a profile object and raises `ProfileError` with the
+field, the invalid value and the accepted values.
 """
 
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ from estimator.media.straylight import (
 FIELDS = ("periphery", "straylight", "yellowing", "spectacle_magnification")
 STRAYLIGHT_FIELDS = ("pigmentation", "log_s", "cataract")
 PERIPHERIES = ("people", "model")
-"""Where a traced eye's wavefronts off the axis come from: measured people with such an
-axis, or the surfaces of the eye model alone."""
+"""Source of a traced eye's wavefronts off the axis: measured people with such an axis,
+or the surfaces of the eye model alone."""
 
 
 def periphery(data: Mapping[str, Any], *, has_own: bool) -> str:
-    """Return one of `PERIPHERIES`; ``has_own``: the profile gives a retina."""
+    """Return one of `PERIPHERIES`; ``has_own`` if the profile gives a retina."""
     is_model = has_own or data.get("kind") == "eye"
     found = fields.choice(
         data, "periphery", PERIPHERIES, default="model" if is_model else "people"
@@ -40,7 +40,7 @@ def periphery(data: Mapping[str, Any], *, has_own: bool) -> str:
 
 
 def straylight(data: Mapping[str, Any], age_years: float | None) -> Straylight | None:
-    """Return the scatter that is asked for; None where none is."""
+    """Return the requested straylight, or None."""
     if data.get("straylight") is None:
         return None
     path = "straylight."
@@ -65,7 +65,7 @@ def straylight(data: Mapping[str, Any], age_years: float | None) -> Straylight |
 
 
 def spectacle_magnification(data: Mapping[str, Any]) -> bool:
-    """Return whether the worn correction shows the world at its own size."""
+    """Return whether the correction's magnification is applied."""
     wanted = data.get("spectacle_magnification", False)
     if not isinstance(wanted, bool):
         raise ProfileError(
@@ -77,7 +77,7 @@ def spectacle_magnification(data: Mapping[str, Any]) -> bool:
 
 
 def yellowing(data: Mapping[str, Any]) -> str | None:
-    """Return how the ageing lens is seen; None where it is not asked for."""
+    """Return the mode of the aging lens's yellowing, or None if not requested."""
     if data.get("yellowing") is None:
         return None
     if "age_years" not in data:

@@ -1,8 +1,8 @@
-"""Eye profiles: what a user or an instrument knows about one eye.
+"""Parsing of eye profiles.
 
-A profile arrives as a JSON object (file or wire), an ``.abp`` file of the paper's
-framework, or a CSV of coefficients, and leaves as an `EyeProfile` in the eye frame
-(x to the person's right, y up).
+A profile is a JSON object (file or wire), an ``.abp`` file of the paper's framework, or
+a CSV file of coefficients.  It is parsed to an `EyeProfile` in the eye frame (x to the
+person's right, y up).
 """
 
 import json
@@ -55,32 +55,32 @@ COMMON_FIELDS = (
 )
 PRESCRIPTION_FIELDS = (*worn.SPECTACLE_FIELDS, "add_dpt", "higher_order")
 HIGHER_ORDERS = ("typical", "none")
-"""What a traced eye has beside its prescription: aberrations of its age, or none."""
+"""Aberrations that a traced eye adds to its prescription: those of its age, or none."""
 
 ZERNIKE_FIELDS = ("frame", "pupil_diameter_mm", "wavelength_nm", "zernike_um")
 SET_FIELDS = ("frame", "measurements")
 MEASURED_FIELD_LIMIT_DEG = 50.0
-"""Instruments measure to 40 deg or so; beyond this a field is a slip."""
+"""Largest field angle accepted: instruments measure to 40 deg or so."""
 
 MAX_MEASUREMENTS = 100
 KINDS = ("prescription", "zernike", "zernike_set", "eye", "preset")
 MAX_COEFFICIENT_UM = 200.0
 
 PRESCRIPTION_RADIUS_MM = 3.0
-"""Circle on which a prescription is written down; it is exact on every other."""
+"""Circle on which a prescription is represented; it is exact on every other."""
 
 
 EYE_PUPIL_MM = 6.0
-"""Entrance pupil at which the wavefront of a given eye is written down."""
+"""Entrance pupil at which the wavefront of a given eye is represented."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One wavefront in the eye frame, with the field it was taken at.
+    """One wavefront in the eye frame, with its field direction.
 
     ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm`` about the chief ray.
-    ``h_deg`` and ``v_deg`` point to the source as the person sees it, whatever frame
-    the coefficients came in.
+    ``h_deg`` and ``v_deg`` point to the source as the person sees it, independent of
+    the frame of the input.
     """
 
     zernike_um: NDArray[np.float64]
@@ -97,43 +97,42 @@ class Measurement:
 
 @dataclass(frozen=True)
 class EyeProfile:
-    """One eye's measured wavefront in the eye frame, and what limits it.
+    """Measured wavefront of one eye in the eye frame, with its limits and options.
 
     Attributes
     ----------
     eye_side : str
         OD or OS.
     pupil_diameter_mm, wavelength_nm : float
-        Circle and light of the leading wavefront.
+        Pupil and wavelength of the leading wavefront.
     age_years : float or None
-        Limits accommodation where it is known.
+        Age, which limits accommodation; None if unknown.
     max_pupil_diameter_mm : float
-        Largest pupil the data speak for (infinite for a prescription).
+        Largest pupil covered by the data (infinite for a prescription).
     correction : Prescription or None
-        Spectacles worn during the simulation; a `WornLens` for what is worn on the eye
-        or in it.
+        Spectacles worn during the simulation; a `WornLens` for a lens on or in the eye.
     add_dpt : float
         Near addition; limits the amplitude of accommodation when above zero.
     measurements : tuple of Measurement
-        All that was measured, the leading one first.  Empty for kind ``eye``.
+        All measurements, the leading one first.  Empty for kind ``eye``.
     eye : EyeParameters or None
         The eye itself, for kind ``eye``.
     retina : RetinaShape or None
-        Instead of the sphere of radius eye length / 2.
+        Retina that replaces the sphere of radius eye length / 2.
     straylight : Straylight or None
-        Scatter in the media, where it is to be seen.
+        Scatter in the media; None to omit it.
     yellowing : {"seen", "adapted"} or None
-        Absorption of the ageing lens, where it is to be seen.
+        Absorption of the aging lens; None to omit it.
     spectacle_magnification : bool
-        Whether the world is seen as large as the worn correction shows it.
+        Whether to apply the magnification of the correction.
     periphery : {"people", "model"}
-        Whether a traced eye has people's periphery; a given eye, and one with a retina
-        of its own, has the model's.
+        Source of a traced eye's periphery; a given eye, and one with a retina of its
+        own, has the model's.
     higher_order : {"typical", "none"}
-        Aberrations to be added where an eye is traced (`typical_aberrations`); a
-        prescription alone asks for any.
+        Aberrations added to a traced eye (`typical_aberrations`); only a prescription
+        requests any.
     notes : tuple of str
-        Where powers count: at their distance from the cornea, and at the cornea.
+        Notes on powers at their distance from the cornea, and at the cornea.
     """
 
     name: str
@@ -157,10 +156,9 @@ class EyeProfile:
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
-        """Return what the eye model is fitted to, the leading one first.
+        """Return the measurements that the eye model is fitted to, the leading first.
 
-        What was measured off the axis is part of people's periphery, where the eye
-        takes that.
+        With people's periphery, measurements off the axis are part of that instead.
         """
         if self.periphery == "model":
             return self.measurements
@@ -168,10 +166,10 @@ class EyeProfile:
 
     @cached_property
     def zernike_um(self) -> NDArray[np.float64]:
-        """Return the leading wavefront (28,), um; a given eye is traced for it once.
+        """Return the leading wavefront (28,), um; a given eye is traced once for it.
 
-        On the circle of ``pupil_diameter_mm``, at ``wavelength_nm``; accommodation
-        relaxed; a worn correction is *not* yet taken off.
+        It is on the circle of ``pupil_diameter_mm``, at ``wavelength_nm``, with
+        accommodation relaxed; the correction is *not* yet subtracted.
 
         Raises
         ------
@@ -184,12 +182,12 @@ class EyeProfile:
 
 
 def parse_profile(data: object) -> EyeProfile:
-    """Read one profile object.
+    """Parse one profile object.
 
     Raises
     ------
     ProfileError
-        Names the field, the bad value and what is allowed.
+        A field is invalid; the error names it, its value and the accepted values.
     """
     data = fields.mapping(data, "profile")
     kind = fields.choice(data, "kind", KINDS)
@@ -212,7 +210,7 @@ def _presets() -> dict[str, dict[str, Any]]:
 
 
 def preset_names() -> tuple[str, ...]:
-    """Names accepted by ``{"kind": "preset", "name": ...}``."""
+    """Return the names accepted by ``{"kind": "preset", "name": ...}``."""
     return tuple(_presets())
 
 
@@ -264,7 +262,7 @@ def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
 
 
 def _higher_order(data: Mapping[str, Any], correction: rx.Prescription | None) -> str:
-    """Return one of `HIGHER_ORDERS`; those of a lens that is gone are gone with it."""
+    """Return one of `HIGHER_ORDERS`; "none" with an intraocular lens."""
     is_gone = replaces_lens(correction)
     found = fields.choice(
         data, "higher_order", HIGHER_ORDERS, default="none" if is_gone else "typical"
@@ -314,7 +312,7 @@ def _measurement(data: Mapping[str, Any], *, path: str = "") -> Measurement:
 
 
 def _parse_zernike_set(data: Mapping[str, Any]) -> EyeProfile:
-    """Several measurements of one eye; the widest on-axis one leads."""
+    """Parse several measurements of one eye; the widest on-axis one leads."""
     fields.only_known(data, COMMON_FIELDS + SET_FIELDS)
     entries = data.get("measurements")
     allowed = f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"

@@ -1,17 +1,16 @@
-"""Higher-order aberrations that people have, for eyes known by a prescription alone.
+"""Typical higher-order aberrations for eyes known by a prescription alone.
 
-Spectacles say nothing of coma, trefoil and spherical aberration, but every eye has
-them.  An eye that is traced from a prescription gets those of a typical person: C(4,0)
-as it is on average, coma and trefoil as large as they are on average.  The average
-*eye* would have hardly any of the latter: their signs differ from one person to the
-next, and a sum over people cancels them.  They point the way in which the population
-leans.
+A prescription does not determine coma, trefoil and spherical aberration, but every eye
+has them.  An eye that is traced from a prescription gets those of a typical person: the
+mean C(4,0), and the mean absolute size of coma and trefoil.  The mean *eye* would have
+hardly any coma or trefoil: their signs differ from one person to the next and cancel in
+the mean.  Their direction is that of the population mean.
 
-Figures: sizes from Thibos et al. 2002 (JOSA A 19:2329); growth with age from Berrio et
-al. 2010 (J Vis 10(14):34).  The terms that these do not give (fifth and sixth order, of
-the fourth all but C(4,0)) are left at zero, so the RMS of 0.22 um in a young eye and
-0.26 um at 41 lies somewhat below what is measured with them: 0.305 +- 0.095 um (Wang &
-Koch 2003, at 41 years on average), 0.33 um (Salmon & van de Pol 2006).
+Sizes are from Thibos et al. 2002 (JOSA A 19:2329), growth with age from Berrio et al.
+2010 (J Vis 10(14):34).  The terms that these do not give (fifth and sixth order, and
+the fourth except C(4,0)) are zero, so the RMS of 0.22 um in a young eye and 0.26 um at
+41 is somewhat below measurements that include them: 0.305 +- 0.095 um (Wang & Koch
+2003, at 41 years on average), 0.33 um (Salmon & van de Pol 2006).
 """
 
 import math
@@ -31,10 +30,10 @@ from estimator.optics.zernike import (
 from estimator.profiles.parse import EyeProfile, Measurement
 
 TYPICAL_PUPIL_MM = 6.0
-"""Pupil of the circle that typical aberrations are given on."""
+"""Diameter of the circle on which typical aberrations are given."""
 
 PRESCRIBED_PUPIL_MM = 4.0
-"""Pupil through which the refraction is the prescription: that of a lit test room."""
+"""Pupil through which the refraction is the prescription, as in a lit test room."""
 
 POPULATION_UM = {
     (3, -3): (-0.021, 0.115),
@@ -44,34 +43,36 @@ POPULATION_UM = {
     (4, 0): (0.094, 0.098),
 }
 """Mean and standard deviation by (n, m) at 6 mm, examiner's frame, of 200 eyes of young
-adults (Thibos et al. 2002).  Thibos, Bradley & Hong 2002 draw eyes from it normally."""
+adults (Thibos et al. 2002).  Thibos, Bradley & Hong 2002 draw eyes from this normal
+distribution."""
 
 GROWTH_UM_PER_YEAR = {(3, 1): 0.0017, (4, 0): 0.0011}
-"""Through `GROWTH_PUPIL_MM`, between 20 and 77 years (Berrio et al. 2010).  Horizontal
-coma is also what Atchison & Markwell 2008 saw change with age.  At 6 mm the RMS then
-grows by 0.003 um a year, as in Seo et al. 2025 (J Clin Med 14:6981)."""
+"""Growth through `GROWTH_PUPIL_MM`, between 20 and 77 years (Berrio et al. 2010).
+Atchison & Markwell 2008 also found horizontal coma to change with age.  At 6 mm the RMS
+then grows by 0.003 um a year, as in Seo et al. 2025 (J Clin Med 14:6981)."""
 
 GROWTH_PUPIL_MM = 5.0
 AGES_YEARS = (20.0, 77.0)
-"""Ages that growth is known for; younger and older eyes are as those at the ends."""
+"""Ages for which growth is known; other ages are clamped to this range."""
 
 YOUNG_ADULT_YEARS = 25.0
-"""Age that `POPULATION_UM` stands for, and an eye whose age is not known."""
+"""Age of `POPULATION_UM`, and of an eye whose age is not known."""
 
 
 def typical_zernike_um(
     age_years: float | None, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Higher-order coefficients (28,), um, of a typical eye, in the eye frame.
+    """Return higher-order coefficients (28,), um, of a typical eye, in the eye frame.
 
-    On the circle of `TYPICAL_PUPIL_MM`, at 555 nm (they hardly change with colour).
+    They are on the circle of `TYPICAL_PUPIL_MM`, at 555 nm (they hardly change with
+    color).
 
     Parameters
     ----------
     age_years : float or None
-        None is a young adult.
+        Age; None is a young adult.
     eye_side : {"OD", "OS"}
-        The figures are taken as those of right eyes; left ones mirror them.
+        Side; the figures are used for right eyes, and left eyes mirror them.
     """
     years = used_age_years(age_years) - YOUNG_ADULT_YEARS
     zernike_um = np.zeros(N_TERMS)
@@ -86,23 +87,23 @@ def typical_zernike_um(
 
 
 def used_age_years(age_years: float | None) -> float:
-    """Return the age whose aberrations stand for this one."""
+    """Return the age clamped to the known range; a young adult's if None."""
     if age_years is None:
         return YOUNG_ADULT_YEARS
     return min(max(age_years, AGES_YEARS[0]), AGES_YEARS[1])
 
 
 def mean_absolute_um(mean_um: float, deviation_um: float) -> float:
-    """Mean of the absolute value of a normally distributed coefficient."""
+    """Return the mean absolute value of a normally distributed coefficient."""
     ratio = mean_um / (math.sqrt(2.0) * deviation_um)
     spread_um = deviation_um * math.sqrt(2.0 / math.pi) * math.exp(-(ratio**2))
     return spread_um + mean_um * math.erf(ratio)
 
 
 def with_typical_aberrations(profile: EyeProfile) -> EyeProfile:
-    """Return the profile with the typical aberrations that it asks for, or as it is.
+    """Return the profile with typical aberrations added if it requests them.
 
-    What is returned asks for none.  Its second order is such that its least-squares
+    The result requests none.  Its second order is chosen so that its least-squares
     refraction through `PRESCRIBED_PUPIL_MM` is that of the profile, which is exactly
     second order.
     """
@@ -126,7 +127,7 @@ def with_typical_aberrations(profile: EyeProfile) -> EyeProfile:
 
 
 def typical_note(profile: EyeProfile) -> str:
-    """Say what `with_typical_aberrations` adds to a profile."""
+    """Return a note on what `with_typical_aberrations` adds to a profile."""
     whose = "a young adult"
     if profile.age_years is not None:
         whose = f"{used_age_years(profile.age_years):g} years of age"

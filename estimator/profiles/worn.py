@@ -1,4 +1,4 @@
-"""What a profile says is worn: spectacles, a contact lens, an intraocular lens."""
+"""The correction in a profile: spectacles, contact lens or intraocular lens."""
 
 import math
 from collections.abc import Mapping
@@ -45,13 +45,13 @@ DESIGNS: dict[str, tuple[str, ...]] = {
     "edof": ("add_dpt", "step_waves"),
     "zones": ("zone_adds_dpt", "zone_diameters_mm"),
 }
-"""Designs of intraocular lenses, and what may be said of each."""
+"""Designs of intraocular lenses, with the fields of each."""
 
 RING_FIELDS = ("design_wavelength_nm", "rings_diameter_mm")
 
 AT_A_DISTANCE = ("spectacles", "progressive", "lenslets")
 ASKS_FROM_DPT = 4.0
-"""From here on 12 mm change a power by 0.2 dpt or more, which a refraction resolves."""
+"""Power above which 12 mm change it by 0.2 dpt or more, which a refraction resolves."""
 
 SHOWN_DPT = 0.005
 
@@ -66,7 +66,7 @@ PATH = "correction."
 
 
 def correction(data: Mapping[str, Any]) -> rx.Prescription | None:
-    """Return what is worn; None where nothing is."""
+    """Return the correction, or None if there is none."""
     if data.get("correction") is None:
         return None
     body = fields.mapping(data["correction"], "correction")
@@ -99,7 +99,7 @@ def _progressive(body: Mapping[str, Any]) -> ProgressiveLens:
 
 
 def _lenslets(body: Mapping[str, Any]) -> WornLens:
-    """Return spectacles with lenslets, by default as DIMS lenses have them."""
+    """Return spectacles with lenslets; the defaults are those of DIMS lenses."""
     fields.only_known(body, ("kind", *SPECTACLE_FIELDS, *LENSLET_FIELDS), path=PATH)
     worn = prescription(body, path=PATH)
 
@@ -133,10 +133,10 @@ def _lenslets(body: Mapping[str, Any]) -> WornLens:
 
 
 def vertex_notes(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return where the powers of a profile count, and what they are at the cornea.
+    """Return notes on the plane of a profile's powers, and on the powers at the cornea.
 
-    A prescription of spectacles that is taken for powers at the cornea is another eye:
-    -8 dpt at 12 mm are -7.30 dpt there.
+    Spectacle powers mistaken for powers at the cornea describe another eye: -8 dpt at
+    12 mm are -7.30 dpt there.
     """
     notes = []
     if data.get("kind") == "prescription":
@@ -168,7 +168,7 @@ def _vertex_note(name: str, data: Mapping[str, Any]) -> str:
 
 
 def prescription(data: Mapping[str, Any], *, path: str = "") -> rx.Prescription:
-    """Return sphere, cylinder and axis, and how far before the cornea they stand."""
+    """Return sphere, cylinder, axis and the distance in front of the cornea."""
     return rx.Prescription(
         **_powers(data, needs_sphere=True, path=path),
         vertex_mm=fields.number(data, "vertex_mm", 0.0, 25.0, default=0.0, path=path),
@@ -196,7 +196,7 @@ def _powers(
 def _seated(
     body: Mapping[str, Any], kind: str, *, needs_sphere: bool
 ) -> dict[str, Any]:
-    """Return what a lens on or in the eye has: its powers, its seat, its aberration."""
+    """Return powers, decentration and aberration of a lens on or in the eye."""
     powers = _powers(body, needs_sphere=needs_sphere, path=PATH)
     turned = fields.number(body, "rotation_deg", -180.0, 180.0, default=0.0, path=PATH)
     powers["axis_deg"] = (powers["axis_deg"] + turned) % 180.0
@@ -213,7 +213,7 @@ def _seated(
 
 
 def _intraocular(body: Mapping[str, Any], *, has_cornea: bool) -> WornLens:
-    """Return an intraocular lens, its powers carried to the entrance pupil."""
+    """Return an intraocular lens, its powers converted to the entrance pupil."""
     design = fields.choice(
         body, "design", tuple(DESIGNS), default="monofocal", path=PATH
     )
@@ -240,7 +240,7 @@ def _intraocular(body: Mapping[str, Any], *, has_cornea: bool) -> WornLens:
 
 
 def _cornea_um(body: Mapping[str, Any], *, has_cornea: bool) -> float:
-    """Return the cornea's own C(4,0), where the profile does not hold it."""
+    """Return the cornea's own C(4,0), or 0 if the profile includes the cornea."""
     name = "cornea_spherical_aberration_um"
     if not has_cornea:
         return fields.number(
@@ -326,7 +326,7 @@ def _trifocal(body: Mapping[str, Any]) -> Profile:
 
 
 def _edof(body: Mapping[str, Any]) -> Profile:
-    """Orders 1 and 2, which makes up for some of the eye's colour (Millán 2017)."""
+    """Return orders 1 and 2, which partly correct the eye's color (Millán 2017)."""
     add_dpt = fields.number(body, "add_dpt", 0.25, 3.0, path=PATH)
     step = fields.number(body, "step_waves", 1.05, 1.95, default=1.5, path=PATH)
     return add_dpt, Kinoform.sawtooth(step), (1, 2), 1

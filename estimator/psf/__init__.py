@@ -1,21 +1,21 @@
-"""Point-spread functions of wavefronts, by the method that holds for each.
+"""Point-spread functions of wavefronts, each by the method that is valid for it.
 
-compute            many PSFs at once: the entry
-arguments          its arguments, checked
+compute            entry point: many PSFs at once
+arguments          argument checks
 kernel_types       finished kernels and their buffers
 pupil              the pupil's ellipse as a unit disc
-survey             slopes, curvatures and sizes, before anything is computed
-switch             waves or rays, by predicted error
+survey             pre-pass: slopes, curvatures and sizes
+switch             choice of waves or rays, by predicted error
 fourier            wave optics by FFT
 fourier_kernels    its compiled loops
 geometric          ray optics with Fresnel's edge
 geometric_kernels  its compiled loops
 enz                the extended Nijboer-Zernike series
 enz_series         its coefficients
-tail               mean light far outside
-stiles_crawford    the eye's apodisation
+tail               mean light far outside the spot
+stiles_crawford    the eye's apodization
 screens            rings in the pupil, of lenses with several foci
-reference          the slow float64 truth
+reference          slow float64 ground truth
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Checks of what callers of the PSF engines pass, and one form for each of it."""
+"""Argument checks of the PSF engines; each returns one canonical form."""
 
 import math
 
@@ -11,7 +11,7 @@ from estimator.psf.pupil import ELLIPSE_COLUMNS
 
 
 def checked_zernike_um(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """(P, 28) finite coefficients."""
+    """Return finite coefficients (P, 28)."""
     array = np.asarray(zernike_um, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != N_TERMS:
         raise ValueError(f"zernike_um has shape {array.shape}: must be (P, {N_TERMS})")
@@ -33,7 +33,7 @@ def checked_positive(name: str, values: ArrayLike, count: int) -> NDArray[np.flo
 
 
 def checked_choice(name: str, value: str, allowed) -> None:
-    """Refuse a word that is not among the allowed ones."""
+    """Raise unless the value is one of the allowed ones."""
     if value not in allowed:
         raise ValueError(f"{name} {value!r}: must be one of {', '.join(allowed)}")
 
@@ -41,7 +41,7 @@ def checked_choice(name: str, value: str, allowed) -> None:
 def checked_scale(
     pixel_pitch_mrad: ArrayLike | None, pixel_from_mrad: ArrayLike | None, count: int
 ) -> NDArray[np.float64]:
-    """Pixel pitch or Jacobian, of which one is given, as Jacobians (P, 2, 2)."""
+    """Return Jacobians (P, 2, 2) from either a pixel pitch or Jacobians."""
     if (pixel_pitch_mrad is None) == (pixel_from_mrad is None):
         raise ValueError("give either pixel_pitch_mrad or pixel_from_mrad")
     if pixel_from_mrad is None:
@@ -72,9 +72,9 @@ def checked_scale(
 def checked_ellipse(
     pupil_ellipse: ArrayLike | None, circle_radius_mm: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """(P, 5) ellipses that lie on their circles, to 2 % of the radius, or None.
+    """Return ellipses (P, 5) within their circles to 2 % of the radius, or None.
 
-    A rim that was fitted by an ellipse bulges beyond its circumscribed circle a little.
+    An ellipse fitted to a rim bulges slightly beyond the rim's circumscribed circle.
     """
     if pupil_ellipse is None:
         return None

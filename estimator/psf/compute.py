@@ -1,7 +1,7 @@
-"""Point-spread functions of wavefronts, by the method that holds for each.
+"""Point-spread functions of wavefronts, each by the method that is valid for it.
 
-Wavefronts in, pixel-integrated kernels out: between the eye (`zernike_um`) and the
-PSF store.  `reference.py` is the slow float64 truth beside it.
+Takes wavefronts of the eye (`zernike_um`) and returns pixel-integrated kernels for the
+PSF store.  `reference.py` is the slow float64 ground truth.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -70,17 +70,17 @@ ACCURACY = {
 MIN_ENERGY_RATIO = 0.999
 
 EDGE_LIGHT_TRUSTED = 0.03
-"""Share up to which the edge-light formula is nearer the truth than a kernel's sum."""
+"""Share up to which the edge-light formula is more accurate than a kernel's sum."""
 
 
 @dataclass(frozen=True)
 class PsfBatch:
-    """P point-spread functions, one kernel behind the other; items are `Psf`.
+    """P point-spread functions with concatenated kernels; items are `Psf`.
 
     Attributes
     ----------
     flat_kernels : (total,) float32
-        PSF p fills (2R+1)² elements from ``offset_count[p]``, rows first.
+        PSF p fills (2R+1)² elements from ``offset_count[p]``, row-major.
     offset_count, radius_px : (P,) int64
     lost_energy_ratio, blur_radius_px : (P,)
     geometric_ratio : (P,)
@@ -116,7 +116,7 @@ class PsfBatch:
 
 @dataclass(frozen=True)
 class PsfPlan:
-    """What is known of P kernels before one is computed.
+    """Survey, radii and methods of P kernels, known before any is computed.
 
     Attributes
     ----------
@@ -168,10 +168,11 @@ def finished_batch(
     method: str,
     first: int = 0,
 ) -> PsfBatch:
-    """Refuse dark kernels, and say what each lost; ``first`` is the call's number of 0.
+    """Return the batch with each kernel's lost light; raise if a kernel is dark.
 
-    The light outside is known in closed form while it is little; a kernel's own sum
-    carries the method's energy error of a few 1e-3.
+    ``first`` is the index of PSF 0 in the call.  The lost light comes from a closed
+    form while it is small; a kernel's own sum has the method's energy error of a few
+    1e-3.
     """
     dark = np.flatnonzero(~(output.total_ratio > 0.0))
     if dark.size:
@@ -211,7 +212,7 @@ def plan_psfs(
     max_radius_px: int = 255,
     min_energy_ratio: float = MIN_ENERGY_RATIO,
 ) -> PsfPlan:
-    """Check the arguments of `compute_psf_batch`; survey, radii and methods of all."""
+    """Check the arguments of `compute_psf_batch` and choose all radii and methods."""
     zernike_um = checked_zernike_um(zernike_um)
     count = zernike_um.shape[0]
     checked_choice("method", method, METHODS)
@@ -287,48 +288,49 @@ def compute_psf_batch(
     min_energy_ratio: float = MIN_ENERGY_RATIO,
     workers: int | None = None,
 ) -> PsfBatch:
-    """Point-spread functions of many wavefronts, integrated over pixels.
+    """Compute pixel-integrated point-spread functions of many wavefronts.
 
     Parameters
     ----------
     zernike_um : (P, 28), um
-        Wavefronts on circles of half the pupil diameter; tilt moves the kernel,
-        piston does nothing.
+        Wavefronts on circles of the given diameter; tilt moves the kernel, piston has
+        no effect.
     pupil_diameter_mm, wavelength_nm : (P,) or scalar
-        Diameter of the circle the coefficients are on: the pupil, where no ellipse is
-        given.
+        Diameter of the circle of the coefficients, which is the pupil unless an
+        ellipse is given; wavelength.
     pixel_pitch_mrad : (x, y) or scalar
-        Visual angle of a pixel; or, instead,
+        Visual angle of a pixel; the alternative to ``pixel_from_mrad``.
     pixel_from_mrad : (P, 2, 2) or (2, 2)
-        Jacobian of the image at each PSF's place: visual angle (x right, y up, in the
-        pupil axes of the field) to pixels (x right, y up), see `pinhole.py`.
+        Jacobian of the image at each PSF's position: visual angle (x right, y up, in
+        the pupil axes of the field) to pixels (x right, y up), see `pinhole.py`.
     pupil_ellipse : (P, 5) or (5,), optional
-        Pupil on the circle: centre x, centre y, semi-major and semi-minor axis in mm,
-        angle of the major axis in rad from x.  Only it passes light; the circle where
-        it is None.
+        Pupil on the circle: center x, center y, semi-major and semi-minor axis in mm,
+        angle of the major axis in rad from x.  Only the ellipse passes light.
+        Default: the whole circle.
     stiles_crawford : StilesCrawford, optional
-        Directional sensitivity of the cones; none where it is None.
+        Directional sensitivity of the cones.
     pupil_screen : PupilScreen, optional
-        Rings of a lens with several foci, before all pupils; by the wave method alone.
+        Rings of a lens with several foci, in front of all pupils; wave method only.
     radius_px : int, optional
-        Kernel radius of all PSFs; chosen for each where it is None.
+        Kernel radius of all PSFs; by default chosen for each.
     method : "auto", "fourier", "geometric", "enz" or "enz_unchecked"
-        "auto" asks `switch.geometric_shares`; "enz" refuses what its series does
-        not hold, and "enz_unchecked" does not: only for tables that show where it
-        breaks.
+        "auto" uses `switch.geometric_shares`.  "enz" raises outside the domain of its
+        series; "enz_unchecked" does not and serves only tables that show where the
+        series fails.
     accuracy : "normal" or "fine"
         Wave method: relative L2 error of at most 3e-2 or 1e-2.
     enz_degree : int
         Largest Zernike degree of "enz"; the default is the paper's.
     diffraction : bool
-        False: ray optics only, and a perfect eye gives exactly one pixel.
+        False: ray optics only; a perfect eye then gives exactly one pixel.
     max_radius_px : int
-        Blur beyond it is refused.  Light that diffraction alone sends farther is left
-        out and counted (`lost_energy_ratio`), whatever ``min_energy_ratio`` asks for.
+        Largest kernel radius; wider blur raises `PsfTooLarge`.  Light that only
+        diffraction sends farther is omitted and counted (`lost_energy_ratio`),
+        regardless of ``min_energy_ratio``.
     min_energy_ratio : float
-        Share of the light that a chosen radius must hold.
+        Least share of the light within a chosen radius.
     workers : int, optional
-        Threads; as many as the process may use where it is None.
+        Number of threads; by default as many as the process may use.
 
     Returns
     -------
@@ -337,9 +339,9 @@ def compute_psf_batch(
     Raises
     ------
     PsfTooLarge
-        A PSF blurs farther than ``max_radius_px``.
+        The blur of a PSF exceeds ``max_radius_px``.
     EnzOutsideDomain
-        The ENZ series of this degree does not hold a wavefront.
+        The ENZ series of this degree cannot represent a wavefront.
     ValueError
         Wrong shapes, values out of range, or no light inside a given radius.
 
@@ -385,5 +387,5 @@ def compute_psf_batch(
 
 
 def compute_psfs(zernike_um: ArrayLike, **options) -> list[Psf]:
-    """Point-spread functions of many wavefronts, as a list; see `compute_psf_batch`."""
+    """Return point-spread functions of many wavefronts, see `compute_psf_batch`."""
     return list(compute_psf_batch(zernike_um, **options))

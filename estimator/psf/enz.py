@@ -1,10 +1,10 @@
-"""PSFs by the extended Nijboer-Zernike (ENZ) series, where it holds.
+"""PSFs by the extended Nijboer-Zernike (ENZ) series, within its domain.
 
 The method of Csoba & Kunkli 2023 (section 4): the pupil function is expanded in Zernike
 functions with complex coefficients beta, and every Zernike function has a known image
-V.  Defocus is carried outside the expansion, with its sign; tilt shifts the image.  The
-series needs Zernike degrees up to about 2 pi times the waves (peak to valley) of all
-other aberrations, so it is for good eyes and small pupils: outside, it refuses.
+V.  Signed defocus stays outside the expansion; tilt shifts the image.  The series needs
+Zernike degrees up to about 2 pi times the waves (peak to valley) of all other
+aberrations, so it suits good eyes and small pupils and raises an error elsewhere.
 """
 
 import math
@@ -31,11 +31,11 @@ RELEASED_DEGREE = 30
 
 MAX_DEGREE = 120
 MIN_CAPTURED_RATIO = 0.998
-"""Share of the pupil's energy that the expansion must hold: kernels then err by at most
-2 % (L2), at 99 % by up to 6 % (the six presets, fields to 40 deg)."""
+"""Least share of the pupil's energy in the expansion: kernels then err by at most 2 %
+(L2), at 99 % by up to 6 % (the six presets, fields to 40 deg)."""
 
 DEGREE_PER_WAVE = 2.0 * math.pi
-"""Degree that holds 99 % of the energy per wave of PV: measured 0.9 to 1.4 times it."""
+"""Degree per wave of PV that holds 99 % of the energy; measured 0.9 to 1.4 times it."""
 
 _RADIAL_STEPS = 32
 """Samples of V per lambda / pupil radius; cubic interpolation errs by 4e-5."""
@@ -47,7 +47,7 @@ class EnzOutsideDomain(ValueError):
     Attributes
     ----------
     index : int
-        Which PSF of the call it is.
+        Index of the PSF in the call.
     degree_count, needed_degree_count : int
     """
 
@@ -65,7 +65,7 @@ class EnzOutsideDomain(ValueError):
 
 @njit(cache=True, nogil=True)
 def _intensities(qx, qy, step_x, step_y, table, per_r, out):
-    """|U|² on a tensor grid of pixels' samples, by cubic interpolation of the table.
+    """Compute |U|² on a grid of pixel samples by cubic interpolation of the table.
 
     U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
     """
@@ -102,7 +102,7 @@ def _intensities(qx, qy, step_x, step_y, table, per_r, out):
 
 
 class _Series:
-    """One PSF's series: expansion, check, and its image on the pixel grid."""
+    """Series of one PSF: expansion, domain check and image on the pixel grid."""
 
     def __init__(self, survey: PupilSurvey, index: int, degree: int, is_checked: bool):
         frames = survey.frames
@@ -155,7 +155,7 @@ class _Series:
         return betas
 
     def _radial_table(self, reach: float):
-        """2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m on radii -1, 0, 1 ... steps."""
+        """Return 2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m at radii -1, 0, 1 ... steps."""
         rho, weight = radial_nodes(self.degree, abs(self.defocus_rad), reach)
         weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
         weighted = np.empty((rho.size, 2 * self.degree + 1), np.complex128)
@@ -168,13 +168,13 @@ class _Series:
         r = np.arange(math.ceil(reach * _RADIAL_STEPS) + 4) / _RADIAL_STEPS
         table = np.empty((r.size + 1, weighted.shape[1]), np.complex128)
         hankel_table(r, rho, weighted, table[1:])
-        # J_m is even or odd in r as m is: the sample before 0 makes it cubic there.
+        # J_m has the parity of m; the sample before 0 permits cubic interpolation at 0.
         signs = (-1.0) ** np.abs(np.arange(-self.degree, self.degree + 1))
         table[0] = signs * table[2]
         return table
 
     def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
-        """(2R+1, 2R+1) shares of the light inside a window, edge light beyond."""
+        """Return shares of the light (2R+1, 2R+1); beyond a window, the edge light."""
         survey, p = self.survey, slice(self.index, self.index + 1)
         plan = plan_grids(
             extent_px=survey.extent_px[p], unit_px=survey.unit_px[p], accuracy=accuracy
@@ -205,7 +205,7 @@ class _Series:
         return kernel
 
     def _intensity(self, x_px, y_px):
-        """Share of the light per sample-pixel area at a grid of image points."""
+        """Return the share of the light per sample-pixel area on a grid of points."""
         room = math.sqrt(1.0 - self.shear**2)
         # q = T^T p / lambda, t = T w with T lower triangular.
         qx = np.array([self.half[0], 0.0]) / self.wavelength_um
@@ -230,7 +230,7 @@ def _reach(samples_per_px: int) -> int:
 
 
 def _filter_matrix(n_px: int, samples_per_px: int) -> NDArray[np.float64]:
-    """(pixels, samples): pixel integrals of samples 1/k apart, in shares of a pixel."""
+    """Return weights (pixels, samples) that average samples 1/k px apart by pixel."""
     weights = pixel_filter(samples_per_px, _FILTER_REACH) / samples_per_px
     matrix = np.zeros((n_px, (n_px - 1) * samples_per_px + weights.size))
     for q in range(n_px):
@@ -258,7 +258,7 @@ def enz_kernels(
     degree : int
         Largest Zernike degree of the expansion.
     is_checked : bool
-        False leaves out the domain's check: for tables that show where it breaks.
+        False skips the domain check; only for tables that show where the series fails.
     accuracy, output, pool
         As in `fourier.fourier_kernels`.
 

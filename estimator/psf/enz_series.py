@@ -1,7 +1,7 @@
-"""Mathematics of the extended Nijboer-Zernike (ENZ) series: its functions and fit.
+"""Functions and coefficients of the extended Nijboer-Zernike (ENZ) series.
 
-V_n^m is the image of a Zernike function through a defocused lens; beta_n^m are a pupil
-function's coefficients.  `enz.py` makes PSFs of them.
+V_n^m is the image of a Zernike function through a defocused lens; beta_n^m are the
+coefficients of a pupil function.  `enz.py` computes PSFs from them.
 """
 
 import math
@@ -16,18 +16,18 @@ from estimator.optics.zernike import zernike_values
 
 
 def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
-    """Zernike's R_n^|m|, by the recurrence of Jacobi polynomials: stable at any n."""
+    """Return Zernike's R_n^|m| by the Jacobi recurrence, which is stable at any n."""
     m, rho = abs(m), np.asarray(rho, np.float64)
     return rho**m * eval_jacobi((n - m) // 2, 0, m, 2.0 * rho**2 - 1.0)
 
 
 _UPWARD_FROM = 50.0
-"""Arguments from which J_0 and J_1 come from Hankel's expansion, to 1e-15."""
+"""Argument from which J_0 and J_1 are computed by Hankel's expansion, to 1e-15."""
 
 
 @njit(cache=True, nogil=True)
 def _hankel_asymptotic(order, x):
-    """J_order(x) for order 0 or 1 and large x."""
+    """Return J_order(x) for order 0 or 1 and large x."""
     term, even, odd = 1.0, 1.0, 0.0
     for k in range(1, 13):
         term *= (4.0 * order * order - (2.0 * k - 1.0) ** 2) / (8.0 * k * x)
@@ -43,9 +43,9 @@ def _hankel_asymptotic(order, x):
 
 @njit(cache=True, nogil=True)
 def _bessel_orders(x, count, out):
-    """J_0 .. J_(count-1) at x >= 0, by whichever recurrence is stable.
+    """Compute J_0 .. J_(count-1) at x >= 0 by the stable recurrence.
 
-    Upward below the argument; Miller's downward one elsewhere.
+    Upward for orders below the argument, Miller's downward recurrence elsewhere.
     """
     out[:count] = 0.0
     if x > max(_UPWARD_FROM, count + 1.0):
@@ -76,7 +76,7 @@ def _bessel_orders(x, count, out):
 
 @njit(cache=True, nogil=True)
 def hankel_table(r, rho, weighted, out):
-    """Sum over nodes: out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
+    """Compute out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
 
     ``weighted`` is (nodes, 2 M + 1) for m = -M .. M.
     """
@@ -91,14 +91,16 @@ def hankel_table(r, rho, weighted, out):
 
 
 def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
-    """V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.
+    """Evaluate V_n^|m|(r, f), the image of a Zernike function.
+
+    V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.
 
     Parameters
     ----------
     r : (k,)
-        Image radius in lambda / pupil radius (lambda / NA); 0 is no special case.
+        Image radius in lambda / pupil radius (lambda / NA), 0 included.
     defocus_rad : float
-        f, signed; 0 is no special case: (-1)^((n-|m|)/2) J_(n+1)(2 pi r) / (2 pi r).
+        f, signed; at 0, V is (-1)^((n-|m|)/2) J_(n+1)(2 pi r) / (2 pi r).
 
     Returns
     -------
@@ -108,7 +110,7 @@ def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
     -----
     Gauss-Legendre quadrature.  The Bessel-Bessel series of Braat et al. 2008 is the
     same integral with exp(i f rho²) expanded by Bauer's formula; it needs f/2 + 15
-    terms, a table of weights, and limits of its own at r = 0 and f = 0.
+    terms, a table of weights, and separate limits at r = 0 and f = 0.
     """
     r = np.atleast_1d(np.asarray(r, np.float64))
     rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
@@ -122,10 +124,10 @@ def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
 
 
 def radial_nodes(degree: int, defocus_rad: float, r: float):
-    """Gauss-Legendre nodes on 0..1 for degree, defocus and image radius together."""
+    """Return Gauss-Legendre nodes, weights on 0..1 for degree, defocus and radius."""
     swing = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
     count = math.ceil(swing / 2.0 + 3.0 * swing ** (1.0 / 3.0)) + 8
-    # Rounded up: few sets of nodes then serve all PSFs.
+    # Rounded up so that a few sets of nodes serve all PSFs.
     node, weight = _legendre(32 * math.ceil(count / 32))
     return (node + 1.0) / 2.0, weight / 2.0
 
@@ -137,7 +139,7 @@ def _legendre(count: int):
 
 @lru_cache(maxsize=8)
 def _basis(degree: int, n_nodes: int):
-    """Nodes and every sqrt(n+1) R_n^m on them: {m: (n, nodes)} for m = 0 .. degree."""
+    """Return nodes, weights and sqrt(n+1) R_n^m as {m: (n, nodes)}, m = 0 .. degree."""
     node, weight = _legendre(n_nodes)
     rho, weight = (node + 1.0) / 2.0, weight / 2.0
     radial = {
@@ -159,21 +161,21 @@ def zernike_betas(
     degree: int,
     log_amplitude=None,
 ) -> dict[int, NDArray[np.complex128]]:
-    """Coefficients beta_n^m of the pupil function, {m: values for n = |m|, |m|+2 ...}.
+    """Return beta_n^m of the pupil function as {m: values for n = |m|, |m|+2 ...}.
 
     Parameters
     ----------
     zernike_um : (28,)
-        On the unit disc; every term acts.
+        Coefficients on the unit disc; every term counts.
     degree : int
         Largest n.
     log_amplitude : callable, optional
-        Logarithm of the apodisation at unit-disc points (x, y).
+        Logarithm of the apodization at unit-disc points (x, y).
 
     Notes
     -----
     Projection by Gauss-Legendre times trapezoid, converged for any wavefront that the
-    degree can hold.  The sum of |beta|² is the share of the energy that is held.
+    degree can represent.  The sum of |beta|² is the share of the energy it holds.
     """
     n_nodes, n_angles = 2 * degree + 40, 4 * degree + 64
     rho, weight, radial = _basis(degree, n_nodes)

@@ -1,8 +1,8 @@
 """Wave-optical PSFs: one FFT per wavefront, integrated exactly over pixels.
 
-The angular sampling is an integer fraction of the pixel, so that the integral over
-pixels is one short filter for all PSFs of a call; the pupil's edge is low-passed, so
-that its diffraction does not fold back into the window.  float32 throughout.
+The angular sampling is an integer fraction of the pixel, so the integral over pixels
+is one short filter for all PSFs of a call.  The pupil's edge is low-passed, so its
+diffraction does not alias into the window.  float32 throughout.
 """
 
 import math
@@ -27,10 +27,10 @@ from estimator.psf.kernel_types import KernelBuffer
 from estimator.psf.survey import PupilSurvey
 
 MARGIN_PX = 1.6
-"""Least margin in pixels: the neighbours of the spot's pixels lie inside the window.
+"""Least margin in pixels; it keeps the neighbors of the spot's pixels in the window.
 
-With large pupils a pixel is 16 lambda/D wide and its neighbours hold up to 10 % of a
-sharp spot: the mean edge light is no answer there (L2 7 % instead of 2 %).
+With large pupils a pixel is 16 lambda/D wide and its neighbors hold up to 10 % of a
+sharp spot; the mean edge light is too inaccurate there (L2 7 % instead of 2 %).
 """
 
 MAX_LENGTH = 4096
@@ -38,7 +38,7 @@ MAX_LENGTH = 4096
 
 _EDGE_TAPER = 3.75
 _CHUNK_SAMPLES = 1 << 17
-"""Complex samples worked on at a time: 1 MiB stays in a core's L2 cache."""
+"""Complex samples processed at a time: 1 MiB stays in a core's L2 cache."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class FourierAccuracy:
     Attributes
     ----------
     oversampling : float
-        Least field samples per lambda/D.  From 2 on the intensity is band-limited; less
-        is enough where a pixel holds many samples, for it then averages the fringes
-        that are sampled too coarsely.
+        Least field samples per lambda/D.  From 2 on the intensity is band-limited;
+        fewer suffice where a pixel holds many samples, because it then averages the
+        undersampled fringes.
     min_samples_per_px : int
-        Samples in a pixel below which the oversampling rises, up to 2.
+        Samples per pixel below which the oversampling rises, up to 2.
     margin : float
-        Window beyond the geometric spot, lambda/D on each side.
+        Margin of the window around the geometric spot, lambda/D on each side.
     filter_half_width : int
         Reach of the pixel filter beyond the pixel, samples.
     """
@@ -74,9 +74,9 @@ class FourierPlan:
     length_count : (M, 2) int64
         FFT lengths.
     samples_per_px_count : (M, 2) int64
-        Angular samples in a pixel.
+        Angular samples per pixel.
     pupil_samples : (M, 2)
-        Pupil samples across the bounding box, not whole numbers.
+        Pupil samples across the bounding box, not integers.
     """
 
     length_count: NDArray[np.int64]
@@ -85,7 +85,7 @@ class FourierPlan:
 
 
 def _fast_lengths() -> NDArray[np.int64]:
-    """Even 5-smooth lengths: measured within 20 % of the cost of powers of two."""
+    """Return even 5-smooth lengths, measured within 20 % of powers of two in cost."""
     found = {
         2**a * 3**b * 5**c for a in range(2, 15) for b in range(6) for c in range(4)
     }
@@ -102,14 +102,14 @@ def plan_grids(
     accuracy: FourierAccuracy,
     lengths: NDArray[np.int64] = FAST_LENGTHS,
 ) -> FourierPlan:
-    """Smallest grids whose windows hold the spots (M, 2) and their margins.
+    """Return the smallest grids whose windows hold the spots (M, 2) and their margins.
 
-    ``lengths``: FFTs to choose from, ascending.
+    ``lengths`` are the FFT lengths to choose from, ascending.
 
     Raises
     ------
     ValueError
-        None of them holds the window.
+        No length holds the window.
     """
     margin_px = np.maximum(accuracy.margin * unit_px, MARGIN_PX)
     window_px = extent_px + 2.0 * margin_px
@@ -134,10 +134,10 @@ def plan_grids(
 
 @lru_cache(maxsize=1)
 def edge_response() -> NDArray[np.float32]:
-    """Response of a Kaiser-windowed sinc to a step, at 1/256 sample.
+    """Return the step response of a Kaiser-windowed sinc, at 1/256 sample.
 
     Half width 8, beta 3.75: light from the pupil's edge is kept up to 0.43 of the
-    window and 40 dB down from 0.57 on, so that hardly any folds back into the window.
+    window and 40 dB down from 0.57 on, so hardly any aliases into the window.
     Wider or less tapered edges measured no better.
     """
     t = np.arange(-EDGE_HALF_WIDTH * EDGE_STEPS, EDGE_HALF_WIDTH * EDGE_STEPS + 1)
@@ -152,9 +152,9 @@ def edge_response() -> NDArray[np.float32]:
 
 @lru_cache(maxsize=256)
 def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
-    """Weights that integrate a band-limited intensity over one pixel.
+    """Return weights that integrate a band-limited intensity over one pixel.
 
-    Tap l stands for the sample at l - reach from the pixel's centre,
+    Tap l stands for the sample at l - reach from the pixel's center,
     reach = ceil(k/2) + half_width.  Exact weights of the sinc interpolation,
     (Si(pi b) - Si(pi a)) / pi with a, b the distances to the pixel's edges, tapered
     beyond the pixel; their sum is k, the pixel in samples.
@@ -170,7 +170,7 @@ def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
 
 
 def _filter_table(samples_per_px: NDArray[np.int64], half_width: int):
-    """All pixel filters of a plan: (n, longest) table, lengths, and which (M, 2)."""
+    """Return a plan's pixel filters: (n, longest) table, lengths and index (M, 2)."""
     counts, which = np.unique(samples_per_px, return_inverse=True)
     filters = [pixel_filter(int(k), half_width) for k in counts]
     table = np.zeros((len(filters), max((f.size for f in filters), default=1)))
@@ -181,9 +181,9 @@ def _filter_table(samples_per_px: NDArray[np.int64], half_width: int):
 
 
 def _chunks(plan: FourierPlan, shear: NDArray) -> list[NDArray[np.int64]]:
-    """Members (indices into the plan) in batches of equal FFT lengths.
+    """Return members (indices into the plan) in batches of equal FFT lengths.
 
-    Equal pupils come together: they share their mask.
+    Equal pupils are adjacent, because they share their mask.
     """
     keys = (*plan.pupil_samples.T, shear, *plan.length_count.T)
     order = np.lexsort(keys)
@@ -193,12 +193,12 @@ def _chunks(plan: FourierPlan, shear: NDArray) -> list[NDArray[np.int64]]:
     for group in np.split(order, ends):
         step = max(1, _CHUNK_SAMPLES // int(plan.length_count[group[0]].prod()))
         chunks += [group[i : i + step] for i in range(0, group.size, step)]
-    # The longest first: threads end together.
+    # Longest first, so that threads finish together.
     return chunks[::-1]
 
 
 class _Work:
-    """What the threads of one call share."""
+    """State shared by the threads of one call."""
 
     def __init__(self, survey, members, accuracy, output):
         self.survey, self.members, self.output = survey, members, output
@@ -228,9 +228,9 @@ class _Work:
         )
 
     def _scratch(self, *shape: int) -> NDArray[np.complex64]:
-        """Zeros in memory that this thread uses again and again.
+        """Return zeros in memory that this thread reuses.
 
-        Fresh memory costs a third of the whole time in page faults.
+        Page faults of fresh memory cost a third of the total time.
         """
         count = math.prod(shape)
         if getattr(self.local, "field", np.empty(0)).size < count:
@@ -261,7 +261,7 @@ class _Work:
         if self.survey.screen is not None:
             samples = self.plan.pupil_samples[part]
             self.survey.screen.apply(members, samples, size, field)
-        # In place; the rows below the pupil are zero and stay so.
+        # In place; the rows below the pupil stay zero.
         lit = field[:, : int(size[:, 1].max())]
         spectra = scipy.fft.fft(lit, axis=2, overwrite_x=True)
         if not np.may_share_memory(spectra, lit):
@@ -304,16 +304,16 @@ def fourier_kernels(
     ----------
     survey : PupilSurvey
     members : (M,)
-        Which PSFs of the survey.
+        Indices of the PSFs in the survey.
     accuracy : FourierAccuracy
     output : KernelBuffer
     pool : Executor
-        Of threads; the work of each holds no Python lock for most of its time.
+        Thread pool; tasks release the GIL for most of their time.
 
     Notes
     -----
     PSF(p) = |int_pupil exp(2 pi i (W - p.t) / lambda) dt|² / (lambda² A) in the
-    coordinates of `pupil.py`, A the pupil's area there.
+    coordinates of `pupil.py`, with A the pupil's area there.
     """
     if members.size == 0:
         return

@@ -1,7 +1,7 @@
-"""Inner loops of the wave method, compiled: pupil phase and pixel integration.
+"""Compiled inner loops of the wave method: pupil phase and pixel integration.
 
-Free of the Python lock and single-threaded, so that callers may run them from any
-number of threads whatever thread layer numba finds.
+They release the GIL and are single-threaded, so callers may run them from any number
+of threads with any numba threading layer.
 """
 
 import math
@@ -14,32 +14,32 @@ from estimator.psf.tail import add_tail
 
 
 def _even_polynomial(function) -> tuple[np.float32, ...]:
-    """Polynomial in z = t², t in [-1/2, 1/2], through 7 Chebyshev nodes."""
+    """Return the polynomial in z = t², t in [-1/2, 1/2], through 7 Chebyshev nodes."""
     nodes = (1.0 + np.cos(np.pi * (np.arange(7) + 0.5) / 7.0)) / 8.0
     coefficients = np.polynomial.polynomial.polyfit(nodes, function(np.sqrt(nodes)), 6)
     return tuple(np.float32(c) for c in coefficients)
 
 
-# cos(2 pi t) and sin(2 pi t) / t to 3e-7: reduction in turns is one floor, and the
-# loop vectorises, which libm's sincos does not (about 10 times slower).
+# cos(2 pi t) and sin(2 pi t) / t to 3e-7: range reduction in turns is one floor, and
+# the loop vectorizes; libm's sincos does not and is about 10 times slower.
 COSINE_OF_TURNS = _even_polynomial(lambda t: np.cos(2.0 * np.pi * t))
 SINE_OF_TURNS = _even_polynomial(lambda t: np.sin(2.0 * np.pi * t) / t)
 _HALF = np.float32(0.5)
 
 EDGE_HALF_WIDTH = 8
-"""Samples by which the smoothed pupil reaches beyond its edge."""
+"""Samples by which the smoothed pupil extends beyond its edge."""
 
 EDGE_STEPS = 256
 """Entries per sample of the tabulated edge."""
 
 
 # The loops below run over whole slices from 0: an index that numba can prove positive
-# needs no wrap-around test, and without that test they vectorise.
+# needs no wrap-around test, and without that test they vectorize.
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _fill_row(row, x, mask, cosine, sine, out_re_im):
-    """Mask * exp(2 pi i W) along one row; ``row`` are the 7 coefficients in x."""
+    """Write mask * exp(2 pi i W) along one row; ``row`` has the 7 coefficients in x."""
     c0, c1, c2, c3, c4, c5, c6 = row[0], row[1], row[2], row[3], row[4], row[5], row[6]
     a0, a1, a2, a3, a4, a5, a6 = COSINE_OF_TURNS
     b0, b1, b2, b3, b4, b5, b6 = SINE_OF_TURNS
@@ -59,7 +59,7 @@ def _fill_row(row, x, mask, cosine, sine, out_re_im):
 
 @njit(cache=True, nogil=True)
 def _chord(y, r, shear, samples_x, middle):
-    """First and last column, as reals, of an ellipse scaled by r in the row at y."""
+    """Return the real first and last column of an ellipse scaled by r in the row y."""
     square = (r * r - y * y) * (1.0 - shear * shear)
     if r <= 0.0 or square <= 0.0:
         return 0.0, -1.0
@@ -69,10 +69,10 @@ def _chord(y, r, shear, samples_x, middle):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _edge_places(x, y, shear, half, places):
-    """Entries of the edge's table, as reals, for consecutive samples of a row.
+    """Compute real indices into the edge table for consecutive samples of a row.
 
-    From the distance to the edge in samples, taken by the slope of
-    q = (x² - 2 r x y + y²) / (1 - r²): exact for a circle, right to first order.
+    The distance to the edge in samples follows from the slope of
+    q = (x² - 2 r x y + y²) / (1 - r²): exact for a circle, else of first order.
     """
     one, steps = np.float32(1.0), np.float32(EDGE_STEPS)
     least, most = np.float32(0.0), np.float32(2 * EDGE_HALF_WIDTH * EDGE_STEPS)
@@ -92,7 +92,7 @@ def _edge_places(x, y, shear, half, places):
 
 @njit(cache=True, nogil=True)
 def _edge_row(first, end, x, y, shear, half, edge, places, row):
-    """Smoothed pupil near its edge, for the samples from first to end of a row."""
+    """Write the smoothed pupil near its edge, for samples first to end of a row."""
     if end <= first:
         return
     _edge_places(x[first:end], y, shear, half, places[: end - first])
@@ -109,7 +109,7 @@ def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
     Parameters
     ----------
     samples : (2,)
-        Samples across the bounding box, not whole numbers.
+        Samples across the bounding box, not integers.
     shear : float
     log_amplitude : (6,)
     edge : (2 EDGE_HALF_WIDTH EDGE_STEPS + 1,) float32
@@ -179,7 +179,7 @@ def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
             value = 0.0
             for power in range(6 - a, -1, -1):
                 value = value * y + turns[power, a]
-            # Whole turns go before the cast: float32 keeps 1e-6 of the rest.
+            # Remove whole turns before the cast: float32 keeps the rest to 1e-6.
             row[a] = value - math.floor(value) if a == 0 else value
         _fill_row(
             row,
@@ -193,7 +193,7 @@ def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
 
 @njit(cache=True, nogil=True)
 def fill_pupils(frames, power_x, power_y, grid, center_px, edge, field):
-    """Fill a batch of fields with their pupils, windows centred on whole samples.
+    """Fill a batch of fields with their pupils, windows centered on whole samples.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel
         Spectrum of the pupil, not shifted: sample j stands for center + j, or
         center + j - N beyond the middle.
     center : (2,) int64
-        Window centre (x, y) in angular samples.
+        Window center (x, y) in angular samples.
     window : (4,) int64
         Pixel offsets x0, x1, y0, y1 (y upward, ends included) to fill.
     k : (2,) int64
@@ -285,7 +285,7 @@ def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel
     sums = np.zeros((n_y, n_columns + 2 * pad), np.float32)
     first_row = max(0, y0 * ky - center[1] + half_y - reach_y)
     last_row = min(n_rows - 1, y1 * ky - center[1] + half_y + reach_y)
-    # Rows first: each meets about two pixels, and whole rows add up vectorised.
+    # Rows first: each overlaps about two pixels, and sums of whole rows vectorize.
     for j in range(first_row, last_row + 1):
         parts = field[(j + half_y) % n_rows].view(np.float32)
         _intensity(parts[:n_columns], line[half_x:])
@@ -315,7 +315,7 @@ def integrate_batch(field, grid, filters, tails, output):
     filters : (table (n, longest) float32, length (n,) int64, which (B, 2) int64)
     tails : (edge_slope_px (B, n, 2), half (B, 2), shear (B,), edge_um (B,))
     output : (flat float32, offset (B,), radius_px (B,), share (B,), total (B,))
-        Kernels are added, brought to a sum of ``share``; ``total`` is written.
+        Kernels are scaled to a sum of ``share`` and added; ``total`` is written.
     """
     center, k, scale = grid
     table, length, which = filters

@@ -1,8 +1,8 @@
-"""Ray-optical PSFs: every pupil cell splats its footprint, then the edge diffracts.
+"""Ray-optical PSFs: splatted footprints of pupil cells plus diffraction at the edge.
 
-The pupil's edge sends the only light that rays do not explain until blur is no wider
-than diffraction: Fresnel's straight edge, laid along the edge's own image.  Without
-diffraction the method is the answer at any blur, down to a perfect eye's delta.
+As long as blur is wider than diffraction, only light from the pupil's edge deviates
+from ray optics: Fresnel's straight edge, applied along the edge's image.  Without
+diffraction the method is exact at any blur, down to a perfect eye's delta.
 """
 
 import math
@@ -19,16 +19,16 @@ from estimator.psf.kernel_types import KernelBuffer
 from estimator.psf.survey import PupilSurvey
 
 FRESNEL_LIMIT = 14.0
-"""Fresnel's edge is tabulated to here; beyond, its fringes count as averaged."""
+"""Limit of the table of Fresnel's edge; beyond, its fringes are taken as averaged."""
 
 _FRESNEL_STEPS = 4096
 _PART = 32
-"""PSFs per task: a task handed to a thread costs as much as half a PSF."""
+"""PSFs per task: dispatching a task to a thread costs as much as half a PSF."""
 
 
 @lru_cache(maxsize=1)
 def fresnel_table() -> NDArray[np.float64]:
-    """Integral from the dark side of (1/2)[(1/2+C)² + (1/2+S)²] less the step."""
+    """Integrate (1/2)[(1/2+C)² + (1/2+S)²] less the step, from the dark side."""
     fine = 16
     v = np.linspace(-FRESNEL_LIMIT, FRESNEL_LIMIT, fine * _FRESNEL_STEPS + 1)
     s, c = fresnel(v)
@@ -54,12 +54,12 @@ def geometric_kernels(
     ----------
     survey : PupilSurvey
     members : (M,)
-        Which PSFs of the survey.
+        Indices of the PSFs in the survey.
     diffraction : bool
-        False leaves the edge's light out.
+        False omits the edge's light.
     output : KernelBuffer
     pool : Executor
-        Of threads.
+        Thread pool.
     """
     frames = survey.frames
     extent_px = survey.extent_px.max(axis=1)

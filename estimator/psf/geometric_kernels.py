@@ -1,6 +1,6 @@
-"""Inner loops of ray optics, compiled: footprints of pupil cells, and the edge's light.
+"""Compiled inner loops of ray optics: footprints of pupil cells, and the edge's light.
 
-Free of the Python lock and single-threaded, as those of `fourier_kernels.py`.
+They release the GIL and are single-threaded, like those of `fourier_kernels.py`.
 """
 
 import math
@@ -25,24 +25,24 @@ POINTS_AT_ONCE = 8
 
 NEAR_PX = 2
 FAR_PX = 6
-"""Distances from the edge's image up to which its light is laid at half and at whole
-pixels; beyond, its mean is taken (`tail.py`)."""
+"""Distances from the edge's image up to which its light is computed at half and at
+whole pixels; beyond, its mean is used (`tail.py`)."""
 
 MIN_CURVATURE_RATIO = 0.1
 """Share of the wavefront's curvature below which the curvature along the edge counts
-as none: the rim's image has a cusp there, and Fresnel's edge no meaning."""
+as zero: the rim's image has a cusp there, and Fresnel's edge does not apply."""
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _row_footprints(row, x, cell, factor_x, factor_y, boxes):
-    """Left and lower ends (px), sizes and inverse sizes of one row of footprints.
+    """Compute left and lower ends (px), sizes and inverse sizes of a footprint row.
 
-    ``row``: float32 coefficients in x of W, dW/dy and d²W/dy² at this row.  Sizes are
-    those of the box with the same variance as the parallelogram that the cell's
-    corners make.
+    ``row`` holds float32 coefficients in x of W, dW/dy and d²W/dy² at this row.  Sizes
+    are those of the box with the same variance as the parallelogram of the cell's
+    corners.
     """
-    # Scalars first: read inside the loop they might alias its outputs, and the loop
-    # would not vectorise.
+    # Load scalars first: read inside the loop they might alias its outputs, and the
+    # loop would not vectorize.
     two, three, four, five = np.float32(2), np.float32(3), np.float32(4), np.float32(5)
     c, d, e = row[0], row[1], row[2]
     c1, c2, c3, c4 = c[1], two * c[2], three * c[3], four * c[4]
@@ -84,7 +84,7 @@ def _splat_wide_box(image, box, weight):
 
 @njit(cache=True, nogil=True)
 def _three_shares(over, per_width):
-    """Shares of three pixels in a box that ends ``over`` beyond the first one."""
+    """Return shares of three pixels in a box ending ``over`` beyond the first one."""
     one, zero = np.float32(1.0), np.float32(0.0)
     last = max(over - one, zero) * per_width
     middle = min(max(over, zero), one) * per_width
@@ -95,7 +95,7 @@ def _three_shares(over, per_width):
 def _splat_boxes(image, boxes, first, end, weights):
     """Spread weights over the pixels that boxes cover; a point fills its pixel.
 
-    Most boxes span at most two pixels each way and take the short path.
+    Most boxes span at most two pixels per axis and take the short path.
     """
     radius = image.shape[0] // 2
     half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -109,7 +109,7 @@ def _splat_boxes(image, boxes, first, end, weights):
         over_y = y0 + height - np.float32(iy) - half
         is_inside = -radius <= ix < radius - 1 and -radius <= iy < radius - 1
         if not is_inside or over_x > two or over_y > two:
-            # Never empty: a box without size in the last pixel would divide by zero.
+            # Never empty: a zero-size box in the last pixel would divide by zero.
             tiny = 1e-9
             box = (x0, x0 + width + tiny, y0, y0 + height + tiny)
             _splat_wide_box(image, box, weights[i])
@@ -124,8 +124,8 @@ def _splat_boxes(image, boxes, first, end, weights):
                 image[row - j, column + 1] += part * x_shares[1]
                 image[row - j, column + 2] += part * x_shares[2]
             continue
-        # All four pixels are written, with a share of zero where the box ends before:
-        # cheaper than branches that no processor can predict.
+        # Write all four pixels, with zero share where the box ends earlier: cheaper
+        # than unpredictable branches.
         share_x = max(over_x, zero) * per_wide[i]
         share_y = max(over_y, zero) * per_high[i]
         upper = weights[i] * share_y
@@ -138,7 +138,7 @@ def _splat_boxes(image, boxes, first, end, weights):
 
 @njit(cache=True, nogil=True)
 def _row_coefficients(polynomial, y, row):
-    """Coefficients (3, 7) in x of W, dW/dy and half d²W/dy² ... at one y."""
+    """Compute coefficients (3, 7) in x of W, dW/dy and d²W/dy² at one y."""
     for a in range(7):
         value, first, second = 0.0, 0.0, 0.0
         for b in range(6 - a, -1, -1):
@@ -150,7 +150,7 @@ def _row_coefficients(polynomial, y, row):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
-    """Splat the footprints of all cells of the elliptical pupil; returns their weight.
+    """Splat the footprints of the elliptical pupil's cells and return their weight.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
     n_cells : int
         Cells across the bounding box.
     image : (2R+1, 2R+1) float32
-        Added to; image orientation.
+        Image to add to, in image orientation.
     """
     cell = 2.0 / n_cells
     x = ((np.arange(n_cells) + 0.5) * cell - 1.0).astype(np.float32)
@@ -171,7 +171,7 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
     is_apodised = False
     for c in log_amplitude:
         is_apodised = is_apodised or c != 0.0
-    # Within this the whole cell lies inside: the ellipse is least curved-in there.
+    # Cells within this radius lie wholly inside, even at the ellipse's narrowest.
     inner = max(0.0, 1.0 - 0.75 * cell / math.sqrt(1.0 - abs(shear)))
     total = 0.0
     for j in range(n_cells):
@@ -187,7 +187,7 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
             weights[i] = 1.0
             if core_first <= i < core_end:
                 continue
-            # Area of the cell inside the ellipse, its edge taken as straight.
+            # Area of the cell inside the ellipse, with the edge taken as straight.
             slope_x, slope_y = x[i] - shear * y, y - shear * x[i]
             r = math.sqrt((x[i] * slope_x + y * slope_y) / room)
             steep = math.sqrt(slope_x * slope_x + slope_y * slope_y)
@@ -214,7 +214,7 @@ def _apodise(x, y, log_amplitude, first, end, weights):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fresnel(v, table, limit):
-    """Integral of Fresnel's straight edge less its step, from the dark to v."""
+    """Integrate Fresnel's straight edge less its step, from the dark to v."""
     if abs(v) >= limit:
         return -1.0 / (2.0 * math.pi**2 * v)
     place = (v + limit) / (2.0 * limit) * (table.size - 1)
@@ -224,7 +224,7 @@ def _fresnel(v, table, limit):
 
 @njit(cache=True, nogil=True)
 def _lay(image, x, y, per_width, light):
-    """Spread light over the up to four pixels that a small box at (x, y) covers."""
+    """Spread light over the pixels (up to four) under a small box at (x, y)."""
     radius = image.shape[0] // 2
     ix, iy = math.floor(x), math.floor(y)
     if ix < -radius or iy < -radius or ix >= radius or iy >= radius:
@@ -242,7 +242,7 @@ def _lay(image, x, y, per_width, light):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point_on_edge(polynomial, x, y, half, row):
-    """Slope (px) and second derivatives in t (px²/um) of W at a box point."""
+    """Return slope (px) and second derivatives in t (px²/um) of W at a box point."""
     _row_coefficients(polynomial, y, row)
     sx, sy, hxx, hxy, hyy = 0.0, 0.0, 0.0, 0.0, 0.0
     value = 0.0
@@ -259,10 +259,10 @@ def _point_on_edge(polynomial, x, y, half, row):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lay_profile(image, start, normal, strength, v_per_px, fresnel):
-    """Lay one edge point's light along its normal: half pixels near, whole ones far.
+    """Add an edge point's light along its normal: half pixels near, whole ones far.
 
-    One half pixel is centred on the edge: where the wavefront is flat the profile has
-    a pole there, whose two sides cancel.
+    One half pixel is centered on the edge: where the wavefront is flat, the profile
+    has a pole there whose two sides cancel.
     """
     table, limit = fresnel
     near_end, end = NEAR_PX + 0.25, FAR_PX + 0.25
@@ -283,20 +283,20 @@ def _lay_profile(image, start, normal, strength, v_per_px, fresnel):
 def add_edge_light(
     polynomial, half, shear, log_amplitude, passed, wave, extent_px, image
 ):
-    """Add what diffraction at the pupil's edge changes in a ray-optical spot.
+    """Add the effect of diffraction at the pupil's edge to a ray-optical spot.
 
     Parameters
     ----------
     polynomial, half, shear, log_amplitude
         As in `splat_pupil`.
     passed : float
-        Light that the apodised pupil passes.
+        Light that the apodized pupil passes.
     wave : (wavelength_um, table, limit)
         Fresnel's edge, see `geometric`.
     extent_px : float
         Larger side of the spot.
     image : (2R+1, 2R+1) float32
-        Added to, in shares of the light.
+        Image to add to, in shares of the light.
 
     Notes
     -----
@@ -305,7 +305,7 @@ def add_edge_light(
     k = H_nn - H_nt²/H_tt, H its second derivatives, so that d = k q at a depth q; the
     irradiance is Fresnel's straight edge at v = -sign(k) d sqrt(2 / (lambda |k|)) and
     its difference from the rays' step holds ds/A sqrt(lambda / (2 |k|)) times the
-    integral over v.  For k -> 0, and far outside, that is the mean edge light of
+    integral over v.  For k -> 0, and far outside, this is the mean edge light of
     `survey.needed_radius_px`.
     """
     wavelength_um, table, limit = wave
@@ -338,7 +338,7 @@ def add_edge_light(
 
 @njit(cache=True, nogil=True)
 def trace_batch(frames, power_x, power_y, survey, wave, output):
-    """Compute ray-optical kernels one after the other into the output buffer.
+    """Compute ray-optical kernels into the output buffer, one by one.
 
     Parameters
     ----------
@@ -349,7 +349,7 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
         The last is the larger side of the spot.
     wave : (wavelength_um (B,), table, limit, is_diffracting)
     output : (flat float32, offset (B,), radius_px (B,), share (B,), total (B,))
-        Kernels are added, brought to a sum of ``share``; ``total`` is written.
+        Kernels are scaled to a sum of ``share`` and added; ``total`` is written.
     """
     polynomial, half, shear, log_amplitude, passed = frames
     wavelength_um, table, limit, is_diffracting = wave
@@ -388,8 +388,8 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
                 extent_px[b],
                 image,
             )
-            # Beside a caustic the edge's fringes can outweigh the rays: no light is
-            # negative.
+            # Beside a caustic the edge's fringes can outweigh the rays; clamp negative
+            # light.
             for row in range(side):
                 for column in range(side):
                     image[row, column] = max(image[row, column], np.float32(0.0))

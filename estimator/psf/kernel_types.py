@@ -1,4 +1,4 @@
-"""What the PSF engines share: the result, the refusal, and the kernel's disc."""
+"""Types shared by the PSF engines: result, size error, buffer and kernel disc."""
 
 import math
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ class Psf:
     kernel : (2R+1, 2R+1) float32
         ``[y, x]`` in image orientation: the row index grows downward, so light sent
         to +theta_y lands in a smaller row.  Unit sum, zero outside the disc
-        dx² + dy² <= (R + 0.5)², centre element = chief ray (theta = 0).
+        dx² + dy² <= (R + 0.5)², center element = chief ray (theta = 0).
     radius_px : int
         R.
     lost_energy_ratio : float
-        Share of the light that falls outside the disc, before the kernel was
-        brought to unit sum.
+        Share of the light outside the disc, before the kernel was normalized to
+        unit sum.
     method : str
         ``"fourier"`` or ``"geometric"``.
     blur_radius_px : float
@@ -45,9 +45,9 @@ class PsfTooLarge(ValueError):
     radius_px : int
         Radius that the worst PSF of the call needs.
     max_radius_px : int
-        Radius that was allowed.
+        Allowed radius.
     index : int
-        Which PSF of the call it is.
+        Index of the PSF in the call.
     """
 
     def __init__(self, *, radius_px: int, max_radius_px: int, index: int):
@@ -61,7 +61,7 @@ class PsfTooLarge(ValueError):
         self.index = index
 
     def __reduce__(self):
-        """Pickle by keyword: builds run in worker processes."""
+        """Pickle by keyword, because builds run in worker processes."""
         return _rebuild_psf_too_large, (
             self.radius_px,
             self.max_radius_px,
@@ -75,7 +75,7 @@ def _rebuild_psf_too_large(radius_px, max_radius_px, index):
 
 @lru_cache(maxsize=512)
 def disc_mask(radius_px: int) -> NDArray[np.bool_]:
-    """(2R+1, 2R+1): True where dx² + dy² <= (R + 0.5)²."""
+    """Return a mask (2R+1, 2R+1), True where dx² + dy² <= (R + 0.5)²."""
     offset = np.arange(-radius_px, radius_px + 1)
     mask = offset[:, None] ** 2 + offset**2 <= (radius_px + 0.5) ** 2
     mask.setflags(write=False)
@@ -84,7 +84,7 @@ def disc_mask(radius_px: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class KernelBuffer:
-    """Where the engines put the kernels of one call, one behind the other.
+    """Output buffer of the engines: the concatenated kernels of one call.
 
     Attributes
     ----------
@@ -92,9 +92,9 @@ class KernelBuffer:
         All kernels; PSF p starts at ``offset_count[p]``.
     offset_count, radius_px : (P,) int64
     geometric_ratio : (P,)
-        Share of ray optics in a kernel; both engines add theirs.
+        Share of ray optics in a kernel; each engine adds its part.
     total_ratio : (P,)
-        Light inside the disc, by the kernels' own sums.
+        Light inside the disc, from the kernels' own sums.
     """
 
     flat_kernels: NDArray[np.float32]
@@ -108,7 +108,7 @@ def empty_buffer(
     radius_px: NDArray[np.int64],
     geometric_ratio: NDArray[np.float64],
 ) -> KernelBuffer:
-    """Buffer of zeros for kernels of the given radii."""
+    """Return a buffer of zeros for kernels of the given radii."""
     counts = (2 * radius_px + 1) ** 2
     ends = np.cumsum(counts)
     return KernelBuffer(
@@ -122,9 +122,9 @@ def empty_buffer(
 
 @njit(cache=True, nogil=True)
 def finish_kernel(kernel, share, flat):
-    """Cut a kernel to its disc and add it at a sum of ``share``; its light in the disc.
+    """Crop a kernel to its disc and add it, scaled to a sum of ``share``.
 
-    Returns ``share`` times the light; adds nothing where there is none.
+    Returns ``share`` times the light in the disc; adds nothing where there is none.
     """
     radius = kernel.shape[0] // 2
     side = 2 * radius + 1

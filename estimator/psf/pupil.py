@@ -1,9 +1,9 @@
-"""Pupil of a PSF in the pixel's own coordinates: ellipse, image scale and shear in one.
+"""Pupils in pixel coordinates, which combine the ellipse, image scale and shear.
 
 An elliptical pupil seen through a sheared image scale is again an ellipse.  With
 p = J theta (J = `pixel_from_mrad`) the kernel is |int exp(2 pi i (W - p.t) / lambda)|²
-over t = J^-T u, so that every engine sees square pixels of size 1 and an ellipse in t
-(um/px) that its bounding box and one shear describe; nothing is stretched or resampled.
+over t = J^-T u.  Every engine therefore sees square pixels of size 1 and an ellipse in
+t (um/px), given by its bounding box and one shear; nothing is stretched or resampled.
 """
 
 import math
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import EXPONENTS, N_TERMS
 
 ELLIPSE_COLUMNS = 5
-"""Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad)."""
+"""Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad)."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class PupilFrames:
         The same over the unit disc w; the box point is (w_x, r w_x + s w_y) with
         r = ``shear_ratio`` and s = sqrt(1 - r²).
     half_width_um_per_px : (P, 2)
-        Half sides of the box; a slope per box coordinate over it is in pixels.
+        Half sides of the box; a slope per box coordinate divided by it is in pixels.
     shear_ratio : (P,)
         r: the pupil is x² - 2 r x y + y² <= 1 - r².
     log_amplitude : (P, 6)
-        Apodisation exp(c0 + c1 x + c2 y + c3 x² + c4 x y + c5 y²) over the box.
+        Apodization exp(c0 + c1 x + c2 y + c3 x² + c4 x y + c5 y²) over the box.
     wavelength_nm : (P,)
     """
 
@@ -48,7 +48,7 @@ class PupilFrames:
 
 
 def _bos_nodes() -> NDArray[np.float64]:
-    """28 points that fix a polynomial of degree 6: rings of 13, 9, 5 and 1."""
+    """Return 28 points that fix a polynomial of degree 6: rings of 13, 9, 5 and 1."""
     points = [
         (radius * math.cos(angle), radius * math.sin(angle))
         for radius, count in ((1.0, 13), (0.78, 9), (0.43, 5), (0.0, 1))
@@ -69,7 +69,7 @@ _POWER_Y = np.ascontiguousarray(EXPONENTS[:, 1])
 
 @njit(cache=True, nogil=True)
 def _substitute(source, matrix, shift, nodes, from_nodes, power_x, power_y, out):
-    """Coefficients ``out`` of source(shift + matrix w), through values at the nodes."""
+    """Write coefficients of source(shift + matrix w) to ``out``, from node values."""
     values = np.zeros(source.size)
     xs, ys = np.empty(7), np.empty(7)
     xs[0] = ys[0] = 1.0
@@ -90,7 +90,7 @@ def _substitute(source, matrix, shift, nodes, from_nodes, power_x, power_y, out)
 
 @njit(cache=True, nogil=True)
 def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shear):
-    """Fill the arrays of `PupilFrames`, one pupil after the other."""
+    """Fill the arrays of `PupilFrames`, pupil by pupil."""
     nodes, from_nodes, power_x, power_y = tables
     matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.zeros((2, 2))
     lower[0, 0] = 1.0
@@ -145,7 +145,7 @@ def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shea
 
 
 def _log_amplitudes(apodisation, jacobian, ellipse, half) -> NDArray[np.float64]:
-    """Apodisation -k |u - u0|² over each box; k (P,) per mm², u0 (P, 2) mm."""
+    """Expand -k |u - u0|² (log amplitude) over boxes; k (P,) per mm², u0 (P, 2) mm."""
     log_amplitude = np.zeros((ellipse.shape[0], 6))
     if apodisation is None:
         return log_amplitude
@@ -164,7 +164,7 @@ def _log_amplitudes(apodisation, jacobian, ellipse, half) -> NDArray[np.float64]
 def pupil_ellipses(
     pupil_ellipse: NDArray[np.float64] | None, circle_radius_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Ellipses (P, 5) of pupils, see `ELLIPSE_COLUMNS`; whole circles where None."""
+    """Return ellipses (P, 5) of pupils, see `ELLIPSE_COLUMNS`; by default circles."""
     if pupil_ellipse is not None:
         return pupil_ellipse
     found = np.zeros((circle_radius_mm.size, ELLIPSE_COLUMNS))
@@ -181,19 +181,19 @@ def pupil_frames(
     pupil_ellipse: NDArray[np.float64] | None = None,
     apodisation: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> PupilFrames:
-    """Pupils in the coordinates of their pixels.
+    """Convert pupils to pixel coordinates.
 
     Parameters
     ----------
     polynomial_um : (P, 28), um
-        Monomial coefficients on the unit circle; tilt acts, piston does not.
+        Monomial coefficients on the unit circle; tilt counts, piston does not.
     circle_radius_mm, wavelength_nm : (P,)
     pixel_from_mrad : (P, 2, 2)
         Visual angle (x right, y up) to image pixels (x right, y up).
     pupil_ellipse : (P, 5), optional
-        See `ELLIPSE_COLUMNS`; the whole circle where it is None.
+        See `ELLIPSE_COLUMNS`; default: the whole circle.
     apodisation : ((P,), (P, 2)), optional
-        k in mm^-2 and centre in mm of the amplitude exp(-k |u - u0|²).
+        k in mm^-2 and center in mm of the amplitude exp(-k |u - u0|²).
     """
     count = polynomial_um.shape[0]
     pupil_ellipse = pupil_ellipses(pupil_ellipse, circle_radius_mm)

@@ -1,7 +1,7 @@
-"""Brute-force float64 point-spread functions: the truth the fast engines answer to.
+"""Brute-force float64 point-spread functions: ground truth for the fast engines.
 
-No FFT, no grid shared with `fourier.py`: the pupil integral is done by spectral
-quadrature for every direction asked for, the pixel integral by Gauss-Legendre nodes
+No FFT, no grid shared with `fourier.py`: the pupil integral is computed by spectral
+quadrature for every requested direction, the pixel integral by Gauss-Legendre nodes
 inside every pixel.  Slow (milliseconds to minutes); tests and benchmarks only.
 """
 
@@ -18,14 +18,14 @@ from estimator.psf.arguments import checked_scale
 from estimator.psf.stiles_crawford import StilesCrawford
 
 VALUES_AT_A_TIME = 1 << 24
-"""Field values held at a time (256 MiB): columns of pixels are done in such parts."""
+"""Field values held at a time (256 MiB); pixel columns are processed in such parts."""
 
 
 @dataclass(frozen=True)
 class _Pupil:
-    """One elliptical pupil: u = centre + matrix w (mm) over the unit disc w.
+    """One elliptical pupil: u = center + matrix w (mm) over the unit disc w.
 
-    ``matrix`` is turned so that J^-T matrix is upper triangular: the second pixel
+    ``matrix`` is rotated so that J^-T matrix is upper triangular: the second pixel
     coordinate then has one phase on each chord of constant w_y.
     """
 
@@ -39,19 +39,19 @@ class _Pupil:
     bright_mm: NDArray[np.float64]
 
     def circle_point(self, x, y):
-        """Unit-disc points to points of the Zernike circle."""
+        """Map unit-disc points to points of the Zernike circle."""
         u = self.centre_mm[0] + self.matrix_mm[0, 0] * x + self.matrix_mm[0, 1] * y
         v = self.centre_mm[1] + self.matrix_mm[1, 0] * x + self.matrix_mm[1, 1] * y
         return u / self.circle_mm, v / self.circle_mm
 
     def amplitude(self, x, y):
-        """Apodisation at unit-disc points."""
+        """Return the apodization at unit-disc points."""
         u, v = self.circle_point(x, y)
         u, v = u * self.circle_mm - self.bright_mm[0], v * self.circle_mm
         return np.exp(-self.per_mm2 * (u**2 + (v - self.bright_mm[1]) ** 2))
 
     def slope_limit(self) -> float:
-        """Largest |dW/dw| over the pupil, um, from a dense polar grid."""
+        """Return the largest |dW/dw| over the pupil, um, from a dense polar grid."""
         rho, angle = np.meshgrid(np.linspace(0, 1, 33), np.linspace(0, 2 * np.pi, 129))
         x, y = self.circle_point(rho * np.cos(angle), rho * np.sin(angle))
         gradient = zernike_gradient(x, y) @ self.zernike_um
@@ -77,7 +77,7 @@ def _pupil(
     matrix = turn @ np.diag([major, minor])
     image = np.linalg.inv(jacobian).T @ matrix
     norm = math.hypot(*image[1])
-    # Turns the last row of `image` into (0, norm).
+    # Rotates the last row of `image` to (0, norm).
     swing = np.array([[image[1, 1], image[1, 0]], [-image[1, 0], image[1, 1]]]) / norm
     per_mm2, bright_mm = 0.0, np.zeros(2)
     if apodisation is not None:
@@ -95,16 +95,16 @@ def _pupil(
 
 
 def _node_count(bandwidth: float) -> int:
-    """Gauss-Legendre nodes for exp(i f), |f'| <= bandwidth on [-1, 1].
+    """Return the number of Gauss-Legendre nodes for exp(i f), |f'| <= B on [-1, 1].
 
-    The error of n nodes falls faster than exponentially from n = B/2 on, where the
-    zone of transition is B^(1/3) wide; 3 of it and 8 nodes give 1e-11.
+    The error of n nodes falls faster than exponentially from n = B/2 on, after a
+    transition zone B^(1/3) wide; 3 times that width and 8 nodes give 1e-11.
     """
     return math.ceil(bandwidth / 2.0 + 3.0 * bandwidth ** (1.0 / 3.0)) + 8
 
 
 def _chord_nodes(n_chords: int, n_nodes: int):
-    """Quadrature of the unit disc by chords y = sin t: x, y, weight (chords, nodes).
+    """Return x, y, weight (chords, nodes) of the unit disc by chords y = sin t.
 
     Trapezoid in t, where the chord's half length cos t and dy = cos t dt make the
     integrand periodic and smooth, times Gauss-Legendre on each chord.
@@ -118,10 +118,10 @@ def _chord_nodes(n_chords: int, n_nodes: int):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _chord_integrals(phase_rad, weight, x, start, step, offsets, out):
-    """Sum over a chord's nodes of w exp(i phase) exp(-i x (start + o + q step)).
+    """Sum w exp(i phase) exp(-i x (start + o + q step)) over each chord's nodes.
 
-    ``out`` is (chords, offsets, steps).  One rotation per step instead of a sine and
-    a cosine; rounding grows to about 1e-16 times the number of steps.
+    ``out`` is (chords, offsets, steps).  One rotation per step replaces a sine and a
+    cosine; rounding grows to about 1e-16 times the number of steps.
     """
     n_nodes = x.shape[1]
     re, im = np.empty(n_nodes), np.empty(n_nodes)
@@ -157,10 +157,10 @@ def _polynomial_values(coefficients, x, y):
 
 
 def _chords(pupil: _Pupil, x_px, y_px, refine):
-    """Quadrature of the pupil that resolves all directions asked for.
+    """Return a quadrature of the pupil that resolves all requested directions.
 
-    Returns x, weight, phase (chords, nodes) and y (chords,): x and y multiply a
-    direction in pixels to a phase.
+    Returns x, weight, phase (chords, nodes) and y (chords,); x and y times a
+    direction in pixels give a phase.
     """
     image = pupil.image_matrix
     per_um = 2.0 * math.pi / pupil.wavelength_um
@@ -178,7 +178,7 @@ def _chords(pupil: _Pupil, x_px, y_px, refine):
 
 
 def _field(pupil: _Pupil, x_px, y_px, x_offset_px, refine, workers):
-    """Complex field (ny, no, nx) on a tensor grid of directions in pixels."""
+    """Return the complex field (ny, no, nx) on a grid of directions in pixels."""
     x, weight, phase_rad, y = _chords(
         pupil, x_px[[0, -1], None] + x_offset_px, y_px, refine
     )
@@ -213,7 +213,7 @@ def reference_field(
     refine: float = 1.0,
     workers: int = 2,
 ) -> NDArray[np.complex128]:
-    """Complex field on a tensor grid of directions.
+    """Compute the complex field on a tensor grid of directions.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def reference_field(
 
 
 def _passed_light(pupil: _Pupil) -> float:
-    """Mean of the squared amplitude over the pupil."""
+    """Return the mean squared amplitude over the pupil."""
     if pupil.per_mm2 == 0.0:
         return 1.0
     x, y, weight = _chord_nodes(64, 48)
@@ -262,12 +262,12 @@ def reference_kernel(
     refine: float = 1.0,
     workers: int = 2,
 ) -> NDArray[np.float64]:
-    """Wave-optical PSF integrated over pixels, float64.
+    """Compute a wave-optical PSF integrated over pixels, float64.
 
     Parameters
     ----------
     zernike_um : (28,), um
-        Wavefront on the circle of half the pupil diameter; tilt acts.
+        Wavefront on the circle of the given diameter; tilt counts.
     radius_px : int
     pixel_pitch_mrad, pixel_from_mrad, pupil_ellipse, stiles_crawford
         As in `compute.compute_psf_batch`, for one PSF.
@@ -279,8 +279,8 @@ def reference_kernel(
     Returns
     -------
     kernel : (2R+1, 2R+1) float64
-        Image orientation.  Each pixel holds its share of the whole light: the sum
-        is below 1 by what falls outside the square.
+        Image orientation.  Each pixel holds its share of the total light; the sum is
+        below 1 by the light outside the square.
 
     Notes
     -----
@@ -304,8 +304,8 @@ def reference_kernel(
         apodisation,
     )
     pixels = np.arange(-radius_px, radius_px + 1).astype(np.float64)
-    # |E|² swings by at most 4 pi a / lambda per pixel, a the pupil's half width; half
-    # a pixel is the unit of Gauss-Legendre's interval.
+    # The phase of |E|² changes by at most 4 pi a / lambda per pixel, a the pupil's half
+    # width; half a pixel is the unit of the Gauss-Legendre interval.
     half_width_um = np.hypot(*pupil.image_matrix.T)
     swing = 2.0 * math.pi * half_width_um / pupil.wavelength_um
     (node_x, weight_x), (node_y, weight_y) = (

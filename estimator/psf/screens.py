@@ -1,7 +1,7 @@
-"""Rings in the pupil that no polynomial describes: a factor by the distance from them.
+"""Rings in the pupil that no polynomial describes, as a factor by radial distance.
 
-Only the wave method knows them.  They are tabulated over the squared distance from
-their centre, where the rings of a lens are about equally wide.
+Only the wave method supports them.  They are tabulated over the squared distance from
+their center, where the rings of a lens are about equally wide.
 """
 
 import math
@@ -14,34 +14,34 @@ from numpy.typing import NDArray
 from estimator.optics.pupil_screen import PupilScreen
 
 TABLE_COUNT = 1 << 15
-"""Entries of a table: rings of 40 waves over the pupil have 800 each."""
+"""Entries of a table; rings of 40 waves over the pupil have 800 each."""
 
 
 BEYOND_EDGE = 1.5
-"""How far tables go over the pupil's radius: its smoothed edge reaches beyond it."""
+"""Extent of tables in pupil radii: the smoothed edge extends beyond the pupil."""
 
 
 ONE_CENTRE = (0.0, 0.0, 0.0)
-"""Stands for no honeycomb."""
+"""Lattice without a honeycomb."""
 
 
 @dataclass(frozen=True)
 class ScreenTables:
-    """A screen before P pupils.
+    """Tables of a screen in front of P pupils.
 
     Attributes
     ----------
     from_box_mm : (P, 2, 3)
-        Place against the screen's centre: a matrix of the box's x and y, and an offset.
+        Position from the screen's center: matrix for the box's x and y, and offset.
     tables : (n_wavelengths, TABLE_COUNT) complex64
     which : (P,) int64
-        Table of each pupil.
+        Table index of each pupil.
     radius_mm : float
-        Of the last entry.
+        Radius of the last entry.
     lattice_mm : (pitch, inner, outer)
-        Of a honeycomb of such rings; zeros where there is one centre.
+        Honeycomb of such rings; zeros for a single center.
     reach_px : (P, 2)
-        How much farther light goes than without it, x and y.
+        Distance that light goes farther than without the screen, x and y.
     """
 
     from_box_mm: NDArray[np.float64]
@@ -91,7 +91,7 @@ class ScreenTables:
         size: NDArray[np.int64],
         field: NDArray[np.complex64],
     ) -> None:
-        """Multiply fields (B, My, N) of some pupils; grids as in `fill_pupils`."""
+        """Multiply fields (B, My, N) by the screen; grids as in `fill_pupils`."""
         _apply(
             self.from_box_mm[members],
             self.tables,
@@ -106,7 +106,7 @@ class ScreenTables:
 
 @njit(cache=True, nogil=True)
 def _square_mm2(u, v, lattice):
-    """Squared distance from the nearest centre; beyond all rings where none is near."""
+    """Return the squared distance from the nearest center; infinite if none is near."""
     pitch, inner, outer = lattice
     if pitch == 0.0:
         return u * u + v * v

@@ -1,7 +1,7 @@
 """Stiles-Crawford effect: cones see light through the pupil's rim as dimmer.
 
-An apodisation of the pupil, off unless asked for: it matters for pupils above 4 mm,
-and for what is perceived, not for a photographic image.
+An apodization of the pupil, off by default: it matters for pupils above 4 mm and for
+perceived images, not for photographic ones.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ SLOPES_PER_MM2 = (0.0565, 0.049, 0.041, 0.045, 0.050)
 
 NASAL_MM = 0.51
 SUPERIOR_MM = 0.20
-"""Mean centre of the apodisation: Applegate & Lakshminarayanan 1993."""
+"""Mean center of the apodization: Applegate & Lakshminarayanan 1993."""
 
 EYE_SIDES = ("OD", "OS")
 
@@ -37,9 +37,9 @@ class StilesCrawford:
 
     @classmethod
     def of_eye(cls, eye_side: str) -> "StilesCrawford":
-        """Effect of the average right ("OD") or left eye: nasal is towards the nose.
+        """Return the effect of the average right ("OD") or left ("OS") eye.
 
-        The nose is at a right eye's left.
+        Nasal is toward the nose, which is to the left of a right eye.
         """
         if eye_side not in EYE_SIDES:
             raise ValueError(f"eye_side {eye_side!r}: must be one of OD, OS")
@@ -47,12 +47,12 @@ class StilesCrawford:
         return cls(centre_mm=(nasal_x, SUPERIOR_MM))
 
     def slope_per_mm2(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
-        """Rho at a wavelength; constant beyond the table's ends."""
+        """Return rho at a wavelength; constant beyond the table's ends."""
         rho = np.interp(wavelength_nm, WAVELENGTHS_NM, SLOPES_PER_MM2)
         return self.slope_ratio * rho
 
     def amplitude(self, wavelength_nm: ArrayLike) -> tuple[NDArray, NDArray]:
-        """Field's factor exp(-k |u - u0|²): k (P,) per mm² and u0 (P, 2) mm.
+        """Return k (P,) per mm² and u0 (P, 2) mm of the factor exp(-k |u - u0|²).
 
         The field is the root of the sensitivity: k = rho ln(10) / 2.
         """

@@ -1,7 +1,7 @@
-"""Cheap look at every wavefront before its PSF is computed: slopes and radius.
+"""Cheap pre-pass over all wavefronts: slopes and kernel radii.
 
-The slopes decide the method, the sampling and the size of the kernel; this is the
-pre-pass of the PSF engines (`fourier.py`, `geometric.py`).
+The slopes determine the method, the sampling and the kernel size of the PSF engines
+(`fourier.py`, `geometric.py`).
 """
 
 import math
@@ -21,7 +21,7 @@ N_RING = 24
 RADIUS_LIMIT_PX = 1 << 14
 
 PIXEL_CORNER_PX = 0.21
-"""With half a pixel's diagonal the corners of the last pixels lie in a disc."""
+"""Added to a blur radius so that the disc holds the corners of the last pixels."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,20 @@ class PupilSurvey:
     slope_low_px, slope_high_px : (P, 2)
         Bounding box (x, y) of the slopes.
     edge_slope_px : (P, N_EDGE, 2)
-        Slopes along the pupil's edge, anticlockwise from +x of the unit disc.
+        Slopes along the pupil's edge, counterclockwise from +x of the unit disc.
     edge_normal_px_per_um : (P, N_EDGE, 2)
-        Outward normals of the edge in t, as long as w is per t.
+        Outward normals of the edge in t; their length is that of w per t.
     blur_radius_px : (P,)
         Largest slope.
     narrow_ratio : (P,)
         RMS of the slopes along the spot's narrowest direction, in lambda/D.
     passed_ratio : (P,)
-        Share of the light that the apodised pupil passes.
+        Share of the light that the apodized pupil passes.
     edge_light_um : (P,)
-        Wavelength, times the edge's share of the passed light over its share of the
-        area: what the edge's diffracted light is proportional to.
+        Wavelength times the edge's share of the passed light over its share of the
+        area; the edge's diffracted light is proportional to it.
     screen : ScreenTables, optional
-        Rings in the pupils; light then goes farther than the slopes at the edge say.
+        Rings in the pupils; light then goes farther than the slopes indicate.
     """
 
     frames: PupilFrames
@@ -62,7 +62,7 @@ class PupilSurvey:
     screen: ScreenTables | None = None
 
     def behind(self, screen: ScreenTables) -> "PupilSurvey":
-        """Return the same pupils with rings before them."""
+        """Return the same pupils with rings in front of them."""
         return replace(
             self,
             slope_low_px=self.slope_low_px - screen.reach_px,
@@ -73,18 +73,18 @@ class PupilSurvey:
 
     @property
     def extent_px(self) -> NDArray[np.float64]:
-        """(P, 2): sides of the slope bounding box."""
+        """Sides of the slope bounding box, (P, 2)."""
         return self.slope_high_px - self.slope_low_px
 
     @property
     def unit_px(self) -> NDArray[np.float64]:
-        """(P, 2): lambda / D along the image's axes."""
+        """Lambda / D along the image's axes, (P, 2)."""
         wavelength_um = self.frames.wavelength_nm[:, None] / 1000.0
         return wavelength_um / (2.0 * self.frames.half_width_um_per_px)
 
     @property
     def wave_number(self) -> NDArray[np.float64]:
-        """(P,): n = 2 g D / lambda, the spot's larger side in units of lambda/D."""
+        """Larger side of the spot in units of lambda/D, n = 2 g D / lambda, (P,)."""
         return (self.extent_px / self.unit_px).max(axis=1)
 
 
@@ -97,7 +97,7 @@ def _sample_points() -> tuple[NDArray, NDArray]:
 
 
 def _monomial_slopes() -> tuple[NDArray, NDArray, NDArray]:
-    """Sample points (2, n) and the slopes (28, n) of every monomial at them."""
+    """Return sample points (2, n) and the slopes (28, n) of every monomial there."""
     x, y = _sample_points()
     a, b = EXPONENTS[:, :1], EXPONENTS[:, 1:]
     d_x = a * x ** np.maximum(a - 1, 0) * y**b
@@ -158,9 +158,9 @@ _N_RADIAL = 8
 
 
 def _passed_points() -> tuple[NDArray, NDArray]:
-    """Powers (6, n) of the unit disc's points, ring by ring; weights (8,) of rings.
+    """Return powers (6, n) of unit-disc points, ring by ring, and ring weights (8,).
 
-    The last ring is the edge, and has no weight.
+    The last ring is the edge and has no weight.
     """
     node, weight = np.polynomial.legendre.leggauss(_N_RADIAL)
     rings = np.append(np.sqrt((node + 1.0) / 2.0), 1.0)
@@ -173,7 +173,7 @@ PASSED_POWERS, RING_WEIGHTS = _passed_points()
 
 
 def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
-    """Apodisation (P, 6) over the unit disc instead of the box."""
+    """Return the apodization (P, 6) over the unit disc instead of the box."""
     one, x, y, xx, xy, yy = frames.log_amplitude.T
     r = frames.shear_ratio
     s = np.sqrt(1.0 - r * r)
@@ -182,7 +182,7 @@ def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
 
 
 def _passed_light(frames: PupilFrames) -> tuple[NDArray, NDArray]:
-    """Mean of the intensity (P,) over each apodised pupil, and over its edge."""
+    """Return the mean intensity (P,) over each apodized pupil and over its edge."""
     count = frames.shear_ratio.size
     if not frames.log_amplitude.any():
         return np.ones(count), np.ones(count)
@@ -192,7 +192,7 @@ def _passed_light(frames: PupilFrames) -> tuple[NDArray, NDArray]:
 
 
 def survey_pupils(frames: PupilFrames) -> PupilSurvey:
-    """Slope range of P wavefronts from 193 points each (about 3 us per wavefront)."""
+    """Sample the slopes of P wavefronts at 193 points each (about 3 us a wavefront)."""
     count = frames.shear_ratio.size
     low, high = np.empty((count, 2)), np.empty((count, 2))
     edge, normal = np.empty((count, N_EDGE, 2)), np.empty((count, N_EDGE, 2))
@@ -225,7 +225,7 @@ def survey_pupils(frames: PupilFrames) -> PupilSurvey:
 
 @njit(cache=True, nogil=True)
 def _edge_light_outside(edge_px, normal, edge_um, radius_px):
-    """Share of the light that the pupil's edge throws beyond a disc."""
+    """Return the share of the light that the pupil's edge sends beyond a disc."""
     total = 0.0
     for i in range(edge_px.shape[0]):
         sx, sy = edge_px[i, 0], edge_px[i, 1]
@@ -274,17 +274,17 @@ def _edge_light_outside_all(edge_px, normal, edge_um, radius_px):
 
 
 def _edge_geometry(survey: PupilSurvey):
-    """Edge slopes, normals and strengths as the compiled loops take them."""
+    """Return edge slopes, normals and strengths in the form of the compiled loops."""
     return survey.edge_slope_px, survey.edge_normal_px_per_um, survey.edge_light_um
 
 
 def edge_light_outside(
     survey: PupilSurvey, *, radius_px: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Share (P,) of the light beyond the discs of given radii, by the edge's light.
+    """Return the share (P,) of light that the edge sends beyond discs of given radii.
 
-    Infinite where the geometric spot itself reaches the disc's rim; the formula is
-    that of `needed_radius_px`.
+    Infinite where the geometric spot reaches the disc's rim; the formula is that of
+    `needed_radius_px`.
     """
     outside = _edge_light_outside_all(*_edge_geometry(survey), radius_px + 0.5)
     return np.where(radius_px + 0.5 > survey.blur_radius_px, outside, math.inf)
@@ -293,12 +293,12 @@ def edge_light_outside(
 def needed_radius_px(
     survey: PupilSurvey, *, lost_energy_ratio: float, tail_end_px: int | None = None
 ) -> NDArray[np.int64]:
-    """Smallest kernel radius (P,) px that keeps all but a share of the light.
+    """Return the smallest kernel radius (P,) px that loses at most a share of light.
 
     Parameters
     ----------
     tail_end_px : int, optional
-        Where rays land within this radius, diffraction does not need more: its light
+        Upper bound of the radius where all rays land within it: diffracted light
         falls so slowly that a share of it always lies farther out.
 
     Notes

@@ -1,8 +1,8 @@
-"""Mean light far outside the geometric spot: where no grid needs to reach.
+"""Mean light far outside the geometric spot, where no grid needs to reach.
 
 At 3 mm and 550 nm, 99.9 % of a perfect eye's light lies within 200 lambda/D, far
-beyond any affordable FFT window; there the pupil's edge alone sends light, with a
-closed form.
+beyond any affordable FFT window.  Only the pupil's edge sends light there, in closed
+form.
 """
 
 import math
@@ -11,12 +11,12 @@ import numpy as np
 from numba import njit
 
 EDGE_STRIDE = 4
-"""Every fourth edge sample serves: distances to the edge need no more."""
+"""Every fourth edge sample is used; distances to the edge need no more."""
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _distances(x, y, edge_x, edge_y, near, far):
-    """Squared distances of a row of pixels to the nearest and farthest edge slope."""
+    """Write squared distances of a pixel row to the nearest and farthest edge slope."""
     for i in range(near.shape[0]):
         near[i] = np.float32(1e30)
         far[i] = np.float32(0.0)
@@ -33,9 +33,9 @@ def _distances(x, y, edge_x, edge_y, near, far):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _densities(x, centre, half, shear, strength, near, far, light):
-    """Light of a row of pixels from their squared distances.
+    """Compute the light of a row of pixels from their squared distances.
 
-    ``centre``: x of the spot's centre, and how far the row lies above it.
+    ``centre`` holds x of the spot's center and the row's height above it.
     """
     y = centre[1]
     xx, yy = np.float32(half[0] * half[0]), np.float32(half[1] * half[1])
@@ -59,16 +59,16 @@ def _densities(x, centre, half, shear, strength, near, far, light):
 
 @njit(cache=True, nogil=True)
 def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
-    """Bring pixels that no engine reaches up to the mean edge-diffracted light.
+    """Raise pixels that no engine reaches to the mean edge-diffracted light.
 
     Parameters
     ----------
     kernel : (2R+1, 2R+1) float32
-        Image orientation, in shares of the whole light; only the disc is written.
+        Image orientation, in shares of the total light; only the disc is written.
     window : (4,) int64
-        Pixel offsets x0, x1, y0, y1 (y upward, ends included) that are done already.
+        Pixel offsets x0, x1, y0, y1 (y upward, ends included) already computed.
     border_px : float
-        Pixels nearer than this to an edge slope are done already.
+        Distance to an edge slope below which pixels are already computed.
     edge : (n, 2), px
         Edge slopes.
     half, shear : (2,), float
@@ -80,10 +80,10 @@ def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
     The edge light of `survey.needed_radius_px` for a wavefront whose edge slopes
     lie on a circle of radius g about c: density lambda / (2 pi³ D rho)
     [1/(rho-g)² + 1/(rho+g)²], rho = |p - c|.  For any other edge the distances to its
-    nearest and farthest point take the places of rho -+ g, so that an elongated spot
-    gets no light beside its long sides that only its ends could send.  An elliptical
-    pupil sends it along its normals: D³ becomes the pupil's cubed width towards p over
-    its area.  Fringes are left out: pixels average them.
+    nearest and farthest point replace rho -+ g, so that an elongated spot gets no light
+    beside its long sides that only its ends could send.  An elliptical pupil sends
+    light along its normals: D³ becomes the pupil's cubed width toward p over its area.
+    Fringes are omitted, because pixels average them.
     """
     radius = kernel.shape[0] // 2
     edge_x = np.ascontiguousarray(edge[::EDGE_STRIDE, 0]).astype(np.float32)
@@ -92,7 +92,7 @@ def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
     border2 = np.float32(border_px * border_px)
     area = half[0] * half[1] * math.sqrt(1.0 - shear * shear)
     strength = wavelength_um * area / (4.0 * math.pi**3)
-    # No conversion of whole numbers within the loops: it would not vectorise.
+    # No integer conversions in the loops, which would not vectorize with them.
     pixels = np.arange(-radius, radius + 1).astype(np.float32)
     distances = np.empty((3, 2 * radius + 1), np.float32)
     for dy in range(-radius, radius + 1):

@@ -1,16 +1,16 @@
-"""Wavefronts of a stack of surfaces, traced from the retina outwards.
+"""Wavefronts of a stack of surfaces, traced from the retina outward.
 
 aberrations        coefficients at any field, pupil and wavelength; many eyes at once
-results            what is known of wavefronts and their pupils
-circle             on axis, on a given circle outside the eye, filled whatever the stop
-bundle             one bundle of rays aimed at the stop and followed out
-kernels            compiled steps of aiming and of optical paths
-nodes              where the rays of a bundle cross the stop or a circle
+results            results for wavefronts and their pupils
+circle             wavefront on a given circle outside the eye, regardless of the stop
+bundle             ray bundle aimed at the stop and traced out of the eye
+kernels            compiled ray aiming and optical paths
+nodes              sampling points of the stop or a circle
 fit                coefficients and the pupil's rim from rays
-chief_rays         where chief rays of other colours end: lateral colour
+chief_rays         chief rays of other colors: lateral color
 chief_ray_kernels  its compiled loops
-field_wavefronts   sets of wavefronts with their pupils, as PSFs are made of
-moved_plane        coefficients carried from the cornea to the entrance pupil
+field_wavefronts   wavefronts over the field with their pupils, input of the PSF engines
+moved_plane        coefficients transferred from the cornea to the entrance pupil
 pupil_refraction   least-squares refraction over the light that passes
 """
 

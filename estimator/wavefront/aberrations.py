@@ -3,9 +3,9 @@
 Rays run from the retinal point of the chief ray out of the eye.  They are aimed at the
 stop by Broyden's method from a warm start, where the paper contracts a grid: the same
 rays at a few traces each.  W at a point of the plane through the cornea, normal to the
-chief ray, is the chief ray's optical path less that point's; its slope is the ray's.
-Pupil coordinates are true ones on the circle circumscribed about the chief ray; nothing
-is stretched, and the projected pupil's ellipse is given beside them.
+chief ray, is the chief ray's optical path minus that point's; its slope is the ray's.
+Pupil coordinates are true positions on the circumscribed circle about the chief ray;
+nothing is stretched, and the ellipse of the projected pupil is returned as well.
 """
 
 import math
@@ -35,10 +35,10 @@ TRACED_FIELD_LIMIT_DEG = 75.0
 
 
 def pupil_magnification(eye: EyeSurfaces) -> float:
-    """Entrance pupil over stop, at 555 nm, about the axial chief ray (parabasal).
+    """Return entrance pupil over stop at 555 nm about the axial chief ray (parabasal).
 
-    Where the cornea is astigmatic it is the root of the product of both meridians'.
-    nan where no axial ray passes the middle of the stop.
+    For an astigmatic cornea, the root of the product of both meridians' ratios.
+    nan where no axial ray passes the center of the stop.
     """
     return float(
         magnification(pack_eye(eye), media_indices(eye, REFERENCE_WAVELENGTH_NM))
@@ -83,7 +83,7 @@ def _is_at_pupil(plane: str) -> bool:
 
 
 def _in_threads(n: int, n_threads: int | None, work: Callable[[slice], None]) -> None:
-    """Share ``n`` items among threads; the compiled work releases the lock."""
+    """Distribute ``n`` items over threads; the compiled work releases the GIL."""
     n_threads = max(1, min(n_threads or thread_count(), n))
     bounds = np.linspace(0, n, n_threads + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(bounds)]
@@ -109,7 +109,7 @@ def wavefront_grid(
     n_azimuths: int = N_AZIMUTHS,
     n_threads: int | None = None,
 ) -> FieldResults:
-    """Aberrations over fields, wavelengths and pupils, each traced exactly.
+    """Trace the aberrations over fields, wavelengths and pupils, each exactly.
 
     Parameters
     ----------
@@ -118,20 +118,20 @@ def wavefront_grid(
         Azimuth h and elevation v of the source.
     wavelengths_nm : (n_wavelengths,)
     stop_diameters_mm or pupil_diameters_mm : (n_stops,)
-        The iris, or the entrance pupil at 555 nm; give one.
+        Diameter of the iris, or of the entrance pupil at 555 nm; give one.
     object_dpt : float
         Vergence of the source, from the entrance pupil along the chief ray; the
-        wavefront is taken against its spherical wave on the plane.
+        wavefront is relative to its spherical wave on the plane.
     plane : {"cornea", "pupil"}
-        Of the wavefront, normal to the chief ray: where that meets the cornea, as
-        instruments and prescriptions have it, or crosses the plane of the paraxial
-        entrance pupil, where pupils and distances are counted.
+        Plane of the wavefront, normal to the chief ray: where the chief ray meets the
+        cornea, as for instruments and prescriptions, or where it crosses the plane of
+        the paraxial entrance pupil, the reference of pupils and distances.
     fit : {"opd", "slope"}
         Least squares of W, or of its slopes (Algorithm 1).
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
     n_threads : int, optional
-        As many as the machine gives us where it is None.
+        Number of threads; by default as many as the process may use.
 
     Returns
     -------
@@ -141,8 +141,8 @@ def wavefront_grid(
     Raises
     ------
     ValueError
-        Values out of range, an eye that cannot be traced, or an entrance pupil asked
-        of an eye that has none.
+        Values out of range, an eye that cannot be traced, or an entrance pupil
+        diameter for an eye without entrance pupil.
     """
     check_eye(eye)
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
@@ -184,14 +184,14 @@ def wavefront_aberrations(
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
 ) -> Aberrations:
-    """Aberrations of one field, wavelength and pupil, traced exactly.
+    """Trace the aberrations of one field, wavelength and pupil exactly.
 
     Parameters
     ----------
     eye : EyeSurfaces
     wavelength_nm : float
     stop_diameter_mm or pupil_diameter_mm : float
-        The iris, or the entrance pupil at 555 nm; give one.
+        Diameter of the iris, or of the entrance pupil at 555 nm; give one.
     h_deg, v_deg : float
         Azimuth and elevation of the source.
     object_dpt : float
@@ -209,8 +209,8 @@ def wavefront_aberrations(
     Raises
     ------
     ValueError
-        Values out of range, an eye that cannot be traced, or an entrance pupil asked
-        of an eye that has none.
+        Values out of range, an eye that cannot be traced, or an entrance pupil
+        diameter for an eye without entrance pupil.
     """
     stops_mm = _stop_diameters_mm(eye, stop_diameter_mm, pupil_diameter_mm)
     found = wavefront_grid(
@@ -253,7 +253,7 @@ def eyes_aberrations(
     n_azimuths: int = N_AZIMUTHS,
     n_threads: int | None = None,
 ) -> FieldResults:
-    """Aberrations of many eyes, each at one field; leading axis (n_eyes,).
+    """Trace the aberrations of many eyes, each at one field; leading axis (n_eyes,).
 
     Parameters
     ----------
@@ -263,8 +263,8 @@ def eyes_aberrations(
         From `surfaces.media_indices`, at the wavelength of the wavefront.
     stop_diameters_mm, h_deg, v_deg : scalar or (n_eyes,)
     pupil_z_mm : scalar or (n_eyes,)
-        Where the chief ray crosses the plane of the wavefront, as the entrance pupil;
-        at the cornea where it is nan.
+        Position where the chief ray crosses the plane of the wavefront, such as the
+        entrance pupil; nan for the cornea.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
     """
@@ -306,10 +306,10 @@ def on_axis_zernike(
     pupil_z_mm: ArrayLike = math.nan,
     n_threads: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Coefficients of many eyes on given circles outside the eye.
+    """Compute coefficients of many eyes on given circles outside the eye.
 
-    The circle is filled, whatever the stop; for measurements, whose circle is half
-    the pupil diameter they were taken at.
+    The circle is filled regardless of the stop; used for measurements, whose circle
+    has half their pupil diameter as its radius.
 
     Parameters
     ----------
@@ -321,17 +321,17 @@ def on_axis_zernike(
     h_deg, v_deg : float
         Field; off axis a real pupil fills its circle only in part.
     pupil_z_mm : scalar or (n_eyes,)
-        Where the chief ray crosses the plane of the circle, as the entrance pupil;
-        at the cornea where it is nan.
+        Position where the chief ray crosses the plane of the circle, such as the
+        entrance pupil; nan for the cornea.
     n_threads : int, optional
-        As many as the machine gives us where it is None.
+        Number of threads; by default as many as the process may use.
 
     Returns
     -------
     zernike_um : (n_eyes, 28)
         Piston zero.  nan where the chief ray or most of the circle fails.
     status_index : (n_eyes,) int
-        Worst `RayStatus`; rays that fail are left out of the fit.
+        Worst `RayStatus`; failed rays are excluded from the fit.
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes, n_rows = packed.shape[:2]

@@ -1,4 +1,4 @@
-"""Compiled: the bundle that fills the stop of one field, and everything read from it.
+"""Compiled: the ray bundle that fills the stop of one field, and its results.
 
 Rays are aimed at the nodes of a quadrature over the stop: Gauss-Radau rings in the
 squared radius (the last one on the rim), equal azimuths.  It integrates polynomials of
@@ -32,7 +32,7 @@ from estimator.wavefront.kernels import (
 )
 
 _AIM_TOLERANCE_MM = 1e-7  # only moves a sample
-_RIM_TOLERANCE_MM = 1e-9  # is the error of the radius
+_RIM_TOLERANCE_MM = 1e-9  # equals the error of the radius
 _EDGE_HALVINGS = 40
 _EDGE_MARGIN = 1e-6  # times the stop: more than the aim's tolerance
 _FEWEST_SPOKES = 6
@@ -50,14 +50,14 @@ PLANE_POINT = RETINA_POINT + 3
 N_RESULT = PLANE_POINT + 3
 
 
-# Several arguments that always go together travel as one tuple, ``light``:
+# Arguments that always go together are passed as one tuple, ``light``:
 # (packed, indices, chief (2, 3): retinal point and plane's point, frame (2, 3) across
 # the chief ray in the eye and the ray itself, axes (3, 3) outside, chief path in mm).
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, sag):
-    """Chief ray of a field, in and out again; (status, its optical path in mm)."""
+    """Trace a field's chief ray in and out; return (status, optical path in mm)."""
     ray, start = np.empty(RAY_SIZE), np.empty(2)
     status = chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag)
     if status != TRACED:
@@ -96,7 +96,7 @@ def extrapolate(radii, solution, ring, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shoot(light, x, y, tolerance, guess, inverse, ray, sample, sag):
-    """One ray through (x, y) of the stop and out; its status."""
+    """Trace one ray through (x, y) of the stop and out; return its status."""
     packed, indices, chief, frame, axes, path = light
     status = aim(
         packed, indices, chief, frame, x, y, tolerance, guess, inverse, ray, sag
@@ -108,9 +108,9 @@ def _shoot(light, x, y, tolerance, guess, inverse, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
-    """Rings 1.. of one azimuth, outwards; (rings done, status of the next).
+    """Trace rings 1.. of one azimuth, outward; return (rings done, status of the next).
 
-    ``radii`` (n_rings + 1,) start at 0, the chief ray; ``out`` (n_rings, N_SAMPLE).
+    ``radii`` (n_rings + 1,) start at 0, the chief ray; ``out`` is (n_rings, N_SAMPLE).
     """
     inverse, guess, ray = response.copy(), np.empty(2), np.empty(RAY_SIZE)
     solution[0] = 0.0
@@ -134,7 +134,7 @@ def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
 def _open_radius(light, low, high, azimuth, inner, response, sag):
     """Bisect the largest stop radius on this azimuth that light still passes.
 
-    ``inner`` (2,) are the direction cosines of the ray through radius ``low``.
+    ``inner`` (2,) holds the direction cosines of the ray through radius ``low``.
     """
     ray, sample, guess = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
     inverse, known = np.empty((2, 2)), inner.copy()
@@ -160,9 +160,8 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
 def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, sag):
     """Fill ``samples`` (n_azimuths, n_rings, N_SAMPLE) with one field's wavefront.
 
-    Where light does not pass the whole radius of an azimuth, its rings are drawn
-    together on the open part; ``edge`` (n_azimuths,) is the open share of the radius.
-    Returns the worst status.
+    Where an azimuth is vignetted, its rings are compressed to the open part; ``edge``
+    (n_azimuths,) is the open share of the radius.  Returns the worst status.
     """
     n_rings, worst = rings.shape[0], TRACED
     radii, solution = np.zeros(n_rings + 1), np.zeros((n_rings + 1, 2))
@@ -195,7 +194,7 @@ def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, s
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refer_to_object(samples, distance_mm):
-    """Take the spherical wave of a point ``distance_mm`` before the plane off W."""
+    """Subtract from W the wave of a point ``distance_mm`` in front of the plane."""
     for i in range(samples.shape[0]):
         squared = samples[i, X] ** 2 + samples[i, Y] ** 2
         root = math.sqrt(1.0 + squared / (distance_mm * distance_mm))
@@ -207,7 +206,7 @@ def _refer_to_object(samples, distance_mm):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
-    """Coefficients, radius, ellipse and residual of one filled stop."""
+    """Compute coefficients, radius, ellipse and residual of one filled stop."""
     n_azimuths, n_rings = samples.shape[0], samples.shape[1]
     weights = np.zeros((n_azimuths, n_rings))
     rim = np.empty((2, n_azimuths))
@@ -239,7 +238,7 @@ def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results):
-    """Everything asked of one field and wavelength: a row of results per stop.
+    """Compute the results of one field and wavelength, one row per stop.
 
     Parameters
     ----------
@@ -284,7 +283,7 @@ def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
-    """`analyse_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
+    """Run `analyse_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
 
     ``results`` is (F, L, n_stops, N_RESULT).
     """
@@ -300,7 +299,7 @@ def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, resul
 def analyse_eyes(
     packed, indices, fields_rad, stop_radii, pupil_z_mm, use_slopes, nodes, results
 ):
-    """`analyse_field` over eyes, each with a field and a stop of its own.
+    """Run `analyse_field` over eyes, each with its own field and stop.
 
     ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
     (E, 2), ``stop_radii`` and ``pupil_z_mm`` (E,), nan for the plane at the cornea,

@@ -1,4 +1,4 @@
-"""Compiled: chief rays of several wavelengths, and where each is seen."""
+"""Compiled: chief rays of several wavelengths and their apparent directions."""
 
 import math
 
@@ -19,15 +19,15 @@ from estimator.wavefront.kernels import (
 )
 
 _TOLERANCE_MM = 1e-10
-"""Of the aim at the middle of the stop: 1e-8 mrad of the shift."""
+"""Tolerance of aiming at the stop's center: 1e-8 mrad of the shift."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
-    """Shifts (F, L, 2) as direction cosines.
+    """Write shifts (F, L, 2) as direction cosines.
 
     ``indices`` (L, n_surfaces + 1) are those of the wavelengths, ``reference``
-    (n_surfaces + 1,) of the one that images are seen by.
+    (n_surfaces + 1,) those of the reference wavelength.
     """
     chief, frame, axes = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     ray, sample, start = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
@@ -40,7 +40,7 @@ def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
             if status != TRACED:
                 continue
             put(ray, chief[0])
-            chief[1] = 0.0  # any plane outside does: only the slope is read
+            chief[1] = 0.0  # any plane outside: only the slope is read
             for i in range(3):
                 frame[2, i] = -ray[3 + i]
             across(frame[2], frame)
@@ -66,6 +66,6 @@ def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
                     packed, reference, chief, axes, 0.0, ray, sample, sag
                 )
             if status == TRACED:
-                # A sample holds the slope of the wave, against the ray's way out.
+                # A sample holds the slope of the wave, opposite to the outgoing ray.
                 shifts[f, w, 0] = -sample[SLOPE_X] / UM_PER_MM
                 shifts[f, w, 1] = -sample[SLOPE_Y] / UM_PER_MM

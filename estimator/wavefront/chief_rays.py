@@ -1,10 +1,9 @@
-"""Lateral colour: where in the visual field each wavelength's chief ray is seen.
+"""Lateral color: apparent direction of each wavelength's chief ray.
 
-Light of one wavelength from a direction u goes through the middle of the stop to a
-point of the retina.  The eye takes what it finds there as coming from the direction
-whose light at 555 nm ends at that point: that of the 555 nm ray from the point back
-through the middle of the stop and out.  The angle from u to that direction is the
-shift.
+Light of one wavelength from a direction u goes through the center of the stop to a
+point of the retina.  The eye attributes it to the direction whose light at 555 nm ends
+at that point, that is the 555 nm ray from the point back through the center of the
+stop and out.  The angle from u to that direction is the shift.
 """
 
 import numpy as np
@@ -18,7 +17,7 @@ from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
 def chief_shift_mrad(
     eye: EyeSurfaces, *, fields_deg: ArrayLike, wavelengths_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Shifts (n_fields, n_wavelengths, 2) against 555 nm, along the pupil axes, mrad.
+    """Return the shift of chief rays against 555 nm, along the pupil axes, mrad.
 
     Parameters
     ----------
@@ -28,9 +27,9 @@ def chief_shift_mrad(
 
     Returns
     -------
-    shift_mrad
-        Direction cosines of the seen direction along ex and ey of the field; nan where
-        a chief ray fails.
+    shift_mrad : (n_fields, n_wavelengths, 2)
+        Direction cosines of the apparent direction along ex and ey of the field; nan
+        where a chief ray fails.
     """
     check_eye(eye)
     fields_rad = np.radians(np.atleast_2d(np.asarray(fields_deg, dtype=np.float64)))

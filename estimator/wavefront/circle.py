@@ -1,8 +1,8 @@
 """Compiled: the wavefront on a given circle outside the eye, for many eyes at once.
 
-What estimation compares: a measurement is known on a circle about the chief ray, so
+Estimation compares these: a measurement is given on a circle about the chief ray, so
 rays are aimed at fixed points of that circle instead of the stop.  The fit is then one
-fixed matrix.  A ray need not hit its point exactly: its slope carries W over to it.
+fixed matrix.  A ray need not hit its point exactly: its slope extrapolates W to it.
 """
 
 import math
@@ -29,14 +29,14 @@ from estimator.wavefront.kernels import (
 )
 
 _TOLERANCE_MM = 2e-5
-"""Miss that the slope makes up for: W'' of 20 um/mm² leaves 4e-9 um."""
+"""Miss that the slope compensates: W'' of 20 um/mm² leaves 4e-9 um."""
 
 _STEPS = 20
 _SMALLEST_SHARE = 1e-2
 _DIFFERENCE_COSINE = 1e-6
 _FEWEST_RAYS = 2 * N_TERMS
 _BY_VALUES = np.bool_(False)
-"""A plain False is a type of its own, for which the fit is compiled twice."""
+"""A plain False has a different type and would compile the fit twice."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -50,7 +50,7 @@ def _through(light, a, b, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _circle_response(light, inverse, ray, sample, sag):
-    """Inverse (2, 2) of the change on the circle with the direction at the retina."""
+    """Write the inverse (2, 2) of the change on the circle with retinal direction."""
     h = _DIFFERENCE_COSINE
     status = _through(light, h, 0.0, ray, sample, sag)
     if status != TRACED:
@@ -66,7 +66,7 @@ def _circle_response(light, inverse, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _aim_outside(light, x, y, guess, inverse, ray, sample, sag):
-    """Broyden for the ray that leaves at (x, y); W is carried to that point."""
+    """Find the ray that leaves at (x, y) by Broyden's method; extrapolate W to it."""
     a, b = guess[0], guess[1]
     status = _through(light, a, b, ray, sample, sag)
     if status != TRACED:
@@ -96,7 +96,7 @@ def _aim_outside(light, x, y, guess, inverse, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
-    """Fill ``samples`` (n_azimuths, n_rings, N_SAMPLE); the worst status."""
+    """Fill ``samples`` (n_azimuths, n_rings, N_SAMPLE); return the worst status."""
     n_rings = rings.shape[0]
     ray, sample, guess = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
     response, worst = np.empty((2, 2)), TRACED
@@ -138,7 +138,7 @@ def _count_used(weights):
 def circle_zernike(
     packed, indices, field_rad, radii_mm, pupil_z_mm, nodes, zernike_um, status
 ):
-    """Coefficients of many eyes, each on its circle about the chief ray of one field.
+    """Compute coefficients of many eyes, each on its circle about one chief ray.
 
     Parameters
     ----------
@@ -147,13 +147,13 @@ def circle_zernike(
     field_rad : (h, v)
     radii_mm : (n_eyes,)
     pupil_z_mm : (n_eyes,)
-        Where the chief ray crosses the plane of the circle; nan: at the cornea.
+        Position where the chief ray crosses the plane of the circle; nan: the cornea.
     nodes : (rings (n_rings,), weights (n_rings,), azimuths (n_azimuths, 2),
         projection (28, n_azimuths * n_rings))
     zernike_um : (n_eyes, 28) out
         nan where the chief ray or most of the circle fails.
     status : (n_eyes,) out
-        Worst ray status; rays that fail are left out of the fit.
+        Worst ray status; failed rays are excluded from the fit.
     """
     rings, ring_weights, azimuths, projection = nodes
     n_azimuths, n_rings = azimuths.shape[0], rings.shape[0]

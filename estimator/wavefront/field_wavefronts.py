@@ -1,8 +1,8 @@
 """Wavefronts over the visual field, in the form that the PSF engines take.
 
-Between their nodes wavefronts are polynomials in mm of the pupil plane: those do not
-depend on which circle they were fitted on.  A pupil's rim is a centre and a symmetric
-matrix, which turn smoothly where the axes of an ellipse jump.
+Wavefronts are interpolated between nodes as polynomials in mm of the pupil plane, which
+do not depend on the circle of the fit.  A pupil's rim is a center and a symmetric
+matrix, which vary smoothly where the axes of an ellipse jump.
 """
 
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import EXPONENTS, monomial_matrix, wavefront_polynomial
 
 DEGREE = EXPONENTS.sum(axis=1)
-"""(28,): degree of each monomial."""
+"""Degree of each monomial, (28,)."""
 
 TILT_Y, TILT_X = 1, 2
 """Index of C(1,-1) and C(1,1)."""
 
 N_RIM = 5
-"""Columns of a rim: centre x, y and the matrix' xx, xy, yy, mm."""
+"""Columns of a rim: center x, y and the matrix' xx, xy, yy, mm."""
 
 N_SAMPLED, N_NEWTON_STEPS, NEWTON_STEP_RAD = 16, 4, 0.2
-"""How a rim's farthest point is found: the farthest of so many, and Newton's steps."""
+"""Search for a rim's farthest point: number of samples, then Newton steps and limit."""
 
 _ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 
@@ -40,7 +40,7 @@ class FieldWavefronts:
     circle_diameter_mm : (P,)
         Circle about the chief ray, circumscribed about the pupil.
     pupil_ellipse : (P, 5)
-        Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad).
+        Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad).
     """
 
     zernike_um: NDArray[np.float64]
@@ -49,7 +49,7 @@ class FieldWavefronts:
 
 
 def rim_from_ellipse(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centre and symmetric matrix (..., 5) of ellipses (..., 5), mm."""
+    """Return center and symmetric matrix (..., 5) of ellipses (..., 5), mm."""
     x, y, major, minor, angle = np.moveaxis(ellipse_mm, -1, 0)
     cosine, sine = np.cos(angle), np.sin(angle)
     xx = major * cosine**2 + minor * sine**2
@@ -58,7 +58,7 @@ def rim_from_ellipse(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ellipse_from_rim(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ellipses (..., 5): centre x, y, semi-major, semi-minor, angle in [0, pi)."""
+    """Return ellipses (..., 5): center x, y, semi-major, semi-minor, angle < pi."""
     x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)
     mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) % np.pi
@@ -66,19 +66,19 @@ def ellipse_from_rim(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Radius (...) of the circle about the chief ray that a rim just fits into."""
+    """Return the radius (...) of the circle about the chief ray that holds a rim."""
     x, y, xx, xy, yy = np.moveaxis(rim_mm[..., None], -2, 0)
 
     def rim_point(cosine, sine):
         return x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
 
     def half_square(angle):
-        """Half the squared distance of a rim point."""
+        """Return half the squared distance of a rim point."""
         px, py = rim_point(np.cos(angle), np.sin(angle))
         return 0.5 * (px * px + py * py)
 
     def derivatives(angle):
-        """Return the first two of that."""
+        """Return the first two derivatives of that."""
         cosine, sine = np.cos(angle), np.sin(angle)
         px, py = rim_point(cosine, sine)
         tx, ty = xy * cosine - xx * sine, yy * cosine - xy * sine
@@ -99,7 +99,7 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def polynomial_in_mm(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Monomial coefficients (..., 28), um/mm^degree, of sets on circles (...)."""
+    """Return monomial coefficients (..., 28), um/mm^degree, from circles (...)."""
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
     return wavefront_polynomial(zernike_um) / radius_mm**DEGREE
 
@@ -107,7 +107,7 @@ def polynomial_in_mm(
 def zernike_from_polynomial(
     polynomial_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """OSA coefficients (..., 28), um, on circles (...); piston zero."""
+    """Return OSA coefficients (..., 28), um, on circles (...); piston zero."""
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
     zernike_um = (polynomial_um * radius_mm**DEGREE) @ np.linalg.inv(monomial_matrix())
     zernike_um[..., 0] = 0.0
@@ -117,11 +117,11 @@ def zernike_from_polynomial(
 def correction_polynomial(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> NDArray[np.float64]:
-    """Monomial coefficients (28,), um/mm^degree, that a worn correction takes off.
+    """Return monomial coefficients (28,), um/mm^degree, that a correction subtracts.
 
-    The same dioptres at every field, in the plane of the entrance pupil so far behind
-    the cornea: a lens that is turned to the source.  What a real lens adds off its axis
-    depends on its shape.
+    The same diopters at every field, in the plane of the entrance pupil at that depth
+    behind the cornea: a lens that is turned to the source.  The off-axis aberrations of
+    a real lens depend on its shape.
     """
     if correction is None:
         return np.zeros(DEGREE.size)
@@ -134,7 +134,7 @@ def correction_polynomial(
 def total_defocus_dpt(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Least-squares M = -4 sqrt(3) C(2,0) / r² (...) of sets on circles (...)."""
+    """Return M = -4 sqrt(3) C(2,0) / r² (...), least-squares, of sets on circles."""
     return -SPHERE_PER_C20 * zernike_um[..., rx.C20] / np.square(radius_mm)
 
 
@@ -145,7 +145,7 @@ def with_defocus(
     *,
     total_defocus_dpt: ArrayLike,
 ) -> FieldWavefronts:
-    """Wavefronts (P, 28) on circles (P,) with their defocus replaced."""
+    """Return wavefronts (P, 28) on circles (P,) with their defocus replaced."""
     zernike_um = zernike_um.copy()
     zernike_um[:, rx.C20] = -np.ravel(total_defocus_dpt) * radius_mm**2 / SPHERE_PER_C20
     return FieldWavefronts(
@@ -158,7 +158,7 @@ def with_defocus(
 def with_tilt(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike, shift_mrad: ArrayLike
 ) -> NDArray[np.float64]:
-    """Wavefronts (P, 28) on circles (P,) whose PSFs lie aside by (P, 2), x and y.
+    """Return wavefronts (P, 28) on circles (P,) with PSFs shifted by (P, 2), x and y.
 
     A PSF lies at +grad W (mrad = um/mm), and Z(1,1) = 2 x / r.
     """
@@ -169,11 +169,11 @@ def with_tilt(
 
 
 def distinct_rows(*columns: NDArray) -> tuple[NDArray, NDArray]:
-    """First index of each distinct row of columns (n,), and every row's number."""
+    """Return the first index of each distinct row of columns (n,), and row numbers."""
     number = np.zeros(columns[0].size, dtype=np.int64)
     for column in columns:
         if (column == column[:1]).all():
-            continue  # most calls vary one or two of them only
+            continue  # most calls vary only one or two of them
         values, place = np.unique(column, return_inverse=True)
         number = np.unique(number * values.size + place, return_inverse=True)[1]
     return np.unique(number, return_index=True)[1], number

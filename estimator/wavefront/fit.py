@@ -11,11 +11,11 @@ from estimator.wavefront.kernels import SLOPE_X, SLOPE_Y, W, X, Y
 _FROM_MONOMIALS = np.ascontiguousarray(monomial_matrix().T)  # [monomial, j]
 _ORDER = MAX_RADIAL_ORDER
 _PIVOT_LIMIT = 1e-13
-"""Smallest pivot, relative to its diagonal, of a fit that means something."""
+"""Smallest pivot, relative to its diagonal, of a non-singular fit."""
 
 _RIM_STEPS = 20
 _NO_DERIVATIVE = np.int64(0)
-"""A plain 0 is a type of its own, for which loops are compiled twice."""
+"""A plain 0 has a different type and would compile the loops twice."""
 
 # --- columns of the ellipse ---
 CENTRE_X, CENTRE_Y, SEMI_MAJOR, SEMI_MINOR, MAJOR_AXIS_RAD = 0, 1, 2, 3, 4
@@ -53,7 +53,7 @@ def cholesky_solve(matrix, right):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _add_row(matrix, row, weight):
-    """Weight * row row^T into the lower triangle."""
+    """Add weight * row row^T to the lower triangle."""
     for i in range(row.shape[0]):
         factor = weight * row[i]
         for j in range(i + 1):
@@ -91,7 +91,7 @@ def _powers(x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _combine(px, py, d_x, d_y, basis):
-    """Basis (28, n) from monomials; ``d_x`` or ``d_y`` takes that derivative first."""
+    """Write the basis (28, n) from monomials, or its derivative by ``d_x``, ``d_y``."""
     basis[:] = 0.0
     monomial = np.empty(px.shape[1])
     t = -1
@@ -110,7 +110,7 @@ def _combine(px, py, d_x, d_y, basis):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def zernike_basis(x, y):
-    """Values (28, n) of the polynomials at points (n,) of the unit circle."""
+    """Return values (28, n) of the polynomials at points (n,) of the unit circle."""
     basis = np.empty((N_TERMS, x.shape[0]))
     px, py = _powers(x, y)
     _combine(px, py, _NO_DERIVATIVE, _NO_DERIVATIVE, basis)
@@ -129,23 +129,23 @@ def _add_normal_equations(basis, values, weights, first, matrix, right):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
-    """Weighted least squares of samples on the circle of ``radius_mm``.
+    """Fit samples on the circle of ``radius_mm`` by weighted least squares.
 
     Parameters
     ----------
     samples : (n, N_SAMPLE)
         Position (mm), W (um) and slopes (um/mm).
     weights : (n,)
-        Zero leaves a sample out.
+        Zero excludes a sample.
     use_slopes : bool
         Fit the slopes (Algorithm 1) instead of W.
     zernike_um : (28,) out
-        Piston is zero; the residual is taken without it.
+        Piston is zero and not part of the residual.
 
     Returns
     -------
     rms_um : float
-        Of W against the fit, over the samples; nan where the fit is singular.
+        RMS residual of W over the samples; nan where the fit is singular.
     """
     x, y = samples[:, X] / radius_mm, samples[:, Y] / radius_mm
     first = 1 if use_slopes else 0
@@ -177,7 +177,7 @@ def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _series_peak(mean, even, odd, angle, reach):
-    """Largest value of a Fourier series within ``reach`` of ``angle``, by Newton."""
+    """Return a Fourier series' maximum within ``reach`` of ``angle``, by Newton."""
     largest, start = 0.0, angle
     for _ in range(_RIM_STEPS):
         value, slope, bend = mean, 0.0, 0.0
@@ -197,12 +197,12 @@ def _series_peak(mean, even, odd, angle, reach):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rim_radius(x, y, is_whole):
-    """Largest distance (mm) of the rim from the chief ray.
+    """Return the largest distance (mm) of the rim from the chief ray.
 
     ``x``, ``y`` (n,) are rim points at equal steps of stop azimuth.  A whole rim is
-    smooth: its squared distance is interpolated by its Fourier series, and the peak
-    beside every locally largest point is found by Newton.  A vignetted one has kinks,
-    and its largest point counts.
+    smooth: its squared distance is interpolated by its Fourier series, and Newton's
+    method finds the peak near every local maximum.  A vignetted rim has kinks, and its
+    farthest point is used.
     """
     n = x.shape[0]
     squared = x * x + y * y
@@ -228,7 +228,7 @@ def rim_radius(x, y, is_whole):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_ellipse(x, y, radius_mm, ellipse):
-    """Least-squares conic a x² + b xy + c y² + d x + e y = 1 through rim points."""
+    """Fit the conic a x² + b xy + c y² + d x + e y = 1 to rim points."""
     matrix, right, row = np.zeros((5, 5)), np.zeros(5), np.empty(5)
     for i in range(x.shape[0]):
         u, v = x[i] / radius_mm, y[i] / radius_mm
@@ -249,6 +249,6 @@ def fit_ellipse(x, y, radius_mm, ellipse):
     ellipse[CENTRE_X], ellipse[CENTRE_Y] = cx * radius_mm, cy * radius_mm
     ellipse[SEMI_MAJOR] = radius_mm * math.sqrt(level / (half - spread))
     ellipse[SEMI_MINOR] = radius_mm * math.sqrt(level / (half + spread))
-    # The larger eigenvalue's direction is the minor axis; a quarter turn is the major.
+    # The direction of the larger eigenvalue is the minor axis; the major is at 90 deg.
     axis = 0.5 * math.atan2(b, a - c) + 0.5 * math.pi
     ellipse[MAJOR_AXIS_RAD] = axis % math.pi

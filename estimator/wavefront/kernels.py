@@ -1,9 +1,9 @@
-"""Chief ray, ray aiming and wavefront samples of one eye and field, compiled.
+"""Compiled: chief ray, ray aiming and wavefront samples of one eye and field.
 
-The chief ray comes from the air through the centre of the stop to the retina.  From
-its retinal point O rays run *out* of the eye (Algorithm 1 of the paper): all share O
-exactly, so their optical paths to a plane outside are the eikonal of one wave, and an
-error in aiming only moves a sample, it does not spoil its value.
+The chief ray comes from the air through the center of the stop to the retina.  From
+its retinal point O rays run *out* of the eye (Algorithm 1 of the paper).  All share O
+exactly, so their optical paths to a plane outside are the eikonal of one wave; an error
+in aiming moves a sample without corrupting its value.
 """
 
 import math
@@ -42,7 +42,7 @@ _HALVINGS = 12
 _SMALLEST_SHARE = 1e-3
 _CONTINUATION_STEPS = 10
 _FIRST = np.int64(0)
-"""Of the surfaces: a plain 0 is a type of its own, for which all is compiled twice."""
+"""First surface; a plain 0 has a different type and would compile everything twice."""
 
 # --- columns of one sample of the wavefront ---
 X, Y, W, SLOPE_X, SLOPE_Y = 0, 1, 2, 3, 4
@@ -51,7 +51,7 @@ N_SAMPLE = 5
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def field_axes(h_rad, v_rad, axes):
-    """Rows of ``axes`` (3, 3): ex, ey and u, the unit vector to the source."""
+    """Write ex, ey and u, the unit vector to the source, to the rows of ``axes``."""
     ex, ey, u = axes[0], axes[1], axes[2]
     u[0] = math.sin(h_rad) * math.cos(v_rad)
     u[1] = math.sin(v_rad)
@@ -65,7 +65,7 @@ def field_axes(h_rad, v_rad, axes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def entrance_pupil_z(packed, indices):
-    """Paraxial image of the stop in the air, mm, from mean curvatures."""
+    """Return z of the stop's paraxial image in air, mm, from mean curvatures."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     z, height, slope = packed[-1, STOP_Z], 0.0, 1.0 / indices[n_before]
     for i in range(n_before - 1, -1, -1):
@@ -80,7 +80,7 @@ def entrance_pupil_z(packed, indices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chief_shot(packed, indices, axes, base_z, a, b, ray, sag):
-    """Parallel ray at (a, b) of the plane through the entrance pupil, to the stop."""
+    """Trace a parallel ray from (a, b) in the entrance pupil's plane to the stop."""
     for i in range(3):
         ray[i] = a * axes[0, i] + b * axes[1, i] + _START_MM * axes[2, i]
         ray[3 + i] = -axes[2, i]
@@ -95,7 +95,7 @@ def _chief_shot(packed, indices, axes, base_z, a, b, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve_chief(packed, indices, axes, base_z, start, ray, sag):
-    """Newton on the miss at the stop; ``start`` (2,) holds guess, then solution."""
+    """Minimize the miss at the stop by Newton; ``start`` (2,): guess, then solution."""
     a, b = start[0], start[1]
     status = _chief_shot(packed, indices, axes, base_z, a, b, ray, sag)
     if status != TRACED:
@@ -137,10 +137,10 @@ def _solve_chief(packed, indices, axes, base_z, start, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
-    """Chief ray of a field down to the retina; its status.
+    """Trace the chief ray of a field to the retina and return its status.
 
-    On return ``ray`` is at the retina, ``axes`` and ``start`` are those of the field.
-    Where a straight aim at the paraxial entrance pupil fails, the field is approached
+    On return ``ray`` is at the retina, and ``axes`` and ``start`` belong to the field.
+    Where direct aiming at the paraxial entrance pupil fails, the field is approached
     from the axis in steps.
     """
     base_z = entrance_pupil_z(packed, indices)
@@ -152,7 +152,7 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
         share = 1.0 if step < 0 else step / _CONTINUATION_STEPS
         field_axes(share * h_rad, share * v_rad, axes)
         status = _solve_chief(packed, indices, axes, base_z, start, ray, sag)
-        # The straight aim ends it by success, the approach by failure.
+        # Direct aiming ends the loop on success, the approach on failure.
         if (status == TRACED) == (step < 0):
             break
     if status != TRACED:
@@ -166,10 +166,10 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def magnification(packed, indices):
-    """Entrance pupil over stop: parabasal, about the axial chief ray; nan if none.
+    """Return entrance pupil over stop, parabasal about the axial chief ray; else nan.
 
     Parallel light at height h crosses the stop at h / m, so m is the inverse of the
-    map's stretch (root of its determinant, where the eye is astigmatic).
+    map's stretch (root of its determinant for an astigmatic eye).
     """
     axes, start = np.empty((3, 3)), np.empty(2)
     ray, sag = np.empty(RAY_SIZE), np.empty(3)
@@ -190,7 +190,7 @@ def magnification(packed, indices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def magnifications(packed, indices):
-    """`magnification` (n_eyes,) of eyes (n_eyes, n_surfaces + 1, 48)."""
+    """Return `magnification` (n_eyes,) of eyes (n_eyes, n_surfaces + 1, 48)."""
     found = np.empty(packed.shape[0])
     for e in range(packed.shape[0]):
         found[e] = magnification(packed[e], indices)
@@ -199,7 +199,7 @@ def magnifications(packed, indices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def across(direction, frame):
-    """Rows of ``frame`` (2, 3): two unit vectors that complete a right-handed basis."""
+    """Write two unit vectors to ``frame`` (2, 3) that complete a right-handed basis."""
     dx, dy, dz = direction[0], direction[1], direction[2]
     length = math.hypot(dx, dz)
     frame[0, 0], frame[0, 1], frame[0, 2] = dz / length, 0.0, -dx / length
@@ -210,7 +210,7 @@ def across(direction, frame):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def depth_along(chief, axes, pupil_z):
-    """From the plane's point to where the chief ray crosses z = ``pupil_z``, mm."""
+    """Return the distance along the chief ray from the plane to z = ``pupil_z``, mm."""
     along = 0.0
     for i in range(3):
         along += (chief[1, i] - (pupil_z if i == 2 else 0.0)) * axes[2, i]
@@ -219,14 +219,14 @@ def depth_along(chief, axes, pupil_z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sink_plane(chief, axes, along):
-    """Move the plane's point inwards along the chief ray, as if all were air."""
+    """Move the plane's point inward along the chief ray, as if in air."""
     for i in range(3):
         chief[1, i] -= along * axes[2, i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def launch(chief, frame, a, b, ray):
-    """Ray from the retinal point at direction cosines (a, b) from the chief ray."""
+    """Start a ray at the retinal point, direction cosines (a, b) to the chief ray."""
     squared = 1.0 - a * a - b * b
     if squared <= 0.0:
         return False
@@ -240,7 +240,7 @@ def launch(chief, frame, a, b, ray):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
-    """From the stop out to the plane through ``chief[1]``, and the sample there."""
+    """Trace from the stop to the plane through ``chief[1]`` and write the sample."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     status = outwards(packed, indices, ray, _FIRST, n_before, sag)
     if status != TRACED:
@@ -265,7 +265,7 @@ def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def back_to_stop(packed, indices, chief, frame, a, b, ray, sag):
-    """From the retinal point through the lens to the stop plane."""
+    """Trace from the retinal point through the lens to the stop plane."""
     if not launch(chief, frame, a, b, ray):
         return NOT_CONVERGED
     n_before, n_surfaces = int(packed[-1, N_BEFORE_STOP]), packed.shape[0] - 1
@@ -277,7 +277,7 @@ def back_to_stop(packed, indices, chief, frame, a, b, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stop_response(packed, indices, chief, frame, ray, inverse, sag):
-    """Inverse (2, 2) of the change at the stop with (a, b), at the chief ray."""
+    """Write the inverse (2, 2) of the stop's change with (a, b) at the chief ray."""
     h = _DIFFERENCE_COSINE
     ends = np.empty((3, 2))
     for i in range(3):
@@ -296,7 +296,7 @@ def stop_response(packed, indices, chief, frame, ray, inverse, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def update_inverse(inverse, da, db, cx, cy):
-    """Broyden (Sherman-Morrison form): inverse @ change becomes the step."""
+    """Apply Broyden's update (Sherman-Morrison): inverse @ change becomes the step."""
     va = da * inverse[0, 0] + db * inverse[1, 0]
     vb = da * inverse[0, 1] + db * inverse[1, 1]
     scale = va * cx + vb * cy
@@ -312,9 +312,9 @@ def update_inverse(inverse, da, db, cx, cy):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def aim(packed, indices, chief, frame, x, y, tolerance, guess, inverse, ray, sag):
-    """Broyden's method for the ray through (x, y) of the stop; its status.
+    """Aim a ray at (x, y) of the stop by Broyden's method and return its status.
 
-    ``guess`` (2,) holds (a, b) and returns the solution; ``inverse`` is updated.
+    ``guess`` (2,) holds (a, b) and receives the solution; ``inverse`` is updated.
     """
     a, b = guess[0], guess[1]
     status = back_to_stop(packed, indices, chief, frame, a, b, ray, sag)

@@ -1,9 +1,9 @@
-"""Wavefronts carried to another plane along the chief ray, by their coefficients alone.
+"""Transfer of wavefronts to another plane along the chief ray, from coefficients alone.
 
-Instruments and networks give them at the cornea; images are made in the entrance
+Instruments and networks give them at the cornea; images are computed in the entrance
 pupil.  Light that leaves the eye obeys the eikonal equation; for slopes of a few
-mrad/mm dW/ddepth = -|grad W|² / 2, which the terms up to the sixth order fulfil among
-themselves where the chief ray has no slope.
+mrad/mm dW/ddepth = -|grad W|² / 2, an equation that is closed in the terms up to the
+sixth order where the chief ray has no slope.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 @cache
 def _slope_products() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Terms (n, 3) and factors (n,): terms i and j of W add to term k of |grad W|²."""
+    """Return terms (n, 3) and factors (n,): i and j of W add to k of |grad W|²."""
     place = {tuple(e): k for k, e in enumerate(EXPONENTS.tolist())}
     found: Counter[tuple[int, int, int]] = Counter()
     for i, (a, b) in enumerate(EXPONENTS.tolist()):
@@ -54,14 +54,14 @@ def _squared_slopes(polynomial_um: NDArray) -> NDArray[np.float64]:
 def moved_polynomial(
     polynomial_um: NDArray[np.float64], *, depth_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Wavefronts (..., 28) in planes that lie (...) mm deeper, towards the eye.
+    """Return wavefronts (..., 28) in planes (...) mm deeper, toward the eye.
 
-    Monomials in mm, as `field_wavefronts.polynomial_in_mm` has them.  One step of
-    Runge and Kutta's fourth order: 30 dpt moved by 3 mm are 1e-5 dpt off.
+    Monomials in mm, as in `field_wavefronts.polynomial_in_mm`.  One Runge-Kutta step
+    of fourth order: moving 30 dpt by 3 mm errs by 1e-5 dpt.
     """
     step = np.asarray(depth_mm, dtype=np.float64)[..., None] / (-2.0 * UM_PER_MM)
     start = polynomial_um.copy()
-    start[..., 1:3] = 0.0  # of the fit: the chief ray itself has no slope
+    start[..., 1:3] = 0.0  # an artifact of the fit: the chief ray has no slope
     k1 = _squared_slopes(start)
     k2 = _squared_slopes(start + step / 2.0 * k1)
     k3 = _squared_slopes(start + step / 2.0 * k2)
@@ -75,12 +75,12 @@ def moved_rim(
     *,
     depth_mm: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Rims (..., 5), centre and matrix, there, where their rays meet those planes.
+    """Return rims (..., 5), center and matrix, where their rays meet deeper planes.
 
     Parameters
     ----------
     polynomial_um : (..., 28)
-        Before the move.
+        Wavefronts before the move.
     """
     x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)[..., None]
     cosine, sine = _RIM.T

@@ -1,9 +1,10 @@
-"""Where the pupil is sampled: quadratures over rings and azimuths.
+"""Sampling of the pupil: quadratures over rings and azimuths.
 
 The coefficients of a wavefront that six orders do not describe exactly depend on how
-the fit weighs the pupil.  Ours is that of the reference data (eye_reference.json): 14
-rings of equal area, each taken at its outer edge.  We trace fewer: the Gauss rule of
-that very measure, whose error falls exponentially with the number of rings.
+the fit weights the pupil.  The weighting here is that of the reference data
+(eye_reference.json): 14 rings of equal area, each sampled at its outer edge.  Fewer
+rings are traced: the Gauss rule of the same measure, whose error falls exponentially
+with the number of rings.
 """
 
 from functools import cache
@@ -25,7 +26,7 @@ Nodes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def _gauss_nodes(atoms: NDArray, weights: NDArray, n: int) -> NDArray:
-    """Nodes of the n-point Gauss rule of a discrete measure (Golub-Welsch)."""
+    """Return the nodes of a discrete measure's n-point Gauss rule (Golub-Welsch)."""
     before, current = np.zeros_like(atoms), np.ones_like(atoms)
     diagonal, squares, last_norm = [], [], 1.0
     for k in range(n):
@@ -42,7 +43,7 @@ def _gauss_nodes(atoms: NDArray, weights: NDArray, n: int) -> NDArray:
 
 
 def _rule(atoms: NDArray, weights: NDArray, n: int, *, with_rim: bool):
-    """Gauss, or Gauss-Radau with a node at 1, for a measure on [0, 1]; unit sum."""
+    """Return a unit-sum Gauss rule, or Gauss-Radau with a node at 1, on [0, 1]."""
     weights = weights / weights.sum()
     if with_rim:
         inner = _gauss_nodes(atoms, weights * (1.0 - atoms), n - 1)
@@ -61,7 +62,7 @@ def _azimuths(n: int) -> NDArray[np.float64]:
 
 @cache
 def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
-    """Rings (share of the stop's radius), their weights, azimuths (cosine, sine).
+    """Return rings (share of the stop's radius), weights and azimuths (cosine, sine).
 
     The last ring is the rim.  From 14 rings on the rule is the measure itself.
 
@@ -85,7 +86,7 @@ def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
 def circle_nodes(
     n_rings: int = N_CIRCLE_RINGS, n_azimuths: int = N_CIRCLE_AZIMUTHS
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Nodes for a full circle with uniform weight, and the projection (28, n) of W."""
+    """Return nodes of a uniformly weighted circle and the projection (28, n) of W."""
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_rings)
     rings, weights = np.sqrt((legendre_nodes + 1.0) / 2.0), legendre_weights / 2.0
     azimuths = _azimuths(n_azimuths)

@@ -1,8 +1,8 @@
-"""The refraction that leaves the least of a wavefront in the light that passes.
+"""Least-squares refraction over the light that passes the pupil.
 
-On a round pupil that is -4 sqrt(3) C(2,0) / r².  Where the iris is seen as an ellipse
-or aside of the chief ray, it is the least squares over that: with the wavefront of a
-cataract the two differ by 0.1 dpt at 7 mm.
+On a round pupil that is -4 sqrt(3) C(2,0) / r².  Where the projected iris is elliptical
+or decentered from the chief ray, it is the least squares over that shape: with the
+wavefront of a cataract the two differ by 0.1 dpt at 7 mm.
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ N_RINGS, N_AZIMUTHS = 5, 14
 
 @cache
 def _disc() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (n, 2) of the unit disc and their shares (n,) of its area."""
+    """Return points (n, 2) of the unit disc and their shares (n,) of its area."""
     unit, weights = np.polynomial.legendre.leggauss(N_RINGS)
     radius = np.sqrt(0.5 + 0.5 * unit)
     angle = 2.0 * np.pi * np.arange(N_AZIMUTHS) / N_AZIMUTHS
@@ -30,12 +30,12 @@ def _disc() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def pupil_refraction_dpt(
     polynomial_um: NDArray[np.float64], rim_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """M (...), dpt, of wavefronts (..., 28) over pupils (..., 5).
+    """Return M (...), dpt, of wavefronts (..., 28) over pupils (..., 5).
 
     Parameters
     ----------
     polynomial_um : monomials in mm, see `field_wavefronts.polynomial_in_mm`
-    rim_mm : centre and matrix, see `field_wavefronts.rim_from_ellipse`
+    rim_mm : center and matrix, see `field_wavefronts.rim_from_ellipse`
     """
     points, shares = _disc()
     cosine, sine = points.T
@@ -45,7 +45,7 @@ def pupil_refraction_dpt(
         polynomial_um[..., k, None] * px**a * py**b
         for k, (a, b) in enumerate(EXPONENTS.tolist())
     )
-    # Over the unit disc 1, x and y are orthogonal: tilt and piston come off by parts.
+    # 1, x and y are orthogonal over the unit disc: project out piston and tilt.
     plane = np.stack([np.ones_like(cosine), 2.0 * cosine, 2.0 * sine])
     bowl = px**2 + py**2
     bowl = bowl - (bowl * shares) @ plane.T @ plane

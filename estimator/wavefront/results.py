@@ -1,4 +1,4 @@
-"""What is known of wavefronts and of the pupils that they fill."""
+"""Result types for wavefronts and the pupils that they fill."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from estimator.wavefront.fit import N_ELLIPSE
 class PupilEllipse:
     """Least-squares ellipse of the projected pupil's rim, chief ray at the origin.
 
-    ``major_axis_deg`` counts from +x towards +y, 0 to 180.
+    ``major_axis_deg`` is measured from +x toward +y, 0 to 180.
     """
 
     centre_x_mm: float
@@ -26,7 +26,7 @@ class PupilEllipse:
 
     @property
     def axis_ratio(self) -> float:
-        """Minor over major semi-axis."""
+        """Ratio of minor to major semi-axis."""
         return self.semi_minor_mm / self.semi_major_mm
 
 
@@ -41,18 +41,18 @@ class FieldResults:
     zernike_radius_mm : (...)
         Largest distance of the pupil's rim from the chief ray.
     ellipse_mm : (..., 5)
-        Centre x, y, semi-axes major, minor (mm) and the major axis' angle (rad).
+        Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad).
     rms_residual_um : (...)
-        Of W against the fit.
+        RMS residual of W.
     open_ratio : (...)
         Share of the stop's area that light passes; below 1 the pupil is vignetted.
     chief_status_index, worst_status_index : (...) int
         `RayStatus` of the chief ray, and the worst of all rays.
     retinal_point_mm : (..., 3)
-        Where the chief ray meets the retina.
+        Intersection of the chief ray with the retina.
     pupil_point_mm : (..., 3)
-        Where it meets the cornea, or the plane of the entrance pupil: origin of the
-        plane of the wavefront.
+        Intersection with the cornea or the plane of the entrance pupil: origin of the
+        wavefront's plane.
     """
 
     zernike_um: NDArray[np.float64]
@@ -67,7 +67,7 @@ class FieldResults:
 
     @classmethod
     def from_rows(cls, rows: NDArray) -> "FieldResults":
-        """Take apart the rows (..., N_RESULT) that the compiled code wrote."""
+        """Unpack the rows (..., N_RESULT) that the compiled code wrote."""
         ellipse, retina, plane = bundle.ELLIPSE, bundle.RETINA_POINT, bundle.PLANE_POINT
         return cls(
             zernike_um=rows[..., :N_TERMS],
@@ -99,7 +99,7 @@ class Aberrations:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say in words what did not go through; empty for a whole pupil."""
+        """Explanations of blocked light; empty for a whole pupil."""
         if self.chief_status != RayStatus.TRACED:
             return (f"no chief ray: {STATUS_WORDS[self.chief_status]}",)
         if self.worst_status != RayStatus.TRACED:

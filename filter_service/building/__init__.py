@@ -1,15 +1,15 @@
-"""The worker process: from a profile to an eye and the nodes of its PSFs.
+"""Builder: the worker process that turns profiles into eyes and nodes of their PSFs.
 
-jobs            what is asked for and what comes back
-limits          what every build keeps to
-read_profile    a profile's body, checked
-from_profile    the work itself
-worker          the process
-worker_handle   the service's end of it
+jobs            requests and results of the worker
+limits          limits of every build
+read_profile    validation of a profile's body
+from_profile    the build itself
+worker          main program of the worker process
+worker_handle   the service's interface to the worker process
 inline_worker   a worker without a process
-head_start      work begun before it is asked for
-compile_builds  every loop compiled before the first build
-helper_process  another program beside, while it is needed
+head_start      warm-up before the first build
+compile_builds  compilation of all loops before the first build
+helper_process  subprocesses that end with their parent
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
-"""Has the loops that trace and integrate compiled before the worker's first build.
+"""Warm-up that compiles the loops of tracing and integration before the first build.
 
-numba compiles them at their first call on a machine and keeps them on disk: a minute of
-one core, then 0.5 s to read them.  Both are done while the worker is idle.
+numba compiles them at their first call on a machine and caches them on disk: a minute
+of one core, then 0.5 s to read them.  Both happen while the worker is idle.
 """
 
 from dataclasses import replace
@@ -26,10 +26,11 @@ FEW_PSFS = BuildJob(
 )
 
 HELPER = ("filter_service.filtering.compile_loops", "psfs", "frames")
-"""Module and arguments of what compiles beside: in another order than `build_a_few`."""
+"""Module and arguments of the process that helps compiling, in another order than
+`build_a_few`."""
 
 HELP_AFTER_S = 1.0
-"""Reading what is compiled already takes less."""
+"""Delay before the helper starts; reading compiled code takes less."""
 
 
 def build_a_few() -> None:
@@ -44,21 +45,21 @@ def _built(job: BuildJob) -> PsfStore:
 
 
 def build_a_few_with_help() -> None:
-    """`build_a_few`; where it has to compile, another process does so from the end.
+    """Run `build_a_few`; if it has to compile, a second process helps from the end.
 
-    They meet: what one has compiled, the other reads.
+    The two processes meet, as each reads what the other has compiled.
     """
     with HelperProcess(*HELPER, after_s=HELP_AFTER_S):
         build_a_few()
 
 
 def trace_an_eye() -> None:
-    """Estimate, trace and plan for one eye, for the first half of the loops."""
+    """Estimate, trace and plan for one eye: compiles the first half of the loops."""
     _built(FEW_PSFS).plan_all()
 
 
 def build_without_tracing() -> None:
-    """Build PSFs of a given wavefront, for the other half."""
+    """Build PSFs of a given wavefront: compiles the second half of the loops."""
     settings = replace(FEW_PSFS.settings, eye_model="wavefront", mode="on-axis")
     job = replace(FEW_PSFS, settings=settings)
     _built(job).fill()

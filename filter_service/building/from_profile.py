@@ -1,4 +1,4 @@
-"""From a profile to an eye and the nodes of its PSFs, in the worker process."""
+"""Build of an eye and the nodes of its PSFs from a profile, in the worker process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Progress = Callable[[float, str], None]
 
 
 def grid_spec(job: BuildJob) -> GridSpec:
-    """Return the grid that a job asks for."""
+    """Return the grid specification of a job."""
     return GridSpec(
         camera=job.camera,
         settings=job.settings,
@@ -35,7 +35,7 @@ def grid_spec(job: BuildJob) -> GridSpec:
 def build(
     job: BuildJob, *, progress: Progress, cancelled: Callable[[], bool]
 ) -> BuiltStore:
-    """Estimate the eye of a job and plan its nodes; no PSF is computed.
+    """Estimate the eye of a job and plan its nodes, without computing PSFs.
 
     Runs in the worker process.
 
@@ -49,11 +49,11 @@ def build(
         raise GridTooLarge(
             str(error), field="settings", allowed=f"{error.budget_mb:.0f} MB"
         ) from error
-    except ProfileError as error:  # light does not pass a given eye
+    except ProfileError as error:  # light does not pass the eye
         raise unknown_profile(error) from error
     except ValueError as error:  # the settings do not suit this eye or camera
         field = getattr(error, "field", None)
-        if field is None:  # of a computation, which knows nothing of fields
+        if field is None:  # raised by a computation, which knows no fields
             raise BuildFailed(
                 f"no PSFs can be computed for this eye ({error})",
                 field="settings",
@@ -82,8 +82,8 @@ def _built(
     eye, notes = eye_for_spec(profile, spec, progress=progress, cancelled=cancelled)
     go_on()
     progress(1.0, "plan")
-    # Only with all ranges prepared at once is it known what all PSFs take; else nodes
-    # are planned when frames first read them.
+    # The total memory of the PSFs is known only if all ranges are prepared at once;
+    # otherwise nodes are planned when frames first read them.
     plan: PlanAxes
     if job.settings.prepare == "ranges":
         plan = plan_cache(eye, spec)

@@ -1,4 +1,4 @@
-"""Work that a process begins before somebody asks for what needs it."""
+"""Warm-up work that a process starts before the first request that needs it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from filter_service.errors import BuildCancelled
 
 COMPILING_STAGE = "compiling"
 QUIET_S = 1.0
-"""Reading what is compiled already takes less: nothing is said of it."""
+"""Time without a report; reading compiled code takes less."""
 
 POLL_S = 0.1
 
@@ -20,9 +20,9 @@ log = logging.getLogger("ocufilter.worker")
 
 
 class HeadStart:
-    """A call that runs in a thread until a build needs what it prepares.
+    """Warm-up call that runs in a thread, and for which the first build waits.
 
-    It fails quietly but for a line of the log: a build then does what is left.
+    Failures are only logged; the build then does the remaining work.
     """
 
     def __init__(self, work: Callable[[], None]):
@@ -47,9 +47,9 @@ class HeadStart:
         log.info("compiling, which takes up to a minute; it is kept for the next time")
 
     def before(self, progress: Progress, cancelled: Callable[[], bool]) -> Progress:
-        """Return a ``progress`` that waits for this call when it is first called.
+        """Return a ``progress`` function that first waits for the warm-up.
 
-        What a build reads from the disk has no progress and waits for nothing.
+        A build that is read from the disk reports no progress, so it does not wait.
         """
 
         def waited(fraction: float, stage: str) -> None:
@@ -59,7 +59,7 @@ class HeadStart:
         return waited
 
     def wait(self, progress: Progress, cancelled: Callable[[], bool]) -> None:
-        """Return when it is done; says so if that takes long.
+        """Wait for the warm-up, and report progress if that takes long.
 
         Raises
         ------

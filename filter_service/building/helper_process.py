@@ -1,4 +1,4 @@
-"""A Python program that runs beside this one, if that takes long, and ends with it."""
+"""Python subprocesses: started on demand, and ended with their parent."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Self
 
 
 class HelperProcess:
-    """Starts ``python -m`` with arguments a while after it is entered.
+    """Context manager that runs ``python -m`` with arguments if its body takes long.
 
     Parameters
     ----------
     after_s : float
-        Left sooner, it starts nothing.
+        Time after which the process starts, unless the body has finished.
     """
 
     def __init__(self, *arguments: str, after_s: float) -> None:
@@ -27,12 +27,12 @@ class HelperProcess:
         self._timer.daemon = True
 
     def __enter__(self) -> Self:
-        """Begin to wait."""
+        """Start the timer."""
         self._timer.start()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """End it, done or not."""
+        """Kill the process, finished or not."""
         self._timer.cancel()
         self._timer.join()
         if self._process is not None:
@@ -44,9 +44,9 @@ class HelperProcess:
 
 
 def start_module(*arguments: str) -> subprocess.Popen[bytes]:
-    """Start ``python -m`` with what this process imports from.
+    """Start ``python -m`` with the import path of this process.
 
-    Its standard input ends with this process; see `end_with_parent`.
+    Its standard input closes when this process ends; see `end_with_parent`.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", *arguments],
@@ -56,12 +56,12 @@ def start_module(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 def import_path() -> list[str]:
-    """Return where this process imports from; what is no text it skips, too."""
+    """Return the import path of this process, without entries that are not strings."""
     return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
 
 
 def end(process: subprocess.Popen[bytes], patience_s: float) -> int:
-    """Wait for a process that is to end, then end it by force; return its code."""
+    """Wait for a process to end, and kill it after a timeout; return its exit code."""
     try:
         return process.wait(patience_s)
     except subprocess.TimeoutExpired:
@@ -70,7 +70,7 @@ def end(process: subprocess.Popen[bytes], patience_s: float) -> int:
 
 
 def how_it_ended(exit_code: int) -> str:
-    """Return what a process's exit code says, in words."""
+    """Return a description of a process's exit code."""
     if exit_code >= 0:
         return f"ended with code {exit_code}"
     try:
@@ -80,7 +80,7 @@ def how_it_ended(exit_code: int) -> str:
 
 
 def is_stopped(pid: int) -> bool:
-    """Return whether a signal has stopped a process (Linux; elsewhere never)."""
+    """Return whether a process is stopped by a signal (Linux only; otherwise False)."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except (OSError, IndexError):
@@ -89,7 +89,7 @@ def is_stopped(pid: int) -> bool:
 
 
 def end_with_parent() -> None:
-    """End this process when whoever started it by `start_module` is gone."""
+    """End this process when the parent that ran `start_module` ends."""
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 1):

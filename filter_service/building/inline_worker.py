@@ -1,7 +1,7 @@
-"""A worker without a process: estimates an eye when it is polled.
+"""Worker without a process: it estimates an eye when polled.
 
-For programs with nothing else to do meanwhile: starting a process takes longer than
-estimating most eyes.
+It is for programs that have nothing else to do meanwhile: starting a process takes
+longer than estimating most eyes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ log = logging.getLogger("ocufilter.worker")
 
 
 class InlineWorker:
-    """The interface of `WorkerHandle`, in the caller's thread."""
+    """Implementation of `WorkerHandle`'s interface in the caller's thread."""
 
     file_descriptor = None
     is_busy = False

@@ -1,4 +1,4 @@
-"""What the worker is asked to estimate, and what comes back; plain data."""
+"""Requests and results of the worker, as plain data."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ USUAL_LIMITS = BuildLimits()
 
 @dataclass(frozen=True)
 class BuildJob:
-    """One eye for one camera.
+    """Request to estimate one eye for one camera.
 
     Attributes
     ----------
     near : (pupil_diameter_mm, focus_dpt), optional
-        Around this state nodes are planned once the eye is sent; none are without it.
+        State around which nodes are planned after the eye is sent; by default none are.
     """
 
     profile: EyeProfile
@@ -33,13 +33,13 @@ class BuildJob:
 
 @dataclass(frozen=True)
 class BuiltStore:
-    """An estimated eye with the nodes of its PSFs, as an engine's ``load`` takes it."""
+    """An estimated eye with the nodes of its PSFs, for an engine's ``load``."""
 
     store: Any
     notes: tuple[str, ...] = ()
 
     def parts_ahead(self, job: BuildJob) -> Iterator[Any]:
-        """Yield what frames will need of the store, for its ``take``."""
+        """Yield parts of the store that frames will need, for its ``take``."""
         planned = getattr(self.store, "planned_ahead", None)
         if planned is not None and job.near is not None:
             yield from planned(*job.near)

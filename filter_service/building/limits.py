@@ -1,4 +1,4 @@
-"""What every build of a service has to keep to."""
+"""Limits of every build of a service."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["BuildLimits", "default_cache_dir"]
 
 @dataclass(frozen=True)
 class BuildLimits:
-    """What the service's configuration sets for every build.
+    """Limits from the service's configuration that apply to every build.
 
-    ``max_stores_mb`` is for all that are loaded at once, ``max_store_mb`` for each.
-    ``store_cache_dir`` is empty where stores are not kept on disk.
+    ``max_stores_mb`` limits all loaded stores together, ``max_store_mb`` each of them.
+    ``store_cache_dir`` is empty if there is no on-disk cache.
     """
 
     max_blur_radius_px: int = 255

@@ -1,4 +1,4 @@
-"""A profile's body as a profile, its errors as the service says them."""
+"""Parsing of a profile's body, with errors of the service."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from filter_service.errors import UnknownProfile
 
 
 def read_profile(body: dict[str, Any]) -> EyeProfile:
-    """Return the profile that a body describes; nothing is traced.
+    """Return the profile that a body describes, without tracing it.
 
     Raises
     ------
     UnknownProfile
-        Names the field and what is allowed.
+        If the body is invalid; the error has the field and the allowed values.
     """
     try:
         return parse_profile(body)
@@ -24,5 +24,5 @@ def read_profile(body: dict[str, Any]) -> EyeProfile:
 
 
 def unknown_profile(error: ProfileError) -> UnknownProfile:
-    """Take an error apart: field and limits travel in fields of their own."""
+    """Convert an error; the field and the allowed values become separate attributes."""
     return UnknownProfile(error.problem, field=error.field, allowed=error.allowed)

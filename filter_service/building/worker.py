@@ -1,14 +1,14 @@
-"""The worker process: estimates eyes and plans the nodes of their PSFs.
+"""Worker process that estimates eyes and plans the nodes of their PSFs.
 
-A process, not a thread: estimating holds the interpreter lock for tenths of a second,
-which frames would wait for.
+It is a process, not a thread, because estimating holds the GIL for tenths of a second,
+which would delay frames.
 
-Parent to worker: ``("build", ticket, job)``, ``("cancel", ticket)``.  Worker to parent:
-``("ready",)``, ``("progress", ticket, fraction, stage)``; at the end ``("result",
-ticket, built)`` or ``("failed", ticket, code, message, field, allowed)``.  After a
-result come its parts, ``("part", ticket, part)``, until a new message does.  A result
-has 0.3 to 2 MB, a part 0.2 to 1.  The pipe joins two processes of ours, so it may carry
-pickles; nothing from outside does.
+Messages from the parent: ``("build", ticket, job)``, ``("cancel", ticket)``.  Messages
+from the worker: ``("ready",)``, ``("progress", ticket, fraction, stage)``; at the end
+``("result", ticket, built)`` or ``("failed", ticket, code, message, field, allowed)``.
+The parts of a result follow it as ``("part", ticket, part)``, until a new message
+arrives.  A result has 0.3 to 2 MB, a part 0.2 to 1.  The pipe connects two processes of
+this service, so it may carry pickles; no external data is unpickled.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from filter_service.log_lines import start_log
 
 PROGRESS_INTERVAL_S = 0.1
 IDLE_S = 3.0
-"""Without a job for so long, the worker prepares for those that will come."""
+"""Time without a job after which the worker starts the warm-up."""
 
 log = logging.getLogger("ocufilter.worker")
 
 
 class ParentGone(Exception):
-    """The service has ended; so does the worker."""
+    """The service has ended, so the worker ends too."""
 
 
 def main() -> None:
-    """Run as ``python -m``: DESCRIPTOR BUILD NICENESS WARM_UP; the entry point."""
+    """Run the worker; arguments are DESCRIPTOR BUILD NICENESS WARM_UP."""
     descriptor, build_name, niceness, warm_up_name = sys.argv[1:]
     os.nice(int(niceness))
     serve_builds(Connection(int(descriptor)), build_name, warm_up_name)
 
 
 def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> None:
-    """Build what is asked for until the pipe closes."""
-    # Ctrl-C goes to the whole group; the service ends the worker in its own time.
+    """Serve build requests until the pipe closes."""
+    # Ctrl-C goes to the whole process group; the service ends the worker itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     start_log("worker")
     try:
         build, head_start = _named(build_name), None
         pipe.send(("ready",))
-        # A client that knows a restarted service comes at once, and maybe for a store
-        # from the disk: it shall not share the processor with what it does not need.
+        # After a restart of the service, clients reconnect at once, possibly for a
+        # store from the disk; the warm-up must not compete with them for the processor.
         if warm_up_name and not pipe.poll(IDLE_S):
             head_start = HeadStart(_named(warm_up_name))
         while True:
@@ -99,12 +99,12 @@ def _build_one(
     pipe.send(("result", ticket, built))
     try:
         for part in built.parts_ahead(job):
-            if pipe.poll(0):  # something newer is asked for
+            if pipe.poll(0):  # a newer request has arrived
                 return
             pipe.send(("part", ticket, part))
     except OSError:
         raise ParentGone from None
-    except Exception as error:  # a frame that needs it fails, and says so to its client
+    except Exception as error:  # a frame that needs it fails and tells its client
         log.info("nodes ahead of frames: %s", error)
 
 
@@ -114,7 +114,7 @@ def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str],
     def progress(fraction: float, stage: str) -> None:
         nonlocal next_s, last_stage
         now_s = time.monotonic()
-        # The first word of a stage is never held back: a short one has no second.
+        # The first message of a stage is never dropped: a short stage has no second.
         if now_s >= next_s or stage != last_stage:
             next_s, last_stage = now_s + PROGRESS_INTERVAL_S, stage
             pipe.send(("progress", ticket, min(max(float(fraction), 0.0), 1.0), stage))
@@ -123,7 +123,7 @@ def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str],
 
 
 def _is_cancelled(pipe: Connection, ticket: int) -> bool:
-    """Return whether the parent cancelled this ticket (2 us when it did not)."""
+    """Return whether the parent canceled this ticket (2 us if it did not)."""
     while pipe.poll(0):
         try:
             message = pipe.recv()

@@ -1,4 +1,4 @@
-"""The service's end of the worker: a queue of builds, one running, crashes repaired."""
+"""The service's interface to the worker process: a build queue with crash recovery."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from filter_service.errors import (
     error_from_code,
 )
 
-RECEIVE_BUDGET_S = 0.004  # the render loop's time for one call of poll
-RESTART_DELAY_S = 1.0  # after a worker that never got ready
+RECEIVE_BUDGET_S = 0.004  # time of the render worker for one call of poll
+RESTART_DELAY_S = 1.0  # after a worker that never became ready
 STOP_GRACE_S = 1.0
 WATCH_INTERVAL_S = 0.5
 STOPPED_LIMIT_S = 3.0
-"""Stopped by a signal for longer, a worker is taken for one that stays so."""
+"""Time after which a worker stopped by a signal is killed."""
 
 BUILD = "filter_service.building.from_profile:build"
 WARM_UP = "filter_service.building.compile_builds:build_a_few_with_help"
@@ -45,7 +45,7 @@ log = logging.getLogger("ocufilter.worker")
 
 @dataclass(frozen=True)
 class BuildProgress:
-    """How far a build is."""
+    """Progress of a build."""
 
     ticket: int
     fraction: float
@@ -54,7 +54,7 @@ class BuildProgress:
 
 @dataclass(frozen=True)
 class BuildDone:
-    """What a build made."""
+    """Result of a build."""
 
     ticket: int
     built: BuiltStore
@@ -62,7 +62,7 @@ class BuildDone:
 
 @dataclass(frozen=True)
 class BuildPart:
-    """What frames will need of the store that a build has made."""
+    """Part of a built store that frames will need."""
 
     ticket: int
     part: Any
@@ -70,7 +70,7 @@ class BuildPart:
 
 @dataclass(frozen=True)
 class BuildError:
-    """Why a build made nothing."""
+    """Failure of a build."""
 
     ticket: int
     error: FilterError
@@ -81,7 +81,7 @@ BuildEvent = BuildProgress | BuildDone | BuildPart | BuildError
 
 @dataclass(frozen=True)
 class _Worker:
-    """A process and the pipe to it: there are both or neither."""
+    """A process and the pipe to it, which exist together."""
 
     process: subprocess.Popen[bytes]
     pipe: Connection
@@ -89,24 +89,25 @@ class _Worker:
 
 @dataclass
 class WorkerHandle:
-    """Runs builds in a process of its own, one at a time, in the order asked for.
+    """Runs builds in a separate process, one at a time, in the order of requests.
 
     Parameters
     ----------
     build : str
         ``module:function`` of ``build(job, *, progress, cancelled)``, which returns a
-        `BuiltStore`.  A name, because to import the function here would keep the new
-        process waiting.
+        `BuiltStore`.  It is a name because importing the function here would delay the
+        start of the process.
     cancel_grace_s : float
-        A cancelled build that goes on longer is ended with its process.
+        Time after which a canceled build that is still running is killed with its
+        process.
     build_limit_s : float
-        A build that takes longer is ended with its process.
+        Time after which a build is killed with its process.
     warm_up : str
-        ``module:function`` of what the process does until the first job comes.
+        ``module:function`` that the process runs until the first job arrives.
     niceness : int
-        Of the process.  While a new eye is estimated on two busy cores, 0 and 5 make
-        91 to 96 and 95 to 98 % of a stream's frames whole; with 10, eyes that take long
-        to estimate hardly come.
+        Niceness of the process.  While a new eye is estimated on two busy cores, 91 to
+        96 % of a stream's frames are complete with 0, and 95 to 98 % with 5; with 10,
+        eyes that take long to estimate hardly ever finish.
     """
 
     build: str = BUILD
@@ -127,13 +128,13 @@ class WorkerHandle:
     _stopped_since_s: float | None = None
 
     def start(self) -> None:
-        """Start the process, if there is none; it gets ready on its own time."""
+        """Start the process if there is none, without waiting until it is ready."""
         if self._worker is not None:
             return
         ours, theirs = socket.socketpair()
-        # A plain process: one that multiprocessing spawns would run the main module
-        # again, which a script without a guard does not survive.  Without -P a file
-        # of the current folder would come before every module of its name.
+        # A plain subprocess: multiprocessing's spawn would run the main module again,
+        # which fails in scripts without a __main__ guard.  Without -P, files in the
+        # current folder would shadow modules of the same name.
         process = subprocess.Popen(
             [
                 *(sys.executable, "-P", "-m", "filter_service.building.worker"),
@@ -141,7 +142,7 @@ class WorkerHandle:
             ],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
-            # One thread: a second one saved no time, and took 0.4 s from the frames.
+            # One thread: a second one saved no time, and cost the frames 0.4 s.
             env=os.environ
             | {"PYTHONPATH": os.pathsep.join(import_path()), THREADS_VARIABLE: "1"},
         )
@@ -149,7 +150,7 @@ class WorkerHandle:
         self._worker = _Worker(process, Connection(ours.detach()))
 
     def close(self) -> None:
-        """End the process, with patience first."""
+        """Terminate the process, and kill it after a grace period."""
         if self._worker is None:
             return
         self._worker.pipe.close()
@@ -159,17 +160,17 @@ class WorkerHandle:
 
     @property
     def file_descriptor(self) -> int | None:
-        """Return what to poll for reading; it changes when the worker restarts."""
+        """Descriptor to poll for reading; it changes when the worker restarts."""
         return None if self._worker is None else self._worker.pipe.fileno()
 
     @property
     def is_busy(self) -> bool:
-        """Return whether a build runs or waits."""
+        """Return whether a build is running or queued."""
         return self._running is not None or bool(self._queue)
 
     @property
     def needs_attention_soon(self) -> bool:
-        """Return whether poll has something to do although the pipe is silent."""
+        """Return whether `poll` has work to do even if the pipe is silent."""
         return self._worker is None or self._kill_at_s is not None
 
     def submit(self, job: BuildJob) -> int:
@@ -181,14 +182,14 @@ class WorkerHandle:
         return ticket
 
     def cancel(self, ticket: int) -> None:
-        """Stop a build; no event follows for a ticket that only waited."""
+        """Cancel a build; no event follows for a ticket that was still queued."""
         self._queue = deque(item for item in self._queue if item[0] != ticket)
         if ticket == self._running and self._kill_at_s is None:
             self._kill_at_s = time.monotonic() + self.cancel_grace_s
             self._tell(("cancel", ticket))
 
     def poll(self) -> list[BuildEvent]:
-        """Return what happened, in at most a few milliseconds."""
+        """Return new events; this takes at most a few milliseconds."""
         events: list[BuildEvent] = []
         now_s = time.monotonic()
         worker = self._worker
@@ -211,7 +212,7 @@ class WorkerHandle:
         return events
 
     def _watch(self, worker: _Worker, now_s: float) -> None:
-        """End a worker that stands still, or whose build has no end."""
+        """Kill a worker that is stopped, or whose build exceeds its limit."""
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + WATCH_INTERVAL_S
@@ -249,7 +250,7 @@ class WorkerHandle:
         self._kill_at_s = None
 
     def _start_next(self) -> None:
-        """Hand the next job over; a worker that starts up would not read it yet."""
+        """Send the next job, unless the worker is busy or not yet ready."""
         if self._running is None and self._is_ready and self._queue:
             ticket, job = self._queue.popleft()
             self._running = ticket
@@ -258,14 +259,14 @@ class WorkerHandle:
 
     def _tell(self, message: tuple[Any, ...]) -> None:
         if self._worker is None:
-            return  # closed: nobody will read it
+            return  # closed
         try:
             self._worker.pipe.send(message)
         except OSError:
             log.debug("the worker is gone; poll will find out")
 
     def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
-        """Start a new process; the build that ran is lost, those that wait are not."""
+        """Start a new process; the running build is lost, queued ones are not."""
         how = how_it_ended(end(worker.process, STOP_GRACE_S))
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
@@ -281,7 +282,7 @@ class WorkerHandle:
             error = WorkerCrashed(f"the process that computes PSFs {how}")
             log.error("%s; a new one is started", error.message)
         if not was_ready:
-            # No job was the reason, so those that wait would wait for ever.
+            # No job was the cause, so queued ones would wait forever.
             tickets += [ticket for ticket, _ in self._queue]
             self._queue.clear()
             self._start_at_s = time.monotonic() + RESTART_DELAY_S

@@ -1,14 +1,14 @@
-"""OpenGL: one owner of the context.
+"""OpenGL: the context and everything that uses it directly.
 
-choose_device  on which device the context is opened
-copying        copies of large images by several threads
-egl_devices    which there are
+choose_device  choice of the EGL device of the context
+copying        multithreaded copies of large images
+egl_devices    list of the EGL devices
 gpu            context, buffers, textures
-hardware       which renderers are a GPU
-passes         programs, and how they are run
+hardware       detection of GPUs and software renderers
+passes         compilation and dispatch of programs
 shader_source  shader text: includes, defines, line numbers
 stage_timer    times of a frame's stages
-staging        memory that both sides see, for what goes to the GPU and comes from it
+staging        mapped memory for transfers to and from the GPU
 """
 
 import lazy_loader

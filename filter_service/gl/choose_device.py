@@ -1,4 +1,4 @@
-"""On which EGL device a context is opened: the one named, or the first that works."""
+"""Choice of the EGL device of a context: the one named, or the first that works."""
 
 import logging
 import os
@@ -25,14 +25,14 @@ def open_on_device(
     Parameters
     ----------
     choice : str
-        "auto" takes the first that works, hardware before software; an index that one.
+        "auto" for the first device that works, hardware before software; or an index.
     open_context : callable
-        ``open_context(index)`` raises where the device gives no context.
+        ``open_context(index)``; raises if the device has no suitable context.
 
     Raises
     ------
     RenderFailed
-        None works, or not the one named; says which there are.
+        No device works, or the named one does not; the message lists the devices.
     """
     devices = egl_devices()
     with _without_backend_variable():
@@ -63,7 +63,7 @@ def _open_first(
 ) -> tuple[Context, int]:
     failed: list[str] = []
     last: Exception | None = None
-    # Without a list the backend says best what is wrong.
+    # If there is no list, the backend's error is the most informative.
     for device in by_preference(devices) or [EglDevice(0, "first")]:
         try:
             context = open_context(device.index)
@@ -82,7 +82,7 @@ def _open_first(
 
 
 def by_preference(devices: Sequence[EglDevice]) -> list[EglDevice]:
-    """Return hardware before software, else in EGL's order."""
+    """Return the devices, hardware before software, otherwise in EGL's order."""
     return sorted(devices, key=lambda device: device.is_software)
 
 
@@ -92,7 +92,7 @@ def _one_line(error: Exception) -> str:
 
 @contextmanager
 def _without_backend_variable() -> Iterator[None]:
-    """Hide the variable that would win over the index; it was looked at before."""
+    """Hide the variable that would override the index; it has already been read."""
     said = os.environ.pop(BACKEND_VARIABLE, None)
     try:
         yield

@@ -1,4 +1,4 @@
-"""The devices that EGL lists: GPUs, and the software renderer among them."""
+"""The devices that EGL lists: GPUs and the software renderer."""
 
 import ctypes
 import ctypes.util
@@ -13,7 +13,8 @@ NAME_EXTENSION = "EGL_EXT_device_query_name"
 NODE_EXTENSION = "EGL_EXT_device_drm_render_node"
 
 LIBRARY_VARIABLE = "GLCONTEXT_LINUX_LIBEGL"
-"""Names the library to the package that opens contexts, and so here."""
+"""Environment variable with the EGL library, shared with the package that opens
+contexts."""
 
 _pointer, _int = ctypes.c_void_p, ctypes.c_int
 _QUERY_DEVICES = ctypes.CFUNCTYPE(
@@ -24,13 +25,13 @@ _QUERY_STRING = ctypes.CFUNCTYPE(ctypes.c_char_p, _pointer, _int)
 
 @dataclass(frozen=True)
 class EglDevice:
-    """What EGL tells of a device before anything is opened on it.
+    """Properties of an EGL device, available before it is opened.
 
     Attributes
     ----------
     index : int
     name : str
-        As well as EGL knows it.
+        Name as far as EGL provides one.
     extensions : tuple of str
     """
 
@@ -40,7 +41,7 @@ class EglDevice:
 
     @property
     def is_software(self) -> bool:
-        """Whether a processor does the work."""
+        """Whether the device renders on the processor."""
         return SOFTWARE_EXTENSION in self.extensions
 
     def __str__(self) -> str:
@@ -49,7 +50,7 @@ class EglDevice:
 
 
 def egl_devices() -> list[EglDevice]:
-    """Return the devices in EGL's order; none where EGL has no such list."""
+    """Return the devices in EGL's order; empty if EGL cannot list them."""
     address_of = _address_of()
     addresses = [
         address_of(name) for name in (b"eglQueryDevicesEXT", b"eglQueryDeviceStringEXT")
@@ -70,7 +71,7 @@ def egl_devices() -> list[EglDevice]:
 
 
 def _address_of() -> Callable[[bytes], int | None]:
-    """Return what finds a function of EGL; it finds none where there is no EGL."""
+    """Return a lookup of EGL functions; it returns None if there is no EGL."""
     library = os.environ.get(LIBRARY_VARIABLE) or ctypes.util.find_library("EGL")
     try:
         address_of = ctypes.CDLL(library or "libEGL.so.1").eglGetProcAddress
@@ -81,7 +82,7 @@ def _address_of() -> Callable[[bytes], int | None]:
 
 
 def _described(index: int, text_of: Callable[[int], bytes | None]) -> EglDevice:
-    """Ask for what the device's extensions allow to ask for."""
+    """Return a device, described as far as its extensions allow."""
 
     def text(what: int) -> str:
         return (text_of(what) or b"").decode(errors="replace")

@@ -1,4 +1,4 @@
-"""The OpenGL context and its memory: buffers, textures, what comes and goes."""
+"""The OpenGL context and its memory: buffers, textures, transfers."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,16 +20,16 @@ from filter_service.gl_device import checked_gl_device, wanted_gl_device
 Query = moderngl.Query
 
 GROWTH = 1.25
-"""A buffer that must grow gets this much more than asked, so that slowly rising needs
-do not reallocate every frame."""
+"""Over-allocation of a buffer that must grow, so that slowly rising sizes do not
+reallocate every frame."""
 
 ATLAS_TEXEL_BYTES = 16
 
 ATLAS_BYTES = 1 << 30
-"""More than an atlas ever takes: twice the kernels of a frame."""
+"""Upper bound of an atlas: twice the kernels of a frame."""
 
 PASS_BLOCKS = 9
-"""Storage blocks of the pass with most, if an atlas is one of them."""
+"""Largest number of storage blocks in a pass, if an atlas is one of them."""
 
 
 class Gpu:
@@ -38,7 +38,7 @@ class Gpu:
     Parameters
     ----------
     device : str, optional
-        "auto", or the index of an EGL device; else what the environment asks for.
+        "auto", or the index of an EGL device; by default from the environment.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Gpu:
         Renderer, version, index of the EGL device, and the limits that the renderer
         plans with.
     is_software : bool
-        Whether a CPU does the work.
+        Whether the renderer runs on the CPU.
     passes : Passes
     """
 
@@ -70,16 +70,16 @@ class Gpu:
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
-        # On a software renderer all memory is the host's: a copy more gains nothing.
+        # On a software renderer all memory is the host's: staging only adds a copy.
         self.use_staging(not self.is_software)
 
     def _holds_large_atlases(self) -> bool:
-        """Whether a pass may have an atlas of any size beside its other buffers."""
+        """Return whether a pass can bind a full-size atlas with its other buffers."""
         blocks = int(self.context.info["GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS"])
         return blocks >= PASS_BLOCKS and self.max_block_bytes >= ATLAS_BYTES
 
     def use_staging(self, wanted: bool) -> None:
-        """Send and fetch through mapped memory, where the driver has it, or not."""
+        """Enable or disable transfers through mapped memory, if the driver has it."""
         calls = gl_calls() if wanted and has_buffer_storage(self.context) else None
         self._staging = (
             None
@@ -88,8 +88,8 @@ class Gpu:
         )
 
     def close(self) -> None:
-        """Free everything; the object is of no use afterwards."""
-        with self.context:  # without one, the driver frees nothing
+        """Free everything; the object cannot be used afterwards."""
+        with self.context:  # without a context, the driver frees nothing
             for memory in (*self._buffers.values(), *self._atlases.values()):
                 memory.release()
             self.passes.release()
@@ -102,12 +102,12 @@ class Gpu:
     # ----- buffers
 
     def storage(self, name: str, n_bytes: int) -> Buffer:
-        """Buffer of at least this size; its contents are lost when it grows.
+        """Return a buffer of at least this size; its contents are lost when it grows.
 
         Raises
         ------
         OutOfGpuMemory
-            More than one storage block may hold, or than the device has.
+            The size exceeds a storage block or the memory of the device.
         """
         buffer = self._buffers.get(name)
         if buffer is not None and buffer.size >= n_bytes:
@@ -131,7 +131,7 @@ class Gpu:
         return created
 
     def upload(self, name: str, *arrays: NDArray) -> Buffer:
-        """Copy arrays to the start of a named buffer, one behind the other."""
+        """Copy arrays to the start of a named buffer, one after the other."""
         buffer = self.storage(name, sum(data.nbytes for data in arrays))
         start = 0
         for data in arrays:
@@ -153,14 +153,15 @@ class Gpu:
         block.copy_to(buffer, start, offset, words.size)
 
     def pages(self, n_words: int) -> Pages:
-        """Texture array of 16-bit words for data that outlives a frame.
+        """Return a texture array of 16-bit words for data that outlives a frame.
 
-        Pages of STORE_SIDE lines of STORE_SIDE words; the last line, or page, is whole.
+        Pages have STORE_SIDE lines of STORE_SIDE words; the last line, or page, is
+        complete.
 
         Raises
         ------
         OutOfGpuMemory
-            More pages than a texture array may have, or than the device holds.
+            There are more pages than a texture array, or the device, can hold.
         """
         side = constants.STORE_SIDE
         lines = max(-(-n_words // side), 1)
@@ -183,7 +184,7 @@ class Gpu:
         )
 
     def write_pages(self, pages: Pages, first_line: int, lines: NDArray) -> None:
-        """Copy whole lines (n, STORE_SIDE) of words to pages, from a line on."""
+        """Copy whole lines (n, STORE_SIDE) of words to pages from a line on."""
         side = constants.STORE_SIDE
         while len(lines):
             page, row = divmod(first_line, side)
@@ -195,9 +196,10 @@ class Gpu:
             first_line, lines = first_line + count, lines[count:]
 
     def atlas(self, name: str, n_texels: int) -> Atlas:
-        """Named, grow-only line of texels of four uints.
+        """Return a named, grow-only line of texels of four uints.
 
-        A storage buffer, or a texture in lines of ATLAS_WIDTH, see `atlas_is_buffer`.
+        It is a storage buffer, or a texture in lines of ATLAS_WIDTH, see
+        `atlas_is_buffer`.
         """
         if self.atlas_is_buffer:
             return self.storage(f"{name} atlas", ATLAS_TEXEL_BYTES * n_texels)
@@ -222,11 +224,11 @@ class Gpu:
         return atlas
 
     def claim(self, name: str, owner: object) -> None:
-        """Note who has filled memory of a name last."""
+        """Record the owner that last filled the memory of a name."""
         self._owners[name] = owner
 
     def is_owner(self, name: str, owner: object) -> bool:
-        """Return whether nobody else has filled it since."""
+        """Return whether no other owner has filled the memory since."""
         return self._owners.get(name) is owner
 
     def read(self, buffer: Buffer, shape: tuple, dtype) -> NDArray:
@@ -236,14 +238,14 @@ class Gpu:
         return out
 
     def read_into(self, *parts: tuple[Buffer, int, NDArray]) -> None:
-        """Fill arrays from buffers, each from a byte on; waits for the GPU once."""
+        """Fill arrays from (buffer, byte offset) each; waits for the GPU once."""
         self.begin_read(*parts)()
 
     def begin_read(self, *parts: tuple[Buffer, int, NDArray]) -> Callable[[], None]:
-        """Have buffers sent; call what is returned to wait for it and fill the arrays.
+        """Start a readback; return a function that waits for it and fills the arrays.
 
-        What is dispatched between may change the buffers.  Without mapped memory it is
-        done at once.
+        Later dispatches may change the buffers.  Without mapped memory the arrays are
+        filled at once.
         """
         parts = tuple(part for part in parts if part[2].nbytes)
         if self._staging is None:
@@ -274,11 +276,11 @@ class Gpu:
             copy_bytes(target, source)
         if not self._reads:
             for block in self._staging.values():
-                block.reset()  # nothing waits any more
+                block.reset()  # no readback is pending
 
     @property
     def memory_mb(self) -> float:
-        """Bytes held by the named buffers and atlases."""
+        """Memory of the named buffers and atlases, MB."""
         buffers = sum(buffer.size for buffer in self._buffers.values())
         texels = sum(a.width * a.height for a in self._atlases.values())
         return (buffers + ATLAS_TEXEL_BYTES * texels) / 1e6
@@ -286,15 +288,15 @@ class Gpu:
     # ----- timers and errors
 
     def take_query(self) -> moderngl.Query:
-        """Return a timer that is not in use; see `give_queries`."""
+        """Return an unused timer query; see `give_queries`."""
         return self._queries.pop() if self._queries else self.context.query(time=True)
 
     def give_queries(self, queries: list[moderngl.Query]) -> None:
-        """Take timers back: none is ever freed, so each is used again."""
+        """Return timer queries to the pool; they are never freed, only reused."""
         self._queries += queries
 
     def check(self, where: str) -> None:
-        """Raise if OpenGL has noted an error since the last look."""
+        """Raise if OpenGL has recorded an error since the last check."""
         error = self.context.error
         if error == "GL_OUT_OF_MEMORY":
             raise OutOfGpuMemory(f"{where}: {error}")
@@ -303,7 +305,7 @@ class Gpu:
 
 
 class _Read(NamedTuple):
-    """What was sent: after a fence, to arrays from mapped memory."""
+    """A pending readback: its fence, and pairs of arrays and mapped memory."""
 
     fence: int
     targets: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]

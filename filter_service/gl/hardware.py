@@ -1,16 +1,16 @@
-"""Which renderers are a GPU, and whether there may be one: no driver is started."""
+"""Detection of GPUs and of software renderers, without starting a driver."""
 
 import sys
 from pathlib import Path
 
 RENDER_NODES = ("/dev/dri/renderD*", "/dev/nvidia[0-9]*", "/dev/dxg")
-"""What a GPU's driver puts into a Linux system; the last is Windows' subsystem."""
+"""Device files of GPU drivers on Linux; the last is that of the Windows subsystem."""
 
 
 def may_have_gpu(root: Path = Path("/")) -> bool:
-    """Return whether a driver is there; elsewhere than on Linux one may always be.
+    """Return whether a driver is present; always True on systems other than Linux.
 
-    It takes a fraction of a millisecond, where to open a context takes 0.2 s.
+    This takes a fraction of a millisecond; opening a context takes 0.2 s.
     """
     if not sys.platform.startswith("linux"):
         return True
@@ -21,5 +21,5 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr", "software")
 
 
 def is_software_renderer(name: str) -> bool:
-    """Return whether a renderer of this name is the processor."""
+    """Return whether a renderer of this name runs on the processor."""
     return any(word in name.lower() for word in SOFTWARE_RENDERERS)

@@ -1,4 +1,4 @@
-"""The passes: compiled once for each variant, run on buffers by name."""
+"""Passes: compiled once per variant, dispatched on buffers by name."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ Pages = moderngl.TextureArray
 Atlas = moderngl.Buffer | moderngl.Texture
 
 ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
-"""Of atlases that are buffers, by the name of their texture."""
+"""Binding of an atlas that is a buffer, by the name of its texture."""
 
 POINTS = {
     name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
@@ -22,7 +22,7 @@ POINTS = {
 
 _BARRIERS = (
     moderngl.SHADER_STORAGE_BARRIER_BIT
-    | moderngl.COMMAND_BARRIER_BIT  # sizes of dispatches that a pass has written
+    | moderngl.COMMAND_BARRIER_BIT  # dispatch sizes written by a pass
     | moderngl.BUFFER_UPDATE_BARRIER_BIT  # copies to mapped memory
 )
 _IMAGE_BARRIERS = (
@@ -30,13 +30,13 @@ _IMAGE_BARRIERS = (
     | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
     | moderngl.TEXTURE_FETCH_BARRIER_BIT
 )
-"""What comes after a pass and may read what it wrote."""
+"""Kinds of access after a pass that may read its output."""
 
 
 class BufferPart(NamedTuple):
-    """Some bytes of a buffer, for a pass that has them as its own.
+    """A range of a buffer that is bound like a buffer.
 
-    It begins at a multiple of 256 bytes: any device allows that.
+    It starts at a multiple of 256 bytes, which every device allows.
     """
 
     buffer: Buffer
@@ -45,7 +45,7 @@ class BufferPart(NamedTuple):
 
 
 class Passes:
-    """Programs of a context, and what is bound in it.
+    """Programs of a context, and its current bindings.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Passes:
     Attributes
     ----------
     programs : dict
-        Compiled so far, by name and defines in order.
+        Compiled programs by name and sorted defines.
     """
 
     def __init__(self, context: moderngl.Context) -> None:
@@ -72,7 +72,7 @@ class Passes:
             known.clear()
 
     def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
-        """Compiled pass ``shaders/passes/<name>.comp.glsl``, kept for reuse."""
+        """Return the compiled pass ``shaders/passes/<name>.comp.glsl``, cached."""
         program = self._variants.get((name, *defines.items()))
         if program is not None:
             return program
@@ -98,22 +98,22 @@ class Passes:
         textures: dict[str, Atlas | Pages] | None = None,
         indirect: tuple[Buffer, int] | None = None,
     ) -> None:
-        """Run a pass and order its writes before what follows.
+        """Dispatch a pass, followed by a memory barrier.
 
         Parameters
         ----------
         groups : (x, y) or (x, y, z)
         buffers : dict
-            Binding name without the ``BINDING_`` prefix to buffer, or a part of one.
+            Buffers, or parts of buffers, by binding name without ``BINDING_``.
         uniforms : dict, optional
-            A uniform that the compiler removed is skipped.
+            Values by name; a uniform that the compiler removed is skipped.
         defines : dict, optional
             Variant of the pass.
         images, textures : dict, optional
-            Name without the ``IMAGE_`` or ``TEXTURE_`` prefix to texture, or to what
-            `atlas` returned.
+            Textures, or results of `Gpu.atlas`, by name without ``IMAGE_`` or
+            ``TEXTURE_``.
         indirect : (buffer, byte), optional
-            Where on the GPU the groups stand; ``groups`` are not looked at.
+            Location of the group counts on the GPU; ``groups`` is ignored.
         """
         program, images, textures = self._variant_of(
             name, defines or {}, buffers, images or {}, textures or {}
@@ -135,7 +135,7 @@ class Passes:
     def _variant_of(
         self, name: str, defines: dict, buffers: dict, images: dict, textures: dict
     ) -> tuple[moderngl.ComputeShader, dict, dict]:
-        """Return a pass and its images and textures; buffers among them are bound."""
+        """Return a pass and its images and textures; bind the buffers among them."""
         is_buffer = False
         for named in (images, textures):
             for key, atlas in named.items():
@@ -148,9 +148,9 @@ class Passes:
         return self.program(name, **defines), images, textures
 
     def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
-        """Bind a buffer, unless it is: from frame to frame most of them stay.
+        """Bind a buffer unless it is already bound; most stay from frame to frame.
 
-        What is kept here is the buffer itself, so that no other takes its place.
+        The buffer itself is kept here, so that no other buffer can get its identity.
         """
         if self._bound.get(point) == buffer:
             return
@@ -162,7 +162,10 @@ class Passes:
         self._bound[point] = buffer
 
     def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
-        """Set those that differ from the last dispatch's: each is a driver call."""
+        """Set the uniforms that have changed since the last dispatch.
+
+        Each is a driver call.
+        """
         known = self._uniforms.setdefault(program, {})
         for key, value in uniforms.items():
             if key in known and known[key] == value:

@@ -11,13 +11,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _INSIDE = _PACKAGE / "shaders"
 
 SHADER_ROOT = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "shaders"
-"""Inside the package where it was installed from a wheel, beside it in a checkout."""
+"""Inside the package if it was installed from a wheel, beside it in a checkout."""
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
 def shared_defines() -> dict[str, int | float]:
-    """Every upper-case number of `constants`, and the bindings."""
+    """Return every upper-case number of `constants`, and the bindings."""
     numbers = {
         name: value
         for name, value in vars(constants).items()
@@ -31,14 +31,14 @@ def _literal(value: int | float) -> str:
 
 
 def load_shader(name: str, **defines: int | float) -> tuple[str, list[str]]:
-    """Full text of ``shaders/<name>`` ready to compile.
+    """Return the full text of ``shaders/<name>``, ready to compile.
 
     Parameters
     ----------
     name : str
         Path below ``shaders/``.
     **defines
-        Further defines, for variants.
+        Additional defines of a variant.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def load_shader(name: str, **defines: int | float) -> tuple[str, list[str]]:
     Raises
     ------
     ShaderError
-        A file that does not exist.
+        The file, or an included one, does not exist.
     """
     files: list[str] = []
     body = _expand(name, files)
@@ -75,6 +75,6 @@ def _expand(name: str, files: list[str]) -> list[str]:
 
 
 def legend(message: str, files: list[str]) -> str:
-    """Compiler message with a legend of its file numbers."""
+    """Return a compiler message with a legend of its file numbers."""
     names = ", ".join(f"{i} = {name}" for i, name in enumerate(files))
     return f"{message}\n(files: {names})"

@@ -9,7 +9,7 @@ from filter_service.gl.gpu import Gpu, Query
 class StageTimer:
     """Times of named stages, ms: GPU queries on hardware, wall clock on software.
 
-    A software renderer works inside the call, so waiting for it costs nothing there.
+    A software renderer runs inside the call, so waiting for it costs nothing there.
     """
 
     def __init__(self, gpu: Gpu):
@@ -18,7 +18,7 @@ class StageTimer:
         self._queries: list[tuple[str, Query]] = []
 
     def stage(self, name: str) -> AbstractContextManager:
-        """Time a GPU stage; entering a name twice adds up."""
+        """Time a GPU stage; times of the same name add up."""
         if self._gpu.is_software:
             return self._finished(name)
         query = self._gpu.take_query()
@@ -45,7 +45,7 @@ class StageTimer:
 
 
 class _Wall:
-    """Adds the time within to a stage; a generator would take four times as long."""
+    """Adds its wall time to a stage; a generator would take four times as long."""
 
     def __init__(self, times_ms: dict[str, float], name: str):
         self._times_ms, self._name = times_ms, name

@@ -1,10 +1,9 @@
-"""Memory that both sides see: pinned, mapped for good, filled and emptied by copies.
+"""Staging buffers: pinned, persistently mapped memory for transfers with the GPU.
 
-A driver moves a buffer that is mapped for reading to the host's memory, and every pass
-that uses it then works over the bus.  So buffers that passes use are never mapped; what
-goes to them or comes from them lies in a block of its own on the way.  That takes
-`glBufferStorage` (OpenGL 4.4, or ARB_buffer_storage), which moderngl does not have: its
-few calls are made here.
+A driver moves a buffer that is mapped for reading to host memory, and every pass that
+uses it then works over the bus.  So the buffers of the passes are never mapped; their
+data is copied through a separate block.  This requires `glBufferStorage` (OpenGL 4.4,
+or ARB_buffer_storage), which moderngl does not offer, so the few calls are made here.
 """
 
 import ctypes
@@ -31,8 +30,8 @@ ALIGNMENT = 256
 FIRST_BYTES = 1 << 20
 
 MOST_BYTES = 1 << 29
-"""A block grows to hold what is in flight, up to this; then it waits, and starts anew.
-"""
+"""Largest block: up to this it grows to hold all transfers in flight; then it waits and
+starts over."""
 
 GL_SYNC_GPU_COMMANDS_COMPLETE = 0x9117
 GL_SYNC_FLUSH_COMMANDS_BIT = 0x1
@@ -55,7 +54,7 @@ _SIGNATURES = {
 
 
 def gl_calls() -> dict[str, Callable] | None:
-    """Return the calls that `Staging` needs; None where EGL knows one of them not."""
+    """Return the calls that `Staging` needs, or None if EGL lacks one of them."""
     library = ctypes.util.find_library("EGL") or "libEGL.so.1"
     try:
         address_of = ctypes.CDLL(library).eglGetProcAddress
@@ -72,12 +71,12 @@ def gl_calls() -> dict[str, Callable] | None:
 
 
 def has_buffer_storage(context: "moderngl.Context") -> bool:
-    """Whether the context may map a buffer for good."""
+    """Return whether the context supports persistently mapped buffers."""
     return context.version_code >= 440 or "GL_ARB_buffer_storage" in context.extensions
 
 
 class Staging:
-    """A block of mapped memory, given out from its start; starts anew when it is full.
+    """A block of mapped memory, allocated from its start; starts over when it is full.
 
     Parameters
     ----------
@@ -99,32 +98,32 @@ class Staging:
         return self._bytes.size
 
     def release(self) -> None:
-        """Free the block; what was given out must not be touched again."""
+        """Free the block; allocated parts must not be accessed afterwards."""
         if self._name.value:
             self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
         self._name, self._bytes, self._used = _uint(0), np.zeros(0, np.uint8), 0
 
     def reset(self) -> None:
-        """Give out the block from its start; the caller knows that no copy waits."""
+        """Start over from the beginning; the caller ensures that no copy is pending."""
         self._used = 0
 
     def has_room(self, n_bytes: int) -> bool:
-        """Whether so many bytes are free."""
+        """Return whether this many bytes are free."""
         return self._used + n_bytes <= self.size
 
     def fence(self) -> int:
-        """Return a mark behind all that the GPU was told; it begins with that now."""
+        """Return a fence after all commands so far, and submit them to the GPU."""
         mark = self._calls["glFenceSync"](GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
         self._calls["glFlush"]()
         return int(mark)
 
     def wait(self, mark: int) -> None:
-        """Wait until the GPU has come to a mark, which is of no use afterwards.
+        """Wait until the GPU has passed a fence, and delete the fence.
 
         Raises
         ------
         RenderFailed
-            The driver cannot wait: it has lost the GPU.
+            The driver cannot wait because it has lost the GPU.
         """
         found = GL_TIMEOUT_EXPIRED
         while found == GL_TIMEOUT_EXPIRED:
@@ -136,14 +135,14 @@ class Staging:
             raise RenderFailed("the driver cannot wait for the GPU")
 
     def take(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
-        """Return the place of free bytes and the bytes.
+        """Allocate bytes; return their offset and the bytes.
 
-        Waits for the GPU where there are none, for its copies of what was given out.
+        If there are not enough free bytes, this waits for the GPU to finish its copies.
 
         Raises
         ------
         OutOfGpuMemory
-            The driver maps no block of that size.
+            The driver cannot map a block of that size.
         """
         if not self.has_room(n_bytes):
             self._context.finish()
@@ -156,11 +155,11 @@ class Staging:
         return start, self._bytes[start : start + n_bytes]
 
     def copy_to(self, buffer: "moderngl.Buffer", start: int, at: int, n_bytes: int):
-        """Have bytes from a place of the block copied to a buffer."""
+        """Queue a copy of bytes from an offset of the block to a buffer."""
         self._copy(self._name.value, buffer.glo, start, at, n_bytes)
 
     def copy_from(self, buffer: "moderngl.Buffer", at: int, start: int, n_bytes: int):
-        """Have bytes of a buffer copied to a place of the block."""
+        """Queue a copy of bytes from a buffer to an offset of the block."""
         self._copy(buffer.glo, self._name.value, at, start, n_bytes)
 
     def _copy(self, source: int, target: int, read_at: int, write_at: int, n_bytes):

@@ -1,8 +1,8 @@
-"""Compiled loops, for machines without a GPU: frames, and PSFs.
+"""Compiled C loops: PSFs, and frames on machines without a GPU.
 
-library        the loops, as Python calls them
-records        what they are called with, field by field
-source/        the loops, in C
+library        Python interface of the compiled library
+records        argument records, field by field
+source/        C source code
 """
 
 import lazy_loader

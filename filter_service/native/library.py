@@ -1,4 +1,4 @@
-"""The compiled loops: where they lie, what they are called with, what to do without."""
+"""Python interface of the compiled library."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ REMEDY = (
 
 
 class Library:
-    """The loops of `source/`, one function a stage.
+    """Compiled loops of `source/`, one function per stage.
 
-    Calls give up Python's lock, so that other threads go on while a frame is made.
+    Calls release the GIL, so that other threads continue while a frame is rendered.
 
     Parameters
     ----------
     path : Path
-        The shared library.
+        Path of the shared library.
     portable : bool
-        Leave out what only some processors have; for tests.
+        Do not use optional processor features; for tests.
 
     Raises
     ------
     RenderFailed
-        It cannot be loaded, or was built from another version of this package.
+        If the library cannot be loaded, or is of another version of this package.
     """
 
     def __init__(self, path: Path, *, portable: bool = False):
@@ -83,7 +83,7 @@ class Library:
         self._stages[stage](self._own, ctypes.byref(frame))
 
     def shrink(self, job: records.ShrinkJob) -> None:
-        """Make kernels of a store coarse."""
+        """Downsample kernels of a store."""
         self._c.ocu_shrink(self._own, ctypes.byref(job))
 
     def psfs(
@@ -92,13 +92,13 @@ class Library:
         outcome: NDArray[np.int32],
         sizes: NDArray[np.int64],
     ) -> NDArray[np.uint16]:
-        """Compute PSFs; their kernels one after the other.
+        """Compute PSFs; return their concatenated kernels.
 
         Parameters
         ----------
         job : PsfJob
         outcome, sizes : (n,)
-            The arrays that the job points to.
+            Arrays that the job points to.
 
         Raises
         ------
@@ -118,39 +118,39 @@ class Library:
         return words
 
     def new_threads(self, count: int) -> int:
-        """Start threads that loops share, the caller among them; returns a handle."""
+        """Start a pool of ``count`` threads including the caller; return its handle."""
         threads = self._c.ocu_pool_new(count)
         if not threads:
             raise RenderFailed(f"{count} threads cannot be started: out of memory")
         return int(threads)
 
     def thread_count(self, threads: int) -> int:
-        """Return how many threads there really are."""
+        """Return the actual number of threads in a pool."""
         return int(self._c.ocu_pool_size(threads))
 
     def call_between(
         self, threads: int, function: Callable[[], None], interval_s: float
     ) -> object:
-        """Have a function called in the middle of loops, while the threads rest.
+        """Register a function to be called within loops, while the threads are idle.
 
         Returns
         -------
         object
-            To be kept for as long as the threads are there.
+            Callback object that must outlive the threads.
         """
         held = Between(function)
         self._c.ocu_pool_set_between(threads, held, interval_s)
         return held
 
     def end_threads(self, threads: int) -> None:
-        """End them."""
+        """End the threads of a pool."""
         self._c.ocu_pool_free(threads)
 
 
 def library_path() -> Path | None:
-    """Return where the compiled loops lie; None where they were not built.
+    """Return the path of the compiled library, or None if it was not built.
 
-    The environment variable ``OCUFILTER_NATIVE_LIBRARY`` names another build.
+    The environment variable ``OCUFILTER_NATIVE_LIBRARY`` selects another build.
     """
     if other := os.environ.get(LIBRARY_VARIABLE):
         return Path(other)
@@ -163,12 +163,12 @@ def library_path() -> Path | None:
 
 @cache
 def compiled_library() -> Library:
-    """Load the compiled loops, once.
+    """Return the compiled library, loaded once.
 
     Raises
     ------
     RenderFailed
-        They were not built, or cannot be loaded; says what to do.
+        If it was not built or cannot be loaded; the message has the remedy.
     """
     path = library_path()
     if path is None:

@@ -1,4 +1,4 @@
-"""Records of `source/frame.h`, field by field."""
+"""ctypes records that match the structs of `source/`, field by field."""
 
 import ctypes as c
 
@@ -10,7 +10,7 @@ POINTER = c.c_void_p
 PSF_DONE, PSF_NO_MEMORY = 0, 2
 
 RESOLUTIONS = 3
-"""Kernels in pixels of 1, 2 and 4 px."""
+"""Number of kernel resolutions: pixels of 1, 2 and 4 px."""
 
 KERNEL_SHAPE = np.dtype(
     {
@@ -44,7 +44,7 @@ RECIPE_IMAGE_BYTES = 16
 
 
 class Frame(c.Structure):
-    """The one record that all stages take; `source/frame.h` says what is in it."""
+    """Argument of all stages; `source/frame.h` documents the fields."""
 
     _fields_ = (
         ("threads", POINTER),
@@ -127,7 +127,7 @@ class Frame(c.Structure):
 
 
 class ShrinkJob(c.Structure):
-    """Kernels of a store to be made coarse."""
+    """Job that downsamples kernels of a store."""
 
     _fields_ = (
         ("threads", POINTER),
@@ -195,7 +195,7 @@ class PsfTables(c.Structure):
 
 
 class PsfJob(c.Structure):
-    """PSFs to be computed."""
+    """Job that computes PSFs."""
 
     _fields_ = (
         ("threads", POINTER),
@@ -238,7 +238,7 @@ class PsfJob(c.Structure):
 
 
 def pointer_to(array: np.ndarray) -> int:
-    """Return the address of an array's first element; its caller keeps the array."""
+    """Return the address of an array's first element; the caller keeps it alive."""
     return int(array.ctypes.data)
 
 
@@ -254,4 +254,4 @@ SIZES = (
     c.sizeof(PsfJob),
     c.sizeof(PsfTables),
 )
-"""What `ocu_sizes` must say."""
+"""Expected result of `ocu_sizes`."""

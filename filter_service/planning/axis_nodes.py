@@ -1,8 +1,8 @@
-"""Where the planned nodes lie: closer where PSFs change faster and blur hides less.
+"""Placement of nodes along one axis: denser where PSFs change faster or are sharper.
 
-Along each axis nodes are spread so that blending errs equally between all neighbours,
-and as many are taken as the axis' share of the tolerance needs.  With errors that fall
-as the same power of the number of nodes, equal shares make the smallest product.
+Nodes are spread so that blending errs equally between all neighbors, and their number
+is the smallest that meets the axis's share of the tolerance.  As errors fall with the
+same power of the number of nodes on each axis, equal shares minimize the product.
 """
 
 import math
@@ -27,41 +27,41 @@ from filter_service.planning.sampled_use import (
 )
 
 TOLERANCE_DB = {"loose": 47.0, "normal": 53.0, "fine": 56.0}
-"""PSNR that interpolation may cost down to on average over states, by the error law,
-in both modes.  `error_law.FLOOR` is 57.4 dB.  Of blocks of 32x32 pixels of encoded
-pictures 95 % keep 39.0, 44.1 and 46.3 dB, the median 45.2, 49.9 and 52.3 dB
+"""Lowest PSNR after interpolation, averaged over states by the error law, in both
+modes.  `error_law.FLOOR` is 57.4 dB.  In encoded images, 95 % of blocks of 32x32 pixels
+keep 39.0, 44.1 and 46.3 dB, and the median block 45.2, 49.9 and 52.3 dB
 (`bench_levels`, six eyes, 320x180)."""
 
 MAX_NODES = 64
-"""On one axis but defocus."""
+"""Largest number of nodes on one axis, except defocus."""
 
 COUNTS_AT_ONCE = 3
-"""Node counts evaluated in one call of the eye, which takes 12 ms however small."""
+"""Node counts evaluated in one call of the eye, which takes at least 12 ms."""
 
 STATE_AXES = ("pupil", "accommodation")
-"""A narrow range of these may have one node, in its middle; frames read it at their own
-defocus.  The field has two at least."""
+"""Axes that may have a single node, in the middle of a narrow range; frames read it at
+their own defocus.  The field has at least two."""
 
 _LADDER = 33
 _STATES_ON_LADDER = 16
 
 
 def target_error(spec: GridSpec) -> float:
-    """Mean square error that interpolation may make in all."""
+    """Return the mean square error that interpolation may cause in total."""
     return 10.0 ** (-TOLERANCE_DB[spec.settings.tolerance] / 10.0)
 
 
 def axis_nodes(
     use: Use, axis: str, range_: tuple[float, float], *, allowed_error: float
 ) -> tuple[NDArray[np.float64], float]:
-    """Nodes (n,) of one axis from end to end of its range, and their error.
+    """Return the nodes (n,) of one axis over its whole range, and their error.
 
     Parameters
     ----------
     range_ : (low, high)
-        Not a point.
+        Range of the axis; low < high.
     allowed_error : float
-        Mean square error that as few nodes as possible must meet.
+        Mean square error to meet with as few nodes as possible.
     """
     low, high = range_
     ladder = np.linspace(low, high, _LADDER)
@@ -81,8 +81,8 @@ def axis_nodes(
         for nodes, error in zip(choices, errors, strict=True):
             if error <= allowed_error or nodes.size >= MAX_NODES:
                 return nodes, error
-        # The error falls as the fourth power of the intervals, a little slower where
-        # rays do not move in proportion; do not overshoot.
+        # The error falls with the fourth power of the number of intervals, slightly
+        # slower where rays do not move in proportion; do not overshoot.
         grown = (counts[-1] - 1) * (errors[-1] / allowed_error) ** 0.25
         count = min(max(counts[-1] + 1, 1 + math.floor(0.9 * grown)), MAX_NODES)
 
@@ -90,7 +90,7 @@ def axis_nodes(
 def _needed_over_ladder(
     use: Use, axis: str, ladder: NDArray, allowed_error: float
 ) -> NDArray[np.float64]:
-    """Intervals needed up to each step of a ladder along an axis."""
+    """Return the number of intervals needed up to each step of a ladder."""
     count = min(_STATES_ON_LADDER, use.vergence_dpt.size)
     some = use.taken(np.arange(count))
     repeated = use.taken(np.tile(np.arange(count), ladder.size))
@@ -105,7 +105,7 @@ def _needed_over_ladder(
             unit_px=some.unit_px,
             half_way_error=half_way_error(axis, allowed_error),
         )
-        # The mean square error goes with the fourth power of the difference.
+        # The mean square error grows with the fourth power of the difference.
         power += light_ratio**2 * (difference_px / allowed_px) ** 4
     dense = power.mean(axis=1) ** 0.25
     return np.concatenate([[0.0], np.cumsum(dense + 0.1 * dense.mean() + 1e-12)])

@@ -1,4 +1,4 @@
-"""The blur of every node and channel: a compiled loop, once for each new plan."""
+"""Compiled loop for the blur of every node and channel, run once for each new plan."""
 
 import math
 
@@ -15,11 +15,11 @@ def fill_blur_px(zero_px, per_dpt, values_dpt, starts, shift_dpt, foci_dpt, blur
     Parameters
     ----------
     zero_px, per_dpt : (n_groups, n_rays, 2)
-        Where rays land at 0 dpt, and how far they move by one.
+        Landing points of rays at 0 dpt, and their shift per diopter.
     values_dpt, starts : see `RaggedNodes`
     shift_dpt : (n_groups, 3)
     foci_dpt : (3, n_foci)
-        Where light is in focus; infinity for none.
+        Defocus at which light is in focus; infinity for unused entries.
     """
     for group in range(starts.size - 1):
         for node in range(starts[group], starts[group + 1]):

@@ -1,4 +1,4 @@
-"""What a planned cache costs: memory from predicted radii, time from a cost model."""
+"""Cost of a planned cache: memory from predicted radii, time from a cost model."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,19 @@ from filter_service.planning.slopes import state_survey
 _LENGTHS = np.unique(
     [2**a * 3**b * 5**c for a in range(5, 24) for b in range(3) for c in range(2)]
 )
-"""FFTs of any length: what is too long is refused when it is built."""
+"""FFT lengths, without a limit: PSFs that need too long ones are refused when built."""
 
 SAMPLES = 1536
-"""PSFs whose wavefronts are looked at."""
+"""Largest number of PSFs whose wavefronts are evaluated for a prediction."""
 
 BYTES_PER_TEXEL = 2
 
 COMPUTED_BEYOND = 0.2
-"""Light that trimming drops, over what a computed kernel lacks (`psfs/build.py`)."""
+"""Light that a computed kernel may lack, over what trimming may drop."""
 
 
 def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
-    """Fields of `PlanPrediction`: count, memory, time and cores."""
+    """Return fields of `PlanPrediction`: count, memory, time and cores."""
     count = channels_of(spec) * len(plan.nodes.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
     survey = state_survey(eye, spec, states)
@@ -59,7 +59,7 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
 
 
 def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
-    """States of a plan's PSFs: all of them, or so many spread evenly."""
+    """Return the states of a plan's PSFs: all, or ``most`` of them spread evenly."""
     channels = channels_of(spec)
     count = channels * len(plan.nodes.defocus.values_dpt)
     psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
@@ -77,7 +77,7 @@ def states_of(
     nodes: NDArray[np.int64],
     channel: NDArray[np.int64],
 ) -> PupilStates:
-    """States of the eye (n,) whose PSFs some nodes and channels of a plan have."""
+    """Return the states (n,) of the eye at some nodes and channels of a plan."""
     defocus = plan.nodes.defocus
     groups = defocus.group_at(nodes)
     pupil, used, v, h = np.unravel_index(groups, plan.group_shape)
@@ -95,7 +95,7 @@ def states_of(
 def kernel_radius_px(
     spec: GridSpec, survey: PupilSurvey, *, share: float
 ) -> NDArray[np.int64]:
-    """Radii (P,) that hold all but a share of the light that a cache may drop."""
+    """Return radii (P,) that hold all but a share of the light a cache may drop."""
     if not spec.settings.diffraction:
         radius_px = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX)
         return np.minimum(radius_px, LARGEST_RADIUS_PX).astype(np.int64)
@@ -107,10 +107,10 @@ def kernel_radius_px(
 
 
 def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
-    """Size (P,) of the boxes that kernels are cut to (`psfs/pack.py`).
+    """Return the size (P,) of the boxes that kernels are cropped to (`psfs/pack.py`).
 
-    The box of where rays land, and around it what diffraction needs of the disc.
-    Measured: 0.89 to 1.09 of what caches of 24 plans take.
+    This is the bounding box of the rays, widened by what diffraction needs of the disc.
+    It was 0.89 to 1.09 of the measured size of the caches of 24 plans.
     """
     beyond_px = np.maximum(
         kernel_radius_px(spec, survey, share=1.0)
@@ -125,17 +125,17 @@ def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
 
 
 LARGEST_RADIUS_PX = 1e9
-"""Far more than any plan allows, and within what integers hold."""
+"""Far more than any plan allows, and within the range of integers."""
 
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
-"""Processor time of what `cost_terms` counts, on an AMD EPYC (another machine's is
-scaled by `machine_speed`): 36 batches of
-768 PSFs of three eyes and three image sizes, 56 to 465 us a PSF, are within 0.77 to
-1.19 of it (`python -m tests.benchmarks.bench_plan --calibrate` fits it again)."""
+"""Processor time per unit of each term of `cost_terms` on an AMD EPYC; other machines
+are scaled by `machine_speed`.  36 batches of 768 PSFs of three eyes and three image
+sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
+(`python -m tests.benchmarks.bench_plan --calibrate` repeats the fit)."""
 
 
 def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.float64]]:
-    """Count what takes time in each PSF (P,): itself, its transform and its texels."""
+    """Count the work of each PSF (P,): the PSF itself, its transform and its texels."""
     radius_px = kernel_radius_px(spec, survey, share=COMPUTED_BEYOND)
     count = survey.blur_radius_px.size
     share = geometric_shares(survey) if spec.settings.diffraction else np.ones(count)

@@ -1,9 +1,9 @@
-"""Nodes of total defocus: closer where blur hides less, none where frames read none.
+"""Nodes of total defocus: denser where PSFs are sharper, none where frames read none.
 
-A node is one defocus for all channels, or one for green with red and blue beside it at
-their chromatic differences.  The first suits deep scenes, the second what is seen at
-few distances, where the three of a distance are read alike; each group has what needs
-fewer nodes.
+A node is either one defocus for all channels, or one for green with red and blue
+shifted by their chromatic differences.  The first suits deep scenes; the second suits
+few object distances, where the three channels of a distance are read together.  Each
+group uses the variant that needs fewer nodes.
 """
 
 from __future__ import annotations
@@ -32,23 +32,25 @@ from filter_service.planning.slopes import main_foci_dpt, main_light_ratio
 _LADDER = 49
 
 _LARGEST_RATIO = 0.86
-"""Of the largest kernel: how far rays may land; diffraction and the rim lie beyond."""
+"""Limit of ray landing points, as a share of the largest kernel radius; the remainder
+is left for diffraction and the rim."""
 
 EXACT_DPT = 1e-9
-"""A range as narrow as this is one value."""
+"""Ranges narrower than this are treated as one value."""
 
 DEEP_DPT = 6.0
-"""From here on, the shift saves a range too little to be tried."""
+"""Width of a range from which chromatic shifts save too little to be tried."""
 
 MAX_GROUP_NODES = 100_000
-"""Of defocus at one place.  The largest blur, 255 px, takes 1,000 steps of 0.25 px."""
+"""Limit of defocus nodes in one group.  The largest blur, 255 px, takes 1,000 steps of
+0.25 px."""
 
 Ranges = list[NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class DefocusNodes:
-    """Nodes of total defocus of all groups of a plan; fields as in `CachePlan`."""
+    """Nodes of total defocus of all groups of a plan; fields as in `PlanNodes`."""
 
     nodes: RaggedNodes
     channel_shift_dpt: NDArray[np.float64]
@@ -59,7 +61,7 @@ class DefocusNodes:
     def unlimited(
         cls, nodes: RaggedNodes, channel_shift_dpt: NDArray[np.float64]
     ) -> DefocusNodes:
-        """Return nodes whose kernels are all taken as they are."""
+        """Return nodes whose kernels are neither limited nor shrunk."""
         count = len(nodes.starts) - 1
         return cls(nodes, channel_shift_dpt, np.zeros(count, bool), np.ones(count))
 
@@ -73,7 +75,7 @@ def defocus_nodes(
     *,
     allowed_error: float,
 ) -> DefocusNodes:
-    """Nodes of total defocus of every group, for a mean square error.
+    """Return the nodes of total defocus of every group for a mean square error.
 
     Parameters
     ----------
@@ -112,23 +114,23 @@ def defocus_nodes(
 
 @dataclass(frozen=True)
 class _Rays:
-    """Where rays of each group (P,) land, px: in proportion to defocus.
+    """Landing points of the rays of each group (P,), px, linear in defocus.
 
     Attributes
     ----------
     zero_px, per_dpt : (P, n, 2)
     covariance : (P, 4, 3)
         Polynomial in defocus of the spot's covariance xx, yy, xy, px²: three
-        coefficients of each; then the mean square that a dioptre moves rays by.
+        coefficients of each; then the mean square shift of rays per diopter.
     unit_px : (P,)
     half_way_error : float
         RMS error half-way between nodes.
     foci_dpt : (n_foci,)
-        Defocus at which light is in focus: 0, and more with a lens that has several.
+        Defocus at which light is in focus: 0, and others with a multifocal lens.
     light_ratio : (n_foci, P)
-        Share of the light that has each of those.
+        Share of the light in each focus.
     reach_px : (P,)
-        How much farther than rays such a lens sends light.
+        Distance beyond the rays to which such a lens sends light.
     """
 
     zero_px: NDArray[np.float64]
@@ -175,7 +177,7 @@ class _Rays:
         ranges: Ranges,
         shifts_dpt: NDArray[np.float64] | None = None,
     ) -> RaggedNodes:
-        """Nodes of some groups (n,), over one or several ranges (k, 2) of each."""
+        """Return the nodes of groups (n,) over one or several ranges (k, 2) of each."""
         counts = [len(own) for own in ranges]
         lows, highs = np.concatenate(ranges).T
         place = np.repeat(np.arange(index.size), counts)
@@ -199,12 +201,12 @@ class _Rays:
     def limited(
         self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Ranges (P, 2) without the defocus whose kernels would be too large.
+        """Clip ranges (P, 2) to the defocus whose kernels are small enough.
 
-        A range that holds no kernel small enough becomes the defocus of its smallest,
-        with the ratio (P,) by which that has to shrink.  On the axis it stays as it is,
-        to be refused with numbers when it is computed: what the eye looks at is never
-        drawn so.
+        If no kernel of a range is small enough, the range becomes the defocus of the
+        smallest one, with the ratio (P,) by which that has to shrink.  On the axis the
+        range stays, so that computing it raises an error with numbers: the object that
+        the eye looks at is never drawn shrunk.
         """
         lows, highs = ranges_dpt.T
         limit_px = _LARGEST_RATIO * spec.max_blur_radius_px - self.reach_px
@@ -236,10 +238,10 @@ class _Rays:
     def _within(
         self, limit_px: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """First and last defocus (P,) with all rays within a limit, if any are.
+        """Return the first and last defocus (P,) with all rays within a limit.
 
-        Where |zero + t per|² = limit², ray by ray; the room (P, n) is above zero for
-        rays that ever come within.
+        They solve |zero + t per|² = limit² for each ray; the discriminant (P, n) is
+        positive for rays that come within the limit at all.
         """
         a = np.maximum((self.per_dpt**2).sum(axis=-1), 1e-12)
         half_b = (self.zero_px * self.per_dpt).sum(axis=-1)
@@ -268,7 +270,7 @@ def _reach_px(
 def _spread(
     lows: NDArray[np.float64], highs: NDArray[np.float64], needed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Nodes from end to end of ranges (n,), and how many each has."""
+    """Return nodes from end to end of ranges (n,), and the number in each."""
     # Imported here: reading a plan must not load numba.
     from filter_service.planning.spread_loops import spread_nodes
 

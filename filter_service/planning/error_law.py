@@ -1,11 +1,11 @@
-"""How much an image suffers when neighbouring PSFs are blended.
+"""Image error caused by blending neighboring PSFs.
 
 The law is a fit (`python -m tests.benchmarks.plan_law` repeats it).  3,600 random pairs
-of neighbours in defocus, pupil, accommodation and field - five eyes, pupils of 2 to
+of neighbors in defocus, pupil, accommodation and field - five eyes, pupils of 2 to
 7 mm, fields to 40 x 25 deg, pixels of 0.8 to 3.5 mrad - were blended half and half and
 compared with the exact PSF between them on linear 720p frames of the scene *Courtyard*.
-Blending errs in two ways: rays that lie apart by D are doubled, which counts as D²
-against the blur; and where rays do not move in proportion, the blend aims beside the
+Blending has two errors.  Rays at a distance D are doubled, which counts as D² relative
+to the blur.  Where rays do not move in proportion, the blend is displaced from the
 exact PSF, which counts at first order.
 """
 
@@ -22,7 +22,7 @@ BLUR_EXPONENT = 0.795
 SHARP_PX = 0.384
 OWN_SHARE = 0.41
 DIFFRACTION_SHARE = 2.9
-"""Squared blur added to the rays' own: the pixel's; per squared difference D²; per
+"""Squared blur added to that of the rays: of the pixel; per squared difference D²; per
 squared lambda / pupil diameter."""
 
 AXIS_FACTOR = {
@@ -32,30 +32,30 @@ AXIS_FACTOR = {
     "accommodation": 2.5,
     "defocus": 2.2,
 }
-"""Mean square error measured over that of the law, by what is interpolated."""
+"""Measured mean square error over that of the law, by interpolated axis."""
 
 COHERENCE = 0.09
-"""How far the errors of several axes add up as amplitudes: all of them blur."""
+"""Degree to which errors of several axes add as amplitudes: all of them blur."""
 
 FLOOR = 1.8e-6
-"""Mean square error that denser nodes leave: rims of spots that cross the edge of a
-pixel between two nodes, and the change from one PSF method to the other.  Both from
-whole plans, measured and predicted (36 of three eyes, spread 0.7 dB)."""
+"""Mean square error that remains with denser nodes: rims of spots that cross a pixel
+edge between two nodes, and the transition between PSF methods.  Both are from whole
+plans, measured and predicted (36 of three eyes, spread 0.7 dB)."""
 
 LEAST_SHARE = 0.02
-"""Of the whole error, for an axis whose others have spent it all."""
+"""Share of the total error left to an axis when the others have spent all of it."""
 
 MEAN_OF_HALF_WAY = 8.0 / 15.0
-"""Mean square over an interval of an error that is 4 f (1 - f) of its middle's."""
+"""Mean square over an interval of an error that is 4 f (1 - f) of its middle value."""
 
 
 def mean_square(vectors_px: NDArray) -> NDArray[np.float64]:
-    """Mean (P,) over the pupil of squared vectors (P, n, 2)."""
+    """Return the mean (P,) over the pupil of squared vectors (P, n, 2)."""
     return (WEIGHTS[:, None] * np.square(vectors_px)).sum(axis=(-2, -1))
 
 
 def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
-    """Covariance (P, 3) xx, yy, xy of where rays land, px²."""
+    """Return the covariance (P, 3) xx, yy, xy of landing points of rays, px²."""
     centred = slopes_px - (WEIGHTS[:, None] * slopes_px).sum(axis=-2, keepdims=True)
     x, y = centred[..., 0], centred[..., 1]
     return np.stack([(x * x) @ WEIGHTS, (y * y) @ WEIGHTS, (x * y) @ WEIGHTS], axis=-1)
@@ -64,7 +64,7 @@ def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
 def _blur_px2(
     covariance_px2: NDArray, difference_px2: NDArray, unit_px: NDArray
 ) -> NDArray[np.float64]:
-    """Blur (P,), px²: the geometric mean of the spot's larger and smaller variance."""
+    """Return the blur (P,), px²: the geometric mean of the two principal variances."""
     xx, yy, xy = np.moveaxis(covariance_px2, -1, 0)
     more = (
         SHARP_PX**2
@@ -82,14 +82,14 @@ def blend_error(
     share_ratio: NDArray,
     unit_px: NDArray,
 ) -> NDArray[np.float64]:
-    """Mean square error (P,) of images filtered with blends of two PSFs.
+    """Return the mean square error (P,) of images filtered with blends of two PSFs.
 
     Parameters
     ----------
     lower_px, upper_px, exact_px : (P, n, 2)
-        Slopes of the neighbours and of the exact PSF between them.
+        Slopes of the neighbors and of the exact PSF between them.
     share_ratio : (P,)
-        Share of the upper neighbour.
+        Share of the upper neighbor.
     unit_px : (P,)
         lambda / pupil diameter.
     """
@@ -99,7 +99,7 @@ def blend_error(
     blur_px2 = _blur_px2(spot_covariance(exact_px), difference_px2, unit_px)
     half_way = 4.0 * share_ratio * (1.0 - share_ratio)
     doubled = DOUBLING * half_way * difference_px2 / blur_px2**BLUR_EXPONENT
-    # A miss larger than the blur counts less and less: an image has no more contrast.
+    # A displacement beyond the blur counts ever less: image contrast is limited.
     aside_square = (
         ASIDE**2 * aside_px2 * (blur_px2 + aside_px2) ** (1.0 - 2.0 * BLUR_EXPONENT)
     )
@@ -109,7 +109,7 @@ def blend_error(
 def allowed_difference_px(
     covariance_px2: NDArray, *, unit_px: NDArray, half_way_error: float | NDArray
 ) -> NDArray[np.float64]:
-    """RMS difference (P,) of neighbours whose blend has a given RMS error half-way.
+    """Return the RMS difference (P,) of neighbors for a given RMS error half-way.
 
     Parameters
     ----------
@@ -124,27 +124,27 @@ def allowed_difference_px(
 
 
 def half_way_error(axis: str, allowed_error: float) -> float:
-    """RMS error by the law half-way between nodes that makes a mean square error."""
+    """Return the RMS error half-way between nodes for a mean square error."""
     return float(np.sqrt(allowed_error / MEAN_OF_HALF_WAY / AXIS_FACTOR[axis]))
 
 
 def combined_error(errors: list[float]) -> float:
-    """Mean square error of several interpolations at once, from those of each."""
+    """Return the mean square error of several combined interpolations."""
     amplitude = float(np.sum(np.sqrt(errors)))
     return FLOOR + (1.0 - COHERENCE) * float(np.sum(errors)) + COHERENCE * amplitude**2
 
 
 def equal_share(allowed_error: float, *, spent: list[float], count: int) -> float:
-    """Mean square error that each of some more interpolations may add.
+    """Return the mean square error that each remaining interpolation may add.
 
     Parameters
     ----------
     spent : list
-        Errors of the interpolations that are decided.
+        Errors of the interpolations that are already decided.
     count : int
-        Equal ones still to come.
+        Number of remaining interpolations, which share equally.
     """
-    # combined_error is a square polynomial of their amplitude.
+    # combined_error is a quadratic polynomial of their amplitude.
     square = (1.0 - COHERENCE) * count + COHERENCE * count**2
     linear = COHERENCE * count * float(np.sum(np.sqrt(spent)))
     left = allowed_error - combined_error(spent)
@@ -155,5 +155,5 @@ def equal_share(allowed_error: float, *, spent: list[float], count: int) -> floa
 
 
 def psnr_db(mean_square_error: float) -> float:
-    """PSNR against a white of 1."""
+    """Return the PSNR for a white of 1."""
     return float(-10.0 * np.log10(max(mean_square_error, 1e-12)))

@@ -1,7 +1,7 @@
 """Directions of a camera in the visual field of an eye that may look elsewhere.
 
-The camera is a pinhole in the eye's entrance pupil; gaze turns the eye within it.
-Field directions (h, v) are the eye's (CONVENTIONS.md), so that the PSFs of a field
+The camera is a pinhole in the eye's entrance pupil; gaze rotates the eye relative to
+it.  Field directions (h, v) are the eye's (CONVENTIONS.md), so the PSFs of a field
 direction move over the image with the gaze.
 """
 
@@ -15,7 +15,7 @@ MAX_FIELD_DEG = 80.0
 """Directions farther from the camera's axis or the gaze have no PSF nodes."""
 
 BORDER_SAMPLES = 33
-"""Points along each image edge at which the extent of the field is looked for."""
+"""Number of points along each image edge at which the field extent is sampled."""
 
 
 def unit_direction(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
@@ -28,7 +28,7 @@ def unit_direction(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
 
 
 def angles_deg(direction: NDArray) -> tuple[NDArray, NDArray]:
-    """Azimuth and elevation (...) of vectors (..., 3)."""
+    """Return azimuths and elevations (...) of vectors (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(direction, float), -1, 0)
     return (
         np.degrees(np.arctan2(x, -z)),
@@ -37,7 +37,7 @@ def angles_deg(direction: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def gaze_rotation(gaze_deg: tuple[float, float]) -> NDArray[np.float64]:
-    """Rotation (3, 3) from the eye's frame to the camera's: up by v, aside by h."""
+    """Return the rotation (3, 3) from eye to camera: up by v, then sideways by h."""
     h, v = np.radians(gaze_deg)
     up = np.array([[1, 0, 0], [0, np.cos(v), -np.sin(v)], [0, np.sin(v), np.cos(v)]])
     aside = np.array([[np.cos(h), 0, -np.sin(h)], [0, 1, 0], [np.sin(h), 0, np.cos(h)]])
@@ -51,9 +51,9 @@ def field_deg(
     *,
     gaze_deg: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Field direction (h, v) in degrees seen at an image point, y downwards.
+    """Return the field direction (h, v), deg, seen at an image point, y downward.
 
-    The middle of the top-left pixel is (0.5, 0.5).
+    The center of the top-left pixel is (0.5, 0.5).
     """
     tangent_x, tangent_y = pinhole.tangents_at(
         x_px,
@@ -70,7 +70,7 @@ def field_deg(
 def field_range_deg(
     camera: Camera, *, gaze_deg: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Smallest and largest h and v that an image holds, within ±`MAX_FIELD_DEG`."""
+    """Return the ranges of h and v in an image, within ±`MAX_FIELD_DEG`."""
     along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
     x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
     return tuple(
@@ -89,7 +89,7 @@ def nearest_inside_deg(
     *,
     gaze_deg: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Field directions (h, v), moved to the image's edge where they lie outside."""
+    """Return field directions (h, v), clamped to the image where they lie outside."""
     turn = gaze_rotation(gaze_deg)
     x, y, z = np.moveaxis(unit_direction(h_deg, v_deg) @ turn.T, -1, 0)
     left, right, up, down = camera.tangents
@@ -112,11 +112,11 @@ def pixel_from_mrad(
     *,
     gaze_deg: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[np.float64]:
-    """Local scale (..., 2, 2) of the image at a field direction.
+    """Return the local scale (..., 2, 2) of the image at a field direction.
 
-    Pixels (x right, y up) per mrad along the pupil axes (ex, ey) of that field; see
-    `pinhole.pixel_from_mrad`.  Directions beyond the camera's ±`MAX_FIELD_DEG` take
-    the scale there.
+    The scale is in pixels (x right, y up) per mrad along the pupil axes (ex, ey) of
+    that field; see `pinhole.pixel_from_mrad`.  Directions beyond the camera's
+    ±`MAX_FIELD_DEG` are clamped to it.
     """
     turn = gaze_rotation(gaze_deg)
     direction = unit_direction(h_deg, v_deg)
@@ -127,7 +127,7 @@ def pixel_from_mrad(
         tangents=camera.tangents,
         size_px=(camera.width_px, camera.height_px),
     )
-    # The eye's pupil axes, turned into the camera's frame, against the camera's own.
+    # The eye's pupil axes, rotated into the camera's frame, relative to the camera's.
     eye_axes = np.stack(_pupil_axes(direction), axis=-1)  # (..., 3, 2)
     camera_axes = np.stack(_pupil_axes(direction @ turn.T), axis=-1)
     roll = np.swapaxes(camera_axes, -1, -2) @ (turn @ eye_axes)
@@ -135,7 +135,7 @@ def pixel_from_mrad(
 
 
 def _pupil_axes(direction: NDArray) -> tuple[NDArray, NDArray]:
-    """Return ex = u x y normalised and ey = ex x u, each (..., 3)."""
+    """Return ex = u x y, normalized, and ey = ex x u, each (..., 3)."""
     ex = np.cross(direction, np.array([0.0, 1.0, 0.0]))
     ex /= np.linalg.norm(ex, axis=-1, keepdims=True)
     return ex, np.cross(ex, direction)

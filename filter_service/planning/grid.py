@@ -1,10 +1,11 @@
-"""Where the PSF cache has its nodes, and where a frame has its layers.
+"""Specification of a PSF cache, and placement of its nodes and of frame layers.
 
-The cache is spanned by pupil and *total defocus* (refraction + object vergence -
-accommodation + chromatic shift): object distance, focus and wavelength act on an
-on-axis PSF through that sum alone, so a node serves every combination that shares it.
-Frame layers follow the paper, as far as they must: never more than a step of blur apart
-(section 6.2, Eq. 8), and where the blur stays, farther than its uniform distances.
+The cache spans pupil and *total defocus* (refraction + object vergence -
+accommodation + chromatic shift).  Object distance, focus and wavelength act on an
+on-axis PSF through that sum alone, so a node serves every combination with the same
+sum.  Frame layers follow the paper in never being more than a step of blur apart
+(section 6.2, Eq. 8); where the blur is constant, they are farther apart than the
+paper's uniform distances.
 """
 
 import math
@@ -28,61 +29,62 @@ from filter_service.planning.field_directions import (
 from filter_service.settings import DEFAULTS, PLANE_ROOM_DPT, FilterSettings
 
 GREEN = 1
-"""Channel that the others are compared with, and that lateral colour leaves."""
+"""Reference channel, which lateral color does not shift."""
 
 PUPIL_RATIO = 1.16
-"""Neighbouring pupil nodes differ by at most this factor (tests/benchmarks)."""
+"""Largest ratio of neighboring pupil nodes (tests/benchmarks)."""
 
 MIN_BLUR_STEP_PX = 0.25
 BLUR_STEP_RATIO = 0.1
 LARGE_BLUR_STEP_RATIO = 0.025
 """Blur step between nodes: a tenth of the blur radius, at least 0.25 px and at most
-`GridSpec.max_blur_step_px`, but never finer than 2.5 % of the radius, because a wide
-kernel shows a change of its radius in proportion only."""
+`GridSpec.max_blur_step_px`, but never finer than 2.5 % of the radius, because in a wide
+kernel only the relative change of the radius is visible."""
 
 BASE_OBJECT_STEP_DPT = 0.25
-"""The paper's object distances: 33 over 8 dpt."""
+"""Step of the paper's object distances: 33 over 8 dpt."""
 
 FOCUS_LADDER = 65
-"""Places between two foci at which the step to the next node is looked at."""
+"""Number of positions between two foci at which the next step is evaluated."""
 
 LAYER_BLUR_RATIO = {"on-axis": 0.05, "quality": 0.05, "dynamic": 0.1}
-"""Step of blur from layer to layer, of the blur radius; at least `MIN_BLUR_STEP_PX`."""
+"""Blur step between layers, of the blur radius; at least `MIN_BLUR_STEP_PX`."""
 
 LAYER_GAP_STEPS = 2.0
-"""Most defocus from layer to layer, in steps of what it would blur a perfect eye; at
-least `BASE_OBJECT_STEP_DPT`.  With 2.5 % and 0.25 dpt a cataract eye has 198 layers at
-1280x720, here 32 and the same error."""
+"""Largest defocus between layers, in blur steps of a perfect eye; at least
+`BASE_OBJECT_STEP_DPT`.  With 2.5 % and 0.25 dpt, a cataract eye has 198 layers at
+1280x720; with these values, 32 and the same error."""
 
 PAPER_REACH_DEG = {"quality": (45.0, 25.0), "dynamic": (45.0, 24.0)}
-"""Azimuth and elevation to both sides (released code)."""
+"""Azimuth and elevation to both sides (released code of the paper)."""
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """What a PSF cache is built for.
+    """Specification of a PSF cache.
 
     Attributes
     ----------
     camera : Camera
-        Image size and tangents; the on-axis mode uses no more than its pixel pitch.
+        Image size and tangents; the on-axis mode uses only its pixel pitch.
     settings : FilterSettings
-        Pupils, distances, field, and how fine.
+        Pupils, distances, field and tolerance.
     memory_budget_mb : float
-        A larger plan is refused.
+        Limit of memory; a larger plan is refused.
     max_blur_step_px : float
-        Blur difference between neighbouring nodes.
+        Blur difference between neighboring nodes.
     max_blur_radius_px : int
-        More blur than this is refused; diffraction's tail ends there.
+        Largest blur, where diffraction tails end; more is refused.
     kept_energy_ratio : float
-        Light within a kernel's box; the rest is spread over it again.  0.99 keeps
-        filtered images at 60 dB or more of the uncut kernel's, 0.995 at 65 dB, 0.998
-        at 67 dB (240 kernels over the field, 2.5 to 6 mm).
+        Share of light within a kernel's box; kernels are normalized to unit sum
+        afterwards.  With 0.99, filtered images have a PSNR of 60 dB or more against
+        uncropped kernels, with 0.995 65 dB, with 0.998 67 dB (240 kernels over the
+        field, 2.5 to 6 mm).
 
     Raises
     ------
     BadMessage
-        Pixels too small or too large, or a gaze that turns the image out of all PSFs.
+        If pixels are too small or too large, or a gaze turns the image beyond all PSFs.
     """
 
     camera: Camera
@@ -93,7 +95,7 @@ class GridSpec:
     kept_energy_ratio: float = 0.99
 
     def __post_init__(self) -> None:
-        """Refuse what no cache can be built for."""
+        """Refuse cameras and gazes that no cache can be built for."""
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise BadMessage(
@@ -104,7 +106,7 @@ class GridSpec:
         self._check_gaze()
 
     def _check_gaze(self) -> None:
-        """Refuse a gaze that turns the image out of all PSFs."""
+        """Refuse a gaze that turns the image beyond all PSFs."""
         if not (self.follows_field and any(self.settings.gaze_range_deg)):
             return
         seen_deg = field_range_deg(self.camera, gaze_deg=self.settings.gaze_deg)
@@ -132,12 +134,12 @@ class GridSpec:
 
     @property
     def follows_field(self) -> bool:
-        """Whether PSFs differ over the visual field."""
+        """Return whether PSFs differ over the visual field."""
         return self.settings.follows_field
 
     @property
     def field_range_deg(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Field directions (h, v) from smallest to largest that PSFs are needed for."""
+        """Ranges of field directions (h, v) that PSFs are needed for."""
         if not self.follows_field:
             return (0.0, 0.0), (0.0, 0.0)
         ranges = [
@@ -159,10 +161,10 @@ class GridSpec:
 
     @property
     def blends_at_equal_blur(self) -> bool:
-        """Whether field nodes are blended at equal defocus, not at equal distance.
+        """Return whether field nodes are blended at equal defocus, not equal distance.
 
-        Nodes that the planner chose hold the defocus that their neighbours read; the
-        paper's hold nine object distances of their own.
+        Planned nodes cover the defocus that their neighbors read; each of the paper's
+        nodes has nine object distances of its own.
         """
         return self.settings.grid == "planned"
 
@@ -180,7 +182,7 @@ class GridSpec:
 
     @property
     def primary_wavelengths_nm(self) -> NDArray[np.float64]:
-        """Wavelengths (n, 3) whose PSFs, averaged, are those of the channels."""
+        """Wavelengths (n, 3) whose averaged PSFs are those of the channels."""
         middle_nm = self.channel_wavelengths_nm
         if not (self.settings.chromatic and self.settings.wide_primaries):
             return middle_nm[None]
@@ -189,19 +191,19 @@ class GridSpec:
 
     @property
     def traced_wavelengths_nm(self) -> NDArray[np.float64]:
-        """Wavelengths (n,) at which the eye must be known, ascending."""
+        """Wavelengths (n,) at which the eye is evaluated, ascending."""
         every = (self.channel_wavelengths_nm, self.primary_wavelengths_nm.ravel())
         return np.unique(np.concatenate(every))
 
     def blur_px_per_dpt(self, pupil_diameter_mm: float) -> float:
-        """Radius of the geometric blur disc on axis per dioptre of defocus, px."""
+        """Return the radius of the geometric blur disc on axis per diopter, px."""
         return pupil_diameter_mm / 2.0 / min(self.pixel_pitch_mrad)
 
     @property
     def object_ranges_dpt(self) -> list[tuple[float, float]]:
-        """Where objects are, dpt: one range, or one for each plane.
+        """Object distances, dpt: one range, or one for each plane.
 
-        Towards the corners of the image a plane is farther than on the axis.
+        Toward the corners of the image a plane is farther away than on the axis.
         """
         planes_dpt = self.settings.object_planes_dpt
         if not planes_dpt:
@@ -222,7 +224,7 @@ class GridSpec:
         return min(low for low, _ in ranges), max(high for _, high in ranges)
 
     def gaze_samples_deg(self) -> list[tuple[float, float]]:
-        """Directions of gaze over the range: its middle, edges and corners."""
+        """Return gaze directions over the range: its middle, edges and corners."""
         steps = [
             (-reach, 0.0, reach) if reach > 0.0 else (0.0,)
             for reach in self.settings.gaze_range_deg
@@ -236,7 +238,10 @@ class GridSpec:
     def pixel_from_mrad(
         self, h_deg, v_deg, *, gaze_deg: tuple[float, float] | None = None
     ) -> NDArray[np.float64]:
-        """Local scale (..., 2, 2) of the image at field directions; on axis its own."""
+        """Return the local scale (..., 2, 2) of the image at field directions.
+
+        The on-axis mode uses the scale on the axis everywhere.
+        """
         if not self.follows_field:
             axis = np.diag(1.0 / np.array(self.pixel_pitch_mrad))
             return np.broadcast_to(axis, (*np.shape(h_deg), 2, 2))
@@ -244,11 +249,11 @@ class GridSpec:
         return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=gaze_deg)
 
     def node_pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
-        """Scale (..., 2, 2) of the pixels that kernels of a field node are stored in.
+        """Return the pixel scale (..., 2, 2) of the stored kernels of a field node.
 
-        That of the image where the node is seen.  A node that the gaze moves over the
-        image has the pixels of its axis, made so much smaller that no place in the
-        image has smaller ones: frames then only ever average stored pixels.
+        It is that of the image where the node is seen.  A node that the gaze moves over
+        the image has the axis's pixels, reduced to be no larger than any in the image,
+        so that frames only ever average stored pixels.
         """
         if not any(self.settings.gaze_range_deg) or not self.follows_field:
             return self.pixel_from_mrad(h_deg, v_deg)
@@ -263,13 +268,13 @@ class GridSpec:
 
 
 def blur_step_px(blur_px: float, max_blur_step_px: float) -> float:
-    """Return the blur difference allowed to the next node at a blur radius."""
+    """Return the allowed blur difference to the next node at a blur radius."""
     step_px = min(max(BLUR_STEP_RATIO * blur_px, MIN_BLUR_STEP_PX), max_blur_step_px)
     return max(step_px, LARGE_BLUR_STEP_RATIO * blur_px)
 
 
 def pupil_nodes_mm(pupil_range_mm: tuple[float, float]) -> NDArray[np.float64]:
-    """Pupil diameters of the cache, geometric from end to end of the range."""
+    """Return the cache's pupil diameters, in geometric progression over the range."""
     low_mm, high_mm = pupil_range_mm
     if math.isclose(low_mm, high_mm):
         return np.array([high_mm])
@@ -285,9 +290,9 @@ def nodes_through_foci_dpt(
     blur_px_per_dpt: float,
     max_blur_step_px: float,
 ) -> NDArray[np.float64]:
-    """Nodes as those of `defocus_nodes_dpt`, of a lens that is sharp at several.
+    """Return nodes as `defocus_nodes_dpt` does, for a lens with several foci.
 
-    Each focus inside the range is a node, and steps are those of the nearest.
+    Each focus inside the range is a node, and steps are those of the nearest focus.
     """
     inside = foci_dpt[(foci_dpt > low_dpt) & (foci_dpt < high_dpt)]
     ends = np.unique(np.concatenate([[low_dpt], inside, [high_dpt]]))
@@ -311,9 +316,10 @@ def nodes_through_foci_dpt(
 def defocus_nodes_dpt(
     low_dpt: float, high_dpt: float, *, blur_px_per_dpt: float, max_blur_step_px: float
 ) -> NDArray[np.float64]:
-    """Total defocus of the cache nodes for one pupil, ascending, covering a range.
+    """Return total defocus of the nodes of one pupil, ascending, covering a range.
 
-    Zero is a node whenever it lies inside, so a focused object meets no interpolation.
+    Zero is a node if it lies in the range, so that a focused object needs no
+    interpolation.
     """
 
     def outwards(limit_dpt: float) -> list[float]:

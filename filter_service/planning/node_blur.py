@@ -1,7 +1,7 @@
 """Geometric blur of a plan's nodes, known before any of their PSFs is computed.
 
-Where the layers of frames lie depends on it, so that it must not depend on which PSFs
-there are.  Rays land in proportion to defocus: two defocus values of a group tell all.
+The layers of frames depend on it, so it must not depend on which PSFs are computed.
+Landing points of rays are linear in defocus, so two defocus values of a group suffice.
 """
 
 from typing import NamedTuple
@@ -20,11 +20,12 @@ from filter_service.planning.slopes import slopes_px
 
 
 class GroupRays(NamedTuple):
-    """Where green rays of each group land, px, at no defocus and by a dioptre more.
+    """Landing points of each group's green rays at 0 dpt, and their shift per diopter.
 
     Attributes
     ----------
     zero_px, per_dpt : (n_groups, n_rays, 2)
+        In px.
     """
 
     zero_px: NDArray[np.float64]
@@ -32,7 +33,7 @@ class GroupRays(NamedTuple):
 
     @classmethod
     def of(cls, wavefronts: NodeWavefronts) -> "GroupRays":
-        """Trace rays through wavefronts; through the mean of a wide primary's."""
+        """Trace rays through wavefronts, averaged over the wavelengths of a primary."""
         zero_um = wavefronts.zernike_um[:, GREEN].mean(axis=1)
         per_dpt_um = wavefronts.per_dpt_um[:, GREEN].mean(axis=1)
         both = (2, 1)
@@ -61,9 +62,9 @@ def node_blur_px(
     channel_shift_dpt: NDArray[np.float64],
     shrink_ratio: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Largest distance (n_psfs,), px, of rays from the chief ray, at PSFs' defocus.
+    """Return the largest distance (n_psfs,), px, of rays from the chief ray.
 
-    With several foci it is that of the nearest.
+    With several foci, it is that of the nearest focus.
     """
     # Imported here: reading a plan must not load numba.
     from filter_service.planning.blur_loops import fill_blur_px

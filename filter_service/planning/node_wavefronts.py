@@ -1,7 +1,7 @@
-"""The wavefronts of field nodes in one state of an eye, evaluated once for all PSFs.
+"""Wavefronts of field nodes in one state of an eye, evaluated once for all PSFs.
 
 Nodes of a group differ by defocus alone, so each group and channel has one wavefront.
-Evaluating the eye for each batch of PSFs took 12 ms a batch, however small.
+Evaluating the eye for each batch of PSFs took 12 ms per batch, regardless of its size.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from filter_service.planning.grid import GREEN, GridSpec
 
 @dataclass(frozen=True)
 class PupilStates:
-    """What a wavefront depends on; arrays (P,)."""
+    """Parameters of wavefronts; arrays (P,)."""
 
     h_deg: NDArray[np.float64]
     v_deg: NDArray[np.float64]
@@ -36,7 +36,7 @@ class PupilStates:
         return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
 
     def taken(self, index: NDArray[np.int64] | slice) -> PupilStates:
-        """Return some of the states, in any order."""
+        """Return a selection of the states, in any order."""
         return PupilStates(**{name: v[index] for name, v in vars(self).items()})
 
 
@@ -51,9 +51,9 @@ class NodeWavefronts:
     Attributes
     ----------
     zernike_um : (n_groups, 3, n_primaries, 28)
-        At a total defocus of 0 dpt in the middle of the channel.
+        Coefficients at a total defocus of 0 dpt in the middle of the channel.
     per_dpt_um : (n_groups, 3, n_primaries, 28)
-        What a dioptre adds.
+        Change per diopter.
     circle_diameter_mm : (n_groups, 3, n_primaries)
     pupil_ellipse : (n_groups, 3, n_primaries, 5)
     wavelength_nm : (3, n_primaries)
@@ -84,7 +84,7 @@ class NodeWavefronts:
         Parameters
         ----------
         wavefronts_of : callable, optional
-            The eye's `node_evaluator`, where it serves several states.
+            Result of `node_evaluator`, if it is shared by several states.
         """
         wavefronts_of = wavefronts_of or node_evaluator(
             eye, spec, groups.h_deg, groups.v_deg
@@ -117,7 +117,7 @@ class NodeWavefronts:
 
     @classmethod
     def joined(cls, several: Sequence[NodeWavefronts]) -> NodeWavefronts:
-        """Join groups of one eye, one after the other."""
+        """Concatenate groups of one eye."""
         if len(several) == 1:
             return several[0]
         names = {field.name for field in fields(cls)} - {"wavelength_nm"}
@@ -130,7 +130,7 @@ class NodeWavefronts:
         )
 
     def flatter(self, ratio: NDArray[np.float64]) -> NodeWavefronts:
-        """Return wavefronts of which so much (n_groups,) is left."""
+        """Return the wavefronts scaled by a ratio (n_groups,)."""
         each = ratio[:, None, None, None]
         return replace(
             self, zernike_um=each * self.zernike_um, per_dpt_um=each * self.per_dpt_um
@@ -139,7 +139,7 @@ class NodeWavefronts:
     def with_lateral_color(
         self, eye: EyeOptics, spec: GridSpec, groups: PupilStates
     ) -> NodeWavefronts:
-        """Return wavefronts tilted as an eye tilts colors against green."""
+        """Return wavefronts with the tilts of the colors relative to green."""
         n_primaries = self.wavelength_nm.shape[1]
         states = of_channels(spec, groups)
         if n_primaries > 1:
@@ -159,12 +159,12 @@ class NodeWavefronts:
         *,
         primaries: int | None = None,
     ) -> FieldWavefronts:
-        """Wavefronts (n n_primaries,) of PSFs (n,), those of a channel in turn.
+        """Return wavefronts (n n_primaries,) of PSFs (n,), grouped by PSF.
 
         Parameters
         ----------
         primaries : int, optional
-            Only so many of each channel.
+            Number of wavelengths of each channel; all by default.
         """
         own = (groups, channels, slice(primaries))
         zernike_um = self.zernike_um[own] + (
@@ -180,7 +180,7 @@ class NodeWavefronts:
 def node_evaluator(
     eye: EyeOptics, spec: GridSpec, h_deg: NDArray, v_deg: NDArray
 ) -> WavefrontsOf:
-    """Return an evaluator of wavefronts at field nodes (n,), channels in turn."""
+    """Return a function that evaluates wavefronts at field nodes (n,), node by node."""
     per_node = spec.primary_wavelengths_nm.size
     return eye.wavefronts_at(
         h_deg=np.repeat(h_deg, per_node),
@@ -190,7 +190,7 @@ def node_evaluator(
 
 
 def of_channels(spec: GridSpec, groups: PupilStates) -> PupilStates:
-    """States (3 n_groups,) of the channels of groups, those of a group in turn."""
+    """Return the states (3 n_groups,) of the channels of groups, group by group."""
     states = groups.taken(np.repeat(np.arange(groups.h_deg.size), RGB))
     wavelength_nm = np.tile(spec.channel_wavelengths_nm, groups.h_deg.size)
     return replace(states, wavelength_nm=wavelength_nm)
@@ -199,9 +199,10 @@ def of_channels(spec: GridSpec, groups: PupilStates) -> PupilStates:
 def states_of_primaries(
     eye: EyeOptics, spec: GridSpec, states: PupilStates
 ) -> PupilStates:
-    """States (n P,) of the wavelengths of each state's primary, n for each in turn.
+    """Return the states (n P,) of the n wavelengths of each state's primary.
 
-    Total defocus differs by the eye's own chromatic difference.
+    The states of a primary are adjacent; their total defocus differs by the eye's
+    chromatic difference.
     """
     of_primary_nm = spec.primary_wavelengths_nm
     away_nm = np.abs(spec.channel_wavelengths_nm - states.wavelength_nm[:, None])
@@ -219,7 +220,7 @@ def states_of_primaries(
 def lateral_shift_mrad(
     eye: EyeOptics, spec: GridSpec, states: PupilStates
 ) -> NDArray[np.float64]:
-    """Shifts (P, 2) of PSFs along the pupil axes, against green's."""
+    """Return the shifts (P, 2) of PSFs along the pupil axes, relative to green."""
     place = {
         "h_deg": states.h_deg,
         "v_deg": states.v_deg,

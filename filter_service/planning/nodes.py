@@ -1,4 +1,4 @@
-"""Nodes of a PSF cache: plain arrays, with the search for a value's neighbours."""
+"""Nodes of a PSF cache: plain arrays, and the search for a value's neighbors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from filter_service.planning.node_wavefronts import NodeWavefronts
 
 @dataclass(frozen=True)
 class RaggedNodes:
-    """Groups of nodes of total defocus, each with its own number of them.
+    """Groups of nodes of total defocus, of different sizes.
 
     Attributes
     ----------
     values_dpt : (n,)
-        All groups one after the other, ascending in each.
+        Values of all groups, concatenated; ascending within a group.
     starts : (n_groups + 1,)
-        Where each group begins in `values_dpt`; the last entry is n.
+        Start of each group in `values_dpt`; the last entry is n.
     """
 
     values_dpt: NDArray[np.float64]
@@ -30,7 +30,7 @@ class RaggedNodes:
 
     @classmethod
     def of(cls, groups: list[NDArray[np.float64]]) -> RaggedNodes:
-        """Join groups, each ascending and not empty."""
+        """Concatenate groups, each ascending and not empty."""
         counts = np.array([len(group) for group in groups], np.int64)
         return cls.joined(np.concatenate([np.zeros(0), *groups]), counts)
 
@@ -38,7 +38,7 @@ class RaggedNodes:
     def joined(
         cls, values_dpt: NDArray[np.float64], counts: NDArray[np.int64]
     ) -> RaggedNodes:
-        """Cut values (n,) into groups of so many (n_groups,)."""
+        """Split values (n,) into groups of ``counts`` (n_groups,)."""
         if not counts.size or counts.min() < 1:
             raise ValueError(f"groups of {counts} nodes: at least one node each")
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -51,18 +51,18 @@ class RaggedNodes:
     def where_fewer(
         self, index: NDArray[np.int64], other: RaggedNodes
     ) -> tuple[RaggedNodes, NDArray[np.int64]]:
-        """Take other nodes of some groups where they are fewer.
+        """Replace the nodes of some groups by others where those are fewer.
 
         Parameters
         ----------
         index : (k,)
-            Groups that `other` has nodes of.
+            Groups to which the groups of `other` correspond.
 
         Returns
         -------
         nodes : RaggedNodes
         taken : (m,)
-            Places in `index` of the groups that have other nodes now.
+            Positions in `index` of the groups that were replaced.
         """
         taken = np.flatnonzero(other.counts < self.counts[index])
         counts, first = self.counts, self.starts[:-1].copy()
@@ -76,7 +76,7 @@ class RaggedNodes:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Nodes (n_groups,) of each group."""
+        """Number of nodes (n_groups,) in each group."""
         return np.diff(self.starts)
 
     @property
@@ -85,7 +85,7 @@ class RaggedNodes:
         return np.repeat(np.arange(len(self.starts) - 1), self.counts)
 
     def group_at(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Group (n,) of some nodes."""
+        """Return the groups (n,) of some nodes."""
         return np.searchsorted(self.starts, nodes, side="right") - 1
 
     @cached_property
@@ -95,7 +95,7 @@ class RaggedNodes:
 
     @cached_property
     def span_dpt(self) -> float:
-        """Stretch that each group has for itself in `keys_dpt`."""
+        """Interval reserved for each group in `keys_dpt`."""
         return float(np.ptp(self.values_dpt)) + 1.0
 
     @cached_property
@@ -106,7 +106,7 @@ class RaggedNodes:
     def bracket(
         self, groups: ArrayLike, t: ArrayLike
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Neighbours of values within their groups, clipped to the groups' ends.
+        """Return the neighbors of values within their groups, clipped to their ends.
 
         Parameters
         ----------
@@ -135,19 +135,19 @@ class RaggedNodes:
 
 @dataclass(frozen=True)
 class PlanPrediction:
-    """What a plan will cost, and what its interpolation will.
+    """Predicted cost and interpolation error of a plan.
 
     Attributes
     ----------
     psf_count : int
     memory_mb : float
-        Kernels, two bytes a texel.
+        Memory of the kernels, two bytes per texel.
     build_s : float
-        On `core_count` processor cores.
+        Time on `core_count` processor cores.
     core_count : int
     interpolation_db : float
-        PSNR of an image filtered by interpolated PSFs against exact ones, over the
-        states that frames can ask for.
+        PSNR of images filtered by interpolated PSFs against exact ones, over the
+        states that frames can request.
     error_db_by_axis : dict
         The same with one axis interpolated at a time: "defocus", "pupil",
         "accommodation", "field".
@@ -165,8 +165,8 @@ class PlanPrediction:
 class PlanAxes:
     """Nodes of a cache over field, pupil and accommodation.
 
-    Those of defocus follow from these, pupil by pupil and accommodation by
-    accommodation: `planning.plan.planned_nodes`.
+    Nodes of defocus follow from these for each pupil and accommodation; see
+    `planning.plan.NodePlanner`.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class PlanAxes:
     accommodations_dpt : (n_accommodations,)
     defocus_error : float
         Mean square error that interpolation in defocus may add; 0 where the nodes do
-        not follow from it.
+        not depend on it.
     """
 
     h_deg: NDArray[np.float64]
@@ -193,7 +193,7 @@ class PlanAxes:
 
     @cached_property
     def axis_node(self) -> int:
-        """Number of the field node that is nearest to the direction of gaze."""
+        """Index of the field node nearest to the gaze direction."""
         return int(np.argmin(np.hypot(*self.field_nodes_deg)))
 
     @property
@@ -216,19 +216,18 @@ class PlanNodes:
     defocus : RaggedNodes
         Total defocus in dpt; a group is one field node [v, h] in one state.
     channel_shift_dpt : (n_groups, 3)
-        Channel c of a node at t is the kernel of total defocus t + shift: zero where a
-        node is one defocus for all channels; the chromatic difference where it is what
-        they see of one object, as where few distances are read and in the paper's
-        grids.
+        Channel c of a node at t is the kernel of total defocus t + shift.  The shift is
+        zero if a node is one defocus for all channels, and the chromatic difference if
+        a node is one object distance, as with few distances and in the paper's grids.
     blur_px : (n_psfs,)
         Geometric blur of the nodes' PSFs, see `planning.node_blur`.
     is_limited : (n_groups,)
-        Groups that end where the blur is as large as kernels may be.
+        Groups that end where the blur reaches the largest allowed kernel.
     shrink_ratio : (n_groups,)
-        By how much wavefronts are made flatter where even the sharpest blur of a group
-        is larger; one elsewhere.
+        Factor by which wavefronts are scaled where even the sharpest blur of a group
+        exceeds that; one elsewhere.
     wavefronts : NodeWavefronts
-        Made flatter by that.
+        Wavefronts scaled by that factor.
     """
 
     defocus: RaggedNodes
@@ -240,14 +239,14 @@ class PlanNodes:
 
     @property
     def arrays(self) -> list[NDArray[Any]]:
-        """All arrays, to tell their size."""
+        """All arrays, for computing their size."""
         parts = (self, self.defocus, self.wavefronts)
         values = [value for part in parts for value in vars(part).values()]
         return [value for value in values if isinstance(value, np.ndarray)]
 
     @classmethod
     def joined(cls, several: Sequence[PlanNodes]) -> PlanNodes:
-        """Join nodes of one eye and field, one after the other."""
+        """Concatenate nodes of one eye and field."""
         if len(several) == 1:
             return several[0]
         return cls(
@@ -275,7 +274,7 @@ class CachePlan(PlanAxes):
     nodes : PlanNodes
         Groups in C order [pupil, accommodation, v, h].
     prediction : PlanPrediction, optional
-        None where it was not asked for: it takes longer than the plan.
+        None unless requested: it takes longer than the plan.
     """
 
     nodes: PlanNodes | None = None
@@ -285,7 +284,7 @@ class CachePlan(PlanAxes):
 def bracket_axis(
     nodes: ArrayLike, value: ArrayLike
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbours of values (...) among ascending nodes; see `RaggedNodes.bracket`."""
+    """Return neighbors of values (...) in sorted nodes; see `RaggedNodes.bracket`."""
     nodes = np.asarray(nodes, np.float64)
     last = nodes.size - 1
     value = np.clip(np.asarray(value, np.float64), nodes[0], nodes[-1])
@@ -298,19 +297,19 @@ def bracket_axis(
 def triangle(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Weights of the corners of half a rectangle, cut along its diagonal.
+    """Return weights of the corners of half a rectangle, split along its diagonal.
 
     Parameters
     ----------
     first, second : (n,)
-        How far along two axes, 0 to 1.
+        Positions along two axes, 0 to 1.
 
     Returns
     -------
     weights : (n, 3)
-        Of the corner (0, 0), of that between and of (1, 1).
+        Weights of the corner (0, 0), of the intermediate corner and of (1, 1).
     is_first : (n,)
-        Whether the corner between is (1, 0), else (0, 1).
+        Whether the intermediate corner is (1, 0), else (0, 1).
     """
     low, high = np.minimum(first, second), np.maximum(first, second)
     return np.stack([1.0 - high, high - low, low], axis=-1), first >= second

@@ -1,8 +1,8 @@
 """The paper's fixed grids, as plans of this cache.
 
-Angles and distances are those of the released code; its nodes of focus become nodes of
-accommodation, and its nodes of object distance nodes of the total defocus that green
-light then has, with the other channels beside it.
+Angles and distances are those of the released code.  Its nodes of focus become nodes of
+accommodation.  Its nodes of object distance become nodes of the total defocus of green
+light, with the other channels shifted by their chromatic differences.
 
 References
 ----------
@@ -33,10 +33,10 @@ DISTANCES_DPT = (0.125, 8.125)
 
 
 def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
-    """Azimuths, elevations, pupils and accommodations.
+    """Return azimuths, elevations, pupils and accommodations.
 
-    Pupils and foci outside of the ranges in use become their ends.  Foci that the eye
-    meets with one and the same accommodation, as a myopic eye beyond its far point,
+    Pupils and foci outside the ranges in use are clamped to their ends.  Foci that the
+    eye meets with the same accommodation, as a myopic eye does beyond its far point,
     are one node.
     """
     settings, mode = spec.settings, spec.settings.mode
@@ -52,7 +52,7 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     used_dpt = np.unique(
         [eye.accommodation_dpt(f, pupil_diameter_mm=widest_mm) for f in foci_dpt]
     )
-    # Through smaller pupils the ends are met with other accommodations.
+    # The ends need other accommodations through smaller pupils.
     low_dpt, high_dpt = eye.accommodation_range_dpt(
         (float(foci_dpt[0]), float(foci_dpt[-1])),
         pupil_range_mm=(float(usable_mm[0]), widest_mm),
@@ -62,7 +62,7 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
 
 
 def paper_defocus(eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> DefocusNodes:
-    """Nodes of total defocus of groups, and the channels' shifts against them."""
+    """Return nodes of total defocus of groups, with the channels' shifts from them."""
     at_infinity_dpt = eye.total_defocus_dpt(
         h_deg=groups.h_deg[:, None],
         v_deg=groups.v_deg[:, None],

@@ -1,8 +1,8 @@
-"""Decides which PSFs a cache holds, and predicts their cost, before any is computed.
+"""Choice of the PSFs in a cache, and prediction of their cost, before computing any.
 
-A frame reads total defocus t within the range that its objects, focus and channels can
-reach, at the neighbouring nodes of pupil and accommodation; only that is planned, and
-for a stream only when a frame first reads those.
+A frame reads total defocus t within the range of its objects, focus and channels, at
+the neighboring nodes of pupil and accommodation.  Only that range is planned, and for a
+stream only when a frame first reads those nodes.
 """
 
 from collections.abc import Callable
@@ -76,7 +76,7 @@ __all__ = [
 ]
 
 USE_SAMPLES = 96
-"""States at which errors are predicted."""
+"""Number of states at which errors are predicted."""
 
 
 class PlanTooLarge(ValueError):
@@ -98,17 +98,16 @@ class PlanTooLarge(ValueError):
 
 
 def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
-    """Nodes over field, pupil, accommodation and defocus that frames can read.
+    """Return all nodes over field, pupil, accommodation and defocus for frames.
 
     Raises
     ------
     ProfileError
-        The eye is out of focus as no eye is.
+        If the eye's defocus is beyond that of any eye.
     GridTooLarge
-        One place, pupil and accommodation alone would need too many PSFs.
+        If one field position, pupil and accommodation alone needs too many PSFs.
     PlanTooLarge
-        The kernels would exceed ``spec.memory_budget_mb``; the message proposes what
-        to change.
+        If the kernels exceed ``spec.memory_budget_mb``; the message proposes a change.
     """
     plan = unchecked_plan(eye, spec)
     if plan.prediction.memory_mb > spec.memory_budget_mb:
@@ -123,14 +122,14 @@ def unchecked_plan(
     target_db: float | None = None,
     predict: bool = True,
 ) -> CachePlan:
-    """Plan like `plan_cache`, however large.
+    """Return a plan like `plan_cache`, without a limit of memory.
 
     Parameters
     ----------
     target_db : float, optional
-        What interpolation may cost; the spec's tolerance says where it is None.
+        PSNR to keep after interpolation; by default that of the spec's tolerance.
     predict : bool
-        Say what all of it would cost.
+        Predict the cost of the plan.
     """
     axes = plan_axes(eye, spec, target_db=target_db)
     plan = CachePlan(
@@ -152,17 +151,17 @@ def unchecked_plan(
 def plan_axes(
     eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
 ) -> PlanAxes:
-    """Nodes over field, pupil and accommodation that frames can read.
+    """Return the nodes over field, pupil and accommodation for frames.
 
     Parameters
     ----------
     target_db : float, optional
-        What interpolation may cost; the spec's tolerance says where it is None.
+        PSNR to keep after interpolation; by default that of the spec's tolerance.
 
     Raises
     ------
     ProfileError
-        The eye is out of focus as no eye is.
+        If the eye's defocus is beyond that of any eye.
     """
     allowed_error = target_error(spec)
     if target_db is not None:
@@ -178,9 +177,9 @@ def plan_axes(
 
 
 class NodePlanner:
-    """Plans the nodes of total defocus that belong to a plan's axes, state by state.
+    """Planner of the nodes of total defocus for a plan's axes, state by state.
 
-    What it plans of a state is the same whatever it has planned before.
+    The plan of a state does not depend on states planned before.
 
     Parameters
     ----------
@@ -194,7 +193,7 @@ class NodePlanner:
         self._known_dpt: dict[tuple[float, float], NDArray[np.float64]] = {}
 
     def all_nodes(self) -> PlanNodes:
-        """Nodes of all states, in C order [pupil, accommodation]."""
+        """Return the nodes of all states, in C order [pupil, accommodation]."""
         return PlanNodes.joined(
             [
                 self.nodes(pupil, used)
@@ -204,17 +203,17 @@ class NodePlanner:
         )
 
     def nodes(self, pupil: int, used: int) -> PlanNodes:
-        """Nodes of one state.
+        """Return the nodes of one state.
 
         Parameters
         ----------
         pupil, used : int
-            Numbers of the state's nodes of pupil and accommodation.
+            Indices of the state's nodes of pupil and accommodation.
 
         Raises
         ------
         GridTooLarge
-            Too many PSFs at one place.
+            If one field position needs too many PSFs.
         """
         eye, spec, axes = self.eye, self.spec, self.axes
         groups = self._groups(pupil, used)
@@ -252,7 +251,7 @@ class NodePlanner:
         )
 
     def _groups(self, pupil: int, used: int) -> PupilStates:
-        """Field nodes in a state, in green light without defocus."""
+        """Return the field nodes in a state, in green light without defocus."""
         h_deg, v_deg = self.axes.field_nodes_deg
         return PupilStates.of(
             h_deg=h_deg,
@@ -274,7 +273,7 @@ class NodePlanner:
     def _defocus_dpt(
         self, pupil_mm: float, accommodation_dpt: float
     ) -> NDArray[np.float64]:
-        """Total defocus (n_v, n_h, 3) of a state at infinity; neighbours share it."""
+        """Return the total defocus (n_v, n_h, 3) of a state at infinity, memoized."""
         state = pupil_mm, accommodation_dpt
         if state not in self._known_dpt:
             self._known_dpt[state] = self._defocus_of(
@@ -321,9 +320,9 @@ def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
 
 
 def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
-    """Nodes but those of defocus, with the mean square error left to it.
+    """Return nodes of all axes but defocus, with the mean square error left to it.
 
-    Axes with few nodes meet their share with some to spare; it goes to the others.
+    Axes with few nodes stay below their share; the remainder goes to the others.
     """
     eye, spec = use.eye, use.spec
     ranges = {
@@ -350,9 +349,9 @@ def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
 def _central_defocus(
     eye: EyeOptics, spec: GridSpec, readable: ReadableDefocus, pupil_mm: float
 ) -> DefocusNodes:
-    """Nodes on axis: by blur radius alone, far closer than any tolerance asks for.
+    """Return nodes on axis: by blur radius alone, far denser than tolerances require.
 
-    One distance seen in one state needs no more than the exact PSF of each channel.
+    One distance seen in one state needs only the exact PSF of each channel.
     """
     (exact_dpt,) = joined_ranges(readable.beside_shift_dpt)
     if np.ptp(exact_dpt) < EXACT_DPT:
@@ -366,7 +365,7 @@ def _central_defocus(
 def _nodes_by_blur(
     eye: EyeOptics, spec: GridSpec, pupil_mm: float, ranges_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Nodes over ranges (n, 2) of total defocus."""
+    """Return nodes over ranges (n, 2) of total defocus."""
     steps = {
         "blur_px_per_dpt": spec.blur_px_per_dpt(pupil_mm),
         "max_blur_step_px": spec.max_blur_step_px,
@@ -381,7 +380,7 @@ def _nodes_by_blur(
 
 
 def _advice(eye: EyeOptics, spec: GridSpec) -> str:
-    """Say which one setting makes the plan fit, and what it then needs."""
+    """Return text on which change of settings makes the plan fit, and its memory."""
     for words, smaller in _smaller_specs(spec):
         found = unchecked_plan(eye, smaller).prediction
         if found.memory_mb <= spec.memory_budget_mb:
@@ -398,7 +397,7 @@ def _mb(memory_mb: float) -> str:
 
 
 def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
-    """List changes that make a plan smaller, least painful first, each on top."""
+    """Return cumulative changes that make a plan smaller, least harmful first."""
     steps, words = [], []
 
     def step(text: str, **settings) -> None:

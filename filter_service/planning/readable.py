@@ -1,4 +1,4 @@
-"""Which defocus frames read at the nodes of a state."""
+"""Ranges of defocus that frames read at the nodes of a state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,27 +12,28 @@ from filter_service.planning.grid import GREEN, GridSpec
 from filter_service.planning.nodes import PlanAxes
 
 MAX_FIELD_STEP_DPT = 1.5
-"""Change of defocus to the next field node that a node's range follows.  Only where an
-eye hardly sees, as at the edge of a cataract, is it more; there the nodes' own ranges
-end the blend at equal blur, and far objects are read a little nearer."""
+"""Largest change of defocus to the next field node that a node's range covers.  It is
+larger only where an eye hardly sees, as at the edge of a cataract; there the nodes' own
+ranges limit the blend at equal blur, and far objects are read slightly nearer."""
 
 
 MAX_DEFOCUS_DPT = 1000.0
-"""Of an eye that looks at infinity.  More is no eye but a mistake in its profile, and
-the nodes of such a range would fill any memory."""
+"""Limit for an eye that looks at infinity.  More is an error in the profile, and the
+nodes of such a range would exceed any memory."""
 
 GAP_ROOM_DPT = 0.25
-"""Into the gap between two planes: as far as a frame's layers lie beside a plane."""
+"""Extension of ranges into the gap between two planes: the distance of a frame's layers
+from a plane."""
 
 
 def usable_pupils_mm(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
-    """Smallest and largest pupil of a spec that the eye knows."""
+    """Return the smallest and largest pupil of a spec that the eye supports."""
     low_mm, high_mm = spec.settings.pupil_range_mm
     return eye.usable_pupil_mm(low_mm), eye.usable_pupil_mm(high_mm)
 
 
 def used_accommodations_dpt(eye: EyeOptics, spec: GridSpec) -> tuple[float, float]:
-    """Smallest and largest accommodation of a spec."""
+    """Return the smallest and largest accommodation of a spec."""
     return eye.accommodation_range_dpt(
         spec.settings.focus_range_dpt, pupil_range_mm=usable_pupils_mm(eye, spec)
     )
@@ -45,9 +46,9 @@ class ReadableDefocus:
     Attributes
     ----------
     ranges_dpt : (n_groups, n_object_ranges, 3, 2)
-        Smallest and largest for each range of object distances and each channel.
+        Limits for each range of object distances and each channel.
     shift_dpt : (n_groups, 3)
-        Chromatic difference of the channels to green at each node.
+        Chromatic difference of the channels from green at each node.
     """
 
     ranges_dpt: NDArray[np.float64]
@@ -55,17 +56,17 @@ class ReadableDefocus:
 
     @property
     def of_any_channel_dpt(self) -> NDArray[np.float64]:
-        """Ranges (n_groups, n_object_ranges, 2) that hold all channels."""
+        """Ranges (n_groups, n_object_ranges, 2) that contain those of all channels."""
         return _hull(self.ranges_dpt)
 
     @property
     def beside_shift_dpt(self) -> NDArray[np.float64]:
-        """The same, of what is left when the channels' own shifts are taken off."""
+        """The same after subtracting the channels' own shifts."""
         return _hull(self.ranges_dpt - self.shift_dpt[:, None, :, None])
 
 
 def check_plan_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> None:
-    """Refuse an eye that is no eye somewhere in the field, before nodes are planned.
+    """Raise if defocus is out of range anywhere in the field, before planning nodes.
 
     Raises
     ------
@@ -82,14 +83,14 @@ def check_plan_defocus(eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> None:
 
 
 def check_defocus(defocus_dpt: NDArray[np.float64]) -> None:
-    """Refuse defocus that no eye has.
+    """Raise if defocus is larger than that of any eye.
 
     Raises
     ------
     ProfileError
     """
     largest_dpt = float(np.abs(defocus_dpt).max(initial=0.0))
-    if not largest_dpt <= MAX_DEFOCUS_DPT:  # NaN is none either
+    if not largest_dpt <= MAX_DEFOCUS_DPT:  # also true of NaN
         raise ProfileError(
             "profile",
             f"its eye is out of focus by {largest_dpt:.3g} dpt",
@@ -104,7 +105,7 @@ def _hull(ranges_dpt: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 DefocusOf = Callable[[float, float], NDArray[np.float64]]
-"""From a pupil and an accommodation to the total defocus (n_v, n_h, 3) at infinity."""
+"""Function from pupil and accommodation to total defocus (n_v, n_h, 3) at infinity."""
 
 
 def readable_defocus(
@@ -116,9 +117,10 @@ def readable_defocus(
     pupil: int,
     used: int,
 ) -> ReadableDefocus:
-    """Over objects, and over every accommodation and pupil that reads a state's nodes.
+    """Return the defocus read at a state's nodes, over objects and reading states.
 
-    A node is read by states up to its neighbours, a single one by all of its range.
+    A node is read by states up to its neighboring nodes, a single node by all states of
+    its range.
 
     Parameters
     ----------
@@ -126,7 +128,7 @@ def readable_defocus(
         Pupils and accommodations in use.
     defocus_of : callable
     pupil, used : int
-        Numbers of the state's nodes of pupil and accommodation.
+        Indices of the state's nodes of pupil and accommodation.
     """
     pupils_mm, reads_pupil, own_pupil = _readers(axes.pupils_mm, ranges[0], pupil)
     used_dpt, reads_used, own_used = _readers(axes.accommodations_dpt, ranges[1], used)
@@ -149,8 +151,8 @@ def readable_defocus(
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     objects_dpt = eye.vergence.vergence_dpt(_roomy(spec.object_ranges_dpt))
     near_far = np.stack([lows, highs], axis=-1)[..., None, :, :] + objects_dpt[:, None]
-    # A pupil between two nodes reads both at equal blur, up to the other's own; one
-    # with several foci reads them at the same defocus.
+    # A pupil between two nodes reads both at equal blur, up to the other node's own;
+    # with several foci, it reads both at the same defocus.
     if eye.rings is None:
         by = pupils_mm[reads_pupil] / pupils_mm[own_pupil]
         near_far = near_far * by[:, None, None, None]
@@ -164,7 +166,7 @@ def readable_defocus(
 
 
 def _roomy(ranges_dpt: list[tuple[float, float]]) -> NDArray[np.float64]:
-    """Ranges (n, 2) with room towards each other."""
+    """Return ranges (n, 2) extended toward each other."""
     found = np.array(ranges_dpt)
     found[1:, 0] -= GAP_ROOM_DPT
     found[:-1, 1] += GAP_ROOM_DPT
@@ -174,13 +176,13 @@ def _roomy(ranges_dpt: list[tuple[float, float]]) -> NDArray[np.float64]:
 def _readers(
     nodes: NDArray[np.float64], range_: tuple[float, float], node: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
-    """Values at which to ask for defocus, which of them read a node, its place."""
+    """Return values at which to evaluate defocus, which read a node, and its index."""
     if len(nodes) > 1:
         first = max(node - 1, 0)
         values = nodes[first : node + 2]
         return values, np.ones(values.size, bool), node - first
     values = np.unique(np.append(nodes, range_))
-    # A measured wavefront has its node at rest, beside the range that is read.
+    # A measured wavefront has its node at rest, outside the range that is read.
     is_read = (values >= range_[0]) & (values <= range_[1])
     return values, is_read, int(np.searchsorted(values, nodes[0]))
 
@@ -188,7 +190,7 @@ def _readers(
 def _over_neighbours(
     values: NDArray[np.float64], axis: int, extreme
 ) -> NDArray[np.float64]:
-    """Extremes of each field node and those beside it along an axis."""
+    """Return extremes over each field node and its neighbors along an axis."""
     count = values.shape[axis]
     return np.stack(
         [
@@ -200,7 +202,7 @@ def _over_neighbours(
 
 
 def joined_ranges(ranges_dpt: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Ranges (n, 2) of each group, ascending; those that overlap are one.
+    """Return ranges (n, 2) of each group, ascending, with overlapping ones merged.
 
     Parameters
     ----------

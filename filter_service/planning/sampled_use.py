@@ -1,4 +1,4 @@
-"""What frames will ask of a cache, sampled, and how far blended PSFs miss it there."""
+"""Sampled states of the frames of a cache, and the errors of blended PSFs there."""
 
 from dataclasses import dataclass, replace
 
@@ -25,7 +25,7 @@ FIELD_OF_AXIS = {
 }
 
 _PLASTIC = 1.1127756842787055
-"""Root of x^7 = x + 1: its powers fill six dimensions evenly (R-sequence)."""
+"""Root of x^7 = x + 1, whose powers fill six dimensions evenly (R-sequence)."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Use:
     ----------
     states : PupilStates
     vergence_dpt : (P,)
-        Of the object, at the cornea.
+        Vergence of the object, at the cornea.
     pixel_from_mrad : (P, 2, 2) or None
-        Scale of the image there, where frames map stored kernels to it.  None without
-        a range of gaze: between the nodes around a pixel the scale changes so little
-        that to map a kernel costs as much as it gains.
+        Local scale of the image, if frames map stored kernels to it.  None without a
+        range of gaze: between the nodes around a pixel the scale changes so little that
+        mapping a kernel costs as much as it gains.
     exact_px : (P, n, 2)
-        Slopes, px.
+        Slopes of the exact PSFs, px.
     """
 
     eye: EyeOptics
@@ -58,7 +58,7 @@ class Use:
         return unit_px(self.spec, self.states)
 
     def taken(self, index: NDArray[np.int64]) -> "Use":
-        """Return some of the states, in any order."""
+        """Return a selection of the states, in any order."""
         return replace(
             self,
             states=self.states.taken(index),
@@ -71,7 +71,7 @@ class Use:
 
 
 def unit_px(spec: GridSpec, states: PupilStates) -> NDArray[np.float64]:
-    """Lambda over pupil diameter (P,) in pixels of the camera's axis."""
+    """Return lambda over pupil diameter (P,) in pixels of the camera's axis."""
     unit_mrad = states.wavelength_nm / 1e3 / states.pupil_diameter_mm  # um/mm
     return unit_mrad / min(spec.pixel_pitch_mrad)
 
@@ -79,8 +79,8 @@ def unit_px(spec: GridSpec, states: PupilStates) -> NDArray[np.float64]:
 def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
     """Sample states evenly: image positions, pupils, foci, distances and channels.
 
-    Half of the objects are where the eye focuses, where interpolation shows most; the
-    others anywhere in the range.
+    Half of the objects are in focus, where interpolation errors are most visible; the
+    others are anywhere in the range.
     """
     steps = 1.0 / _PLASTIC ** np.arange(1, 7)
     unit = (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
@@ -125,7 +125,7 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
 
 
 def _nearest_object_dpt(spec: GridSpec, focused_dpt: NDArray) -> NDArray[np.float64]:
-    """Objects (P,) nearest to where the eye focuses."""
+    """Return the object distances (P,) nearest to the eye's focus."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     found = np.clip(focused_dpt[:, None], ranges_dpt[:, 0], ranges_dpt[:, 1])
     best = np.abs(found - focused_dpt[:, None]).argmin(axis=1)
@@ -133,7 +133,7 @@ def _nearest_object_dpt(spec: GridSpec, focused_dpt: NDArray) -> NDArray[np.floa
 
 
 def _objects_dpt(spec: GridSpec, share: NDArray) -> NDArray[np.float64]:
-    """Objects (P,) at shares of the way through the ranges, one after the other."""
+    """Return the object distances (P,) at shares of the concatenated ranges."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     steps = share * len(ranges_dpt)
     number = np.minimum(steps.astype(int), len(ranges_dpt) - 1)
@@ -144,9 +144,9 @@ def _objects_dpt(spec: GridSpec, share: NDArray) -> NDArray[np.float64]:
 def _seen_directions(
     spec: GridSpec, x: NDArray, y: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Field directions (P,) at image positions in 0..1, and the image's scale there.
+    """Return field directions (P,) and scales at image positions in 0..1.
 
-    One after the other they take the directions of gaze that frames may have.
+    The positions cycle through the gaze directions that frames may have.
     """
     if not spec.follows_field:
         zeros = np.zeros(x.size)
@@ -170,9 +170,9 @@ def _seen_directions(
 
 
 def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
-    """Neighbouring states (P,) at which a frame's states are read along an axis.
+    """Return the states (P,) at which a frame's states are read along an axis.
 
-    Along the field and accommodation the total defocus stays, along the pupil the
+    Along the field and accommodation the total defocus is kept; along the pupil the
     geometric blur, or with several foci the defocus.  The paper's grids are read at the
     distance of the object.
     """
@@ -186,19 +186,19 @@ def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
 
 
 def _blur_scale(use: Use, pupils_mm: NDArray) -> NDArray[np.float64]:
-    """Defocus (P,) at which pupils are read, over that of the states."""
-    if use.eye.rings is not None:  # foci stay where they are in any pupil
+    """Return the ratio (P,) of the defocus at which pupils are read to the states'."""
+    if use.eye.rings is not None:  # foci are the same in any pupil
         return np.ones(pupils_mm.shape)
     return use.states.pupil_diameter_mm / pupils_mm
 
 
 def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
-    """Mean square error of the states when one axis is interpolated between nodes."""
+    """Return the mean square error when one axis is interpolated between nodes."""
     return axis_errors(use, axis, [nodes])[0]
 
 
 def axis_errors(use: Use, axis: str, choices: list[NDArray]) -> list[float]:
-    """Return the same of several choices of nodes; an eye is asked once for all."""
+    """Return `axis_error` of several choices of nodes, evaluating the eye once."""
     found = [
         bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]]) for nodes in choices
     ]
@@ -214,7 +214,7 @@ def axis_errors(use: Use, axis: str, choices: list[NDArray]) -> list[float]:
 
 
 def defocus_error(use: Use, plan: CachePlan) -> float:
-    """Mean square error of the states when defocus is interpolated within its groups.
+    """Return the mean square error when defocus is interpolated within its groups.
 
     Each state reads the group of its nearest field, pupil and accommodation.
     """
@@ -262,14 +262,14 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
 
 
 def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
-    """Mean square error with all lower neighbours and then all upper ones."""
+    """Return the mean square error; neighbors are all lower, then all upper ones."""
     return float(_errors_of(use, neighbours, share).mean())
 
 
 def _errors_of(
     use: Use, neighbours: PupilStates, share: NDArray
 ) -> NDArray[np.float64]:
-    """Square errors (P,) of states with all lower neighbours, then all upper ones."""
+    """Return square errors (P,); neighbors are all lower, then all upper ones."""
     found = np.zeros(share.size)
     for light_ratio, added_dpt in light_of_foci(use):
         lower_px, upper_px = np.split(
@@ -288,10 +288,10 @@ def _errors_of(
 
 
 def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Light and power, dpt, (P,) of each focus that an eye has.
+    """Return the light and power, dpt, (P,) of each focus of an eye.
 
-    What blending costs an image is that of each focus times its light, as amplitudes:
-    where one is sharp the others hardly err.
+    The blending error of an image is that of each focus times its light, as amplitudes:
+    where one focus is sharp, the others contribute little.
     """
     states, rings = use.states, use.eye.rings
     if rings is None:
@@ -311,7 +311,7 @@ def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float6
 def focus_slopes_px(
     use: Use, states: PupilStates, added_dpt: NDArray
 ) -> NDArray[np.float64]:
-    """Slopes (m P, n, 2), px, of light for a focus, in the pixels of a use's states."""
+    """Return slopes (m P, n, 2), px, of light for a focus, in pixels of the states."""
     count = states.h_deg.size // use.states.h_deg.size
     scale = use.pixel_from_mrad
     if scale is not None:

@@ -1,7 +1,7 @@
-"""Slopes of wavefronts over their pupils, in pixels: what a PSF will look like.
+"""Slopes of wavefronts over their pupils, in pixels, as geometric models of PSFs.
 
-Where a ray of the pupil lands is the slope of its wavefront; PSFs differ by how far
-their rays lie apart, point by point of the pupil.
+The landing point of a ray is the slope of its wavefront; the difference of two PSFs is
+the distance between their rays at the same points of the pupil.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ N_RINGS, N_AZIMUTHS = 5, 16
 
 
 def apodisation(eye: EyeOptics, spec: GridSpec) -> StilesCrawford | None:
-    """Return how cones weigh an eye's pupil; None where all of it counts alike."""
+    """Return the Stiles-Crawford weights of an eye's pupil, or None if disabled."""
     if not spec.settings.stiles_crawford:
         return None
     return StilesCrawford.of_eye(eye.eye_side)
@@ -33,12 +33,12 @@ def state_frames(
     *,
     pixel_from_mrad: NDArray | None = None,
 ) -> PupilFrames:
-    """Pupils and wavefronts of states (P,), in the coordinates of the pixels.
+    """Return pupils and wavefronts of states (P,), in pixel coordinates.
 
     Parameters
     ----------
     pixel_from_mrad : (P, 2, 2), optional
-        Pixels other than those that kernels of these states are stored in.
+        Pixel scale; by default the one in which kernels of these states are stored.
     """
     if pixel_from_mrad is None:
         pixel_from_mrad = spec.node_pixel_from_mrad(states.h_deg, states.v_deg)
@@ -55,7 +55,7 @@ def state_frames(
 
 
 def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSurvey:
-    """Slopes of states (P,) and how far their light goes, rings of a lens and all."""
+    """Return slopes of states (P,) and the extent of their light, with lens rings."""
     survey = survey_pupils(state_frames(eye, spec, states))
     if eye.rings is None:
         return survey
@@ -71,11 +71,11 @@ def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSu
 
 
 LEAST_LIGHT = 0.02
-"""Of a focus: with less it is planned for as with this."""
+"""Smallest share of a focus in planning; smaller shares are raised to it."""
 
 
 def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
-    """Total defocus (n,) at which some channel is sharp."""
+    """Return the total defocus (n,) at which some channel is sharp."""
     if eye.rings is None:
         return np.zeros(1)
     channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
@@ -85,7 +85,7 @@ def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
 def main_light_ratio(
     eye: EyeOptics, spec: GridSpec, radius_mm: NDArray
 ) -> NDArray[np.float64]:
-    """Share (n, P) of its channel's light that has each focus, in pupils (P,)."""
+    """Return each focus's share (n, P) of its channel's light, in pupils (P,)."""
     if eye.rings is None:
         return np.ones((1, radius_mm.size))
     channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
@@ -94,10 +94,10 @@ def main_light_ratio(
 
 
 def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:
-    """Weights (n,) and slopes (28, n) of every monomial over the unit disc."""
+    """Return weights (n,) and slopes (28, n) of every monomial over the unit disc."""
     node, weight = np.polynomial.legendre.leggauss(N_RINGS)
     radius = np.sqrt((node + 1.0) / 2.0)[:, None]
-    # Every ring turned by its own angle, so that rings do not line up.
+    # Each ring is rotated by its own angle, so that rings do not line up.
     turn = np.arange(N_RINGS)[:, None] / N_RINGS
     angle = 2.0 * np.pi * (np.arange(N_AZIMUTHS) + turn) / N_AZIMUTHS
     x, y = (radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()
@@ -110,14 +110,15 @@ def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:
 
 
 WEIGHTS, _SLOPE_X, _SLOPE_Y = _sample_slopes()
-"""Shares (n,) of the pupil that its sample points stand for.
+"""Shares (n,) of the pupil that its sample points represent.
 
-Alike also where cones see the rim dimmer: the points that move most then count for
-less, and blended PSFs measured 0.2 to 0.8 dB better than without (three presets)."""
+They stay the same with the Stiles-Crawford effect: the points that move most then count
+for less, and blended PSFs measured 0.2 to 0.8 dB better than without (three presets).
+"""
 
 
 def slopes_px(frames: PupilFrames) -> NDArray[np.float64]:
-    """Slopes (P, n, 2), px, x right and y up, at the same points of each pupil."""
+    """Return slopes (P, n, 2), px, x right, y up, at the same points of each pupil."""
     along_x = frames.disc_polynomial_um @ _SLOPE_X
     along_y = frames.disc_polynomial_um @ _SLOPE_Y
     shear = frames.shear_ratio[:, None]

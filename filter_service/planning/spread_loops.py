@@ -1,4 +1,4 @@
-"""Nodes spread over ranges by ladders: a compiled loop for all groups of a plan."""
+"""Compiled loops that distribute nodes over ranges, for all groups of a plan."""
 
 import math
 
@@ -14,7 +14,7 @@ from filter_service.planning.error_law import (
 )
 
 CHANGE = 1e-4
-"""Of a squared difference, at which its iteration ends."""
+"""Relative change of a squared difference at which its iteration ends."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -30,18 +30,18 @@ def needed_intervals(
     error,
     needed,
 ):
-    """Write intervals (n, n_ladder) needed up to each step through ranges (n,).
+    """Write the intervals (n, n_ladder) needed up to each step through ranges (n,).
 
     Twin: `error_law.allowed_difference_px` at the middle of each step.
 
     Parameters
     ----------
     covariance, unit_px, light_ratio, foci_dpt
-        Of groups, see `defocus_nodes._Rays`.
+        Arrays of groups, see `defocus_nodes._Rays`.
     index, lows, highs : (n,)
         Group and ends of each range.
     shifts : (n_shifts, n)
-        What channels add to the defocus of nodes.
+        Shifts of channels, added to the defocus of nodes.
     error : float
         RMS error half-way between nodes.
     """
@@ -78,22 +78,22 @@ def needed_intervals(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spread_nodes(lows, highs, needed, exact):
-    """Nodes of all ranges one after the other, ascending in each, and their numbers.
+    """Return the nodes of all ranges, concatenated and ascending, and their counts.
 
     Parameters
     ----------
     lows, highs : (n,)
     needed : (n, n_ladder)
-        Intervals needed up to each step of the way through a range.
+        Intervals needed up to each step through a range.
     exact : float
-        A range as narrow as this has one node.
+        Ranges narrower than this have one node.
     """
     n_ladder = needed.shape[1]
     counts = np.empty(lows.size, np.int64)
     for k in range(lows.size):
         if highs[k] - lows[k] < exact:
             counts[k] = 1
-        elif not needed[k, -1] > 0.0:  # PSFs are so wide that no difference shows
+        elif not needed[k, -1] > 0.0:  # PSFs so wide that no difference is visible
             counts[k] = 2
         else:
             counts[k] = 1 + max(1, math.ceil(needed[k, -1] - 1e-9))
@@ -113,7 +113,7 @@ def spread_nodes(lows, highs, needed, exact):
                 rise = needed[k, step + 1] - needed[k, step]
                 share = (wanted - needed[k, step]) / rise if rise > 0.0 else 0.0
                 value = low + (high - low) * (step + share) / (n_ladder - 1)
-            if value > nodes[at - 1]:  # ends that differ by a rounding error are one
+            if value > nodes[at - 1]:  # merges ends that differ by a rounding error
                 nodes[at] = value
                 at += 1
         counts[k] = at - first

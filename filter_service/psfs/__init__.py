@@ -1,23 +1,23 @@
-"""PSFs on the nodes of a plan: computed on demand, packed, read for a frame.
+"""PSFs at the nodes of a plan: computed on demand, packed, interpolated for frames.
 
-eye_for_spec         the eye of a profile, for what a cache covers
+eye_for_spec         the eye of a profile over the ranges of a cache
 compute_kernels      from nodes to packed kernels
-psf_engine           in C, or in Python
+psf_engine           choice of the PSF engine: C or Python
 native_psfs          the engine in C
-boxes                what kernels are cut to
-pack                 kernels cut to boxes, in 16 bits
+boxes                boxes that kernels are cropped to
+pack                 kernels cropped to boxes, in 16 bits
 store                the PSFs of an eye
-frame_layers         how a state reads them, and the layers of a frame
+frame_layers         interpolation for a state, and the layers of a frame
 field_defocus        change of defocus over the field
-read_kernels         which cached kernels a state reads, as plain arrays
-read_loops           the compiled loops that read them
-layer_loops          where a frame's layers lie
-store_cache          eyes and nodes kept on disk
-cache_folder         where, if anywhere
-kept_eyes            whose, to be listed and erased
+read_kernels         the cached kernels that a state reads, as plain arrays
+read_loops           compiled loops that read them
+layer_loops          placement of a frame's layers
+store_cache          on-disk cache of eyes and nodes
+cache_folder         location of the on-disk cache
+kept_eyes            listing and erasing of cached eyes
 store_codec          objects as JSON and arrays
-store_file           the file they go to
-picture              a kernel as a picture
+store_file           file format of the on-disk cache
+picture              image of a kernel
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Where finished PSFs are kept on disk, if anywhere."""
+"""Folder of the on-disk cache, if there is one."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ CACHE_VARIABLE = "OCUFILTER_CACHE_DIR"
 
 
 def default_cache_dir() -> str:
-    """Return where finished PSFs are kept if nothing else is said: nowhere.
+    """Return the default folder of the on-disk cache: none, unless the variable is set.
 
-    They tell of a person's eyes, so that it is for somebody to decide.
+    The files reveal a person's eyes, so keeping them requires a decision.
     """
     return os.environ.get(CACHE_VARIABLE, "")
 
 
 def check_is_private(folder: Path) -> None:
-    """Refuse a folder that others may look into.
+    """Raise if other users have access to a folder.
 
     Raises
     ------

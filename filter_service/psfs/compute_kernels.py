@@ -1,4 +1,4 @@
-"""Computes the kernels of a store: from the wavefronts of nodes to packed PSFs."""
+"""Computation of a store's kernels: from the wavefronts of nodes to packed PSFs."""
 
 import os
 from collections import Counter
@@ -36,23 +36,23 @@ def computed_kernels(
     Parameters
     ----------
     psfs : (n,)
-        Numbers: node n and channel c have PSF 3 n + c.
+        Indices of PSFs: node n and channel c have PSF 3 n + c.
     rings : NodeRings, optional
-        Those of the eye at the nodes.
+        Rings of the eye's lens at the nodes.
 
     Returns
     -------
     kernels : PackedKernels
-        Of the n PSFs.
+        Kernels of the n PSFs.
     methods : Counter
         PSFs by the method that computed the larger share of each.
 
     Raises
     ------
     PsfTooLarge
-        A PSF blurs farther than ``spec.max_blur_radius_px``.
+        If a PSF blurs farther than ``spec.max_blur_radius_px``.
     ValueError
-        No light arrives within a kernel.
+        If no light arrives within a kernel.
     """
     groups, channels = nodes.defocus.group_at(psfs // RGB), psfs % RGB
     total_dpt = nodes.defocus.values_dpt[psfs // RGB]
@@ -87,7 +87,7 @@ def generic_kernels(
     channels: NDArray[np.int64],
     total_dpt: NDArray[np.float64],
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute PSFs (n,) by batches of whole kernels, which are cut afterwards."""
+    """Compute PSFs (n,) in batches of whole kernels, and crop those afterwards."""
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)
@@ -114,22 +114,22 @@ def generic_kernels(
 
 @cache
 def pack_pool() -> ThreadPoolExecutor:
-    """Threads that cut kernels."""
+    """Return the thread pool that crops kernels."""
     return ThreadPoolExecutor(thread_count())
 
 
-os.register_at_fork(after_in_child=pack_pool.cache_clear)  # no thread goes along
+os.register_at_fork(after_in_child=pack_pool.cache_clear)  # threads are not inherited
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:
-    """PSFs by the method that has the larger share in them."""
+    """Count PSFs by the method that has the larger share in them."""
     by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
     counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
     return Counter({name: number for name, number in counts.items() if number})
 
 
 def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
-    """Return a batch (P,) of the means of so many kernels each, of (count P,)."""
+    """Return a batch (P,) of means over ``count`` consecutive kernels each."""
     if count == 1:
         return batch
 

@@ -1,4 +1,4 @@
-"""The eye of a profile, over the pupils, foci and directions that a cache is for."""
+"""The eye of a profile, over the pupils, foci and directions of a cache."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,17 +29,17 @@ def eye_for_spec(
     progress: Callable[[float, str], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> tuple[EyeOptics, tuple[str, ...]]:
-    """Return the eye and what to say about it, see `estimator.prepare_eye`.
+    """Return the eye and notes about it; see `estimator.prepare_eye`.
 
     Parameters
     ----------
     cancelled : callable, optional
-        Asked at every step.
+        Called at every step.
 
     Raises
     ------
     ValueError
-        An eye that light does not pass.
+        If light does not pass the eye.
     BuildCancelled
     """
 
@@ -84,6 +84,6 @@ def _check_diffracts(diffraction: bool) -> None:
 
 
 def _with_axis(ranges_deg: FieldRange) -> FieldRange:
-    """Return field ranges that hold the axis, where eyes focus, wherever they look."""
+    """Return field ranges extended to contain the axis, where eyes focus."""
     (left, right), (down, up) = ranges_deg
     return (min(left, 0.0), max(right, 0.0)), (min(down, 0.0), max(up, 0.0))

@@ -1,4 +1,4 @@
-"""How defocus changes over the field of an eye in one state."""
+"""Change of defocus over the field of an eye in one state."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,17 +14,18 @@ if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
 COLUMNS, ROWS = 17, 11
-"""Directions at which the eye is asked.  Between them, over +-40 x 25 deg at 5 mm, the
-spline is within 0.011 dpt (emmetropia), 0.022 (keratoconus) and 0.030 (myopia), worst
-in the corners, beyond where people were measured, and 99 % within 0.008, 0.014 and
-0.021.  With 13 x 9 it is 0.055 in myopia, and a new state takes 0.1 ms less."""
+"""Number of directions at which the eye is evaluated.  Between them, over +-40 x 25 deg
+at 5 mm, the spline is within 0.011 dpt (emmetropia), 0.022 (keratoconus) and 0.030
+(myopia), worst in the corners, beyond where people were measured, and 99 % within
+0.008, 0.014 and 0.021.  With 13 x 9 it is 0.055 in myopia, and a new state takes 0.1 ms
+less."""
 
 
 class FieldAxes:
-    """Directions at which the eye is asked, and the spline between them.
+    """Directions at which the eye is evaluated, and the spline between them.
 
-    A spline through values is a sum of those through one 1 among zeros, which are the
-    same whatever the values: so a new state costs a product.
+    A spline through values is a linear combination of cardinal splines, which do not
+    depend on the values, so a new state costs a matrix product.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ class FieldAxes:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of rows and columns."""
+        """Number of rows and columns."""
         return self.v_deg.size, self.h_deg.size
 
     @cached_property
@@ -51,7 +52,7 @@ class FieldAxes:
     def weights(
         self, h_deg: ArrayLike, v_deg: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weights (..., n_v) and (..., n_h) at directions; the border's beyond it."""
+        """Return weights (..., n_v) and (..., n_h) at clamped directions."""
         h_deg, v_deg = np.broadcast_arrays(h_deg, v_deg)
         if self.shape == (1, 1):
             return np.ones((*h_deg.shape, 1)), np.ones((*h_deg.shape, 1))
@@ -64,7 +65,7 @@ class FieldAxes:
 
 @dataclass(frozen=True)
 class FieldDefocus:
-    """Total defocus over the field, against that of the direction of gaze.
+    """Total defocus over the field, relative to that in the gaze direction.
 
     Attributes
     ----------
@@ -77,7 +78,7 @@ class FieldDefocus:
 
     @classmethod
     def none(cls) -> "FieldDefocus":
-        """Return that of an eye whose defocus is the same everywhere."""
+        """Return the field defocus of an eye with constant defocus."""
         return cls(FieldAxes(np.zeros(1), np.zeros(1)), np.zeros((1, 1)))
 
     @property
@@ -86,17 +87,17 @@ class FieldDefocus:
         return float(self.change_dpt.min()), float(self.change_dpt.max())
 
     def at(self, h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
-        """Change (...) in dpt at field directions; at the border's beyond it."""
+        """Return the change (...), dpt, at field directions, clamped to the range."""
         return self.of_weights(self.axes.weights(h_deg, v_deg))
 
     def of_weights(self, weights: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
-        """Change (...) where `FieldAxes.weights` were taken."""
+        """Return the change (...) for weights of `FieldAxes.weights`."""
         of_rows, of_columns = weights
         return ((of_rows @ self.change_dpt) * of_columns).sum(axis=-1)
 
 
 class EyeDefocus:
-    """Defocus of an eye at field nodes and over the field, one state after the other.
+    """Defocus of an eye at field nodes and over the field, evaluated state by state.
 
     Parameters
     ----------
@@ -130,9 +131,9 @@ class EyeDefocus:
     def state(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> tuple[NDArray[np.float64], FieldDefocus]:
-        """Total defocus (n_fields, 3) for an object at infinity; and over the field.
+        """Return the total defocus (n_fields, 3) at infinity, and that over the field.
 
-        Over the field it is that of green light.
+        The latter is that of green light.
         """
         at_infinity_dpt = self._defocus_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
@@ -146,16 +147,16 @@ class EyeDefocus:
         return nodes_dpt, FieldDefocus(self._axes, change_dpt.reshape(ROWS, COLUMNS))
 
     def change_at_nodes_dpt(self, change: FieldDefocus) -> NDArray[np.float64]:
-        """Change of a state (n_fields, 1) at the field nodes."""
+        """Return the change (n_fields, 1) of a state at the field nodes."""
         if self._axes is None:
             return np.zeros((self._node_shape[0], 1))
         return change.of_weights(self._node_weights)[:, None]
 
 
 def _directions(h_deg: NDArray, v_deg: NDArray) -> tuple[NDArray, NDArray]:
-    """Azimuths and elevations of a grid, rows first; and of the direction of gaze.
+    """Return azimuths and elevations of a grid, by rows, and of the gaze direction.
 
-    That is asked too: it may lie outside of the camera's image.
+    The gaze direction is included because it may lie outside the camera's image.
     """
     return (
         np.append(np.tile(h_deg, v_deg.size), _nearest(h_deg)),

@@ -1,4 +1,4 @@
-"""How an eye in one state reads its PSFs, and the layers of a frame."""
+"""Interpolation of PSFs for one state of an eye, and the layers of a frame."""
 
 from bisect import bisect_left
 from dataclasses import dataclass
@@ -18,29 +18,28 @@ from filter_service.psfs.store import PsfStore
 
 @dataclass(frozen=True)
 class FrameLayers:
-    """How an eye in one state reads its PSFs, and the layers that frames then have.
+    """PSFs that one state of an eye reads, and the layers of its frames.
 
     Attributes
     ----------
     layer_dpt : (n_layers,)
-        Ascending: an object's vergence plus the change of defocus over the field, so
-        that at one layer field nodes have the same defocus and are blended at equal
-        blur.
+        Object vergence plus the change of defocus over the field, ascending.  At one
+        layer, field nodes thus have the same defocus and are blended at equal blur.
     vergence : ObjectVergence
-        From distances of objects to vergences.
+        Conversion from object distances to vergences.
     field : FieldDefocus
-        That change; none in the paper's grids, whose nodes are object distances.
+        Change of defocus; none in the paper's grids, whose nodes are object distances.
     vergence_range_dpt : (low, high)
-        Vergences that the layers are for.
+        Vergences that the layers cover.
     layer_zero_dpt : (n_fields, 3)
         Total defocus at layer 0 dpt, per field node and channel.
     reads : StateReads
-        Cached neighbours of the state.
+        Cached neighbors of the state.
     layer_blur_px : (n_layers,)
         Largest geometric blur radius over field and channels.
     edge_reach_px : float
-        How much farther than rays a kernel reaches: the diffraction at the pupil's edge
-        that ``spec.kept_energy_ratio`` keeps.
+        Reach of a kernel beyond the rays: the diffraction at the pupil's edge that
+        ``spec.kept_energy_ratio`` keeps.
     """
 
     layer_dpt: NDArray[np.float64]
@@ -57,7 +56,7 @@ class FrameLayers:
     notes: tuple[str, ...]
 
     def reach_px(self, low_dpt: float, high_dpt: float, *, max_px: int) -> int:
-        """Bound how far light of objects between two distances is spread, px."""
+        """Return a bound on the spread, px, of light from objects in a range."""
         low, high = (float(self.vergence.vergence_dpt(d)) for d in (low_dpt, high_dpt))
         change_low, change_high = self.field.range_dpt
         first, last = np.searchsorted(
@@ -78,14 +77,14 @@ def frame_layers(
 ) -> FrameLayers:
     """Plan a frame's layers for a pupil and focus.
 
-    The pupil is clamped to the cache's range and to what was measured, with a note.
+    The pupil is clamped to the cache's range and the measured pupil, with a note.
 
     Parameters
     ----------
     object_range_dpt : (low, high), optional
-        Distances in the frame; default and limit is the cache's range.
+        Distances in the frame; the default and limit is the cache's range.
     step_ratio : float
-        Steps between layers against the usual.
+        Steps between layers, relative to the default.
 
     References
     ----------
@@ -142,7 +141,7 @@ def frame_layers(
 
 
 def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
-    """Distance beyond the rays that holds all but the light that kernels may drop.
+    """Return the distance beyond the rays outside which kernels may drop the light.
 
     A circular pupil of diameter D sends 2 lambda / (pi² D r) of its light farther than
     r from the spot's edge.
@@ -156,7 +155,7 @@ def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
 
 
 def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64]:
-    """Return where layers of several planes end: in the gaps are no PSFs."""
+    """Return the ends of the layers of several planes; gaps have no PSFs."""
     ranges_dpt = store.spec.object_ranges_dpt
     if len(ranges_dpt) == 1:
         return np.zeros(0)
@@ -192,10 +191,10 @@ def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tup
 def _corners(
     plan: PlanAxes, pupil_mm: float, accommodation_dpt: float
 ) -> tuple[tuple[int, int, float], ...]:
-    """Nodes of pupil and accommodation around a state, and their weights.
+    """Return nodes of pupil and accommodation around a state, with their weights.
 
-    The corners of a triangle, as `planning.nodes.triangle` has them; in plain numbers,
-    which costs a tenth.
+    They are the corners of a triangle as in `planning.nodes.triangle`, computed with
+    scalars, which takes a tenth of the time.
     """
     pupil, next_pupil, part = _bracket(plan.pupils_mm, pupil_mm)
     used, next_used, used_part = _bracket(plan.accommodations_dpt, accommodation_dpt)
@@ -222,7 +221,7 @@ def _bracket(nodes: NDArray, value: float) -> tuple[int, int, float]:
 def _in_focus_dpt(
     store: PsfStore, at_infinity_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Vergences at which some channel is sharp; at several foci, where an eye has."""
+    """Return vergences at which some channel is sharp, for all foci of the eye."""
     if store.eye.rings is None:
         return -at_infinity_dpt
     channels_nm = store.spec.channel_wavelengths_nm.tolist()
@@ -237,7 +236,7 @@ def _in_focus_dpt(
 def _state_reads(store: PsfStore, pupil_mm: float, corners: tuple) -> StateReads:
     plan = store.plan
     scales = np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners])
-    if store.eye.rings is not None:  # foci stay where they are in any pupil
+    if store.eye.rings is not None:  # foci are the same in any pupil
         scales = np.ones(len(corners))
     return StateReads(
         groups=store.groups_of([(pupil, used) for pupil, used, _ in corners]),

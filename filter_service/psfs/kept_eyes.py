@@ -1,4 +1,4 @@
-"""Whose PSFs are kept on disk, to be listed and erased."""
+"""Listing and erasing of the eyes in the on-disk cache."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from filter_service.psfs.store_cache import BETWEEN, SUFFIX
 
 @dataclass(frozen=True)
 class KeptEye:
-    """What is kept of one eye.
+    """Files of one eye in the on-disk cache.
 
     Attributes
     ----------
     name : str
-        A hash of its profile.
+        Hash of the eye's profile.
     n_files, size_bytes : int
-        One file for each camera and setting that it was prepared for.
+        Number and size of the files, one for each camera and setting.
     used_s : float
-        When the last of them was used, in seconds since 1970.
+        Time of the last use, in seconds since 1970.
     """
 
     name: str
@@ -30,7 +30,7 @@ class KeptEye:
 
 
 def kept_eyes(folder: Path) -> list[KeptEye]:
-    """Return the eyes that are kept in a folder, the one used last first.
+    """Return the eyes cached in a folder, most recently used first.
 
     Raises
     ------
@@ -51,9 +51,9 @@ def kept_eyes(folder: Path) -> list[KeptEye]:
 
 
 def erase_eyes(folder: Path, name: str = "") -> int:
-    """Remove what is kept of the eyes whose names begin so; return how many files.
+    """Remove cached eyes whose names start with ``name``; return the number of files.
 
-    A service that has such an eye in use goes on with it until its client leaves.
+    A service that is using such an eye continues until its client disconnects.
     """
     removed = [path for path in _stores(folder) if path.name.startswith(name)]
     for path in removed:
@@ -68,7 +68,7 @@ def _stores(folder: Path) -> list[Path]:
 
 
 def _is_store(path: Path) -> bool:
-    """Tell our files from folders and links under such names."""
+    """Return whether a path is a store, not a folder or link with such a name."""
     try:
         return path.suffix == SUFFIX and stat.S_ISREG(path.lstat().st_mode)
     except FileNotFoundError:  # a service has removed it

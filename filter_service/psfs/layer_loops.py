@@ -1,4 +1,4 @@
-"""Where the layers of a frame lie: a compiled loop, once for each new state."""
+"""Compiled loop that places the layers of a frame, run once for each new state."""
 
 import math
 
@@ -17,26 +17,27 @@ from filter_service.psfs.read_loops import layer_blur_px
 def layer_distances_dpt(
     tables, reads, zero_dpt, range_dpt, ends_dpt, blur_px_per_dpt, blur_ratio, pace
 ):
-    """Vergences (n_layers,) of a frame's layers, ascending, over a range of them.
+    """Return the vergences (n_layers,) of a frame's layers over a range, ascending.
 
     Parameters
     ----------
     zero_dpt : (n_fields, 3)
         Total defocus of field nodes and channels at 0 dpt.
     ends_dpt : (n,)
-        Those that become layers themselves: where some channel is in focus, so that
-        the blur is monotone between layers, and where distances begin or end.
+        Vergences that become layers themselves: those at which some channel is in
+        focus, so that the blur is monotonic between layers, and the ends of object
+        ranges.
     blur_px_per_dpt : float
-        Of a perfect eye.
+        Blur of a perfect eye.
     blur_ratio : float
-        Step of blur, of its radius.
+        Blur step between layers, relative to the blur radius.
     pace : float
-        All steps against the usual.
+        Factor of all steps, relative to the default.
 
     References
     ----------
     Csoba & Kunkli 2023, Eq. 8: L = ceil(|R(k+1) - R(k)|) - 1 transitional layers, here
-    with steps in proportion to R, and none where R stays.
+    with steps proportional to R, and none where R is constant.
     """
     low_dpt, high_dpt = range_dpt
     count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
@@ -60,7 +61,7 @@ def layer_distances_dpt(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _steps(first_px, second_px, blur_ratio):
-    """Return steps of blur between two places, the most of any node and channel."""
+    """Return the blur steps between two vergences, the most of any node and channel."""
     most = 0.0
     for k in range(first_px.size):
         smaller_px = min(first_px[k], second_px[k])
@@ -71,7 +72,7 @@ def _steps(first_px, second_px, blur_ratio):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _between(at_dpt, steps_before, ends):
-    """Return places with one step or less to the next, each end among them."""
+    """Return vergences at most one step apart that include each end."""
     found_dpt, first = [at_dpt[0]], 0
     for end in ends:
         low, high = steps_before[first], steps_before[end]

@@ -1,6 +1,6 @@
-"""The compiled PSF engine: from the wavefronts of nodes to packed kernels in one call.
+"""Compiled PSF engine: from the wavefronts of nodes to packed kernels in one call.
 
-`estimator.psf` computes the same in Python; tests compare both.
+`estimator.psf` computes the same in Python; tests compare the two.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ from filter_service.psfs.pack import (
 MAX_PRIMARIES = 16
 
 FILTER_COUNT = 256
-"""Samples a pixel that filters are kept for: pixels of 14 mrad, pupils of 8 mm."""
+"""Largest number of samples per pixel with a tabulated filter: pixels of 14 mrad,
+pupils of 8 mm."""
 
 CORNERS_TWICE = 1.2
-"""Light beyond the four sides of a box over that outside it: what lies beyond a corner
-counts twice.  With 1.2 boxes lose 0.68 to 1.08 % where 1 % may be lost, as those of
-`pack_kernels` do."""
+"""Light beyond the four sides of a box, over the light outside the box, as light beyond
+a corner counts twice.  With 1.2, boxes lose 0.68 to 1.08 % where 1 % may be lost, like
+those of `pack_kernels`."""
 
 VECTOR = 8
 
 
 def fft_lengths() -> NDArray[np.int64]:
-    """Lengths that the engine transforms: multiples of eight."""
+    """Return the FFT lengths that the engine supports: multiples of eight."""
     lengths = fourier.FAST_LENGTHS
     return lengths[lengths % VECTOR == 0]
 
@@ -64,15 +65,15 @@ class NodeRings:
     Attributes
     ----------
     offset_mm : (n_groups, 3, n_primaries, 2)
-        Middle of the pupil, from the centre of the rings.
+        Center of the pupil, relative to the center of the rings.
     reach_mrad : (n_groups, 3, n_primaries)
-        How much farther they send light.
+        Distance beyond the rays to which the rings send light.
     amplitude_ratio : (3, n_primaries, TABLE_COUNT, 2), float32
-        Complex amplitude over the squared distance from a centre.
+        Complex amplitude as a function of the squared distance from a center.
     radius_mm : float
-        Of the last entry.
+        Radius of the last entry.
     lattice_mm : (pitch, inner, outer)
-        Of a honeycomb of such rings; zeros where there is one centre.
+        Dimensions of a honeycomb of such rings; zeros if there is one center.
     """
 
     offset_mm: NDArray[np.float64]
@@ -110,9 +111,9 @@ class NativePsfs:
     ----------
     library : Library
     threads : int
-        Handle of threads that calls share.
+        Handle of the thread pool that calls share.
     lock : Lock
-        Held by the call that has them.
+        Held by the call that uses the threads.
     """
 
     library: Library
@@ -138,7 +139,7 @@ class NativePsfs:
         ----------
         wavefronts : NodeWavefronts
         groups, channels : (n,)
-            Of each PSF.
+            Group and channel of each PSF.
         total_dpt : (n,)
             Total defocus in the middle of the channel.
         kept_energy_ratio : float
@@ -151,12 +152,11 @@ class NativePsfs:
         Returns
         -------
         kernels : PackedKernels
-            Those that are left have no texels.
+            Kernels; those in ``left`` have no texels.
         methods : Counter
             PSFs by the method that computed the larger share of each.
         left : (m,)
-            Places, among the n, of PSFs that `estimator.psf` has to compute or to
-            refuse.
+            Indices, among the n, of PSFs that `estimator.psf` has to compute or refuse.
         """
         count, primaries = groups.size, wavefronts.wavelength_nm.shape[1]
         sampling = ACCURACY["normal"]
@@ -233,7 +233,7 @@ class NativePsfs:
 
 @cache
 def native_psfs() -> NativePsfs | None:
-    """Return the engine of this process; None where the library is not there."""
+    """Return the engine of this process, or None if the library is missing."""
     try:
         library = compiled_library()
     except RenderFailed:
@@ -242,7 +242,7 @@ def native_psfs() -> NativePsfs | None:
 
 
 def _with_changes(table: NDArray) -> NDArray[np.float32]:
-    """Entries (n, 2) of a table (n,): values, and what to add for the next."""
+    """Return entries (n, 2) of a table (n,): values, and differences to the next."""
     return np.stack([table, np.diff(table, append=table[-1])], axis=1).astype(
         np.float32
     )
@@ -250,7 +250,7 @@ def _with_changes(table: NDArray) -> NDArray[np.float32]:
 
 @cache
 def _tables() -> tuple[PsfTables, dict[str, NDArray]]:
-    """Return the tables of the modules of `estimator.psf`, and the arrays they hold."""
+    """Return the tables of `estimator.psf`, and the arrays that they point to."""
     half_width = ACCURACY["normal"].filter_half_width
     filters = [fourier.pixel_filter(k + 1, half_width) for k in range(FILTER_COUNT)]
     stride = -(-filters[-1].size // VECTOR) * VECTOR

@@ -1,8 +1,8 @@
-"""Computed kernels to cached ones: cut to their boxes, sixteen bits a weight.
+"""Packing of computed kernels: cropped to their boxes, 16 bits per weight.
 
-Off axis a kernel is long and lies beside its centre: the box that holds its light has a
-third of the area of the disc about the centre.  Loops over single kernels, so compiled;
-threads share a batch.
+Off axis a kernel is elongated and displaced from its center: the box that holds its
+light has a third of the area of the disc about the center.  The loops over single
+kernels are compiled; threads share a batch.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from filter_service.constants import WEIGHT_MAX
 from filter_service.psfs.boxes import SIDES, box_sizes
 
 MAX_CENTROID_SHIFT_RATIO = 0.005
-"""Cutting may move a kernel's centroid by this share of its spread, and of a pixel for
-sharper ones; `GridSpec.kept_energy_ratio` states what cutting costs in all."""
+"""Largest shift of a kernel's centroid by cropping, relative to its spread, or to a
+pixel for sharper kernels; `GridSpec.kept_energy_ratio` states the total cost."""
 
 CUT_STEPS = 7
-"""Halvings of the light that may be cut, until the centroid stays; then none is."""
+"""Number of halvings of the cropped light, until the centroid shift is small enough;
+after them, nothing is cropped."""
 
 PSFS_PER_TASK = 64
 
 
 @dataclass(frozen=True)
 class PackedKernels:
-    """P kernels, one behind the other.
+    """P concatenated kernels.
 
     Attributes
     ----------
     weights : (n_texels,), uint16
-        Rows downwards; in steps of the kernel's peak over WEIGHT_MAX.
+        Rows from top to bottom; in steps of the kernel's peak over WEIGHT_MAX.
     offsets : (P,)
     reach_px : (P, 4)
-        Columns to the left and right, rows up and down of the centre that are held.
+        Columns left and right of the center, and rows above and below it.
     radius_px : (P,)
-        All weights but zeros lie within dx² + dy² <= (R + 0.5)².
+        Radius R: all nonzero weights lie within dx² + dy² <= (R + 0.5)².
     peak_ratio : (P,)
         Largest weight.
     spread_px : (P,)
         Radius of the uniform disc that has the kernel's sum of squares.
     lost_energy_ratio : (P,)
-        Light outside, before the kernel was brought to unit sum.
+        Light outside the box, before the kernel was normalized to unit sum.
     """
 
     weights: NDArray[np.uint16]
@@ -61,7 +62,7 @@ class PackedKernels:
     def with_kernels(
         self, places: NDArray[np.int64], others: PackedKernels
     ) -> PackedKernels:
-        """Return these kernels with others in some places."""
+        """Return these kernels with those at ``places`` replaced by others."""
         arrays = {
             name: getattr(self, name).copy()
             for name in (
@@ -80,7 +81,7 @@ class PackedKernels:
 def pack_kernels(
     batch: PsfBatch, *, kept_energy_ratio: float, pool: Executor
 ) -> PackedKernels:
-    """Cut and quantise a batch.
+    """Crop and quantize a batch.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def pack_kernels(
 
 @njit(nogil=True, cache=True)
 def _cut(kernels, cut_ratio, starts, full_px, reach_px, removed_ratio):
-    """Reaches beyond which each side has its share of the light that may be cut."""
+    """Write reaches beyond which each side has its share of the light to crop."""
     for p in range(starts.size):
         full, start = full_px[p], starts[p]
         width = 2 * full + 1
@@ -159,7 +160,7 @@ def _cut(kernels, cut_ratio, starts, full_px, reach_px, removed_ratio):
 
 @njit(nogil=True, cache=True)
 def _ends(light, allowed, full):
-    """Reach before and after the centre, and how far the centroid moves by the cut."""
+    """Return reaches before and after the center, and the shift of the centroid."""
     first, cut = 0, 0.0
     while first < full and cut + light[first] <= allowed:
         cut += light[first]
@@ -191,7 +192,7 @@ def _quantise(
     peak_ratio,
     spread_px,
 ):
-    """Bring what boxes hold to unit sum and to steps of its peak."""
+    """Normalize the boxes to unit sum, and quantize them in steps of their peak."""
     for p in range(starts.size):
         full = full_px[p]
         width = 2 * full + 1

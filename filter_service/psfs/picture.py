@@ -1,11 +1,11 @@
-"""A picture of a PSF for people: logarithmic, enlarged, with a scale bar."""
+"""Image of a PSF for display: logarithmic, enlarged, with a scale bar."""
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 DECADES = 4.0
-"""Powers of ten between white and black; the eye's own glare lies below."""
+"""Powers of ten between white and black; the observer's own glare lies below."""
 
 MIN_EDGE_PX = 384
 MARGIN_PX = 12
@@ -14,7 +14,7 @@ BAR_STEPS_ARCMIN = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def half_light_radius_px(kernel: NDArray[np.float32]) -> float:
-    """Radius about the centre element that holds half of the light, px.
+    """Return the radius about the center element that holds half of the light, px.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ def half_light_radius_px(kernel: NDArray[np.float32]) -> float:
 
 
 def draw_psf(kernel: NDArray[np.float32], *, pixel_arcmin: float) -> NDArray[np.uint8]:
-    """Draw a kernel in grey, brightest white, `DECADES` below black.
+    """Draw a kernel in gray, with the peak white and `DECADES` below it black.
 
     Returns
     -------
     (height, width, 3)
-        Every kernel pixel is a square; a bar gives the scale in arcmin.
+        Image with a square for each kernel pixel, and a scale bar in arcmin.
     """
     floor = kernel.max() * 10.0**-DECADES
     decades = np.log10(np.maximum(kernel, floor) / floor)

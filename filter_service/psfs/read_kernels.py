@@ -1,4 +1,4 @@
-"""How an eye's state reads its cache: the plain arrays that `read_loops.py` takes."""
+"""Plain arrays from which `read_loops.py` interpolates the kernels of a state."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ OF_PSFS = (
     *("offsets", "reach_words", "radius_px", "spread_px", "peak_ratio"),
     *("is_computed", "last_used"),
 )
-"""Tables that computed PSFs fill in."""
+"""Tables that are filled when PSFs are computed."""
 
 
 class StoreTables(NamedTuple):
-    """What plans of frames read of a store, as plain arrays that all have one layout.
+    """Data of a store that plans of frames read, as plain arrays of fixed layout.
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class StoreTables(NamedTuple):
     channel_shift_dpt : (n_groups, 3)
     offsets : (n_psfs,)
     reach_words : (n_psfs,)
-        Four reaches, a byte a side.
+        Four reaches, one byte per side.
     radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
         See `PsfStore`.
     is_computed : (n_psfs,)
-        Whether there is a kernel; without one all else but its blur is 0.
+        Whether there is a kernel; without one, everything but the blur is 0.
     last_used : (n_psfs,)
-        Number of the frame that read it last.
+        Number of the last frame that read it.
     """
 
     values_dpt: NDArray[np.float64]
@@ -51,7 +51,7 @@ class StoreTables(NamedTuple):
 
     @classmethod
     def empty(cls) -> StoreTables:
-        """Return the tables of no node."""
+        """Return tables without nodes."""
         none = np.zeros(0)
         return cls(
             values_dpt=none,
@@ -68,7 +68,10 @@ class StoreTables(NamedTuple):
         )
 
     def grown(self, nodes: PlanNodes) -> StoreTables:
-        """Return tables of nodes that begin with those of these; no PSF is computed."""
+        """Return tables extended to ``nodes``, which start with the present ones.
+
+        No PSF of the new nodes is computed.
+        """
         more = len(nodes.blur_px) - self.offsets.size
         return StoreTables(
             values_dpt=np.array(nodes.defocus.values_dpt, np.float64),
@@ -84,17 +87,18 @@ class StoreTables(NamedTuple):
 
 
 class StateReads(NamedTuple):
-    """Cached neighbours in pupil and accommodation that a state reads.
+    """Cached neighbors in pupil and accommodation that a state reads.
 
     Attributes
     ----------
     groups : (n_corners,)
-        Group of each neighbour at the first field node; those at the others follow.
+        Group of each neighbor at the first field node; the other field nodes follow.
     scales : (n_corners,)
-        Neighbouring pupils are blended at equal geometric blur: the node of pupil A_i
-        is read at total defocus t A / A_i, so no blended pair differs in size.
+        Factors A / A_i of total defocus t.  Neighboring pupils are blended at equal
+        geometric blur: the node of pupil A_i is read at total defocus t A / A_i, so
+        blended kernels have the same size.
     weights : (n_corners,)
-        Sum 1.
+        Weights with sum 1.
     """
 
     groups: NDArray[np.int64]

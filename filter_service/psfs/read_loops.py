@@ -1,7 +1,8 @@
-"""How an eye's state reads its cache: compiled loops over field nodes and layers.
+"""Compiled loops over field nodes and layers that interpolate the cache for a state.
 
-Two nodes of defocus for each cached neighbour in pupil and accommodation.  Arrays of a
-few thousand entries, once per frame whose pupil or focus has changed.
+They read two nodes of defocus for each cached neighbor in pupil and accommodation.
+Arrays have a few thousand entries; the loops run once per frame whose pupil or focus
+has changed.
 """
 
 import numpy as np
@@ -12,17 +13,17 @@ from filter_service.constants import RGB
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def clipped(value, low, high):
-    """Bring a value into a range."""
+    """Clip a value to a range."""
     return min(max(value, low), high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def bracket(tables, group, t, start):
-    """Lower and upper node of a total defocus within a group; share of the upper.
+    """Return the lower and upper node of a total defocus, and the share of the upper.
 
-    As `RaggedNodes.bracket` has them.  The search begins at a node of the group: the
-    upper one of the last and smaller t, which is mostly the one that is sought, where
-    the halves of an interval are guessed wrongly every other time.
+    The result is that of `RaggedNodes.bracket`.  The search is linear from ``start``,
+    the upper node of the previous, smaller t.  That is mostly the wanted node, whereas
+    the branches of a binary search are mispredicted half of the time.
     """
     values_dpt = tables.values_dpt
     first, last = tables.starts[group], tables.starts[group + 1] - 1
@@ -38,7 +39,7 @@ def bracket(tables, group, t, start):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def layer_blur_px(tables, reads, zero_dpt, at_dpt):
-    """Geometric blur radius (n, n_fields * 3), px, of n layers, ascending."""
+    """Return the geometric blur radius (n, n_fields * 3), px, of n ascending layers."""
     n_fields = zero_dpt.shape[0]
     found_px = np.zeros((n_fields * RGB, at_dpt.size))
     for field in range(n_fields):
@@ -62,15 +63,14 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def channel_taps(tables, reads, field, channel, total_dpt, uppers, psfs, weights):
-    """PSFs and weights (2 n_corners,) that make up one channel of a total defocus.
+    """Write the PSFs and weights (2 n_corners,) of one channel at a total defocus.
 
     Parameters
     ----------
     field : int
-        Number of the field node.
+        Index of the field node.
     uppers : (n_corners,)
-        Upper nodes of a smaller total defocus, or the groups' first; brought up to
-        date.
+        Upper nodes of a smaller total defocus, or the groups' first; updated.
     """
     for corner in range(reads.groups.size):
         own = reads.groups[corner] + field

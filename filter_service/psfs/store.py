@@ -1,6 +1,7 @@
 """The PSFs of one eye and camera, computed when frames first need them.
 
-Plain arrays without GL: engines copy what is new (`PsfStore.added_since`).
+The store holds plain arrays without GL; engines copy new ones
+(`PsfStore.added_since`).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from filter_service.psfs.boxes import pack_reach, unpack_reach
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.read_kernels import StoreTables
 
-if TYPE_CHECKING:  # they load numba, and the service gets ready before
+if TYPE_CHECKING:  # these load numba, and the service is ready before that
     from estimator.profiles.parse import EyeProfile
     from filter_service.planning.plan import NodePlanner
     from filter_service.psfs.native_psfs import NodeRings
@@ -39,22 +40,22 @@ if TYPE_CHECKING:  # they load numba, and the service gets ready before
 
 BYTES_PER_TEXEL = 2
 FIRST_TEXELS = 2**22
-"""Of a new store: 8 MB; it grows by doubling."""
+"""Initial capacity of a store, 8 MB; it grows by doubling."""
 
 KEPT_AFTER_EVICTION = 0.7
-"""Of the limit: the least recently used kernels beyond it are evicted together, as
-moving the others together costs about 0.1 ms a megabyte."""
+"""Share of the limit that remains after an eviction.  The least recently used kernels
+are evicted together, because moving the others costs about 0.1 ms per megabyte."""
 
 
 State = tuple[int, int]
-"""Numbers of a plan's nodes of pupil and accommodation."""
+"""Indices of a plan's nodes of pupil and accommodation."""
 
 
 class PsfStore:
     """Kernels over field, pupil, accommodation, total defocus and channel.
 
-    Node n of ``nodes`` and channel c have PSF 3 n + c.  What a node is depends on eye,
-    camera and settings alone, its number on which states were read before; kernels are
+    Node n of ``nodes`` and channel c have PSF 3 n + c.  A node depends on eye, camera
+    and settings alone; its index depends on the states read before.  Kernels are
     computed by `fill`.
 
     Parameters
@@ -62,21 +63,21 @@ class PsfStore:
     eye : EyeOptics
     spec : GridSpec
     plan : PlanAxes
-        Where the nodes are but for defocus: those of a state are planned when it is
-        first read (`groups_of`).  Or a `CachePlan`, which holds all of them.
+        Nodes of all axes but defocus; the defocus nodes of a state are planned when it
+        is first read (`groups_of`).  A `CachePlan` holds all of them.
     engine : PsfEngine, optional
-        Computes the PSFs; that of `psf_engine` where it is None.
+        Engine that computes the PSFs; by default that of `psf_engine`.
 
     Attributes
     ----------
     nodes : PlanNodes
-        Of the states that were read; a state's groups [v, h] are beside each other.
+        Nodes of the states read so far; a state's groups [v, h] are adjacent.
     tables : StoreTables
-        For each PSF: whether it is computed, where its kernel lies, how large it is.
+        For each PSF: whether it is computed, and the offset and size of its kernel.
     frame_number : int
-        Of the frame that is being planned; whoever plans one increments it.
+        Number of the frame being planned, incremented by the planner of frames.
     generation : int
-        Incremented by evictions: every kernel may lie elsewhere since.
+        Incremented by evictions, which move kernels.
     methods : Counter
         PSFs by the method that computed the larger share of each.
     """
@@ -108,11 +109,11 @@ class PsfStore:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Arguments that make an equal store without kernels."""
+        """Arguments that construct an equal store without kernels."""
         return {"eye": self.eye, "spec": self.spec, "plan": self.plan}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the parts alone: all else is computed again on demand."""
+        """Pickle the parts alone; everything else is computed again on demand."""
         return partial(type(self), **self.parts), ()
 
     @classmethod
@@ -123,7 +124,7 @@ class PsfStore:
         plan: CachePlan,
         packed: PackedKernels,
     ) -> Self:
-        """Return a store whose kernels (n_psfs,) are given."""
+        """Return a store with given kernels (n_psfs,)."""
         found = cls(eye, spec, plan)
         found._append(np.arange(found.psf_count), packed)
         return found
@@ -132,13 +133,13 @@ class PsfStore:
 
     @property
     def _states(self) -> list[State]:
-        """All states of the plan, in its order."""
+        """All states of the plan, in the order of its groups."""
         n_pupils, n_used = self.plan.group_shape[:2]
         return list(product(range(n_pupils), range(n_used)))
 
     @property
     def fields_count(self) -> int:
-        """Number of field nodes, which is that of a state's groups."""
+        """Number of field nodes, and of groups per state."""
         return len(self.plan.v_deg) * len(self.plan.h_deg)
 
     def groups_of(self, states: Sequence[State]) -> NDArray[np.int64]:
@@ -147,14 +148,14 @@ class PsfStore:
         Parameters
         ----------
         states : sequence of (pupil, accommodation)
-            Numbers of nodes; states that are read for the first time are planned.
+            Indices of nodes; states that are read for the first time are planned.
 
         Raises
         ------
         GridTooLarge
-            A state needs too many PSFs at one place.
+            If a state needs too many PSFs at one field position.
         BuildFailed
-            No PSF can be computed for a state of this eye.
+            If no PSF can be computed for a state of this eye.
         """
         new = [state for state in states if state not in self._first_groups]
         if new:
@@ -169,15 +170,15 @@ class PsfStore:
     def planned_ahead(
         self, pupil_diameter_mm: float, focus_dpt: float
     ) -> Iterator[tuple[State, PlanNodes]]:
-        """Plan the nodes of states that frames may read, for an equal store's `take`.
+        """Plan the nodes of states that frames may read, for `take` of an equal store.
 
-        The worker process does so: in the process that renders, a state takes 12 to
-        30 ms of the first frame that reads it.
+        The worker process runs this; in the rendering process, a state adds 12 to 30 ms
+        to the first frame that reads it.
 
         Parameters
         ----------
         pupil_diameter_mm, focus_dpt : float
-            States around this one come first.
+            State from which planning proceeds outward.
         """
         pupil_mm = pupil_diameter_mm
         used_dpt = self.eye.accommodation_dpt(
@@ -197,13 +198,13 @@ class PsfStore:
             yield state, self._planner.nodes(*state)
 
     def take(self, planned: tuple[State, PlanNodes]) -> None:
-        """Keep nodes that were planned ahead until they are read."""
+        """Store nodes that were planned ahead until they are read."""
         state, nodes = planned
         if state not in self._first_groups:
             self._ahead[state] = nodes
 
     def plan_all(self) -> None:
-        """Plan the nodes of all states, those that no frame has read yet, too."""
+        """Plan the nodes of all states, including those that no frame has read yet."""
         self.groups_of(self._states)
 
     @cached_property
@@ -219,7 +220,7 @@ class PsfStore:
         for state in states:
             self._first_groups[state] = first
             first += self.fields_count
-        # Frames that were begun may still read the old arrays.
+        # Frames in progress may still read the old arrays.
         self.nodes, self.tables = new, self.tables.grown(new)
         self._rings = None
 
@@ -239,26 +240,27 @@ class PsfStore:
         Parameters
         ----------
         psfs : (n,), optional
-            Numbers; all of them where it is None.
+            Indices of PSFs; by default all.
         until_s : float, optional
-            Time of `time.monotonic` at which to stop, after the batch in hand.
+            Time of `time.monotonic` at which to stop, after the current batch.
         batch_count : int, optional
-            PSFs computed between two looks at the time; the engine's where it is None.
+            PSFs computed between checks of the time; by default the engine's.
         between : callable, optional
             Called after each batch but the last.
         progress : callable, optional
-            Called with the share that is done.
+            Called with the completed share.
 
         Raises
         ------
         NotPrepared
-            Some are left at ``until_s``.
+            If some are missing at ``until_s``.
         GridTooLarge
-            A kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
+            If a kernel exceeds ``spec.max_blur_radius_px``; the message has the
+            numbers.
         BuildFailed
-            No PSF can be computed for a state of this eye.
+            If no PSF can be computed for a state of this eye.
         OutOfMemory
-            They exceed ``spec.memory_budget_mb`` together.
+            If all together exceed ``spec.memory_budget_mb``.
         """
         from filter_service.psfs.compute_kernels import computed_kernels
         from filter_service.psfs.psf_engine import psf_engine
@@ -275,7 +277,7 @@ class PsfStore:
         step = batch_count or self.engine.batch_count
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
         for number, batch in enumerate(batches):
-            batch = batch[~self.tables.is_computed[batch]]  # a frame between may have
+            batch = batch[~self.tables.is_computed[batch]]  # frames between may do some
             if not batch.size:
                 continue
             with self._states_of_eye():
@@ -298,7 +300,7 @@ class PsfStore:
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
 
     def _node_rings(self) -> NodeRings | None:
-        """Rings of the eye's lens at the nodes, tabulated when they are needed."""
+        """Return the rings of the eye's lens at the nodes, tabulated on first use."""
         from filter_service.psfs.native_psfs import NodeRings
 
         if self._rings is None and self.eye.rings is not None:
@@ -307,7 +309,7 @@ class PsfStore:
 
     @contextmanager
     def _states_of_eye(self) -> Iterator[None]:
-        """Say what clients can do about states of an eye that have no PSFs."""
+        """Convert errors of states without PSFs into errors with advice for clients."""
         from estimator.psf.compute import PsfTooLarge
 
         try:
@@ -326,7 +328,7 @@ class PsfStore:
             ) from error
 
     def _append(self, psfs: NDArray[np.int64], packed: PackedKernels) -> None:
-        """Add kernels (n,) of PSFs (n,), or of several that share each (m, n)."""
+        """Add kernels (n,) of PSFs (n,), or of m PSFs that share each (m, n)."""
         tables, count = self.tables, packed.weights.size
         self._make_room(count)
         self._words[self._n_words : self._n_words + count] = packed.weights
@@ -361,12 +363,12 @@ class PsfStore:
         return int(self.spec.memory_budget_mb * 1e6 / BYTES_PER_TEXEL)
 
     def evict(self, max_words: int) -> None:
-        """Evict the least recently used kernels; those of the current frame stay.
+        """Evict the least recently used kernels, except those of the current frame.
 
         Parameters
         ----------
         max_words : int
-            Texels that may stay.
+            Number of texels that may remain.
         """
         tables = self.tables
         own = np.flatnonzero(tables.is_computed)
@@ -389,7 +391,7 @@ class PsfStore:
         ):
             start = int(tables.offsets[psf])
             words[to : to + size] = self._words[start : start + size]
-        # Frames that were begun may still read the old arrays.
+        # Frames in progress may still read the old arrays.
         tables = self.tables = tables._replace(offsets=tables.offsets.copy())
         gone = by_use[~is_kept]
         if not self.spec.settings.chromatic:
@@ -403,19 +405,19 @@ class PsfStore:
         self.generation += 1
 
     def box_sizes_of(self, psfs: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Widths and heights (n,) of kernels."""
+        """Return widths and heights (n,) of kernels."""
         left, right, up, down = np.moveaxis(
             unpack_reach(self.tables.reach_words[psfs]).astype(np.int64), -1, 0
         )
         return left + right + 1, up + down + 1
 
     def added_since(self, n_batches: int) -> tuple[int, NDArray[np.int64]]:
-        """Return the number of batches there are, and PSFs of those after some."""
+        """Return the number of batches, and the PSFs added after the first ones."""
         later = self._added[n_batches:]
         found = np.concatenate(later) if later else np.zeros(0, np.int64)
         return len(self._added), found
 
-    # What frames read
+    # Data that frames read
 
     @cached_property
     def defocus(self) -> EyeDefocus:
@@ -425,44 +427,44 @@ class PsfStore:
 
     @property
     def kernels(self) -> NDArray[np.uint16]:
-        """All computed kernels (n_texels,), rows downwards, one after the other.
+        """All computed kernels (n_texels,), concatenated, rows from top to bottom.
 
-        In steps of the kernel's peak over WEIGHT_MAX, which is finer than half floats
-        and half of what floats take.
+        Weights are in steps of the kernel's peak over WEIGHT_MAX, which is finer than
+        half-precision floats and half the size of floats.
         """
         return self._words[: self._n_words]
 
     @property
     def words(self) -> NDArray[np.uint16]:
-        """Memory of the kernels (>= n_texels,); replaced when it grows."""
+        """Buffer of the kernels (>= n_texels,); replaced when it grows."""
         return self._words
 
     @property
     def offsets(self) -> NDArray[np.int64]:
-        """Where each kernel (n_psfs,) starts."""
+        """Start of each kernel (n_psfs,)."""
         return self.tables.offsets.astype(np.int64)
 
     @property
     def reach_px(self) -> NDArray[np.int64]:
-        """Columns to the left and right, rows up and down (n_psfs, 4) of centers."""
+        """Columns left and right, and rows above and below (n_psfs, 4) the centers."""
         return unpack_reach(self.tables.reach_words).astype(np.int64)
 
     @property
     def radius_px(self) -> NDArray[np.int32]:
-        """Each kernel (n_psfs,) lies within dx² + dy² <= (R + 0.5)²."""
+        """Radius R (n_psfs,): each kernel lies within dx² + dy² <= (R + 0.5)²."""
         return self.tables.radius_px
 
     @property
     def blur_px(self) -> NDArray[np.float32]:
-        """Geometric blur radius (n_psfs,), that of the plan."""
+        """Geometric blur radius (n_psfs,), as planned."""
         return self.tables.blur_px
 
     @property
     def spread_px(self) -> NDArray[np.float32]:
         """Radius (n_psfs,) of the disc with the kernel's sum of squares.
 
-        How far it really smears: for a bright core in a wide skirt much less than
-        ``blur_px``.
+        This is the effective blur; for a bright core in a wide skirt it is much less
+        than ``blur_px``.
         """
         return self.tables.spread_px
 
@@ -478,17 +480,17 @@ class PsfStore:
 
     @property
     def computed_count(self) -> int:
-        """Number of PSFs that are computed."""
+        """Number of computed PSFs."""
         return int(np.count_nonzero(self.tables.is_computed))
 
     @property
     def memory_mb(self) -> float:
-        """Size of the kernels."""
+        """Memory of the kernels."""
         return self.kernels.nbytes / 1e6
 
     @property
     def tables_mb(self) -> float:
-        """Size of what is known of each node, of those planned ahead, too."""
+        """Memory of the tables of all nodes, including those planned ahead."""
         planned = [*self._ahead.values()]
         if self._first_groups:
             planned.append(self.nodes)
@@ -511,7 +513,7 @@ def build_psf_store(
     eye : EyeOptics or EyeProfile
         A profile is used as the measured wavefront.
     plan : CachePlan, optional
-        Nodes other than those that `planning.plan.plan_cache` chooses.
+        Nodes; by default those of `planning.plan.plan_cache`.
     engine : PsfEngine
     progress : callable, optional
         Called with a fraction 0..1 and a stage.
@@ -519,7 +521,7 @@ def build_psf_store(
     Raises
     ------
     GridTooLarge
-        A kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
+        If a kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
     filter_service.planning.plan.PlanTooLarge
     """
     from estimator.profiles.measured_wavefront import MeasuredWavefront

@@ -1,9 +1,9 @@
-"""Estimated eyes and their nodes on disk, for the next time the same eye is wanted.
+"""On-disk cache of estimated eyes and their nodes.
 
-A folder of files, each named by hashes of what decides its content: the profile; the
-grid and the code.  Several services may share it without a lock: files appear complete
-(see `store_file`), a file that is being read stays whole when another process removes
-it, and those unused for longest are removed beyond a limit.
+The cache is a folder of files, each named by hashes of the profile, and of the grid and
+the code.  Several services may share it without a lock: files appear complete (see
+`store_file`), and a file being read stays intact if another process removes it.  Beyond
+a size limit, the least recently used files are removed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SUFFIX = ".psfs"
 BETWEEN = "-"
 KEY_BYTES = 16
 ABANDONED_S = 3600.0
-"""A file that has not been finished for so long never will be: its writer is gone."""
+"""Age from which an unfinished file is taken for abandoned by its writer."""
 
 MB = 1e6
 
@@ -51,7 +51,7 @@ log = logging.getLogger("ocufilter.cache")
 
 @dataclass(frozen=True)
 class Stored:
-    """What is kept of an eye.
+    """Cached data of an eye.
 
     Attributes
     ----------
@@ -66,10 +66,10 @@ class Stored:
 
 @cache
 def code_version() -> str:
-    """Return a hash of the files that decide what a store holds.
+    """Return a hash of the files that determine the content of a store.
 
-    All of both packages and the shaders that compute PSFs: to leave out one that
-    matters would serve wrong images; to take in one that does not costs a build.
+    They are both packages and the PSF shaders: omitting a file that matters would serve
+    wrong images; including one that does not costs a build.
     """
     ours = Path(filter_service.__file__).parent
     eyes = Path(estimator.__file__).parent
@@ -85,7 +85,7 @@ def code_version() -> str:
 
 
 def store_key(profile: EyeProfile, spec: GridSpec) -> str:
-    """Return the name under which the store of an eye and a grid is kept."""
+    """Return the cache key for an eye and a grid."""
     spec_tree, _ = pack(spec)
     if not spec.follows_field:
         spec_tree["object"][1]["camera"] = list(spec.pixel_pitch_mrad)
@@ -95,7 +95,7 @@ def store_key(profile: EyeProfile, spec: GridSpec) -> str:
 
 
 def eye_name(profile: EyeProfile) -> str:
-    """Return what the names of all stores of an eye begin with."""
+    """Return the common prefix of the names of all stores of an eye."""
     tree, arrays = pack(profile)
     digest = hashlib.blake2b(digest_size=KEY_BYTES)
     digest.update(json.dumps(tree, sort_keys=True).encode())
@@ -108,31 +108,31 @@ _logged: set[tuple[Path, str]] = set()
 
 
 def _log_once(path: Path, text: str) -> None:
-    """Log what is wrong with an entry the first time; later builds say nothing."""
+    """Log a problem with an entry, the first time only."""
     if (path, text) not in _logged:
         _logged.add((path, text))
         log.warning("%s %s", path, text)
 
 
 def _remove(path: Path, reason: Exception) -> None:
-    """Remove an entry that is damaged; a folder under its name stays."""
+    """Remove a damaged entry; a folder with its name stays."""
     try:
         path.unlink(missing_ok=True)
-    except OSError:  # a folder, or one of a folder that is not ours to change
+    except OSError:  # a folder, or no permission
         _log_once(path, f"is passed over: {reason}")
     else:
         log.warning("%s is removed: %s", path, reason)
 
 
 class StoreCache:
-    """A folder of stores.
+    """On-disk cache of stores.
 
     Parameters
     ----------
     folder : str
-        Made when it is first needed, for its owner only; ``""`` keeps nothing.
+        Folder, created on first use for its owner only; ``""`` disables the cache.
     max_mb : int
-        What the folder may hold.
+        Size limit of the folder.
     """
 
     def __init__(self, folder: str, *, max_mb: int) -> None:
@@ -140,14 +140,14 @@ class StoreCache:
         self._max_bytes = max_mb * MB
 
     def load(self, key: str, *, go_on: Callable[[], None]) -> Stored | None:
-        """Return what is kept under a key; a damaged file is removed.
+        """Return the entry of a key, or None; remove a damaged file.
 
-        What cannot be read or removed is passed over, and logged once.
+        A file that cannot be read or removed is ignored, and logged once.
 
         Parameters
         ----------
         go_on : callable
-            Called now and then; raises to give up.
+            Called repeatedly; raises to cancel.
         """
         if self._folder is None:
             return None
@@ -169,7 +169,7 @@ class StoreCache:
         return stored
 
     def save(self, key: str, stored: Stored) -> None:
-        """Keep a store; where that fails the log says why, and nothing else happens."""
+        """Write a store to the cache; a failure is only logged."""
         if self._folder is None:
             return
         started_s = time.monotonic()
@@ -189,10 +189,10 @@ class StoreCache:
         )
 
     def save_aside(self, key: str, stored: Stored) -> None:
-        """Keep a store while the caller goes on; a process that ends does not wait.
+        """Write a store in a background thread, for which an exit does not wait.
 
-        While an older one is still being written it is not kept: memory would fill up
-        with stores that wait for a slow disk.
+        The store is dropped while an older one is still being written; otherwise memory
+        would fill up with stores that wait for a slow disk.
         """
         if not _WRITING.acquire(blocking=False):
             log.info("a store is not kept: the disk is busy with the last one")
@@ -210,7 +210,7 @@ class StoreCache:
         return self._folder / f"{key}{SUFFIX}"
 
     def _evict(self) -> None:
-        """Remove what was used longest ago until the rest is within the limit."""
+        """Remove the least recently used files until the rest is within the limit."""
         found = []
         for path in self._folder.iterdir():
             try:
@@ -218,7 +218,7 @@ class StoreCache:
             except FileNotFoundError:
                 continue  # another service has removed it
             if not stat.S_ISREG(status.st_mode):
-                continue  # a folder, or a link: none of ours
+                continue  # a folder or a link, not one of our files
             if path.suffix == SUFFIX:
                 found.append((status.st_mtime, status.st_size, path))
             elif path.suffix == UNFINISHED:

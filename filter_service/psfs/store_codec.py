@@ -1,9 +1,9 @@
-"""Our own objects as JSON and plain arrays, and back, without running anybody's code.
+"""Serialization of project objects as JSON and plain arrays, without executing code.
 
-Covers what a PSF store is made of: classes of this project whose state is numbers,
-texts, arrays, lists, dicts and other such classes; what a class caches of that is left
-out.  A file of these can at worst hold
-wrong numbers, where a pickle could hold a program.
+It covers the content of a PSF store: classes of this project whose state is numbers,
+strings, arrays, lists, dicts and other such classes.  Cached properties are omitted.
+A damaged file can at worst contain wrong numbers, whereas a pickle could contain a
+program.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 PACKAGES = ("estimator.", "filter_service.")
-"""Only classes of these are written or made."""
+"""Packages whose classes are written and instantiated; no others are."""
 
 _PLAIN = (bool, int, float, str, type(None))
 
 
 class NotStorable(TypeError):
-    """An object holds something that is no data."""
+    """An object contains a value that is not plain data."""
 
 
 def pack(value: object) -> tuple[Any, dict[str, NDArray]]:
@@ -32,7 +32,7 @@ def pack(value: object) -> tuple[Any, dict[str, NDArray]]:
     Raises
     ------
     NotStorable
-        Says where in the object the thing is that cannot be written.
+        If a value cannot be written; the message has its path in the object.
     """
     arrays: dict[str, NDArray] = {}
     return _packed(value, "", arrays, {}), arrays
@@ -44,7 +44,7 @@ def unpack(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
     Raises
     ------
     ValueError, KeyError, TypeError, AttributeError, ImportError
-        The tree is not one that `pack` has made here.
+        If the tree was not made by this version of `pack`.
     """
     if isinstance(tree, _PLAIN):
         return tree
@@ -108,7 +108,7 @@ def _is_key(key: object, path: str) -> bool:
 def _array_name(
     array: NDArray, path: str, arrays: dict[str, NDArray], known: dict[int, str]
 ) -> str:
-    """Return under which name an array is kept; the same one only once."""
+    """Return the name of an array; an array that occurs repeatedly is stored once."""
     if array.dtype.hasobject:
         raise NotStorable(f"{path} is an array of objects")
     if id(array) not in known:

@@ -1,7 +1,7 @@
-"""One file with an object and its arrays: written whole or not at all, read if intact.
+"""File format for an object and its arrays: written atomically, verified on reading.
 
-Layout: a preamble with sizes and checksums, a header in JSON, and from a page boundary
-on the arrays.  No part of it can run code.
+The layout is a preamble with sizes and checksums, a JSON header, and the arrays from a
+page boundary on.  No part of a file can execute code.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from filter_service.psfs.store_codec import pack, unpack
 
 MAGIC = b"OCUPSFS1"
 PREAMBLE = struct.Struct("<8sQQQII")
-"""Magic, bytes of the header, start and bytes of the arrays, checksums of both."""
+"""Magic, size of the header, start and size of the arrays, and checksums of both."""
 
 UNFINISHED = ".unfinished"
 PAGE_BYTES = 4096
 ALIGNMENT_BYTES = 64
 BLOCK_BYTES = 2**24
-"""Read or written between two looks at cancellation: 5 to 20 ms."""
+"""Bytes read or written between checks for cancellation: 5 to 20 ms."""
 
 _MALFORMED = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError),
     *(OverflowError, RecursionError, MemoryError),
 )
-"""What a header that is not one of ours may lead to."""
+"""Errors that a foreign header may cause."""
 
 Look = Callable[[], None]
 
 
 class DamagedFile(ValueError):
-    """The file is not as it was written."""
+    """The file differs from what was written."""
 
 
 def write_file(path: Path, value: object, *, go_on: Look = lambda: None) -> int:
-    """Write an object so that the file appears complete or not at all; return its size.
+    """Write an object to a file atomically; return the file's size.
 
     Parameters
     ----------
     go_on : callable, optional
-        Called now and then; raises to give up.
+        Called repeatedly; raises to cancel.
 
     Raises
     ------
@@ -95,9 +95,9 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
     Raises
     ------
     DamagedFile
-        It was cut off or changed, or is none of ours.
+        If the file is truncated, modified or of another format.
     OSError
-        Also where it is not there.
+        If the file cannot be read or does not exist.
     """
     with open(path, "rb", buffering=0, opener=_open_plain_file) as file:
         preamble = file.read(PREAMBLE.size)
@@ -133,7 +133,7 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
 
 
 def _open_plain_file(path: str, flags: int) -> int:
-    """Open a file, and nothing that could keep its reader waiting, as a FIFO does."""
+    """Open a regular file; refuse others, such as a FIFO, which would block reading."""
     descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -146,7 +146,7 @@ def _round_up(size: int, step: int) -> int:
 
 
 def _places(arrays: dict[str, NDArray]) -> tuple[dict[str, list], int]:
-    """Return [dtype, shape, start] of each array, and the size of all."""
+    """Return [dtype, shape, start] of each array, and their total size."""
     places, end = {}, 0
     for key, array in arrays.items():
         places[key] = [array.dtype.str, array.shape, end]
@@ -171,7 +171,7 @@ def _array(data: NDArray[np.uint8], place: list) -> NDArray:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the new name last through a crash of the machine."""
+    """Flush the folder, so that the new name survives a crash of the machine."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,32 +1,32 @@
-"""From a frame and the cache to the filtered picture.
+"""Rendering: filter a frame with the PSFs of the cache.
 
-engine         what every frame engine offers
-frame_options  what a frame asks for, checked
-filtered_view  what every engine answers
-white_level    light against which contrast counts
-perfect_eye    a store that changes nothing, to try engines with
-frame          a view made ready: depth filled, colour finite
-gaze           where the eye looks, within what was prepared
+engine         interface of the frame engines
+frame_options  checked options of a frame
+filtered_view  result of a frame, for all engines
+white_level    reference light for contrast
+perfect_eye    store that changes nothing, for testing engines
+frame          preparation of a view: filled depth, extended edges
+gaze           gaze of a frame, clamped to the prepared range
 image_cells    cells of the image that share kernels
-cell_maps      from their pixels to those of stored kernels
-map_loops      compiled loops over those maps
-frame_states   what stays while pupil, focus and gaze stay
-frame_use      what a frame asks for, and which PSFs that needs
+cell_maps      maps from their pixels to those of stored kernels
+map_loops      compiled loops of cell_maps
+frame_states   state kept while pupil, focus and gaze do not change
+frame_use      request of a frame, and the PSFs that it needs
 frame_kernels  recipes of a frame's kernels
-kernel_loops   their compiled loops
-kernel_tables  the same as the passes read it
-table_loops    its compiled loops
-pair_loops     which kernels a frame uses, and the next one will
-srgb           pictures as they are stored, and linear light
-media_effects  what media and spectacles do, where a profile asks for it
-haze           light that the media scatter, over a picture
-haze_loops     its compiled loops
-spectacles     the size of what is seen through them
-spectacle_loops  its compiled loop
-plan_once      what plans need, loaded ahead
-reference      numpy twins of the passes
-gl/            the engine of compute shaders
-native/        the engine of compiled loops
+kernel_loops   compiled loops of frame_kernels
+kernel_tables  kernel records in the layout of the passes
+table_loops    compiled loops of kernel_tables
+pair_loops     kernels that a frame uses, and those predicted for the next
+srgb           conversion between encoded images and linear light
+media_effects  effects of ocular media and spectacles
+haze           straylight of the ocular media
+haze_loops     compiled loops of haze
+spectacles     spectacle magnification
+spectacle_loops  compiled loop of spectacles
+plan_once      warm-up of frame planning
+reference      NumPy twins of the passes
+gl/            engine of compute shaders
+native/        engine of compiled loops
 """
 
 import lazy_loader

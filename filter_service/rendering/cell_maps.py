@@ -1,4 +1,4 @@
-"""From the pixels of an image to those that kernels are stored in, cell by cell."""
+"""Maps from the pixels of an image cell to those that kernels are stored in."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class MapTables(NamedTuple):
-    """Maps of cells and what follows from them.
+    """Maps of cells and quantities derived from them.
 
     Attributes
     ----------
@@ -18,11 +18,11 @@ class MapTables(NamedTuple):
     area_ratio : (n_cells, 3)
         Area of a pixel of the cell in stored pixels.
     box_ratio : (n_cells, 3)
-        That area over that of a box with the mapped pixel's sides.
+        That area over the area of a box with the mapped pixel's sides.
     stretch_ratio : (n_cells, 3)
-        Most by which a kernel is longer than as stored.
+        Largest elongation of a kernel relative to its stored form.
     change_ratio : (n_cells, 3)
-        By how much of its distance from the centre light moves.
+        Displacement of light as a fraction of its distance from the center.
     """
 
     node_from_cell: NDArray[np.float64]
@@ -37,20 +37,20 @@ class MapTables(NamedTuple):
 class CellMaps:
     """Maps of cells, each to its three field nodes.
 
-    A kernel's part is mapped where `moves` says so; else it is read as stored.
+    A part of a kernel is mapped where `moves` is true; otherwise it is read as stored.
 
     Attributes
     ----------
     node_from_cell : (n_cells, 3, 2, 2)
-        From offsets in the cell's pixels (x right, y down) to those of the pixels that
-        a node's kernels are stored in.
+        Map from offsets in the cell's pixels (x right, y down) to offsets in the
+        pixels that a node's kernels are stored in.
     """
 
     node_from_cell: NDArray[np.float64]
 
     @cached_property
     def tables(self) -> MapTables:
-        """The maps in one layout, with their sizes."""
+        """Maps in one memory layout, with the ratios derived from them."""
         from filter_service.rendering.map_loops import fill_ratios
 
         maps = np.array(self.node_from_cell, np.float64, order="C")
@@ -61,5 +61,5 @@ class CellMaps:
 
     @property
     def largest_stretch_ratio(self) -> float:
-        """Of all cells; kernels that are read as stored are not shorter."""
+        """Largest stretch ratio of all cells, at least 1."""
         return float(max(1.0, self.tables.stretch_ratio.max()))

@@ -1,4 +1,4 @@
-"""What every frame engine offers, so that a second fits beside the first."""
+"""Interface of the frame engines."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class LoadedStore(Protocol):
     def take(self, part: Any) -> None: ...  # noqa: D102
 
     def release(self) -> None:
-        """Free what the engine holds of it; once."""
+        """Free the engine's resources for this store; call it once."""
 
 
 class Rendered(Protocol):
-    """What an engine says of one filtered view.
+    """Result of an engine for one view.
 
     Attributes
     ----------
     color : (height, width, 3)
         float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
-        By stage; their sum is the time spent in the engine.
+        Time by stage; their sum is the time spent in the engine.
     pupil_diameter_mm, focus_dpt, gaze_deg : as used
     """
 
@@ -79,20 +79,21 @@ class FrameEngine(Protocol):
 
     @property
     def name(self) -> str:
-        """What does the work, as replies and `ocufilter doctor` name it."""
+        """Name of the renderer in replies and in `ocufilter doctor`."""
 
     def trim(self) -> None:
-        """Give back memory that frames use again, after a while without any."""
+        """Release buffers that frames reuse; called after an idle period."""
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Have a function called in the middle of frames, where this engine can.
+        """Register a function to be called during frames, if this engine can.
 
-        Not sooner than ``interval_s`` after the last time.  It must not raise; it may
-        filter another frame, or have a store taken.  Returns whether it is called.
+        The engine calls it at most once every ``interval_s``.  The function must not
+        raise; it may filter another frame or load a store.  Returns whether the engine
+        will call it.
         """
 
     def load(self, store: Any) -> LoadedStore:
-        """Take a store, whose kernels may all be computed later."""
+        """Load a store; its kernels may all be computed later."""
 
     def render(
         self,
@@ -116,26 +117,26 @@ class FrameEngine(Protocol):
         render_tolerance : float
             0 is exact, 1 leaves no visible difference, more is faster.
         out : array, optional
-            Memory of the shape and type of the picture, which an engine may use for it.
+            Output array of the shape and type of the image; an engine may use it.
         until_s : float, optional
-            Time of `time.monotonic` after which no more PSFs are computed.
+            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
 
         Raises
         ------
         FilterError
             `BadMessage`, `CameraMismatch` or another `RenderError`.
         NotPrepared
-            PSFs that the frame needs were not computed by ``until_s``.
+            Some PSFs that the frame needs were not computed by ``until_s``.
         """
 
 
 def begin_view(
     engine: FrameEngine, view: RgbdView, handle: Any, **options: Any
 ) -> Callable[[], Rendered]:
-    """Have an engine begin with a view; call what is returned for the answer.
+    """Start filtering a view; return a function that waits for the result.
 
-    Where an engine can, other views may be begun between (its ``begin``, with the
-    arguments of `FrameEngine.render`); else the view is done at once.
+    If the engine has a ``begin`` method (with the arguments of `FrameEngine.render`),
+    other views may be started in between; otherwise the view is filtered at once.
     """
     begin = getattr(engine, "begin", None)
     if begin is not None:

@@ -1,4 +1,4 @@
-"""A filtered view and how it was made, whatever engine did it."""
+"""Result of a filtered view, for all engines."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,28 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class FilteredView:
-    """A filtered view and how it was made.
+    """A filtered view with the parameters and statistics of its rendering.
 
     Attributes
     ----------
     color : (height, width, 3)
         float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
-        By stage; their sum is the time spent in the engine.
+        Time by stage; their sum is the time spent in the engine.
     missing_depth_count, clamped_depth_count, bad_color_count : int
-        Pixels whose depth was filled in, lay outside the prepared distances, or whose
-        colour was not finite (taken as black); the last two with those of a hidden
-        layer that hold something.
+        Pixels whose depth was filled in, whose depth was outside the prepared
+        distances, and whose color was not finite (taken as black); the last two
+        include the pixels of a hidden layer that are not empty.
     pupil_diameter_mm, focus_dpt : float
         As used.
     gaze_deg : (h, v)
         As used.
     fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into some, and entries of the bins' lists; rows that
-        two strips of a very large frame share count twice, and with a hidden layer the
-        repeated border counts.
+        Fragments, pixels merged into fragments, and entries of the bins' lists; rows
+        shared by two strips of a very large frame count twice, and with a hidden layer
+        the repeated border counts.
     overflow_count : int
-        Entries that could not be kept, for want of room; their light is missing.
+        Entries dropped because their list was full; their light is missing.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
@@ -53,7 +53,7 @@ class FilteredView:
 
 
 SAMPLED_EVERY = 16
-"""Rows and columns looked at to tell the unit of depth: 25 us of a frame."""
+"""Stride in rows and columns for the check of the depth unit: 25 us of a frame."""
 
 METERS_BELOW = 100.0
 """Scenes with nothing nearer are rare; depth in centimeters or millimeters is not."""
@@ -62,9 +62,9 @@ METERS_BELOW = 100.0
 def input_notes(
     depth_m: NDArray[np.float32], missing_depth_count: int, bad_color_count: int
 ) -> list[str]:
-    """Say what was assumed of a view's depth and color.
+    """Return notes on what was assumed about a view's depth and color.
 
-    The texts do not change from frame to frame: counts are told apart.
+    The texts do not change from frame to frame: counts are reported separately.
     """
     notes = []
     if missing_depth_count == depth_m.size:

@@ -1,4 +1,4 @@
-"""What becomes of a view before it is filtered: depth filled, colour made finite."""
+"""Preparation of a view for filtering: missing depth, borders, object distances."""
 
 from dataclasses import replace
 from math import ceil
@@ -21,10 +21,10 @@ IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 def fill_missing_depth(
     depth_m: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], int]:
-    """Give missing pixels the depth of the nearest valid pixel, and count them.
+    """Fill missing pixels with the depth of the nearest valid pixel, and count them.
 
-    Missing is what is not a number from `LEAST_DEPTH_M` on.
-    Nearest by Euclidean distance in the image; if no pixel is valid, all are at
+    Depth is missing if it is NaN or less than `LEAST_DEPTH_M`.
+    Nearest means by Euclidean distance in the image; if no pixel is valid, all are at
     infinity.
     """
     missing = ~(depth_m >= LEAST_DEPTH_M)
@@ -42,10 +42,11 @@ def fill_missing_depth(
 
 
 def border_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
-    """Return columns and rows to add around a view with a hidden layer, whole tiles.
+    """Return the border to add around a view with a hidden layer, in whole tiles.
 
-    Next to the border of an image no surface is whole, for part of its light would come
-    from beyond; what it hides would shine through.  So the image goes on, as its edge.
+    Near the border of the image part of a surface's light would come from beyond it.
+    Without that light, hidden surfaces would shine through.  So the edge of the image
+    is repeated.
     """
     if view.surface_count == 1:
         return 0
@@ -54,9 +55,10 @@ def border_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
 
 
 def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
-    """Bound how far light of a view is spread, px, by its nearest and farthest depth.
+    """Bound the spread of a view's light, px, from its nearest and farthest depth.
 
-    By rays and the diffraction that kernels keep: which PSFs there are must not count.
+    The bound uses rays and the diffraction that kernels keep, so that it does not
+    depend on which PSFs have been computed.
     """
     depths_m = [m[m >= LEAST_DEPTH_M] for m in view.surface_depths_m]
     far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)
@@ -69,7 +71,7 @@ def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
 
 
 def extended(view: RgbdView, border_px: int) -> RgbdView:
-    """Repeat the edge of a view's images all around."""
+    """Return a view extended on all sides by repeating its edge."""
     if border_px == 0:
         return view
     left, right, up, down = view.tangents
@@ -86,7 +88,7 @@ def extended(view: RgbdView, border_px: int) -> RgbdView:
 
 
 def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
-    """Distance from the eye per unit of planar depth, (height, width)."""
+    """Return the distance from the eye per unit of planar depth, (height, width)."""
     left, right, up, down = view.tangents
     x = left + (right - left) * (np.arange(view.width_px) + 0.5) / view.width_px
     y = up + (down - up) * (np.arange(view.height_px) + 0.5) / view.height_px
@@ -94,18 +96,17 @@ def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
 
 
 def object_dpt(view: RgbdView, depth_m: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Object distance in dioptres (height, width) of valid depths."""
+    """Return the object distance in diopters (height, width) of valid depths."""
     with np.errstate(divide="ignore"):
         inverse = 1.0 / depth_m.astype(np.float64)
     return inverse / radial_stretch(view) if view.depth_kind == "planar" else inverse
 
 
 def object_range_dpt(view: RgbdView) -> tuple[float, float]:
-    """Farthest and nearest object distance of a view, as (low, high) dpt.
+    """Return the farthest and nearest object distance of a view, as (low, high) dpt.
 
-    Missing depth is filled first, by the rule of `fill_missing_depth`; what is hidden
-    counts where it is.  Nearer than the nearest distance that may be prepared counts as
-    that.
+    Missing depth is filled first, as in `fill_missing_depth`.  Hidden pixels that are
+    not empty count.  Both values are clamped to `MAX_VERGENCE_DPT`.
     """
     filled_m, _ = fill_missing_depth(view.depth_m)
     distance_dpt = object_dpt(view, filled_m)

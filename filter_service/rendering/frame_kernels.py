@@ -1,9 +1,9 @@
-"""Which kernels a frame needs, and what each is blended from; CPU only.
+"""Planning of a frame's kernels: which it needs, and how each is blended; CPU only.
 
-A frame's kernels are (image cell, layer interval) pairs, one for each that its pixels
-use.  A kernel holds both ends of its interval.  It is blended from node kernels, which
-are (field node, layer interval) pairs, and those from the cache.  Its loops are loaded
-when a frame first needs them: numba takes 0.3 s to import.
+A frame has one kernel for each (image cell, layer interval) pair that its pixels use.
+A kernel holds both ends of its interval.  It is blended from node kernels, which are
+(field node, layer interval) pairs; node kernels are blended from the cache.  The
+compiled loops are imported when a frame first needs them: numba takes 0.3 s to import.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class NodeKernels:
     near, far : (n,)
         Recipes of the interval's two ends.
     reach_px : (n, 4)
-        Of the interval: left, right, up, down.
+        Reach of the interval: left, right, up, down.
     radius_px : (n,)
     peak_ratio : (n,)
         Bound on the weights of the interval.
@@ -40,7 +40,7 @@ class NodeKernels:
         Per channel six kernel offsets, six reaches (a byte a side), six weights
         (float bits) that turn steps of a cached kernel into its share of a layer.
     recipe_spread_px : (n_recipes,)
-        Smallest spread over the channels; decides what may merge.
+        Smallest spread over the channels; limits merging.
     """
 
     near: NDArray[np.int64]
@@ -59,22 +59,22 @@ class FrameKernels:
     Attributes
     ----------
     cells, intervals : (n,)
-        Which pair a kernel serves.
+        Pair that each kernel serves.
     parts : (n, 3)
-        Node kernels it is blended from.
+        Node kernels that each kernel is blended from.
     weight_ratio : (n, 3)
-        Share of a part; where its map turns or shears, times the area of a mapped pixel
-        over that of its sides.
+        Share of each part; if its map rotates or shears, multiplied by the area of a
+        mapped pixel over the area of a box with its sides.
     maps : (n, 3, 2, 2)
-        From offsets in the image's pixels to those of the part; exactly the identity
-        where it is as good as that.
+        Maps from offsets in the image's pixels to those of the part; exactly the
+        identity where the difference is negligible.
     reach_px : (n, 4)
         Left, right, up, down.
     radius_px : (n,)
     peak_ratio : (n,)
         Bound on the weights.
     spread_px : (n, 2)
-        At both ends of the interval.
+        Spread at both ends of the interval.
     """
 
     nodes: NodeKernels
@@ -95,7 +95,7 @@ class FrameKernels:
 
 
 def interval_count(layers: FrameLayers) -> int:
-    """Intervals between layers; a single layer is its own."""
+    """Return the number of intervals between layers; a single layer counts as one."""
     return max(len(layers.layer_dpt) - 1, 1)
 
 
@@ -108,17 +108,16 @@ def frame_kernels(
     tables: StoreTables | None = None,
     fill: Fill | None = None,
 ) -> FrameKernels:
-    """Plan the kernels of used (cell, interval) pairs; compute the PSFs that lack.
+    """Plan the kernels of used (cell, interval) pairs, and compute missing PSFs.
 
     Parameters
     ----------
     store : PsfStore
     used : (n_cells, n_intervals)
     tables : StoreTables, optional
-        Those of the store, with other offsets, which stand in the recipes.
+        Tables of the store with other offsets, which are written to the recipes.
     fill : callable, optional
-        Computes PSFs (n,) that are missing, as `PsfStore.fill`, which it is where it is
-        None.
+        Function that computes missing PSFs (n,); `PsfStore.fill` by default.
 
     Raises
     ------
@@ -166,7 +165,7 @@ def missing_psfs(
     image: ImageCells,
     used: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Return the PSFs (n,) that kernels of used pairs lack."""
+    """Return the missing PSFs (n,) of the kernels of used pairs."""
     from filter_service.rendering.kernel_loops import used_nodes
 
     *_, fields, intervals = used_nodes(
@@ -233,7 +232,7 @@ def _node_kernels(
 
 
 def pair_index(kernels: FrameKernels, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    """Kernel (n_cells, n_intervals) of a pair; 0 where no pixel uses it."""
+    """Return the kernel index (n_cells, n_intervals) of each pair; 0 if unused."""
     index = np.zeros(shape, dtype=np.uint32)
     index[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     return index

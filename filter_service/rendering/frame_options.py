@@ -1,4 +1,4 @@
-"""How one frame is to be filtered, checked."""
+"""Checked options of one frame."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,21 +18,22 @@ OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """How a frame is filtered.
+    """Options of a frame.
 
     Attributes
     ----------
     paper_rule : bool
-        Fragments add up as the paper has it.
+        Whether fragments are accumulated by the paper's rule.
     merge : bool
     tolerance : float
-        Of merging, of coarse kernels and of layers, against the usual; 0 is exact.
+        Errors of merging, coarse kernels and layers relative to the default; 0 is
+        exact.
     output : str
         One of `OUTPUT_DTYPES`.
     gaze_deg : (h, v)
-        As it is used.
+        As used.
     gaze_notes : tuple of str
-        Where that is not what was asked for.
+        Notes if it differs from the requested gaze.
     """
 
     paper_rule: bool
@@ -44,7 +45,7 @@ class FrameOptions:
 
     @property
     def is_encoded(self) -> bool:
-        """Whether the picture is encoded for a screen."""
+        """Whether the output image is encoded for a display."""
         return self.output == "srgb8"
 
 
@@ -58,13 +59,12 @@ def frame_options(
     output: str,
     gaze_deg: tuple[float, float] | None,
 ) -> FrameOptions:
-    """Check what a frame asks for against the store that shall serve it.
+    """Check the options of a frame against its PSF store.
 
     Raises
     ------
     BadMessage
-        A choice that there is not, a gaze that is no direction, or a tolerance out of
-        range.
+        Unknown choice, invalid gaze, or tolerance out of range.
     CameraMismatch
         The store is for another camera, see `camera.is_same_camera`.
     """
@@ -85,12 +85,12 @@ def frame_options(
 def picture_room(
     view: RgbdView, options: FrameOptions, out: NDArray[Any] | None
 ) -> NDArray[Any]:
-    """Return where the picture of a view goes: the caller's memory, if there is some.
+    """Return the output array of a view: the caller's, or a new one.
 
     Raises
     ------
     BadMessage
-        It has another shape or type, or cannot be written from end to end.
+        The array has another shape or type, or is not contiguous and writeable.
     """
     shape, dtype = view.color.shape, np.dtype(OUTPUT_DTYPES[options.output])
     if out is None:

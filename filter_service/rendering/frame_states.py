@@ -1,4 +1,4 @@
-"""What of a frame depends on the eye's state alone, kept while the state stays."""
+"""Parts of a frame that depend only on the eye's state, kept while it is unchanged."""
 
 import math
 from contextlib import AbstractContextManager
@@ -17,37 +17,37 @@ from filter_service.rendering.frame_use import FrameUse, psfs_for
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
-"""Finest and widest steps of layers against the usual; at the finest, layers leave less
-than the 16 bits of kernels do."""
+"""Finest and widest layer steps relative to the default; at the finest, the error of
+the layers is below that of the 16-bit kernels."""
 
 
 def layer_step_ratio(tolerance: float) -> float:
-    """Return steps of layers against the usual: their error grows as their square."""
+    """Return the layer step relative to the default; the error grows as its square."""
     return min(max(math.sqrt(tolerance), LAYER_STEP_RATIOS[0]), LAYER_STEP_RATIOS[1])
 
 
 class Timer(Protocol):
-    """What an engine times its stages with."""
+    """Stage timer of an engine."""
 
     def wall(self, name: str) -> AbstractContextManager[None]:
-        """Add the time within to a stage."""
+        """Return a context that adds its wall time to a stage."""
 
 
 @dataclass(eq=False)
 class FrameStore:
-    """A PSF store with the image cells of its camera; engines add their own to it."""
+    """A PSF store with the image cells of its camera; engines extend it."""
 
     store: PsfStore
     image: ImageCells
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
-        """Scale of the stored pixels, see `stored_scale`; it takes 3 ms."""
+        """Scale of the stored pixels, see `stored_scale`; it takes 3 ms to compute."""
         return stored_scale(self.store.spec, self.store.plan)
 
     @property
     def computed_count(self) -> int:
-        """Number of PSFs that are computed."""
+        """Number of computed PSFs."""
         return self.store.computed_count
 
     @property
@@ -66,14 +66,14 @@ class FrameStore:
         Parameters
         ----------
         use : FrameUse, optional
-            Of the frame; whatever any frame may need where it is None.
+            Request of the frame; by default everything that any frame may need.
         state : (pupil_diameter_mm, focus_dpt), optional
-            Another than the frame's.
+            State in place of the frame's.
 
         Raises
         ------
         OutOfMemory
-            All are asked for, and some were evicted for want of memory.
+            All PSFs are requested, and some were evicted because memory ran out.
         """
         if use is None:
             if self.store.generation:
@@ -92,11 +92,11 @@ class FrameStore:
         self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
 
     def take(self, part: Any) -> None:
-        """Take what was planned ahead, see `PsfStore.take`."""
+        """Add a part that was planned ahead, see `PsfStore.take`."""
         self.store.take(part)
 
     def evict(self, max_mb: float) -> None:
-        """Evict the PSFs used longest ago, see `PsfStore.evict`."""
+        """Evict the least recently used PSFs, see `PsfStore.evict`."""
         self.store.evict(int(max_mb * 1e6 / self.store.kernels.itemsize))
 
     def _cells_at(self, gaze_deg: tuple[float, float]) -> ImageCells:
@@ -107,11 +107,11 @@ class FrameStore:
 
 
 class FrameStates:
-    """Layers of the last pupil and focus, cells of the last gaze.
+    """Layers of the last pupil and focus, cells of the last gaze, for one store.
 
-    Whoever compares states by identity, as the kernels of a frame do, sees the same
-    objects until something changes.  Of one store at a time: no hold on those that are
-    out of use.
+    The objects stay identical until the state changes, so that callers, such as the
+    kernels of a frame, can compare states by identity.  Stores that are no longer in
+    use are not kept alive.
     """
 
     def __init__(self):
@@ -136,7 +136,7 @@ class FrameStates:
         focus_dpt: float,
         tolerance: float = 1.0,
     ) -> FrameLayers:
-        """Layers of a pupil and focus, at a tolerance of rendering."""
+        """Return the layers of a pupil and focus, at a rendering tolerance."""
         self._forget_others(handle)
         state = (pupil_diameter_mm, focus_dpt, tolerance)
         if self._layers is None or self._layers[0] != state:
@@ -159,7 +159,7 @@ class FrameStates:
         gaze_deg: tuple[float, float],
         cell_px: int | None = None,
     ) -> ImageCells:
-        """Cells of a gaze, larger ones than usual where ``cell_px`` says so."""
+        """Return the cells of a gaze; ``cell_px`` requests larger cells than usual."""
         self._forget_others(handle)
         spec, state = handle.store.spec, (gaze_deg, cell_px)
         if state == (spec.settings.gaze_deg, None):
@@ -181,7 +181,7 @@ class FrameStates:
     def corner_change_dpt(
         self, timer: Timer, layers: FrameLayers, image: ImageCells
     ) -> NDArray[np.float32]:
-        """Change of defocus at the corners of cells, see `FieldDefocus.at`."""
+        """Return the change of defocus at cell corners, see `FieldDefocus.at`."""
         last = self._change
         if last is None or last[0] is not layers or last[1] is not image:
             with timer.wall("psf_plan_ms"):
@@ -192,7 +192,7 @@ class FrameStates:
     def _weights(
         self, layers: FrameLayers, image: ImageCells
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weights of the corners in the field's spline, the same in any state."""
+        """Return the corners' weights in the field's spline, the same in any state."""
         axes, last = layers.field.axes, self._corner_weights
         if last is None or last[0] is not axes or last[1] is not image:
             weights = axes.weights(image.corner_h_deg, image.corner_v_deg)

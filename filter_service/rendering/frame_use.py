@@ -1,4 +1,4 @@
-"""What a frame asks of an eye, and which PSFs that needs."""
+"""Request of a frame, and the PSFs that it needs."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 
 STEP_PX = 4
-"""Every so many pixels of a view are looked at; what lies between is left to frames."""
+"""Stride in pixels at which a view is sampled; frames themselves find the rest."""
 
 FIRST_PUPIL_MM, FIRST_FOCUS_DPT, FIRST_OBJECT_DPT = 4.0, 0.0, (0.0, 2.0)
-"""Where no frame has come yet."""
+"""Assumed state and distances before the first frame."""
 
 FIRST_DISTANCES = 9
 
@@ -30,13 +30,13 @@ ImageCellsOf = Callable[[tuple[float, float]], ImageCells]
 
 @dataclass(frozen=True)
 class SeenView:
-    """Depths of a view at some of its pixels.
+    """Depths of a view at a sample of its pixels.
 
     Attributes
     ----------
     object_dpt : (rows, columns)
     hidden_dpt : (rows, columns) or None
-        Of its hidden layer; NaN where there is none.
+        Distances of its hidden layer; NaN where nothing is hidden.
     """
 
     camera: Camera
@@ -45,7 +45,7 @@ class SeenView:
 
     @classmethod
     def of(cls, view: RgbdView) -> SeenView:
-        """Look at a view, whose memory may be used again by then."""
+        """Sample a view; its memory may be reused afterwards."""
         depths_m = [m[::STEP_PX, ::STEP_PX] for m in view.surface_depths_m]
         filled_m, _ = fill_missing_depth(np.ascontiguousarray(depths_m[0]))
         few = RgbdView(
@@ -63,7 +63,7 @@ class SeenView:
 
 @dataclass(frozen=True)
 class FrameUse:
-    """What one frame asked for."""
+    """Request of one frame."""
 
     at_s: float
     pupil_diameter_mm: float
@@ -73,7 +73,7 @@ class FrameUse:
 
 
 def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
-    """Return a frame to prepare for where none has come yet."""
+    """Return the frame to prepare for before the first one arrives."""
     pupil_mm = float(np.clip(FIRST_PUPIL_MM, *settings.pupil_range_mm))
     focus_dpt = float(np.clip(FIRST_FOCUS_DPT, *settings.focus_range_dpt))
     low_dpt, high_dpt = np.clip(FIRST_OBJECT_DPT, *settings.object_range_dpt)
@@ -83,7 +83,7 @@ def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
             settings.object_planes_dpt[-1],
         )
     rows, columns = -(-camera.height_px // STEP_PX), -(-camera.width_px // STEP_PX)
-    # Every cell of the field sees every distance.
+    # Every cell of the field contains every distance.
     column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCES)
     every_dpt = np.resize(column, (rows, columns))
     return FrameUse(0.0, pupil_mm, focus_dpt, None, (SeenView(camera, every_dpt),))
@@ -96,14 +96,14 @@ def psfs_for(
     *,
     state: tuple[float, float] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the PSFs (n,) that a frame needs of a store and that are not computed.
+    """Return the PSFs (n,) of a store that a frame needs and that are not computed.
 
     Parameters
     ----------
     image_of : callable
-        Gives the cells of the image at a gaze.
+        Function that returns the cells of the image at a gaze.
     state : (pupil_diameter_mm, focus_dpt), optional
-        Another than the frame's.
+        State in place of the frame's.
     """
     pupil_mm, focus_dpt = state or (use.pupil_diameter_mm, use.focus_dpt)
     settings = store.spec.settings
@@ -130,7 +130,7 @@ def _note_used(
     layers: FrameLayers,
     image: ImageCells,
 ) -> None:
-    """Note the pairs of cell and interval that distances at some pixels use."""
+    """Mark the (cell, interval) pairs that the sampled distances use."""
     rows, columns = distances_dpt.shape
     vergences_dpt = np.clip(
         layers.vergence.vergence_dpt(distances_dpt), *layers.vergence_range_dpt

@@ -1,4 +1,4 @@
-"""Where the eye of a frame looks, within what its PSFs were prepared for."""
+"""Gaze of a frame, clamped to the range that its PSFs were prepared for."""
 
 import math
 
@@ -11,17 +11,17 @@ ROUNDING_DEG = 1e-6
 def usable_gaze(
     spec: GridSpec, gaze_deg: tuple[float, float] | None
 ) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Gaze (h, v) of a frame as it is used, and what to say where it is another.
+    """Return the gaze (h, v) that a frame uses, and a note if it was changed.
 
     Parameters
     ----------
     gaze_deg : (h, v) or None
-        As asked for; None is the spec's.
+        Requested gaze; None is the spec's.
 
     Raises
     ------
     BadMessage
-        Not two finite angles.
+        The gaze is not two finite angles.
     """
     if gaze_deg is None:
         return spec.settings.gaze_deg, ()

@@ -1,11 +1,12 @@
-"""Light that the eye's media scatter, over a filtered picture.
+"""Straylight of the ocular media, added to a filtered image.
 
-Scattered light has no detail, so it is made on a coarse grid of visual angle: the mean
-of the pixels in each cell, spread by the scatter function (a convolution by FFT), and
-interpolated back.  Rows and columns of the grid are even in the angle along the axes
-of the image, so that one axis is worked out at a time; in the corner of a field of 80 x
-50 deg distances along v come out a fifth too long.  What lies beyond the picture is
-taken to be as bright as its edge, so that an even picture stays what it is.
+Scattered light has no detail, so it is computed on a coarse grid of visual angle: the
+mean of the pixels in each cell is spread by the scatter function (a convolution by FFT)
+and interpolated back.  Rows and columns of the grid are evenly spaced in the angle
+along the axes of the image, so that each axis can be computed separately; in the corner
+of a field of 80 x 50 deg, distances along v are a fifth too long.  The surroundings of
+the image are assumed to be as bright as its edge, so that a uniform image does not
+change.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from filter_service.constants import RGB
 CELL_DEG = 0.5
 """Edge of a cell, unless there would be too many of them.
 
-Pictures of a cataract are 56 dB from those with cells of 0.125 deg.  With 0.25 deg, 59
-to 62 dB, scattering takes twice as long: 11.5 instead of 4.9 ms at 480x270, 30 instead
-of 16 at 1280x720.
+Images of a cataract differ by 56 dB from those with cells of 0.125 deg.  Cells of 0.25
+deg reach 59 to 62 dB, but scattering takes twice as long: 11.5 instead of 4.9 ms at
+480x270, 30 instead of 16 at 1280x720.
 """
 
 MOST_CELLS = 384
-"""Along one axis: wider fields have larger cells."""
+"""Largest number of cells along one axis; wider fields have larger cells."""
 
 SAMPLES = 4
-"""Points along each edge of a cell that the scatter function is averaged over."""
+"""Points along each edge of a cell over which the scatter function is averaged."""
 
 
 def add_haze(
@@ -47,7 +48,7 @@ def add_haze(
     straylight: Straylight,
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> None:
-    """Scatter linear light (height, width, 3) in place, and take the gains of it."""
+    """Scatter linear light (height, width, 3) and apply the gains, in place."""
     from filter_service.rendering.haze_loops import add_scattered, mean_light
 
     grid = haze_grid(camera, straylight)
@@ -68,7 +69,7 @@ def add_haze(
 
 
 def in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
-    """Run a loop over 0 to a count, shared between threads."""
+    """Run a loop over the range from 0 to a count, split between threads."""
     n = thread_count()
     edges = [count * k // n for k in range(n + 1)]
     waiting = [_pool().submit(loop, *part, *arguments) for part in pairwise(edges)]
@@ -81,11 +82,11 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), thread_name_prefix="haze")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # no thread goes along
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
 class HazeGrid:
-    """Cells of a camera's image, and what of their light each scatters to the others.
+    """Cells of a camera's image, and the light that each scatters to the others.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ class HazeGrid:
     """
 
     def __init__(self, camera: Camera, straylight: Straylight):
-        from scipy import fft  # frames without haze do without
+        from scipy import fft  # not needed by frames without haze
 
         left, right, up, down = camera.tangents
         self.columns = _Axis.of(left, right, camera.width_px)
@@ -112,7 +113,7 @@ class HazeGrid:
         self._outside = np.maximum(self.fraction - inside, 0.0)[..., None]
 
     def scatter(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what of a coarse picture (n, m, 3) arrives in each cell."""
+        """Return the scattered light of a coarse image (n, m, 3) in each cell."""
         beyond = self._outside * _edge_light(coarse)
         return (self._spread(coarse) + beyond).astype(np.float32)
 
@@ -128,7 +129,7 @@ class HazeGrid:
 
 @lru_cache(maxsize=8)
 def haze_grid(camera: Camera, straylight: Straylight) -> HazeGrid:
-    """Return the grid of a camera and an eye; made once."""
+    """Return the cached grid of a camera and an eye."""
     return HazeGrid(camera, straylight)
 
 
@@ -139,11 +140,11 @@ class _Axis:
     Attributes
     ----------
     first_px : (n,)
-        Pixel that each cell begins in.
+        Pixel in which each cell begins.
     shares : (n, k)
-        Of the cell, that this pixel and those after it take.
+        Share of the cell that this pixel and the following ones cover.
     place : (n_px,)
-        Of pixels between the middles of cells, in cells.
+        Coordinate of each pixel in cells; cell centers are at whole numbers.
     cell_deg : float
     """
 
@@ -159,7 +160,7 @@ class _Axis:
 
     @classmethod
     def of(cls, first: float, last: float, n_px: int) -> _Axis:
-        """Cut the angle between two tangents."""
+        """Divide the angle between two tangents into cells."""
         edges_deg = np.degrees(np.arctan(np.linspace(first, last, n_px + 1)))
         edges_deg = np.abs(edges_deg - edges_deg[0])
         span_deg = float(edges_deg[-1])
@@ -185,7 +186,7 @@ class _Axis:
 def _kernel(
     straylight: Straylight, counts: tuple[int, int], cell_deg: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Light (2 n - 1, 2 m - 1) that a cell sends to those around it, of unit light."""
+    """Return the light (2 n - 1, 2 m - 1) that a cell of unit light sends around it."""
     sub = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     offsets = [
         (np.arange(1 - n, n)[:, None] + sub) * size
@@ -207,13 +208,13 @@ def _kernel(
 
 
 def _edge_light(coarse: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Mean light (3,) of the outermost cells."""
+    """Return the mean light (3,) of the outermost cells."""
     edges = (coarse[0], coarse[-1], coarse[:, 0], coarse[:, -1])
     return np.concatenate(edges).mean(axis=0, dtype=np.float64)
 
 
 def _wrapped(kernel: NDArray, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Kernel with its middle at the first element, as an FFT wants it."""
+    """Return a kernel with its center at the first element, as an FFT expects."""
     n, m = (kernel.shape[0] + 1) // 2, (kernel.shape[1] + 1) // 2
     found = np.zeros((max(shape[0], 2 * n - 1), max(shape[1], 2 * m - 1)))
     found[: kernel.shape[0], : kernel.shape[1]] = kernel

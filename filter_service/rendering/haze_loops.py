@@ -1,7 +1,7 @@
 """Compiled loops of `haze.py`: to a coarse grid of angles and back.
 
-Each works on some of the rows, so that threads share them: numba's own threads may end
-a process in which two start at once.
+Each processes a range of rows, so that threads can share the work: numba's own threads
+may end a process in which two start at once.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def mean_light(start, end, image, rows, row_shares, columns, column_shares, coar
     rows, columns : (n,), (m,)
         First pixel of each cell.
     row_shares, column_shares : (n, k), (m, l)
-        Share of a cell that it and those after it take; they sum to 1.
+        Share of a cell that this pixel and the following ones cover; they sum to 1.
     """
     for i in range(start, end):
         for j in range(coarse.shape[1]):
@@ -41,18 +41,18 @@ def mean_light(start, end, image, rows, row_shares, columns, column_shares, coar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
-    """Weaken an image (h, w, 3) by what is scattered, and add that, in place.
+    """Attenuate an image (h, w, 3) and add the scattered light, in place.
 
     Parameters
     ----------
     coarse : (n, m, 3)
         Scattered light.
     row_at, column_at : (h,), (w,)
-        Where pixels lie between the cells' centres, in cells.
+        Coordinates of pixels in cells; cell centers are at whole numbers.
     kept : float
-        Part of the light that is not scattered.
+        Fraction of the light that is not scattered.
     gains : (3,)
-        What of each channel the media let through.
+        Transmittance of the media in each channel.
     """
     last_row, last_column = coarse.shape[0] - 1, coarse.shape[1] - 1
     for y in range(start, end):
@@ -74,7 +74,7 @@ def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def encode_srgb(start, end, image, table, encoded):
-    """Encode linear light (n,) in bytes (n,) by a table (size,) over 0 to 1."""
+    """Encode linear light (n,) as bytes (n,) by a table (size,) over 0 to 1."""
     last = table.size - 1
     for k in range(start, end):
         light = image[k]

@@ -1,11 +1,11 @@
-"""The image in square cells, each with one set of kernels.
+"""Square cells of the image, each with one set of kernels.
 
 PSFs change slowly over the field, so all pixels of a cell share the kernels of the
-cell's middle direction, blended there from three field nodes around it.  That costs
-a frame one look-up per fragment and pixel, on axis and off, where blending in the
-splatting loop costs four (paper section 6.3).  What changes fastest over the field is
-left out of the blend: each node's kernel is mapped from the pixels it is stored in to
-those of the cell, and defocus follows every pixel by its layer.
+cell's central direction, blended from the three field nodes around it.  A frame then
+needs one lookup per fragment and pixel, on axis and off, where blending in the
+splatting loop needs four (paper section 6.3).  The fastest changes over the field are
+handled apart from the blend: each node's kernel is mapped from the pixels it is stored
+in to those of the cell, and every pixel has its own defocus through its layer.
 """
 
 import math
@@ -26,16 +26,16 @@ of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 
 of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""
 
 TEXELS_PER_PIXEL = 10.0
-"""Of the single kernels of a frame, for each pixel: beyond it cells are made twice as
-wide, for memory is short.  16 bytes a texel: 150 MB at 1280x720."""
+"""Texels of a frame's single kernels, per pixel; beyond this, cells are made twice as
+wide to save memory.  16 bytes a texel: 150 MB at 1280x720."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
-"""Cells are powers of two: a merged square lies in one cell."""
+"""Cell edges are powers of two, so that a merged square lies in one cell."""
 
 
 class KernelsTooLarge(Exception):
-    """A frame's kernels take too much; those of larger cells take less."""
+    """A frame's kernels take too much memory; those of larger cells take less."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class ImageCells:
     Attributes
     ----------
     cell_px : int
-        Edge; 0 where one cell is the whole image.
+        Edge of a cell; 0 if one cell is the whole image.
     grid : (columns, rows)
     nodes : (n_cells, 3)
-        Field nodes around a cell's middle, index into [v, h] in C order.
+        Field nodes around each cell's center, as indices into [v, h] in C order.
     weight_ratio : (n_cells, 3)
-        Of the nodes; sum 1.
+        Weights of the nodes; their sum is 1.
     maps : CellMaps
-        To the pixels that the nodes' kernels are stored in.
+        Maps to the pixels that the nodes' kernels are stored in.
     corner_h_deg, corner_v_deg : (rows + 1, columns + 1)
         Field directions of the cells' corners.
     """
@@ -79,16 +79,16 @@ def image_cells(
     cell_px: int | None = None,
     node_scale: NDArray[np.float64] | None = None,
 ) -> ImageCells:
-    """Cells of the spec's camera and their field nodes.
+    """Return the cells of the spec's camera and their field nodes.
 
     Parameters
     ----------
     gaze_deg : (h, v), optional
-        Where the eye looks; the spec's where it is None.
+        Gaze of the eye; the spec's by default.
     cell_px : int, optional
-        Larger cells than the mode's: their kernels take less memory.
+        Edge of larger cells than the mode's; their kernels take less memory.
     node_scale : (n_fields, 2, 2), optional
-        `stored_scale` of the plan, where it is known.
+        `stored_scale` of the plan, if already computed.
     """
     if not spec.follows_field:
         return ImageCells(
@@ -138,11 +138,11 @@ def image_cells(
 def _field_nodes(
     plan: CachePlan, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Nodes and weights (n_cells, 3): corners of the triangle around a direction.
+    """Return nodes and weights (n_cells, 3) of the triangle around each direction.
 
     Each rectangle of nodes is cut along the diagonal that crosses the direction to the
-    axis, as kernels change fastest along that: cut the other way, frames have 0.5 dB
-    more error in the median.
+    axis, because kernels change fastest along that direction; with the other diagonal,
+    frames have 0.5 dB more error in the median.
     """
     h_low, h_high, h_part = bracket_axis(plan.h_deg, h_deg)
     v_low, v_high, v_part = bracket_axis(plan.v_deg, v_deg)
@@ -158,17 +158,17 @@ def _field_nodes(
 
 
 def can_coarsen(image: ImageCells) -> bool:
-    """Whether larger cells are possible."""
+    """Return whether larger cells are possible."""
     return 0 < image.cell_px < MAX_CELL_PX
 
 
 def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
-    """See that the single kernels of a frame are not too many for its cells.
+    """Check the texel count of a frame's single kernels.
 
     Raises
     ------
     KernelsTooLarge
-        Wider cells would have fewer, see `TEXELS_PER_PIXEL`.
+        There are too many texels; wider cells have fewer, see `TEXELS_PER_PIXEL`.
     """
     if not can_coarsen(image):
         return
@@ -181,20 +181,20 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
 
 
 def stored_scale(spec: GridSpec, plan: CachePlan) -> NDArray[np.float64]:
-    """Scale (n_fields, 2, 2) of the pixels that nodes' kernels are stored in."""
+    """Return the scale (n_fields, 2, 2) of the pixels of the nodes' stored kernels."""
     return spec.node_pixel_from_mrad(*plan.field_nodes_deg)
 
 
 def _node_from_cell(
     node_scale: NDArray[np.float64], cell_scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return maps (n_cells, 3, 2, 2) of offsets in pixels, y downwards."""
+    """Return maps (n_cells, 3, 2, 2) of offsets in pixels, y down."""
     upwards = node_scale @ np.linalg.inv(cell_scale)[:, None]
     return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 def usual_cell_px(spec: GridSpec) -> int:
-    """Edge of cells where kernels are few or small enough."""
+    """Return the edge of cells when their kernels are few or small enough."""
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
     power = math.floor(math.log2(max(CELL_DEG[spec.settings.mode] / pixel_deg, 1.0)))
     return min(max(2**power, MIN_CELL_PX), MAX_CELL_PX)

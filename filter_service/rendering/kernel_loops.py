@@ -1,6 +1,7 @@
-"""Compiled loops that plan a frame's kernels; `frame_kernels.py` says what they are.
+"""Compiled loops of `frame_kernels.py`, which plan a frame's kernels.
 
-A few thousand kernels, once per frame whose pupil, focus or gaze has changed.
+They process a few thousand kernels, once per frame whose pupil, focus or gaze has
+changed.
 """
 
 import math
@@ -15,7 +16,7 @@ from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def number_used(place_of):
-    """Put numbers in the place of marks, in order; return where the marks were."""
+    """Replace marks by consecutive numbers, in place; return the marked positions."""
     count = 0
     for place in range(place_of.size):
         if place_of[place]:
@@ -32,9 +33,10 @@ def number_used(place_of):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def used_nodes(used, nodes, weight_ratio, n_fields):
-    """Kernels' cells and intervals (n,), parts (n, 3); nodes' fields and intervals.
+    """Return kernels' cells, intervals and parts, and nodes' fields and intervals.
 
-    A node that weighs nothing is replaced by the heaviest one.
+    Cells and intervals are (n,), parts (n, 3).  A node of zero weight is replaced by
+    the heaviest one.
     """
     n_intervals = used.shape[1]
     count = 0
@@ -64,7 +66,7 @@ def used_nodes(used, nodes, weight_ratio, n_fields):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def used_recipes(fields, intervals, n_fields, n_layers):
-    """Recipes near and far (n,) of node kernels; recipes' fields and layers."""
+    """Return near and far recipes (n,) of nodes, and the recipes' fields and layers."""
     near, far = np.empty(fields.size, np.int64), np.empty(fields.size, np.int64)
     number = np.zeros(n_fields * n_layers, np.int64)
     for n in range(fields.size):
@@ -81,15 +83,15 @@ def used_recipes(fields, intervals, n_fields, n_layers):
 def fill_recipes(
     tables, reads, fields, total_dpt, words, steps, sizes, missing, frame_number
 ):
-    """Write recipes, and what is known of the kernels that they make.
+    """Write recipes, and the sizes of the kernels that they make.
 
-    Returns how many PSFs are missing: then recipes are of no use until those are
-    computed.
+    Returns the number of missing PSFs; if it is not zero, the recipes are invalid until
+    those PSFs are computed.
 
     Parameters
     ----------
     fields : (n,)
-        Field by field.
+        Grouped by field.
     total_dpt : (n, 3)
         Ascending within a field.
     words : (n, 3, 3, RECIPE_TAPS), uint32
@@ -98,9 +100,9 @@ def fill_recipes(
         The same memory.
     sizes : reach_px (n, 4), radius_px (n,), peak_ratio (n,), spread_px (n,)
     missing : (n_psfs,)
-        Written: numbers of PSFs that have no kernel, each once.
+        Output: indices of PSFs that have no kernel, each once.
     frame_number : int
-        Written to ``tables.last_used`` of each PSF that is read.
+        Number written to ``tables.last_used`` of each PSF that is read.
     """
     reach_px, radius_px, peak_ratio, spread_px = sizes
     n_missing = 0
@@ -152,7 +154,7 @@ def fill_recipes(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
-    """Fill in maps, weights and sizes of kernels.
+    """Fill in the maps, weights and sizes of kernels.
 
     Parameters
     ----------
@@ -161,7 +163,7 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
     cells : (n,)
     parts : (n, 3)
     nodes : reach_px (m, 4), radius_px (m,), peak_ratio (m,), spread_px (m, 2)
-        Of the node kernels.
+        Sizes of the node kernels.
     made : weights, maps, reach_px, radius_px, peak_ratio, spread_px
         See `FrameKernels`.
     """

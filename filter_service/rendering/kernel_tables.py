@@ -1,6 +1,6 @@
-"""A frame's kernels as the passes read them: one piece of memory, sent at once.
+"""Kernel records of a frame in the layout of the passes: one array, uploaded at once.
 
-Its loops are loaded when a frame first needs them, as those of the plan are.
+The compiled loops are imported when a frame first needs them, as in `frame_kernels`.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from filter_service.constants import (
 from filter_service.rendering.frame_kernels import FrameKernels, pair_index
 
 PART_ALIGNMENT_WORDS = 64
-"""256 bytes: OpenGL lets a part of a buffer begin there, whatever the device."""
+"""256 bytes: a valid offset of a buffer part on every OpenGL device."""
 
 NODE_WORK = "node work"
 LEVEL_WORK = tuple(f"work of level {level}" for level in range(MAX_LEVEL + 1))
@@ -26,15 +26,15 @@ LEVEL_WORK = tuple(f"work of level {level}" for level in range(MAX_LEVEL + 1))
 
 @dataclass(frozen=True)
 class KernelLevels:
-    """How large the kernels of a frame are.
+    """Sizes of a frame's kernels.
 
     Attributes
     ----------
     sizes, starts, step_ratio : (n, levels)
-        Texels of a kernel and of it summed over squares of 2, 4 and 8 pixels, where
-        they begin, and the steps that they are stored in.
+        Texel count of a kernel and of its sums over squares of 2, 4 and 8 pixels, first
+        texel, and quantization step.
     texel_count : int
-        Of all.
+        Total over all kernels and levels.
     """
 
     sizes: NDArray[np.int64]
@@ -51,9 +51,9 @@ class KernelTables:
     ----------
     words : (n,), uint32
     parts : dict
-        By name, first word and number of words: ``NODES`` (n, 2, 4) and ``RECIPES``
+        First word and number of words by name: ``NODES`` (n, 2, 4) and ``RECIPES``
         for blend_psfs, ``PARTS`` (n, 5, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
-        ``KERNEL_OF`` (n_cells, n_intervals), and the work groups (n, 2) of each pass,
+        ``KERNEL_OF`` (n_cells, n_intervals), and the work groups (n, 2) of each pass:
         kernel and first texel.
     node_texel_count : int
     """
@@ -69,7 +69,7 @@ class KernelTables:
 
 
 def kernel_levels(kernels: FrameKernels) -> KernelLevels:
-    """Return how large kernels are, with their merged forms."""
+    """Return the sizes of kernels and of their merged forms."""
     from filter_service.rendering.table_loops import fill_levels
 
     sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
@@ -85,7 +85,7 @@ def kernel_levels(kernels: FrameKernels) -> KernelLevels:
 def kernel_tables(
     kernels: FrameKernels, levels: KernelLevels, shape: tuple[int, int]
 ) -> KernelTables:
-    """Write the records of kernels that serve pairs (n_cells, n_intervals)."""
+    """Return the records of kernels that serve pairs (n_cells, n_intervals)."""
     from filter_service.rendering.table_loops import (
         count_groups,
         fill_nodes,

@@ -5,22 +5,22 @@ import math
 from numba import njit
 
 UNMOVED_PX = 0.5
-"""Light that a map would move by less stays where it is stored: between stored pixels
-it would blur by as much."""
+"""Maps that would move light by less are not applied: interpolation between stored
+pixels would blur it by as much."""
 
 UNMOVED_RATIO = 0.1
-"""Maps that change a kernel's size by less are left out: what field nodes around a
-cell differ in is blended away.  At 5 mm over the field of the demo that leaves 63 to 69
-dB to the picture with all maps (cataract, myopia, keratoconus), and takes half of the
-time of the blend."""
+"""Maps that change a kernel's size by less are not applied: the differences between the
+field nodes around a cell are blended away.  At 5 mm over the field of the demo the
+image then differs by 63 to 69 dB from the one with all maps (cataract, myopia,
+keratoconus), and the blend takes half of the time."""
 
 MAX_REACH_PX = 255
-"""A byte a side; light that a map takes beyond it is cut."""
+"""One byte per side; light that a map moves beyond it is cut off."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_ratios(maps, inverse, ratios):
-    """Inverses of maps (n, 3, 2, 2), and ratios (4, n, 3) as in `MapTables`."""
+    """Fill in inverses of maps (n, 3, 2, 2), and ratios (4, n, 3) as in `MapTables`."""
     for cell in range(maps.shape[0]):
         for j in range(maps.shape[1]):
             a, b = maps[cell, j, 0, 0], maps[cell, j, 0, 1]
@@ -28,7 +28,7 @@ def fill_ratios(maps, inverse, ratios):
             area = a * d - b * c
             inverse[cell, j, 0, 0], inverse[cell, j, 0, 1] = d / area, -b / area
             inverse[cell, j, 1, 0], inverse[cell, j, 1, 1] = -c / area, a / area
-            # Largest singular value of the map over its area is that of the inverse.
+            # The largest singular value of the inverse is the map's over its area.
             longest = 0.5 * (math.hypot(a + d, b - c) + math.hypot(a - d, b + c))
             ratios[0, cell, j] = abs(area)
             ratios[1, cell, j] = abs(area) / abs(a * d)
@@ -39,15 +39,15 @@ def fill_ratios(maps, inverse, ratios):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def moves(change_ratio, radius_px):
-    """Whether a map is worth applying to a kernel."""
+    """Return whether a map is worth applying to a kernel."""
     return change_ratio > UNMOVED_RATIO and change_ratio * radius_px > UNMOVED_PX
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mapped_reach(out, cell, corner, reach_px):
-    """Bring reaches (left, right, up, down) to the image's pixels, in place.
+    """Convert reaches (left, right, up, down) to the image's pixels, in place.
 
-    Light that is interpolated ends one stored pixel beyond the last one.
+    Interpolated light ends one stored pixel beyond the last one.
     """
     left, right, up, down = reach_px
     for axis in range(2):

@@ -1,6 +1,6 @@
-"""Frames as an eye's media and its spectacles make them, where a profile asks for it.
+"""Effects of the ocular media and of spectacles, if a profile requests them.
 
-Spectacles draw the view anew before the eye filters it, media change its light after.
+Spectacles resample the view before it is filtered; the media change its light after.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ ENCODE_STEPS = 1 << 16
 
 @dataclass(frozen=True)
 class MediaEffects:
-    """What the media and the spectacles of one eye do to a picture.
+    """Effects of one eye's media and spectacles on an image.
 
     Attributes
     ----------
     straylight : Straylight or None
     gain_ratio : (red, green, blue)
-        Of the media, against those of the eye that pictures are made for.
+        Gains of the media relative to the eye that images are made for.
     magnification_ratio : (2, 2) or None
-        Of worn spectacles, see there.
+        Spectacle magnification, see `spectacles`.
     """
 
     straylight: Straylight | None
@@ -52,7 +52,7 @@ class MediaEffects:
 
     @classmethod
     def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
-        """Return those that a profile asks for; None where it asks for none."""
+        """Return the effects that a profile requests, or None if there are none."""
         gain_ratio = UNCHANGED
         if profile.yellowing is not None and profile.age_years is not None:
             red, green, blue = channel_gains(
@@ -73,7 +73,7 @@ class MediaEffects:
 
 
 def render_through_media(*arguments: Any, **options: Any) -> FilteredView:
-    """Filter a view as `FrameEngine.render` does, with effects that are asked for.
+    """Filter a view as `FrameEngine.render` does, with optional media effects.
 
     Arguments are those of `begin_through_media`.
     """
@@ -90,7 +90,7 @@ def begin_through_media(
     out: NDArray[Any] | None = None,
     **options: Any,
 ) -> Callable[[], FilteredView]:
-    """Begin a view as `begin_view` does, with effects that are asked for."""
+    """Start filtering a view as `begin_view` does, with optional media effects."""
     if effects is None:
         begun = begin_view(engine, view, handle, output=output, out=out, **options)
         return cast(Callable[[], FilteredView], begun)
@@ -120,7 +120,7 @@ def _changed(
 
 
 def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
-    """Return linear light as an output has it."""
+    """Return linear light in the encoding of an output."""
     if output == "linear":
         return color
     if output == "linear16":

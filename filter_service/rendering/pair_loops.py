@@ -1,6 +1,6 @@
-"""Which (cell, interval) pairs a frame uses, and the next one will.
+"""The (cell, interval) pairs that a frame uses, and a prediction for the next frame.
 
-The GPU notes parts of intervals, `USED_PARTS` each, as bits of words a cell.
+The GPU marks parts of intervals, `USED_PARTS` each, as bits in the words of a cell.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from filter_service.constants import BITS_PER_WORD, USED_PARTS
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def used_pairs(words, interval_count):
-    """Return used pairs (n_cells, n_intervals) of words (n_cells, n_words)."""
+    """Return the used pairs (n_cells, n_intervals) of words (n_cells, n_words)."""
     used = np.zeros((words.shape[0], interval_count), np.bool_)
     for cell in range(words.shape[0]):
         for k in range(words.shape[1]):
@@ -29,16 +29,16 @@ def used_pairs(words, interval_count):
 def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margin_dpt):
     """Return pairs (rows, columns, n_intervals) of the same scene in a new state.
 
-    A pixel's place among the layers is its vergence plus the change of defocus over
-    the field, which lies between those of its cell's corners.
+    A pixel's position among the layers is its vergence plus the change of defocus over
+    the field, which is between the changes at its cell's corners.
 
     Parameters
     ----------
     words : (rows, columns, n_words)
     edge_dpt : (n_parts + 1,)
-        Of the parts of the intervals, before.
+        Edges of the parts of the intervals in the old state.
     change_dpt, new_change_dpt : (rows + 1, columns + 1)
-        Change of defocus at the corners of cells, before and now.
+        Change of defocus at the corners of cells, in the old and in the new state.
     new_layer_dpt : (n_layers,)
     """
     rows, columns, word_count = words.shape
@@ -74,7 +74,7 @@ def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margi
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spread(used):
-    """Return pairs (rows, columns, n_intervals) of cells and the eight around each."""
+    """Return pairs (rows, columns, n_intervals), spread to the eight cells around."""
     rows, columns, count = used.shape
     found = np.zeros(used.shape, np.bool_)
     for row in range(rows):

@@ -1,4 +1,4 @@
-"""The store of a perfect eye, which leaves every picture as it is."""
+"""The PSF store of a perfect eye, which leaves every image unchanged."""
 
 import numpy as np
 
@@ -25,16 +25,16 @@ VARIANTS = (
     (np.float32, "linear", "coverage"),
     (np.float16, "linear16", "coverage"),
 )
-"""Colour, output and rule of frames that differ in what an engine does."""
+"""Color type, output and accumulation rule for each code path of an engine."""
 
 
 def change_by_perfect_eye(engine: FrameEngine) -> float:
-    """Filter a tiny frame in every variant that clients may ask for.
+    """Filter a tiny frame in every variant that clients may request.
 
     Returns
     -------
     float
-        The largest change of a pixel's value, which a perfect eye leaves as it is.
+        Largest change of a pixel's value; ideally zero.
     """
     handle = engine.load(perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS)))
     depth_m = np.ones((SIDE_PX, SIDE_PX), np.float32)
@@ -57,7 +57,7 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
 def perfect_store(camera: Camera) -> PsfStore:
     """Return PSFs of one pixel at one pupil, focused at infinity, for 0 to 2 dpt.
 
-    Their spread of 16 px is wide enough on paper for every merging pass to run.
+    Their nominal spread of 16 px is wide enough for every merging pass to run.
     """
     spec = GridSpec(
         camera,
@@ -99,7 +99,7 @@ def perfect_store(camera: Camera) -> PsfStore:
 
 
 def _at_rest(spec: GridSpec) -> PupilStates:
-    """Return the one state of the perfect eye."""
+    """Return the only state of the perfect eye."""
     return PupilStates.of(
         h_deg=np.zeros(1),
         v_deg=0.0,

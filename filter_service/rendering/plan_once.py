@@ -1,7 +1,7 @@
-"""Plans a tiny frame, so that what plans need is loaded before the first client's.
+"""Warm-up: plan a tiny frame, so that dependencies are loaded before the first client.
 
-Importing numba and scipy and reading the compiled loops takes 1 s, which a service
-spends after it is ready; compiling them, once on a machine, 10 s.
+Importing numba and SciPy and reading the compiled loops takes 1 s, which a service
+spends after it is ready; compiling them, once per machine, takes 10 s.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ from filter_service.rgbd_view import RgbdView
 
 
 def plan_once() -> None:
-    """Go through every loop that a frame's plan may need, but for the rendering."""
+    """Run every loop that planning a frame may need, without the rendering."""
     from scipy import interpolate  # noqa: F401  (changes over the field)
 
     store = perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS))
@@ -59,7 +59,7 @@ def plan_once() -> None:
 
 
 def _plan_nodes_once(store: PsfStore) -> None:
-    """Of a state over the field, as frames have them planned."""
+    """Plan the nodes of one state over the field, as frames do."""
     spec = store.spec.with_settings(mode="dynamic")
     axes = replace(store.plan, nodes=None, h_deg=np.arange(2.0), defocus_error=1e-3)
     NodePlanner(store.eye, spec, axes).nodes(0, 0)
@@ -73,7 +73,7 @@ def _tell_pairs_once() -> None:
 
 
 def _defocus_once() -> None:
-    """Of a traced eye at fixed fields: the perfect eye is a wavefront."""
+    """Run the defocus loops of a traced eye, as the perfect eye is only a wavefront."""
     count = N_DEGREES + N_RIM
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
     index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))

@@ -1,8 +1,8 @@
-"""Slow, plain twins of the passes in float64; tests and benchmarks only.
+"""Slow, plain twins of the passes in float64, for tests and benchmarks only.
 
-`gather` asks every output pixel for all the light that reaches it and sorts that
-itself: no tiles, no lists, no merging, no shared code with the passes beyond the PSF
-store and the planned layers.
+`gather` collects and sorts all light that reaches each output pixel: no tiles, no
+lists, no merging, and no shared code with the passes beyond the PSF store and the
+planned layers.
 """
 
 from dataclasses import replace
@@ -39,13 +39,13 @@ from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
 NOTHING = -1
-"""Stands for the kernel of a pixel that holds nothing."""
+"""Kernel index of an empty pixel."""
 
 
 def recipe_kernels(
     store: PsfStore, nodes: NodeKernels, radius_px: int
 ) -> NDArray[np.float64]:
-    """Kernels (n_recipes, size, size, 3) of field nodes at layers, float64."""
+    """Return kernels (n_recipes, size, size, 3) of field nodes at layers, float64."""
     size = 2 * radius_px + 1
     kernels = np.zeros((len(nodes.recipes), size, size, 3))
     for k, by_channel in enumerate(nodes.recipes):
@@ -62,7 +62,7 @@ def recipe_kernels(
 
 
 def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
-    """Kernels (n, 2, size, size, 3) of a frame, at both ends of their intervals."""
+    """Return a frame's kernels (n, 2, size, size, 3), at both ends of each interval."""
     radius = int(max(kernels.reach_px.max(), kernels.nodes.reach_px.max()))
     of_recipe = recipe_kernels(store, kernels.nodes, radius)
     nodes = kernels.nodes
@@ -78,7 +78,7 @@ def kernel_pairs(store: PsfStore, kernels: FrameKernels) -> NDArray[np.float64]:
 
 
 def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
-    """Light (2, size, size, 3) of stored pixels that each pixel's sides cover."""
+    """Return the light (2, size, size, 3) of stored pixels that each pixel covers."""
     if np.array_equal(to_stored, np.eye(2)):
         return stored
     radius = stored.shape[1] // 2
@@ -91,7 +91,7 @@ def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
     (left, top), (right, bottom) = middle - half, middle + half
 
     def within(rows: NDArray, columns: NDArray) -> NDArray:
-        """Light up to a point: bilinear in the sums over whole pixels."""
+        """Return the light up to a point, bilinear in the sums over whole pixels."""
         return np.stack(
             [
                 [
@@ -116,7 +116,7 @@ def _mapped(stored: NDArray, to_stored: NDArray) -> NDArray[np.float64]:
 def cell_index(
     view: RgbdView, image: ImageCells, border_px: int = 0
 ) -> NDArray[np.int64]:
-    """Cell (height, width) of each pixel; that of the edge in a border."""
+    """Return the cell (height, width) of each pixel; in a border, the edge's cell."""
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px), np.int64)
     rows, columns = (
@@ -129,9 +129,9 @@ def cell_index(
 def field_change_dpt(
     view: RgbdView, layers: FrameLayers, image: ImageCells, border_px: int = 0
 ) -> NDArray[np.float64]:
-    """Change of defocus (height, width) over the field, bilinear within cells.
+    """Return the change of defocus (height, width) over the field, bilinear in cells.
 
-    In a border it is that of the edge.
+    A border takes the values of the edge.
     """
     if image.cell_px == 0:
         return np.zeros((view.height_px, view.width_px))
@@ -201,9 +201,9 @@ def gather(
 
 
 def surface_vergences_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:
-    """Vergence (surfaces, height, width) at the cornea; NaN where nothing is hidden.
+    """Return the vergence (surfaces, height, width) at the cornea; NaN if empty.
 
-    Nothing that blurs like the surface before it counts as hidden.
+    Hidden pixels that blur like the surface in front of them count as empty.
     """
     seen_dpt = layers.vergence.vergence_dpt(object_dpt(view, view.depth_m))
     vergences = [seen_dpt]
@@ -222,7 +222,7 @@ def _linear_color(color: NDArray) -> NDArray[np.float64]:
 
 
 def _sort_key(distances_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
-    """Smaller is nearer; the paper adds the scan position to the distance."""
+    """Return the sort key: smaller is nearer; the paper adds the scan position."""
     if accumulation == "coverage":
         return -distances_dpt
     with np.errstate(divide="ignore"):
@@ -276,7 +276,7 @@ def _gather(linear, kernel, fraction, key, kernels, paper_rule, depth_step, out)
 
 @njit(cache=True)
 def _over(order, key, weight, color):
-    """Light and coverage by the paper's rule: a weight is an opacity."""
+    """Return light and coverage by the paper's rule: a weight is an opacity."""
     light, coverage = 0.0, 0.0
     for i in order:
         share = weight[i] * (1.0 - coverage)
@@ -287,11 +287,11 @@ def _over(order, key, weight, color):
 
 @njit(cache=True)
 def _by_depths(order, key, weight, color, depth_step):
-    """Light and coverage, one depth after the other.
+    """Return light and coverage, accumulated one depth after the other.
 
-    A depth's fragments share what nearer ones leave free in proportion: had the first
-    of them all that it wants, a surface that is hidden in part would be lit by one side
-    of the kernel alone.
+    The fragments of one depth share the free coverage in proportion to their weights.
+    If the first took its full weight, a partly hidden surface would be lit by one side
+    of the kernel only.
     """
     light, coverage = 0.0, 0.0
     first = 0

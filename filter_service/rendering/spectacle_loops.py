@@ -6,9 +6,10 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_anew(color, depth_m, place, to_source, drawn, deep_m):
-    """Fill a picture from where a map of tangents says that its light comes from.
+    """Resample an image by a linear map of tangents.
 
-    Colour between four pixels, depth of the nearest: between two surfaces is none.
+    Color is bilinear; depth is the nearest pixel's, because no surface lies between two
+    others.
 
     Parameters
     ----------
@@ -18,6 +19,7 @@ def draw_anew(color, depth_m, place, to_source, drawn, deep_m):
         Tangents of the left and the upper edge, and a pixel's step to the right and
         down.
     to_source : (2, 2)
+        Map from output to source tangents.
     """
     height, width = depth_m.shape
     for y in range(height):

@@ -1,10 +1,10 @@
-"""The size of what is seen through worn spectacles: smaller for a myope.
+"""Spectacle magnification: a myope's spectacles make everything appear smaller.
 
-A thin lens of power F at L before the entrance pupil shows every direction at
-1 / (1 - L F) of its tangent: 0.92 at -6 dpt, 12 mm before the cornea.  A cylinder does
-so by its meridians.  The view is drawn anew at that size before the eye filters it, for
-blur is of the eye and does not shrink; what then lies beyond the camera's image is its
-edge, repeated.
+A thin lens of power F at L in front of the entrance pupil shows every direction at
+1 / (1 - L F) of its tangent: 0.92 at -6 dpt, 12 mm in front of the cornea.  A cylinder
+does so along its meridians.  The view is resampled at that size before it is filtered,
+because blur arises in the eye and does not shrink; the surroundings of the camera's
+image are its repeated edge.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
 ENTRANCE_PUPIL_MM = 3.05
-"""Behind the cornea, as everywhere that no eye model says otherwise."""
+"""Distance behind the cornea, as always unless an eye model says otherwise."""
 
 MM_PER_M = 1e3
 Matrix = tuple[tuple[float, float], tuple[float, float]]
 
 
 def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
-    """Return tangents seen over tangents there are; None where nobody asks for it."""
+    """Return seen over actual tangents, or None if the profile does not request it."""
     if not profile.spectacle_magnification or profile.correction is None:
         return None
     m, j0, j45 = rx.power_vector(replace(profile.correction, vertex_mm=0.0))
@@ -40,7 +40,7 @@ def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
 
 
 def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
-    """Return the view as it is seen through spectacles, in linear light."""
+    """Return the view as seen through spectacles, in linear light."""
     from filter_service.rendering.spectacle_loops import draw_anew
 
     left, right, up, down = view.tangents

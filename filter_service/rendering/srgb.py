@@ -1,4 +1,4 @@
-"""Pictures as they are stored, and linear light: IEC 61966-2-1 and half floats."""
+"""Conversion between encoded images and linear light: IEC 61966-2-1 and half floats."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,13 +7,13 @@ from filter_service.constants import HALF_MAX
 
 
 def linear_from_srgb(srgb: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """IEC 61966-2-1 decoding of 8-bit values."""
+    """Decode 8-bit values by IEC 61966-2-1."""
     value = srgb.astype(np.float64) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
-    """IEC 61966-2-1 encoding to 8 bits, rounded."""
+    """Encode linear light to 8 bits by IEC 61966-2-1, rounded."""
     value = np.clip(linear_rgb, 0.0, 1.0)
     curve = 1.055 * np.power(value, 1.0 / 2.4) - 0.055
     encoded = np.where(value <= 0.0031308, 12.92 * value, curve)
@@ -21,5 +21,5 @@ def srgb_from_linear(linear_rgb: NDArray) -> NDArray[np.uint8]:
 
 
 def half_from_linear(linear_rgb: NDArray) -> NDArray[np.float16]:
-    """Nearest half floats, to even; beyond the largest the largest, never infinity."""
+    """Round to the nearest half floats, ties to even, clamped to the finite range."""
     return np.clip(linear_rgb, -HALF_MAX, HALF_MAX).astype(np.float16)

@@ -1,4 +1,4 @@
-"""Compiled loops that write a frame's kernels as the passes read them."""
+"""Compiled loops of `kernel_tables.py`, which write the passes' kernel records."""
 
 import math
 
@@ -22,24 +22,24 @@ VECTOR = 4
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def box(reach_px, k):
-    """Width and height of a kernel's box."""
+    """Return the width and height of a kernel's box."""
     width = reach_px[k, 0] + reach_px[k, 1] + 1
     return width, reach_px[k, 2] + reach_px[k, 3] + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def packed(reach_px, k):
-    """Four reaches as the bytes of a word."""
+    """Pack four reaches as the bytes of a word."""
     across = reach_px[k, 0] | reach_px[k, 1] << 8
     return across | reach_px[k, 2] << 16 | reach_px[k, 3] << 24
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
-    """Texels, first texels and steps (n, levels) of kernels and their merged forms.
+    """Fill in texel counts, first texels and steps (n, levels) of kernels.
 
-    No texels above the level for which a kernel is wide enough at one end.  Returns
-    the texels of all.
+    Levels are the kernel and its merged forms.  There are no texels above the level for
+    which a kernel is wide enough at one end.  Returns the total texel count.
     """
     start = 0
     for k in range(peak_ratio.size):
@@ -61,7 +61,7 @@ def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_groups(node_reach_px, sizes, threads, counts):
-    """Work groups (1 + levels) of node kernels and of each level; texels of nodes."""
+    """Count work groups (1 + levels) of nodes and of each level; return node texels."""
     counts[:] = 0
     texels = 0
     for k in range(node_reach_px.shape[0]):
@@ -76,7 +76,7 @@ def count_groups(node_reach_px, sizes, threads, counts):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_nodes(words, floats, first, nodes, threads, work):
-    """Write records of node kernels from a word on, work groups from another."""
+    """Write node records from word `first` on, and their work groups from `work` on."""
     near, far, reach_px, peak_ratio = nodes
     start = 0
     for k in range(near.size):
@@ -101,11 +101,11 @@ def fill_records(words, floats, firsts, kernels, levels, threads, works):
     words, floats : (n,)
         The same memory.
     firsts : (2,)
-        Words that records and parts begin at.
+        First words of the records and of the parts.
     kernels : spread_px, radius_px, reach_px, parts, weights, maps
     levels : sizes, starts, scale
     works : (levels,)
-        Words that the groups begin at; afterwards, that they end at.
+        First words of the groups; on return, their end.
     """
     spread_px, radius_px, reach_px, parts, weight_ratio, maps = kernels
     sizes, starts, scale = levels

@@ -1,21 +1,22 @@
-"""Light against which the contrast of pixels that may merge counts."""
+"""White level: the reference light for the contrast of pixels that may merge."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 WHITE_STEP_PX = 8
-"""Every so many pixels count for the level of white."""
+"""Stride in pixels at which the white level is sampled."""
 
 WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
-"""White of a linear image is its brightest light, but no more than so many times what
-nine tenths of its lit pixels stay below: a lamp or a window in a room is none."""
+"""The white level of a linear image is its brightest light, but at most this ratio
+times the 90th percentile of its lit pixels, so that a lamp or a window in a room does
+not set it."""
 
 
 def white_level(color: NDArray) -> float:
-    """Return the white of an image: 1 for 8-bit input.
+    """Return the white level of an image: 1 for 8-bit input.
 
-    Linear light may have any unit, so that merging, and with it the whole filter, must
-    scale with the light.
+    Linear light may have any unit, so merging, and with it the whole filter, must scale
+    with the light.
     """
     if color.dtype == np.uint8:
         return 1.0

@@ -1,7 +1,7 @@
-/* Takes parts of a message from a ZeroMQ socket and throws them away.
+/* Receives parts of a message from a ZeroMQ socket and discards them.
  *
- * Called by dropped_parts.py, which passes libzmq's functions: this file needs neither
- * its headers nor its library.
+ * Called by dropped_parts.py, which passes libzmq's functions, so this file needs neither
+ * libzmq's headers nor its library.
  */
 
 #include <stdint.h>

@@ -1,7 +1,7 @@
 // The kernel atlas: one long line of texels.  A texel holds, for red, green and blue, the
 // weights at both ends of an interval of layers.
 // ATLAS_IS_BUFFER: a storage buffer, which a GPU reads faster (shaders/README.md).
-// Otherwise a 2D texture: on a software renderer that costs half.
+// Otherwise a 2D texture, which costs half on a software renderer.
 
 #ifdef ATLAS_IS_BUFFER
 #define ATLAS_FETCH(atlas, texel) atlas[texel]
@@ -17,7 +17,7 @@ ivec2 atlas_position(int texel) {
     return ivec2(texel & (ATLAS_WIDTH - 1), texel >> ATLAS_WIDTH_BITS);
 }
 
-// Weights as parts of the scale; rounded to the nearest step.
+// Weights as fractions of the scale, rounded to the nearest step.
 uvec4 pack_weights(vec3 near, vec3 far, float scale) {
     uvec3 low = uvec3(min(near / scale, 1.0) * WEIGHT_MAX + 0.5);
     uvec3 high = uvec3(min(far / scale, 1.0) * WEIGHT_MAX + 0.5);
@@ -26,9 +26,9 @@ uvec4 pack_weights(vec3 near, vec3 far, float scale) {
 
 vec3 near_weights(uvec4 texel) { return vec3(texel.rgb & WEIGHT_MASK); }
 
-// Weights at a fraction of the way from one end to the other, in steps.  A step number
-// below the bits of 2^23 is that float plus the number: no conversion, of which a GPU does
-// fewer at a time than of sums.
+// Weights interpolated between the two ends, in steps.  A step number in the low bits of
+// 2^23 is the float 2^23 plus that number, so no conversion is needed; a GPU has a lower
+// throughput of conversions than of additions.
 vec3 weights_between(uvec4 texel, float fraction) {
     vec3 near = uintBitsToFloat((texel.rgb & WEIGHT_MASK) | uint(EXACT_FLOAT_BITS));
     vec3 far = uintBitsToFloat((texel.rgb >> WEIGHT_BITS) | uint(EXACT_FLOAT_BITS));

@@ -1,9 +1,9 @@
-// Walk over the fragments whose light reaches a bin, in scan order: blocks row by row
+// Iteration over the fragments whose light reaches a bin, in scan order: blocks row by row
 // through the bin's window, surface after surface, and the fragments of each in order.
-// Each thread takes one part of that line; so the list is the same for any number of
-// threads, and for every run.  It is counted in stretches of a block's slots: of blocks
-// there are fewer than threads where no blur is wide.
-// A window (first column and row of blocks, last ones plus one) holds every block that
+// Each thread takes one contiguous part of that sequence, so the list is the same for any
+// number of threads, and for every run.  The sequence is divided into stretches of a
+// block's slots, because without wide blur there are fewer blocks than threads.
+// A window (first column and row of blocks, last ones plus one) contains every block that
 // reaches the bin, and no row or column without one.
 // Needs buffers `blocks`, `places` and uniforms `tile_grid`, `surface_count` in scope.
 
@@ -11,7 +11,7 @@ struct Walk {
     ivec2 bin;
     ivec2 first;                  // block of the window
     ivec2 size;                   // of the window in blocks
-    int next;                     // next stretch of this thread in the line
+    int next;                     // next stretch of this thread in the sequence
     int end;
 };
 
@@ -41,7 +41,7 @@ bool block_reaches(int block, ivec2 at, ivec2 bin) {
     return blocks[block].x != 0u && gap_squared <= reach * reach;
 }
 
-// Next fragments of this thread's part, of a block in reach; false where there are none.
+// Next fragments of this thread's part, from a block in reach; false if there are none.
 bool next_stretch(inout Walk walk, out Stretch stretch) {
     while (walk.next < walk.end) {
         int place = walk.next / STRETCHES;
@@ -62,7 +62,7 @@ bool next_stretch(inout Walk walk, out Stretch stretch) {
 }
 
 // A bit for each tile of the bin that the fragment lights: within the box of its kernel
-// and within the discs about the pixels of its square.
+// and within the discs around the pixels of its square.
 uint tiles_in_reach(uvec4 place, ivec2 bin) {
     Reach reach = unpack_reach(place.w);
     ivec2 first = place_origin_px(place);

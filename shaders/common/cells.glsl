@@ -1,13 +1,13 @@
-// The image in square cells, each with kernels of its own (filter_service/rendering/image_cells.py).
-// cell_px is 0 where one cell is the whole image.
+// Square cells of the image, each with its own kernels
+// (filter_service/rendering/image_cells.py).  cell_px is 0 if one cell is the whole image.
 
 uniform int cell_px;
 uniform int cell_columns;
 uniform int first_row;            // of the strip within the frame
-uniform int border_px;            // of the frame around the image, whose edge it repeats
+uniform int border_px;            // around the image, with its edge repeated
 uniform ivec2 image_size_px;
 
-// Pixel of the image that a pixel of the strip is, or repeats.
+// Pixel of the image that a pixel of the strip shows or repeats.
 ivec2 image_place(ivec2 at) {
     ivec2 place = at + ivec2(0, first_row) - border_px;
     return clamp(place, ivec2(0), image_size_px - 1);

@@ -1,8 +1,8 @@
-// Depths as whole numbers of KEY_BITS bits within a range of depths.  In dioptres (coverage)
-// steps are equal; in metres (PAPER_RULE) they are steps of the float itself, fine near
-// the eye, and where the range is narrow every depth has its own.
+// Depths as integers of KEY_BITS bits within a range of depths.  In diopters (coverage)
+// steps are equal; in meters (PAPER_RULE) they are steps of the float itself, fine near
+// the eye, and in a narrow range every depth has its own key.
 
-// Bits of a float that order like it.
+// Bits of a float whose integer order is that of the floats.
 uint ordered_bits(float value) {
     uint bits = floatBitsToUint(value);
     uint sign = 1u << uint(BITS_PER_WORD - 1);

@@ -35,8 +35,8 @@ float place_fraction(uvec4 place) {
 
 int place_level(uvec4 place) { return int((place.y >> LEVEL_SHIFT) & LEVEL_MASK); }
 
-// Pixels of its square beyond the first, to the right and down.
+// Pixels of the fragment's square beyond the first, to the right and down.
 int place_extent_px(uvec4 place) { return (1 << place_level(place)) - 1; }
 
-// Largest distance at which the fragment lights a pixel, from the nearest of its own.
+// Largest distance at which the fragment lights a pixel, from its own nearest pixel.
 float place_reach_px(uvec4 place) { return float(place.z >> PLACE_BITS) + 0.5; }

@@ -1,10 +1,10 @@
 // Kernels of this frame, each with both ends of its interval of layers.  Record k:
 //   (spread bits at the near and the far end px, radius px, reach),
-//   (offsets of the kernel by merging level; NO_LEVEL where it has none),
+//   (offsets of the kernel by merging level; NO_LEVEL if it has none),
 //   (scale bits by level).
-// The kernel lies within its reach and within dx^2 + dy^2 <= (radius + 0.5)^2; that of
-// level L is its sum over a square of 2^L pixels, and reaches 2^L - 1 farther to the
-// right and down.
+// The kernel lies within its reach and within dx^2 + dy^2 <= (radius + 0.5)^2.  Its level
+// L is the sum over a square of 2^L pixels, and reaches 2^L - 1 farther to the right and
+// down.
 // Needs a buffer `kernels` of uvec4 in scope.
 
 uvec4 kernel_size(uint kernel) { return kernels[kernel * uint(KERNEL_WORDS)]; }

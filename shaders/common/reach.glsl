@@ -1,5 +1,5 @@
-// How far a kernel reaches from its centre: columns to the left and right, rows up and
-// down (image rows grow downwards), a byte each.
+// Reach of a kernel from its center: columns to the left and right, rows up and down
+// (image rows increase downward), a byte each.
 
 struct Reach { int left; int right; int up; int down; };
 
@@ -18,12 +18,12 @@ bool within(Reach reach, ivec2 at) {
         && at.y <= reach.down;
 }
 
-// Texel of an offset from the centre within the kernel.
+// Texel of the kernel at an offset from its center.
 int reach_texel(Reach reach, ivec2 at) {
     return (at.y + reach.up) * reach_width(reach) + at.x + reach.left;
 }
 
-// Offset from the centre of a texel of the kernel.
+// Offset of a texel of the kernel from its center.
 ivec2 reach_offset(Reach reach, int texel) {
     int width = reach_width(reach);
     return ivec2(texel % width - reach.left, texel / width - reach.up);

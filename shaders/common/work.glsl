@@ -1,4 +1,4 @@
-// One work group's share of kernels of different size: (kernel, first texel).
+// One work group's share of kernels of different sizes: (kernel, first texel).
 // Needs a buffer `work` of uvec2 in scope.
 
 uniform int group_count;

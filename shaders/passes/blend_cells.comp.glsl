@@ -1,6 +1,6 @@
 // Blends the kernels of up to three field nodes into the kernel of an image cell.
-// Each is mapped from the pixels it is stored in to the image's: a pixel takes the light
-// of the stored pixels that its sides cover.
+// Each is mapped from the pixels it is stored in to the image's: a pixel receives the
+// light of the stored pixels that it covers.
 // In:  the node atlas, NODES (as in blend_psfs), PARTS (three node kernels, three weights,
 //      three maps from offsets in the image to those in a node's kernel), KERNELS
 //      (common/kernels.glsl), WORK.
@@ -35,7 +35,7 @@ void add_texel(int first, Reach reach, ivec2 at, float weight, inout vec3 near,
     far += weight * far_weights(ends);
 }
 
-// Adds one part of a kernel at an offset from its centre.
+// Adds one part of a kernel at an offset from its center.
 void add_node(uint part, uint index, ivec2 at, inout vec3 near, inout vec3 far) {
     float weight = uintBitsToFloat(parts[part + 1u][index]);
     if (weight == 0.0) return;

@@ -1,4 +1,4 @@
-// Blends cached PSFs into node kernels: field node, both ends of an interval of layers.
+// Blends cached PSFs into the kernels of field nodes, at both ends of layer intervals.
 // In:  the store (16-bit weights, a texture array addressed as one line), RECIPES (per
 //      layer and channel offsets, reaches and weights of six cached kernels: three nodes
 //      of pupil and accommodation x two of defocus), NODES (records: near recipe, far

@@ -1,15 +1,15 @@
-// Turns colour and depth of the input frame into linear light, vergences and layer
-// positions, and notes which kernels the frame needs.  Surface after surface: what is
-// seen, and what it hides.
+// Converts color and depth of the input frame to linear light, vergences and layer
+// positions, and marks the kernels that the frame needs, for each surface: the visible
+// one and the hidden one.
 // In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
 //      COLOR_IS_HALF),
-//      DEPTH_IN (f32 metres; what is hidden lies where it is above 0),
+//      DEPTH_IN (f32 meters; hidden pixels are empty unless it is above 0),
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
 //      PIXEL_LAYER (position), USED (a bit per cell and part of an interval), STATS
-//      (pixels without depth, beyond what was prepared, and without a finite colour,
-//      which is then 0).
-// Dispatch: one thread a pixel, 8 x 8 groups, z the surface.
+//      (pixels without depth, outside the prepared distances, and without a finite color,
+//      which becomes 0).
+// Dispatch: one thread per pixel, 8 x 8 groups, z is the surface.
 // Twin: reference.gather (intervals, cells, used pairs).
 // Source: Csoba & Kunkli 2023, section 6.1; radial depth as in CONVENTIONS.md.
 
@@ -23,7 +23,7 @@ layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float lay
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
 layout(std430, binding = BINDING_FIELD_DEFOCUS) readonly buffer Field { float field_dpt[]; };
-// Coherent: what other groups have noted is seen, and not noted once more.
+// Coherent: bits set by other groups are visible, and not set again.
 layout(std430, binding = BINDING_USED) coherent buffer Used { uint used[]; };
 layout(std430, binding = BINDING_STATS) buffer Stats { uint stats[]; };
 
@@ -36,8 +36,8 @@ uniform int words_per_cell;
 uniform vec4 tangents;            // left, right, up, down
 uniform int depth_is_planar;
 uniform vec2 object_range_dpt;    // prepared distances of objects; others are counted
-uniform ivec4 counted_px;         // first column and row, last ones plus one, of what counts
-uniform vec2 vergence_range_dpt;  // beyond which vergences are taken as its ends
+uniform ivec4 counted_px;         // counted pixels: first column, row; last ones plus one
+uniform vec2 vergence_range_dpt;  // to which vergences are clamped
 uniform float vergence_scale;     // over distance and offset: vergence at the cornea
 uniform float vergence_offset_m;
 
@@ -45,7 +45,7 @@ bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; 
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
 shared uint group_used[MAX_LAYERS * USED_PARTS / BITS_PER_WORD];
-shared uint group_stats[STAT_FRAGMENTS];  // those that are counted here
+shared uint group_stats[STAT_FRAGMENTS];  // counters of this pass
 
 uint byte_at(uint index) {
     uint word = color_in[index / uint(BYTES_PER_WORD)];
@@ -70,8 +70,8 @@ vec3 read_linear_rgb(uint pixel) {
 #endif
 }
 
-// A depth that there is: above 0, or infinite.  By its bits, for a compiler may take it
-// that nothing is "not a number".
+// Whether depth is present: above 0, or infinite.  Tested by its bits, because a compiler
+// may assume that no value is NaN.
 bool is_depth(float depth_m) {
     uint bits = floatBitsToUint(depth_m);
     return bits != 0u && bits <= uint(FLOAT_INFINITY_BITS);
@@ -101,18 +101,18 @@ bool is_prepared(float depth_m, vec2 position) {
     return dpt >= object_range_dpt.x && dpt <= object_range_dpt.y;
 }
 
-// Change of defocus over the field, between the corners of a pixel's cell.
+// Change of defocus over the field, interpolated between the corners of a pixel's cell.
 float field_defocus_dpt(ivec2 at) {
     if (cell_px == 0) return 0.0;
     int cell = cell_of(at);
-    int corner = cell + cell / cell_columns;  // a corner more than cells in each row
+    int corner = cell + cell / cell_columns;  // each row has one corner more than cells
     vec2 share = (vec2(image_place(at) % cell_px) + 0.5) / float(cell_px);
     float above = mix(field_dpt[corner], field_dpt[corner + 1], share.x);
     int below = corner + cell_columns + 1;
     return mix(above, mix(field_dpt[below], field_dpt[below + 1], share.x), share.y);
 }
 
-// Layer position of a distance between the first and the last layer.
+// Layer position of a distance, between the first and the last layer.
 float layer_position(float dpt) {
     int low = 0;
     int high = max(layer_count - 2, 0);
@@ -126,8 +126,8 @@ float layer_position(float dpt) {
     return float(low) + clamp((dpt - layer_dpt[low]) / span, 0.0, 1.0);
 }
 
-// Object distance, or NOTHING_DPT where a hidden pixel is empty, or as good as on the
-// surface before it: the two would blur alike.
+// Object distance, or NOTHING_DPT if a hidden pixel is empty, or so close to the surface
+// in front of it that the two would blur alike.
 float distance_of(uint pixel, uint seen, vec2 at) {
     if (pixel == seen) return vergence_dpt(depth_in[pixel], at);
     if (!is_depth(depth_in[pixel])) return NOTHING_DPT;
@@ -150,7 +150,7 @@ void note_use(ivec2 at, float place) {
     if ((used[word] & bit) == 0u) atomicOr(used[word], bit);
 }
 
-// Counts what is wrong with a pixel, once: not in what a frame repeats of it.
+// Counts the defects of a pixel, once: repeated pixels of a frame are not counted.
 void note_faults(ivec2 at, uint pixel, uint seen, bool is_finite) {
     if (any(lessThan(at, counted_px.xy)) || any(greaterThanEqual(at, counted_px.zw))) return;
     bool holds = is_depth(depth_in[pixel]);
@@ -165,7 +165,7 @@ void main() {
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS))
         group_used[word] = 0u;
     if (thread < uint(STAT_FRAGMENTS)) group_stats[thread] = 0u;
-    barrier();  // no bit is left from before
+    barrier();  // all bits are clear
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (all(lessThan(at, frame_size_px))) {
         uint seen = uint(at.y * frame_size_px.x + at.x);
@@ -182,7 +182,7 @@ void main() {
         }
         pixels[pixel] = vec4(linear_rgb, dpt);
     }
-    barrier();  // all pixels of the group have noted theirs
+    barrier();  // all pixels of the group have set their bits
     uint lane = (gl_WorkGroupID.x + gl_WorkGroupID.y) % uint(STAT_LANES);
     if (thread < uint(STAT_FRAGMENTS) && group_stats[thread] != 0u)
         atomicAdd(stats[lane * uint(STAT_WORDS) + thread], group_stats[thread]);
@@ -190,7 +190,7 @@ void main() {
     int first = cell_of(ivec2(gl_WorkGroupID.xy) * TILE_SIZE_PX) * words_per_cell;
     for (uint word = thread; word < uint(words_per_cell); word += uint(THREADS)) {
         uint bits = group_used[word];
-        // Most groups find theirs noted: thousands that add to one word wait in a line.
+        // Most groups find their bits set: thousands of atomics on one word serialize.
         if ((used[uint(first) + word] & bits) != bits) atomicOr(used[uint(first) + word], bits);
     }
 }

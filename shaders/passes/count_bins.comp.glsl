@@ -1,9 +1,9 @@
-// Counts the fragments whose light reaches each bin, and notes in which of its tiles two
-// surfaces meet, so that their order matters.
+// Counts the fragments whose light reaches each bin, and marks the tiles in which two
+// surfaces meet, so that order matters.
 // In:  FRAGMENT_PLACE, BLOCKS.   Out: BIN_COUNTS (kept, a bit for each tile whose order
 //      matters, entries beyond the capacity of a list), WINDOWS (blocks that reach a bin).
-// Dispatch: one group of GROUP_THREADS a bin: 8 on a software renderer, whose vectors
-//      then all have work, THREADS on hardware.
+// Dispatch: one group of GROUP_THREADS per bin: 8 on a software renderer, so that its
+//      vectors are full, THREADS on hardware.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
 
 #include "common/tiles.glsl"
@@ -18,7 +18,7 @@ layout(std430, binding = BINDING_WINDOWS) writeonly buffer Windows { ivec4 windo
 layout(std430, binding = BINDING_BIN_COUNTS) writeonly buffer Counts { uvec4 counts[]; };
 
 uniform ivec2 tile_grid;
-uniform int search_blocks;        // as far as the widest blur of the frame goes
+uniform int search_blocks;        // reach of the widest blur of the frame
 uniform int surface_count;
 uniform uint list_capacity;
 uniform int order_always;
@@ -30,8 +30,8 @@ shared uint ordered_tiles;
 shared int window_low[2];
 shared int window_high[2];
 
-// Looks for blocks in reach as far as any may lie.  One wide blur thus widens the windows
-// that it falls into, and only this look of the others.
+// Searches for blocks in reach, up to the largest reach of the frame.  One wide blur thus
+// widens only the windows that it reaches; for others it costs only this search.
 ivec4 find_window(ivec2 bin) {
     ivec2 from = max(bin * BIN_TILES - search_blocks, 0);
     ivec2 size = min((bin + 1) * BIN_TILES + search_blocks, tile_grid) - from;
@@ -50,7 +50,7 @@ ivec4 find_window(ivec2 bin) {
         atomicMin(window_low[axis], low[axis]);
         atomicMax(window_high[axis], high[axis]);
     }
-    barrier();  // every thread has told what it found
+    barrier();  // every thread has contributed its blocks
     return ivec4(window_low[0], window_low[1], window_high[0], window_high[1]);
 }
 
@@ -63,7 +63,7 @@ void main() {
             window_high[axis] = 0;
         }
     }
-    barrier();  // sums start from zero, and windows from nothing
+    barrier();  // sums are zero, and windows are empty
     ivec2 bin = ivec2(gl_WorkGroupID.xy);
     int index = bin.y * int(gl_NumWorkGroups.x) + bin.x;
     ivec4 window = find_window(bin);
@@ -72,7 +72,7 @@ void main() {
     uint edges = 0u;
     Stretch stretch;
     while (next_stretch(walk, stretch)) {
-        // Where a hidden surface arrives, something lies in front of it.
+        // Where light of a hidden surface arrives, a surface lies in front of it.
         bool hidden = stretch.block >= tile_grid.x * tile_grid.y;
         for (uint slot = stretch.first; slot < stretch.end; ++slot) {
             uvec4 place = places[slot];

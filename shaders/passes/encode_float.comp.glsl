@@ -1,7 +1,7 @@
-// Packs the filtered frame as linear floats, twelve bytes a pixel.
+// Packs the filtered frame as linear floats, twelve bytes per pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
-// Dispatch: one thread a pixel (three words).
-// Twin: reference.gather (the picture itself, without its coverage).
+// Dispatch: one thread per pixel (three words).
+// Twin: reference.gather (the image itself, without its coverage).
 
 layout(local_size_x = THREADS) in;
 

@@ -1,6 +1,6 @@
-// Packs the filtered frame as linear half floats, six bytes a pixel.
+// Packs the filtered frame as linear half floats, six bytes per pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
-// Dispatch: one thread for two pixels (three words).
+// Dispatch: one thread per two pixels (three words).
 // Twin: filter_service.rendering.srgb.half_from_linear.
 
 layout(local_size_x = THREADS) in;
@@ -12,8 +12,8 @@ layout(std430, binding = BINDING_COLOR_IN) writeonly buffer Packed { uint packed
 
 uniform int pixel_count;
 
-// The nearest half, to even, as a float.  GLSL leaves the rounding of packHalf2x16 to
-// the driver, and some cut bits off.
+// The nearest half float, ties to even, as a float.  GLSL leaves the rounding of
+// packHalf2x16 to the driver, and some truncate.
 vec3 rounded(vec3 linear_rgb) {
     uvec3 bits = floatBitsToUint(clamp(linear_rgb, -HALF_MAX, HALF_MAX));
     uint step = 1u << uint(HALF_DROPPED_BITS);

@@ -1,14 +1,14 @@
 // Merges similar pixels where the blur hides the difference: 2 x 2, then 4 x 4, then the
-// whole block; and packs the fragments of each 8 x 8 block, in scan order, to the front
-// of the block's slots.  One surface a dispatch; surfaces never merge with each other.
-// What is hidden makes fragments only where an edge of what is seen is within reach.
-// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for what
-//      is hidden, BLOCKS of what is seen.
-// Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots a block), BLOCKS (count, largest
+// whole block.  Packs the fragments of each 8 x 8 block, in scan order, to the front of
+// the block's slots.  One surface per dispatch; surfaces never merge with each other.
+// The hidden surface makes fragments only where an edge of the visible one is in reach.
+// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for the
+//      hidden surface, BLOCKS of the visible one.
+// Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots per block), BLOCKS (count, largest
 //      reach bits, order matters, pixels merged), STATS (fragments, pixels merged).
-// Dispatch: one group a block, one thread a quad of pixels.
+// Dispatch: one group per block, one thread per quad of pixels.
 // Twin: tests/numerical/test_renderer_passes.py.  Source: section 6.3 (merging of tiled
-// splatting), there one level.
+// splatting), which merges one level.
 
 layout(local_size_x = QUADS) in;
 
@@ -31,20 +31,20 @@ uniform ivec2 frame_size_px;
 uniform int layer_count;
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 uniform float white_level;
-uniform int is_encoded;           // the picture is for a screen: dark parts are seen finer
-uniform float tolerance;          // of merging, against the usual
+uniform int is_encoded;           // for a display, where dark parts need finer steps
+uniform float tolerance;          // merging error relative to the default
 uniform int max_level;            // 0: no merging
-uniform ivec2 scan_px;            // of the first pixel, and pixels of the whole frame
-uniform int paper_order;          // sort as the paper does: metres plus scan position
-uniform int surface;              // 0: what is seen, 1: what it hides
+uniform ivec2 scan_px;            // index of the first pixel, pixels of the whole frame
+uniform int paper_order;          // sort as in the paper: meters plus scan position
+uniform int surface;              // 0: visible, 1: hidden
 uniform float largest_reach_px;   // of all kernels of the frame
 
-shared uint alive[2];             // bit per thread: it keeps a fragment
-shared uint largest_reach_bits;   // reach is positive, so its bits order like it
+shared uint alive[2];             // bit per pixel of the block: it has a fragment
+shared uint largest_reach_bits;   // reach is positive, so its bits are ordered like it
 shared uint block_has_edge;
 shared uint block_merged_count;
 shared uint edge_in_reach;
-// The merged square that starts at a thread's quad.
+// The merged square whose first quad is the thread's.
 shared int level_of[QUADS];       // 0: single pixels; -1: the quad is part of another square
 shared vec4 mean[QUADS];          // linear RGB, dpt
 shared vec4 low[QUADS];
@@ -60,7 +60,7 @@ bool inside(ivec2 at) {
     return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, frame_size_px));
 }
 
-// Whether a neighbour lies on another surface, seen through this pupil.
+// Whether a neighbor lies on another surface, as seen through this pupil.
 bool is_edge_pixel(ivec2 at, float dpt) {
     const ivec2 steps[] = ivec2[](ivec2(1, 0), ivec2(-1, 0), ivec2(0, 1), ivec2(0, -1));
     for (int i = 0; i < steps.length(); ++i) {
@@ -92,8 +92,8 @@ uint held_pixels(ivec2 at) {
     return held;
 }
 
-// Notes whether an edge of what is seen is so close that light from this block, behind
-// it, may pass.
+// Records whether an edge of the visible surface is so close that light from this hidden
+// block may pass it.
 void find_edge(ivec2 block, ivec2 grid, uint thread) {
     int search = 2 * (int(largest_reach_px) / TILE_SIZE_PX + 1);
     int width = 2 * search + 1;
@@ -108,7 +108,7 @@ void find_edge(ivec2 block, ivec2 grid, uint thread) {
     }
 }
 
-// Difference of light: where the picture will be encoded, as much as it would be in a
+// Difference of light; if the image will be encoded, the equivalent difference in a
 // midtone.
 vec3 seen_contrast(vec3 least, vec3 most) {
     if (is_encoded == 0) return most - least;
@@ -116,15 +116,15 @@ vec3 seen_contrast(vec3 least, vec3 most) {
     return (most - least) / sqrt(clamp(light, MERGE_DARKEST, 1.0));
 }
 
-// Whether a square of four of the level below may be one fragment.  Seen from a blur of
-// half the size, a square of the next level looks the same: so does its error.
+// Whether four squares of the level below may become one fragment.  Relative to a blur of
+// twice the size, a square of the next level is the same, and so is its error.
 bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
     float spread = place.w / float(1 << (level - 1));
     vec3 contrast = seen_contrast(least.rgb, most.rgb);
     float largest = max(contrast.r, max(contrast.g, contrast.b));
     float fraction;
     uint kernel = kernel_at(at, place.x, fraction);
-    // Neighbouring intervals at most: the kernel of the mean is then one of theirs.
+    // At most neighboring intervals, so that the kernel of the mean is one of theirs.
     return spread >= MERGE_MIN_SPREAD_PX
         && floor(place.z) - floor(place.y) <= 1.0
         && largest <= tolerance * white_level * MERGE_CONTRAST
@@ -142,7 +142,7 @@ vec4 pixel_place(ivec2 at) {
     return vec4(place, place, place, kernel_spread_px(kernel, fraction));
 }
 
-// Adds a member to the sum, the extremes and the places of a square.
+// Adds a member to the sum, the extremes and the positions of a square.
 void take_in(vec4 value, vec4 least, vec4 most, vec4 place, bool is_first, inout vec4 sum,
              inout vec4 all_least, inout vec4 all_most, inout vec4 all_places) {
     sum = is_first ? value : sum + value;
@@ -245,9 +245,9 @@ void main() {
         edge_in_reach = 0u;
     }
     if (surface != 0) {
-        barrier();  // nothing is noted from before
+        barrier();  // the shared counters are clear
         find_edge(block_at, grid, quad);
-        barrier();  // all blocks around have been looked at
+        barrier();  // all surrounding blocks have been searched
     }
     ivec2 local = 2 * ivec2(quad % uint(QUADS_ACROSS), quad / uint(QUADS_ACROSS));
     ivec2 at = block_at * TILE_SIZE_PX + local;
@@ -260,10 +260,10 @@ void main() {
             edges |= 1u << uint(i);
     }
     merge_pixels(at, quad, held, edges);
-    barrier();  // counters are clear and all quads are decided before anyone looks
+    barrier();  // counters are clear and all quads are decided before they are read
     for (int level = 2; level <= max_level; ++level) {
         if (all(equal(local & ((1 << level) - 1), ivec2(0)))) merge_squares(at, quad, level);
-        barrier();  // the level is whole before the next looks at it
+        barrier();  // the level is complete before the next one reads it
     }
     int level = level_of[quad];
     if (level > 0) {
@@ -275,7 +275,7 @@ void main() {
         if (level == 0 && (held & (1u << uint(i))) != 0u)
             note_survivor(pixel_bit(local + step), (edges & (1u << uint(i))) != 0u);
     }
-    barrier();  // every survivor is counted before slots are given out
+    barrier();  // every survivor is counted before slots are assigned
 
     if (level > 0)
         write_fragment(block, pixel_bit(local),

@@ -1,5 +1,5 @@
 // Sums kernels over the squares of merged fragments, level by level, so that a merged
-// fragment costs one look-up and loses no light.
+// fragment needs one lookup and loses no light.
 // In:  KERNELS, the kernel atlas (level below), WORK.
 // Out: the same (this level).
 // Dispatch: one group of THREADS texels per item of WORK.

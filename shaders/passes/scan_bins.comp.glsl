@@ -1,9 +1,9 @@
-// Exclusive sum of the bins' counts: where each list starts.
+// Exclusive prefix sum of the bins' counts: the start of each list.
 // In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
-//      as float bits, by which a caller notices a 32-bit overflow, entries that were not
-//      kept, and the length of the longest list), DISPATCHES (groups of the passes that
-//      follow: scatter, a sort for each size class, splat; none where the lists do not
-//      fit their buffers, so that the caller can make room and run them then).
+//      as float bits, which reveal a 32-bit overflow, dropped entries, and the length of
+//      the longest list), DISPATCHES (groups of the following passes: scatter, a sort for
+//      each size class, splat; zero if the lists do not fit their buffers, so that the
+//      caller can enlarge them and run the passes then).
 // Dispatch: one group.
 // Twin: tests/numerical/tile_lists.py (numpy.cumsum).
 
@@ -45,7 +45,7 @@ void main() {
     }
     sums[thread] = sum;
     float_sums[thread] = float_sum;
-    barrier();  // every thread's share is known, and the totals are clear
+    barrier();  // every thread's sum is known, and the totals are clear
     atomicMax(longest, most);
     atomicAdd(lost_count, lost);
     uint start = 0u;

@@ -1,6 +1,6 @@
-// Writes each bin's list: slots of fragments, and the tiles that they light, in scan order.
+// Writes each bin's list: fragment slots and the tiles that they light, in scan order.
 // In:  FRAGMENT_PLACE, BLOCKS, WINDOWS, BIN_OFFSETS.   Out: ENTRIES.
-// Dispatch: one group of GROUP_THREADS a bin of the band.
+// Dispatch: one group of GROUP_THREADS per bin of the band.
 // Twin: tests/numerical/tile_lists.py (lists by comparing all pairs).
 
 #include "common/tiles.glsl"

@@ -1,11 +1,11 @@
-// Sorts the list of each bin in which order matters, nearest first: stable radix sort by
+// Sorts the list of each bin in which order matters, nearest first: a stable radix sort by
 // depth within the bin's own range, RADIX_BITS at a time; equal depths keep scan order.
 // In:  FRAGMENT_COLOR (sort depth in a), BIN_COUNTS, BIN_OFFSETS.   In/Out: ENTRIES.
-// Dispatch: one group of GROUP_THREADS a bin of the band, once a size class: lists of
-//      more than longest_before entries, and CAPACITY at most.
-// Variants: CAPACITY > 0 sorts 32-bit keys, depth << SORT_INDEX_BITS | place in the list,
-//      in shared memory; 0 takes lists of any length through memory, ENTRIES and
-//      ENTRIES_SPARE in turn.  PAPER_RULE: the paper's depths.  KEY_BITS of depth.
+// Dispatch: one group of GROUP_THREADS per bin of the band, once per size class: lists of
+//      more than longest_before and at most CAPACITY entries.
+// Variants: CAPACITY > 0 sorts 32-bit keys, depth << SORT_INDEX_BITS | index in the list,
+//      in shared memory; 0 sorts lists of any length in global memory, alternating between
+//      ENTRIES and ENTRIES_SPARE.  PAPER_RULE: the paper's depths.  KEY_BITS of depth.
 // Twin: tests/numerical/tile_lists.py (stable order of the listed depths).
 
 #include "common/depth_keys.glsl"
@@ -18,10 +18,10 @@ layout(std430, binding = BINDING_BIN_OFFSETS) readonly buffer Offsets { uint off
 layout(std430, binding = BINDING_ENTRIES) coherent buffer Entries { uint entries[]; };
 
 uniform int first_bin;            // of the band
-uniform uint longest_before;      // list of the class below
+uniform uint longest_before;      // capacity of the class below
 
-// A bucket's row is a word longer than the group: a column of them then lies in as many
-// banks of a GPU's shared memory.
+// A bucket's row is one word longer than the group, so that a column of rows is spread
+// over the banks of a GPU's shared memory.
 const int BUCKET_WORDS = GROUP_THREADS + 1;
 shared uint buckets[RADIX * BUCKET_WORDS];
 shared uint bucket_totals[RADIX];
@@ -48,7 +48,7 @@ void begin(uint first, uint my_first, uint my_end) {
     }
 }
 
-// Entries follow their keys, by way of the half of the keys that is free.
+// Entries are permuted like their keys, through the free half of the keys.
 void finish(uint first, uint my_first, uint my_end, bool odd) {
     for (uint i = my_first; i < my_end; ++i) {
         uint place = read_item(i, first, odd) & uint((1 << SORT_INDEX_BITS) - 1);
@@ -91,7 +91,7 @@ void find_depth_range(uint first, uint my_first, uint my_end) {
     }
     atomicMin(nearest, low);
     atomicMax(farthest, high);
-    barrier();  // every thread has given its extremes
+    barrier();  // every thread has contributed its extremes
 }
 
 // Stable sort by one digit of the keys.
@@ -104,7 +104,7 @@ void sort_digit(uint first, uint my_first, uint my_end, int shift, bool odd) {
         uint digit = (item_key(read_item(i, first, odd)) >> shift) & digit_mask;
         buckets[digit * uint(BUCKET_WORDS) + thread] += 1u;
     }
-    barrier();  // counts of all threads are in
+    barrier();  // the counts of all threads are complete
     for (int bucket = int(thread); bucket < RADIX; bucket += GROUP_THREADS) {
         uint sum = 0u;
         for (int other = 0; other < GROUP_THREADS; ++other) {
@@ -114,7 +114,7 @@ void sort_digit(uint first, uint my_first, uint my_end, int shift, bool odd) {
         }
         bucket_totals[bucket] = sum;
     }
-    barrier();  // places within a bucket are known
+    barrier();  // positions within a bucket are known
     uint base = 0u;
     for (int digit = 0; digit < RADIX; ++digit) {
         buckets[digit * BUCKET_WORDS + int(thread)] += base;
@@ -128,7 +128,7 @@ void sort_digit(uint first, uint my_first, uint my_end, int shift, bool odd) {
         write_item(at, first, odd, item);
     }
     memoryBarrierBuffer();
-    barrier();  // the list is whole before the next digit reads it
+    barrier();  // the list is complete before the next digit reads it
 }
 
 void main() {
@@ -147,7 +147,7 @@ void main() {
     uint my_end = min(my_first + share, count);
     find_depth_range(first, my_first, my_end);
     begin(first, my_first, my_end);
-    barrier();  // all keys are made
+    barrier();  // all keys are written
     bool odd = false;
     for (int shift = 0; shift < KEY_BITS; shift += RADIX_BITS) {
         sort_digit(first, my_first, my_end, shift, odd);

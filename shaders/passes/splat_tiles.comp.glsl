@@ -1,16 +1,16 @@
-// Adds up the light that a tile's fragments send to each of its pixels: walks the list of
-// the tile's bin, stages what reaches the tile, and evaluates that.
+// Accumulates the light that a tile's fragments send to each of its pixels: reads the list
+// of the tile's bin, stages the fragments that reach the tile, and evaluates them.
 // In:  FRAGMENT_COLOR, FRAGMENT_PLACE, BIN_COUNTS, BIN_OFFSETS, ENTRIES, KERNELS,
-//      the kernel atlas, PIXELS (own colour where no light arrives).
+//      the kernel atlas, PIXELS (own color where no light arrives).
 // Out: COLOR_OUT (vec4: linear RGB, mean coverage).
-// Dispatch: (tiles of a bin, bins of the band) groups; a thread serves PIXELS_PER_THREAD
+// Dispatch: (tiles of a bin, bins of the band) groups; a thread computes PIXELS_PER_THREAD
 //      pixels of a column: 8 on a software renderer, where a staged fragment is then read
 //      once by one vector of threads; 2 on hardware, where a tile is one warp.
-// Variants: FRAGMENTS_A_TURN, whose weights are on their way together; PAPER_RULE
-//      (alpha-over by weight, as the paper), otherwise coverage: sums of fragments of one
-//      depth (to DISCONTINUITY_PX of blur), front to back, each of which shares what the
-//      nearer ones leave free: of a surface that another hides in part, no part is taken
-//      before the rest.
+// Variants: FRAGMENTS_A_TURN fragments whose weights are fetched together; PAPER_RULE
+//      (alpha-over by weight, as in the paper), otherwise coverage: fragments of one depth
+//      (to DISCONTINUITY_PX of blur) are summed, front to back, and share the coverage
+//      that nearer ones leave free, so that no part of a partly hidden surface is
+//      accumulated before the rest.
 // Twin: reference.gather.
 // Source: Csoba & Kunkli 2023, section 6.1; accumulation as in shaders/README.md.
 
@@ -45,22 +45,23 @@ layout(binding = TEXTURE_ATLAS) uniform usampler2D atlas;
 const int GROUP_THREADS = THREADS / PIXELS_PER_THREAD;
 const int ENTRIES_PER_THREAD = BATCH / GROUP_THREADS;
 
-// Staged fragments: what the pixel loop needs, ready to use, in as few words as may be: on
-// a software renderer each word that it reads costs a tenth of an evaluation.
-shared vec4 staged_color[BATCH];      // linear RGB, by the scale of the weights but for
-                                      // the paper's rule; layer fraction
-shared uvec4 staged_mark[BATCH];      // columns and rows of the tile that it lights, a bit
-                                      // each, level, length of its kernel's rows; texel of
-                                      // the tile's first pixel, were it lit; as float bits
-                                      // the scale, and the depth.  Before, x is the slot:
-                                      // little shared memory lets many groups run at once
+// Staged fragments: the data of the pixel loop, in as few words as possible, because each
+// word read costs a tenth of an evaluation on a software renderer.
+shared vec4 staged_color[BATCH];      // linear RGB, multiplied by the scale of the weights
+                                      // except for the paper's rule; layer fraction
+shared uvec4 staged_mark[BATCH];      // x: lit columns and rows of the tile, a bit each;
+                                      // level; length of the kernel's rows.  y: texel of
+                                      // the tile's first pixel, as if lit.  z, w: bits of
+                                      // the scale and the depth.  Before staging x is the
+                                      // slot: with little shared memory many groups can
+                                      // run at once
 shared uint hits[HIT_WORDS];          // bit per entry of the batch: it reaches the tile
 
 const int ROWS_SHIFT = TILE_SIZE_PX;
 const int SHAPE_LEVEL_SHIFT = 2 * TILE_SIZE_PX;
 const int WIDTH_SHIFT = SHAPE_LEVEL_SHIFT + 2;
 
-// Bits first to last, cut to those of a tile.
+// Bits first to last, clipped to those of a tile.
 uint bits_between(int first, int last) {
     uint until = (2u << uint(min(last, TILE_SIZE_PX - 1))) - 1u;
     return until & ~((1u << uint(max(first, 0))) - 1u);
@@ -95,7 +96,7 @@ void stage(uint slot, int at, ivec2 tile_first) {
 
 float staged_depth(int at) { return uintBitsToFloat(staged_mark[at].w); }
 
-// Bits, from 0 on, of those of this thread's entries of a batch that reach the tile.
+// Bits, from 0 on, of this thread's entries of a batch that reach the tile.
 uint find_hits(uint first, uint end, uint tile_bit) {
     uint found = 0u;
     for (uint i = 0u; i < uint(ENTRIES_PER_THREAD); ++i) {
@@ -105,7 +106,7 @@ uint find_hits(uint first, uint end, uint tile_bit) {
     return found;
 }
 
-// Fragments of the batch before this one of its entries.
+// Number of fragments of the batch before an entry.
 uint rank_of(uint entry) {
     uint word = entry / uint(BITS_PER_WORD);
     uint rank = bitCount(hits[word] & ((1u << (entry % uint(BITS_PER_WORD))) - 1u));
@@ -119,12 +120,12 @@ int hit_count() {
     return count;
 }
 
-// Stages the fragments of a batch that reach the tile, in order; returns how many.
+// Stages the fragments of a batch that reach the tile, in order; returns their number.
 int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
     uint mine = gl_LocalInvocationIndex * uint(ENTRIES_PER_THREAD);
     uint found = find_hits(batch + mine, end, tile_bit);
     if (gl_LocalInvocationIndex < uint(HIT_WORDS)) hits[gl_LocalInvocationIndex] = 0u;
-    barrier();  // the last batch is used up, and the bits are clear
+    barrier();  // the last batch is done, and the bits are clear
     atomicOr(hits[mine / uint(BITS_PER_WORD)], found << (mine % uint(BITS_PER_WORD)));
     barrier();  // all hits are known
     uint at = rank_of(mine);
@@ -139,10 +140,10 @@ int stage_batch(uint batch, uint end, uint tile_bit, ivec2 tile_first) {
     return count;
 }
 
-// The light of a pixel: of the fragments at one depth, and of those before them.
+// The light of a pixel: of the fragments at the current depth, and of nearer ones.
 struct Sum { vec3 light; vec3 coverage; vec3 near_light; vec3 near_coverage; };
 
-// Adds up a depth; its fragments share what nearer ones leave free.
+// Adds a depth to the total; its fragments share the coverage that nearer ones leave free.
 void close_depth(inout Sum sum) {
     vec3 room = 1.0 - sum.near_coverage;
     vec3 share = min(room / max(sum.coverage, vec3(MIN_COVERAGE)), 1.0);
@@ -152,13 +153,13 @@ void close_depth(inout Sum sum) {
     sum.coverage = vec3(0.0);
 }
 
-// Whether a fragment is behind the depth that is being added up.
+// Whether a fragment is behind the current depth.
 bool is_beyond(float depth, float group_depth) {
     return (depth - group_depth) * blur_px_per_dpt > DISCONTINUITY_PX;
 }
 
 #ifdef PAPER_RULE
-// What the paper's rule leaves of a weight; it merges once: four pixels.
+// Remaining weight by the paper's rule, which merges once: four pixels.
 vec3 paper_weight(vec3 weight, vec3 coverage, int level) {
     if (level > 0) {
         vec3 through = 1.0 - min(weight / QUAD, 1.0);
@@ -180,7 +181,7 @@ uvec4 fetch_weights(uvec4 mark, ivec2 in_tile) {
     return ATLAS_FETCH(atlas, is_lit(mark, in_tile) ? texel : 0);
 }
 
-// Adds a fragment's light at a pixel that it lights, or not, by the weights fetched for it.
+// Adds a fragment's light at a pixel, if lit, by the weights fetched for it.
 void add_fragment(inout Sum sum, uvec4 ends, bool lit, vec4 color, uvec4 mark) {
     vec3 weight = lit ? weights_between(ends, color.a) : vec3(0.0);
     float scale = uintBitsToFloat(mark.z);
@@ -215,7 +216,7 @@ void main() {
     for (uint batch = first; batch < end; batch += uint(BATCH)) {
         int staged = stage_batch(batch, end, tile_bit, tile * TILE_SIZE_PX);
         for (int i = 0; i < staged;) {
-            // Without a branch for each fragment: those of one depth in a loop of their own.
+            // Fragments of one depth have their own loop, without a branch for each.
             int run_end = staged;
 #ifndef PAPER_RULE
             if (ordered) {
@@ -229,7 +230,7 @@ void main() {
             }
 #endif
 #if FRAGMENTS_A_TURN > 1
-            // Several fetches on their way at a time.
+            // Several fetches in flight at a time.
             for (; i + FRAGMENTS_A_TURN <= run_end; i += FRAGMENTS_A_TURN) {
                 uvec4 ends[FRAGMENTS_A_TURN * PIXELS_PER_THREAD];
                 for (int n = 0; n < FRAGMENTS_A_TURN; ++n)

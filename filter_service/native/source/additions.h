@@ -1,9 +1,9 @@
-/* What fragments add to the pixels of a window. */
+/* Accumulation of fragments in the pixels of a window. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* How a fragment reads its kernel. */
+/* Read access of a fragment to its kernel. */
 typedef struct {
     const level_image *image;
     i32x8 factors;            /* near and far share of each pair */
@@ -37,9 +37,9 @@ INLINE const uint32_t *row_texels(const frame *f, const reading *r, int row) {
     return f->kernel_texels + 4 * (texel - r->left);
 }
 
-/* Pairs and rows of a raster that a kernel's box meets. */
+/* Pairs and rows of a raster that a kernel's box overlaps. */
 typedef struct {
-    int pair, pairs;          /* first, and how many */
+    int pair, pairs;          /* first, and count */
     int row, rows;            /* of the kernel */
 } meeting;
 
@@ -50,7 +50,7 @@ INLINE meeting meet(const reading *r, const raster *own) {
                      row, smaller_int(own->height - r->top, r->image->height) - row};
 }
 
-/* What a fragment adds to: rows of a raster, and what it adds. */
+/* Rows of a raster that a fragment is added to, and the data to add. */
 typedef struct {
     pixel_pair *to;
     int to_stride, rows, pairs;
@@ -64,7 +64,7 @@ INLINE f32x8 weights_of(const addition *a, const uint32_t *from) {
     return __builtin_convertvector(pair_sums(read_pairs(from), a->factors), f32x8);
 }
 
-/* Adds one fragment; the compiler makes a loop for each number of pairs. */
+/* Adds one fragment; the compiler generates a loop for each number of pairs. */
 INLINE void add_rows(const addition *a, int pairs) {
     pixel_pair *to = a->to;
     const uint32_t *from = a->from;
@@ -111,7 +111,8 @@ static void add_both(const addition *a, const addition *b) {
 #undef CASE
 }
 
-/* Says what a fragment adds to a window; false where it lights another part of the bin. */
+/* Prepares the addition of a fragment to a window; false if it lights only other parts of
+ * the bin. */
 INLINE int prepare_addition(const frame *f, uint32_t index, window *w, addition *a) {
     const fragment *one = f->fragments + index;
     const float *rgb = f->lights[index].rgb;
@@ -135,7 +136,7 @@ INLINE int prepare_addition(const frame *f, uint32_t index, window *w, addition 
     return 1;
 }
 
-/* Additions on their way: one waits for another to the same rows. */
+/* Pending additions: one waits for another to the same rows. */
 typedef struct {
     addition two[2];
     int waiting;              /* 0 or 1 */
@@ -164,7 +165,7 @@ INLINE void add_fragment(const frame *f, uint32_t index, window *w, additions *a
     all->two[0] = *newest;
 }
 
-/* The paper's rule: a weight is an opacity; it merges once, four pixels. */
+/* The paper's rule: a weight is an opacity; merging has one level, of four pixels. */
 INLINE void cover_with_fragment(const frame *f, uint32_t index, const window *w) {
     const fragment *one = f->fragments + index;
     const float *rgb = f->lights[index].rgb;

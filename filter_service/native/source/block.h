@@ -1,4 +1,4 @@
-/* The pixels of a block: light, distance, place between layers, kernel. */
+/* The pixels of a block: light, distance, position between layers, kernel. */
 
 #include <math.h>
 
@@ -8,7 +8,7 @@
 
 #define BLOCK_PIXELS (TILE_SIZE_PX * TILE_SIZE_PX)
 
-/* Pixels in scan order; sets of them are bits. */
+/* Pixels in scan order; sets of pixels are bit masks. */
 typedef struct {
     const frame *f;
     int surface, x0, y0;      /* first pixel */
@@ -17,9 +17,9 @@ typedef struct {
     float place[BLOCK_PIXELS];       /* in layers */
     float spread_px[BLOCK_PIXELS];
     uint32_t kernel[BLOCK_PIXELS];
-    uint64_t held;            /* those that hold something */
-    uint64_t edges;           /* those beside another surface */
-    int highest_level;        /* to which any of their kernels merges */
+    uint64_t held;            /* pixels that are not empty */
+    uint64_t edges;           /* pixels next to another surface */
+    int highest_level;        /* of merging, over the pixels' kernels */
 } block;
 
 INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
@@ -41,7 +41,7 @@ INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
     return (f32x4){rgb[0], rgb[1], rgb[2], 0.0f};
 }
 
-/* Distances of a block with those around it; beyond the frame as at its edge. */
+/* Distances of a block and the pixels around it, clamped to the frame. */
 #define AROUND_PX (TILE_SIZE_PX + 2)
 
 INLINE void copy_around(const block *b, float *dpt) {
@@ -54,7 +54,7 @@ INLINE void copy_around(const block *b, float *dpt) {
     }
 }
 
-/* Pixels that have a neighbour on another surface, seen through this pupil. */
+/* Pixels with a neighbor on another surface, as seen through this pupil. */
 INLINE uint64_t find_edges(const block *b) {
     const frame *f = b->f;
     float copied[AROUND_PX * AROUND_PX];
@@ -88,7 +88,7 @@ INLINE int cell_row(const frame *f, int y) {
 
 INLINE int cell_column(const frame *f, int x) { return f->cell_px ? f->column_cell[x] : 0; }
 
-/* Reads a row of a block from pixel i on, whose first pixel in the frame is `first`. */
+/* Reads a row of a block into pixels i and on; its first pixel in the frame is `first`. */
 INLINE void read_row(block *b, int i, size_t first, int width) {
     const frame *f = b->f;
     size_t pixels = (size_t)f->width * (size_t)f->height;
@@ -119,7 +119,7 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
     }
 }
 
-/* Begins a block; what it does not hold stays dark and sharp. */
+/* Reads a block; empty pixels stay dark and sharp. */
 INLINE void read_block(block *b, const frame *f, int surface, int column, int row) {
     b->f = f;
     b->surface = surface;
@@ -142,7 +142,7 @@ INLINE void read_block(block *b, const frame *f, int surface, int column, int ro
     }
 }
 
-/* Kernel of a position within the cell of pixel i. */
+/* Kernel of a layer position in the cell of pixel i. */
 INLINE uint32_t kernel_at(const block *b, int i, float place) {
     const frame *f = b->f;
     int cell = cell_row(f, b->y0 + i / TILE_SIZE_PX) + cell_column(f, b->x0 + i % TILE_SIZE_PX);

@@ -7,7 +7,7 @@ static double linear_of_srgb(double srgb) {
     return srgb <= 0.04045 ? srgb / 12.92 : pow((srgb + 0.055) / 1.055, 2.4);
 }
 
-/* From which light on a byte is the nearest; behind the last there is none. */
+/* Light from which a byte is the nearest; infinity beyond the last byte. */
 static float first_light_of(unsigned byte) {
     return byte < 256 ? (float)linear_of_srgb((byte - 0.5) / 255.0) : INFINITY;
 }

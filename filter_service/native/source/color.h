@@ -10,12 +10,13 @@
 
 extern float linear_of_byte[256];
 
-/* Bytes at equal steps of a float's bits, 128 an octave: at most one byte ends in each. */
+/* Bytes at equal steps of a float's bits, 128 per octave: the byte changes at most once in
+ * each. */
 #define STEP_SHIFT 16
 #define FIRST_STEP (0x38000000u >> STEP_SHIFT) /* 2^-15, half of the second byte */
 #define LAST_STEP (0x3F800000u >> STEP_SHIFT)  /* 1 */
 typedef struct {
-    float next_light;         /* from which the next byte is the nearest */
+    float next_light;         /* light from which the next byte is the nearest */
     uint32_t byte;            /* at the start of the step */
 } byte_step;
 extern byte_step byte_steps[LAST_STEP - FIRST_STEP + 1];
@@ -34,7 +35,7 @@ INLINE float float_of(uint32_t bits) {
     return value;
 }
 
-/* Nearest bytes of eight lights; what is not a number is dark. */
+/* Nearest bytes of eight light values; NaN becomes dark. */
 INLINE void bytes_of_linear(f32x8 light, uint8_t *bytes) {
     f32x8 dark = all8(float_of(FIRST_STEP << STEP_SHIFT));
     light = smaller8(larger8(light, dark), all8(1.0f));
@@ -57,7 +58,7 @@ INLINE float float_of_half(uint16_t half) {
     return float_of(sign | ((exponent + 112u) << 23) | (mantissa << 13));
 }
 
-/* Nearest half, to even; beyond the largest the largest. */
+/* Nearest half, ties to even; clamped to the largest. */
 INLINE uint16_t half_of_float(float value) {
     if (value > 65504.0f) value = 65504.0f;
     if (value < -65504.0f) value = -65504.0f;

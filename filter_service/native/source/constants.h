@@ -1,4 +1,4 @@
-/* Numbers of filter_service/constants.py, by the same names; a test compares them. */
+/* Constants of filter_service/constants.py, with the same names; a test compares them. */
 #ifndef OCU_CONSTANTS_H
 #define OCU_CONSTANTS_H
 

@@ -1,14 +1,14 @@
-/* Light of a window, one depth after the other where surfaces meet, else all at once. */
+/* Light of a window: depth by depth where surfaces meet, otherwise all at once. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Sums of a row of coarse pixels, each alone. */
+/* Sums of a row of coarse pixels, not in pairs. */
 typedef struct {
     float light[4 * (PAIRS_ACROSS + 2)], coverage[4 * (PAIRS_ACROSS + 2)];
 } coarse_row;
 
-/* The row of coarse pixels that lies `share` of the way from one to the next. */
+/* Interpolates a row of coarse pixels, `share` of the way from one row to the next. */
 INLINE void row_between(const raster *coarse, const pixel_pair *above, float share,
                         coarse_row *row) {
     const pixel_pair *below = above + coarse->stride;
@@ -25,7 +25,7 @@ INLINE f32x8 between(const float *left, const float *right, f32x8 part) {
     return first + part * (load8(right) - first);
 }
 
-/* The same of the two pixels at one place. */
+/* The same for two pixels that lie between the same coarse pixels. */
 INLINE f32x8 between_twice(const float *left, const float *right, f32x8 part) {
     f32x4 a = load4(left), b = load4(right);
     f32x8 first = {a[0], a[1], a[2], a[3], a[0], a[1], a[2], a[3]};
@@ -33,7 +33,8 @@ INLINE f32x8 between_twice(const float *left, const float *right, f32x8 part) {
     return first + part * (last - first);
 }
 
-/* Adds a row of pixels of 2 px to one of pixels of 1 px: each pair lies between three. */
+/* Adds a row of pixels of 2 px to one of pixels of 1 px: each pair lies between three
+ * coarse pixels. */
 INLINE void add_halves(const coarse_row *row, pixel_pair *to, int pairs) {
     f32x8 part = {0.75f, 0.75f, 0.75f, 0.75f, 0.25f, 0.25f, 0.25f, 0.25f};
     for (int pair = 0; pair < pairs; ++pair) {
@@ -43,7 +44,7 @@ INLINE void add_halves(const coarse_row *row, pixel_pair *to, int pairs) {
     }
 }
 
-/* Adds a row of pixels of 4 px: two pairs from left of a middle to right of it. */
+/* Adds a row of pixels of 4 px: two pairs per coarse pixel, left and right of its center. */
 INLINE void add_quarters(const coarse_row *row, pixel_pair *to, int pairs) {
     f32x8 before = {0.625f, 0.625f, 0.625f, 0.625f, 0.875f, 0.875f, 0.875f, 0.875f};
     f32x8 behind = {0.125f, 0.125f, 0.125f, 0.125f, 0.375f, 0.375f, 0.375f, 0.375f};
@@ -55,7 +56,8 @@ INLINE void add_quarters(const coarse_row *row, pixel_pair *to, int pairs) {
     }
 }
 
-/* Adds the light of pixels of 2^r px to those of 1 px, between the middles of four. */
+/* Adds the light of pixels of 2^r px to those of 1 px, interpolated between the centers of
+ * four. */
 INLINE void add_coarse(window *w, int r) {
     raster *coarse = w->open + r;
     const raster *fine = w->open;
@@ -70,14 +72,14 @@ INLINE void add_coarse(window *w, int r) {
     clear_raster(coarse);
 }
 
-/* Brings all light of the open depth to pixels of 1 px. */
+/* Converts all light of the open depth to pixels of 1 px. */
 static void gather_sizes(window *w) {
     if (w->open[1].is_lit) add_coarse(w, 1);
     if (w->open[2].is_lit) add_coarse(w, 2);
 }
 
-/* Adds up a depth; its fragments share what nearer ones leave free.  Returns whether
- * anything is left free. */
+/* Composites a depth; its fragments share the coverage that nearer ones leave.  Returns
+ * whether any coverage is left. */
 static int close_depth(window *w) {
     gather_sizes(w);
     f32x8 least = all8(1.0f);
@@ -104,7 +106,7 @@ INLINE int is_beyond(const frame *f, float depth, float open_depth) {
     return (depth - open_depth) * f->blur_px_per_dpt > DISCONTINUITY_PX;
 }
 
-/* Light of a tile where order matters: one depth after the other. */
+/* Light of a tile in which order matters: depth by depth. */
 static void splat_ordered(const frame *f, const bin_list *list, uint32_t tile, window *w) {
     float open_depth = f->lights[list->entries[0].fragment].depth;
     additions all = {.waiting = 0};

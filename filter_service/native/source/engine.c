@@ -1,4 +1,4 @@
-/* What Python calls. */
+/* Functions that Python calls. */
 #include <pthread.h>
 #include <stdlib.h>
 
@@ -12,8 +12,8 @@ extern const loops loops_any;
 extern const loops loops_avx2;
 #endif
 
-/* Makes tables and chooses the loops of this processor; `portable` takes those for every
- * one.  The caller hands them to each call: two kinds may be in use in one process. */
+/* Makes tables and returns the loops for this processor; `portable` selects those for every
+ * processor.  The caller passes them to each call, as a process may use both kinds. */
 EXPORT const loops *ocu_loops(int portable) {
     static pthread_once_t once = PTHREAD_ONCE_INIT;
     pthread_once(&once, make_color_tables);
@@ -29,7 +29,7 @@ EXPORT const loops *ocu_loops(int portable) {
 
 EXPORT const char *ocu_name(const loops *own) { return own->name; }
 
-/* Sizes by which the caller sees that its records are ours. */
+/* Sizes of the records, which the caller compares with its own. */
 EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[0] = (int32_t)sizeof(frame);
     sizes[1] = (int32_t)sizeof(fragment);

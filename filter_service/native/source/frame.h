@@ -1,5 +1,5 @@
-/* What the stages of a frame share.  Arrays belong to the caller (records.py mirrors
- * the layout); images are rows downwards, surfaces one behind the other. */
+/* Data shared by the stages of a frame.  Arrays belong to the caller (records.py mirrors
+ * the layout); images are rows from top to bottom, surface by surface. */
 #ifndef OCU_FRAME_H
 #define OCU_FRAME_H
 
@@ -10,26 +10,26 @@
 
 enum { COLOR_SRGB8 = 0, COLOR_LINEAR = 1, COLOR_HALF = 2 };
 
-/* How wide a kernel of the frame is.  radius_px: it lies within
- * dx^2 + dy^2 <= (radius + 0.5)^2; reach: left, right, up, down. */
+/* Size of a kernel of the frame.  The kernel lies within
+ * dx^2 + dy^2 <= (radius_px + 0.5)^2; reach_px: left, right, up, down. */
 typedef struct {
     float spread_px[2];       /* at the near and the far end of its interval */
-    int32_t highest_level;    /* squares of up to 2^level pixels may merge under it */
+    int32_t highest_level;    /* it allows merged squares of up to 2^level pixels */
     uint16_t radius_px;
     uint8_t reach_px[4];
-    uint8_t levels_used;      /* a bit per level; merging sets it */
+    uint8_t levels_used;      /* a bit per level; set by merging */
     uint8_t spare;
 } kernel_shape;
 
-/* Kernels exist in pixels of 1, 2 and 4 px; those of a coarse resolution r reach pixels
- * of 2^r px, whose light is interpolated between their middles. */
+/* Kernels exist in pixels of 1, 2 and 4 px.  Kernels of a coarse resolution r are added to
+ * pixels of 2^r px, whose light is interpolated between their centers. */
 #define RESOLUTIONS 3
 
-/* A kernel as fragments of one level read it: texels of four pairs (red, green, blue,
- * nothing) of 15-bit weights at the near and far end.  weight = scale * (near * (1 - f)
- * + far * f), f the fraction of the interval. */
+/* A kernel for fragments of one level: texels of four pairs (red, green, blue, unused) of
+ * 15-bit weights at the near and far end.  weight = scale * (near * (1 - f) + far * f),
+ * with the fraction f of the interval. */
 typedef struct {
-    uint32_t first_texel;     /* of row 0; a texel of zeros lies before and behind a row */
+    uint32_t first_texel;     /* of row 0; a texel of zeros lies before and after a row */
     int32_t resolution;
     int16_t left, up;         /* of its first texel from that of the fragment's square */
     int16_t width, height;
@@ -41,8 +41,8 @@ typedef struct {
 
 typedef struct { level_image level[MAX_LEVEL + 1]; } kernel_image;
 
-/* A pixel, or a merged square of 2^level pixels, with its blur: where its light goes, and
- * what light it is. */
+/* A pixel, or a merged square of 2^level pixels, with its blur: the extent of its light
+ * (fragment), and the light itself (fragment_light). */
 typedef struct {
     uint16_t x, y;            /* first pixel */
     uint32_t state;           /* kernel | level << LEVEL_SHIFT | EDGE_BIT */
@@ -65,20 +65,20 @@ enum { BOX_LEFT, BOX_RIGHT, BOX_TOP, BOX_BOTTOM };
 /* A block of 8 x 8 pixels; its fragments follow those of the block to its left. */
 typedef struct {
     uint32_t first, end;      /* of its fragments */
-    uint16_t radius_px;       /* of the farthest of them */
+    uint16_t radius_px;       /* largest of its fragments */
     uint8_t has_edge;
     uint8_t merged;           /* pixels that are part of squares */
 } block_info;
 
-/* A node kernel at one resolution: floats in fours (red, green, blue, 0), texels of zeros
- * around.  stride is 0 where no kernel needs it. */
+/* A node kernel at one resolution: floats in fours (red, green, blue, 0), surrounded by
+ * texels of zeros.  stride is 0 if no kernel needs it. */
 typedef struct {
     uint64_t first_texel;
     int32_t stride;           /* texels from row to row */
     uint8_t reach_px[4];
 } recipe_image;
 
-/* Kernels of a store to be made coarse; see shrink.h. */
+/* Job that downsamples kernels of a store; see shrink.h. */
 typedef struct {
     pool *threads;
     const uint16_t *from;
@@ -87,7 +87,7 @@ typedef struct {
     uint16_t *to;
     const uint64_t *to_first;
     const uint32_t *to_reach;
-    const int64_t *kernels;   /* which, count of them */
+    const int64_t *kernels;   /* their indices (count,) */
     int32_t resolution;
     int32_t count;
 } shrink_job;
@@ -114,10 +114,10 @@ typedef struct {
     int32_t cell_px, cell_columns;  /* cell_px is a power of two, or 0: one cell */
     const float *corner_dpt;  /* change of defocus at the corners of the cells */
     const int32_t *column_cell;              /* of each column of the frame */
-    const float *column_share;               /* of the way through it */
-    float *row_scratch;                      /* of cell_columns + 1, one a thread */
+    const float *column_share;               /* position within it, 0 to 1 */
+    float *row_scratch;                      /* cell_columns + 1 for each thread */
 
-    float *dpt;               /* of each pixel; NOTHING_DPT where nothing is hidden */
+    float *dpt;               /* of each pixel; NOTHING_DPT in empty hidden pixels */
     float *position;          /* in layers */
     uint8_t *used;            /* (cells, intervals) */
     int64_t missing_count, clamped_count, bad_color_count;
@@ -129,22 +129,22 @@ typedef struct {
     int32_t max_level;
     int32_t paper_rule;
     float white_level;
-    float tolerance;          /* of merging, against the usual */
+    float tolerance;          /* of merging, relative to the default */
     float largest_reach_px;
-    fragment *fragments;      /* 64 places a block; without gaps in a row of blocks */
+    fragment *fragments;      /* room for 64 per block; no gaps in a row of blocks */
     fragment_light *lights;
-    int16_t *boxes[4];        /* first and last columns, rows that fragments light */
+    int16_t *boxes[4];        /* first and last columns and rows that fragments light */
     block_info *blocks;
     int64_t fragment_count, merged_count;
-    int32_t farthest_px;      /* radius of the fragment that reaches farthest */
-    int32_t is_encoded;       /* for a screen: dark parts are seen finer */
+    int32_t farthest_px;      /* largest radius of a fragment */
+    int32_t is_encoded;       /* for a display: dark parts need a finer tolerance */
 
     /* Kernels. */
     const uint16_t *store[RESOLUTIONS];
     const uint64_t *store_first[RESOLUTIONS];      /* of each cached kernel */
     const uint32_t *store_reach[RESOLUTIONS];      /* four bytes: left, right, up, down */
-    float coarse_spread_px[RESOLUTIONS];           /* least spread that may use it */
-    const uint32_t *recipes;  /* (n, 3, 18): cached kernels, nothing, weights */
+    float coarse_spread_px[RESOLUTIONS];           /* smallest spread that may use it */
+    const uint32_t *recipes;  /* (n, 3, 18): cached kernels, unused, weights */
     int32_t recipe_count;
     recipe_image *recipe_images;                   /* (n, RESOLUTIONS) */
     float *recipe_texels;
@@ -157,10 +157,10 @@ typedef struct {
     uint64_t blend_scratch_floats;                 /* of one thread */
     uint64_t recipe_texel_count, kernel_texel_count;
 
-    /* The picture. */
+    /* The output image. */
     void *picture;            /* (image_height, image_width, 3) */
     int32_t output_kind;      /* as color_kind */
-    int32_t failed;           /* memory ran out */
+    int32_t failed;           /* out of memory */
     int64_t entry_count;
 } frame;
 

@@ -1,5 +1,5 @@
-/* A kernel at one layer: recipes of up to three field nodes, each as it is stored or mapped to
- * the cell's pixels; and its sums over merged squares.  Twins: blend_cells and merge_psfs of
+/* A kernel at one layer: recipes of up to three field nodes, each as stored or mapped to the
+ * cell's pixels; and its sums over merged squares.  Twins: blend_cells and merge_psfs of
  * shaders/passes. */
 
 #include <math.h>
@@ -7,13 +7,13 @@
 #include "frame.h"
 #include "vectors.h"
 
-/* A kernel at one layer: floats in fours, and the sums over squares that it needs. */
+/* A kernel at one layer: floats in fours, and its sums over squares as needed. */
 typedef struct {
-    int recipes[FIELD_CORNERS];    /* that it was made of; -1: nothing yet */
+    int recipes[FIELD_CORNERS];    /* its parts; -1: none */
     double maps[FIELD_CORNERS][4];
     int64_t cell;
     reach box;
-    int level_count;               /* made so far */
+    int level_count;               /* computed so far */
     float *texels[MAX_LEVEL + 1];
     float largest[MAX_LEVEL + 1];
 } kernel_end;
@@ -22,7 +22,7 @@ INLINE int is_unmoved(const double *map) {
     return map[0] == 1.0 && map[1] == 0.0 && map[2] == 0.0 && map[3] == 1.0;
 }
 
-/* Reach in the image's pixels of a kernel stored in others; twin: cell_maps.mapped_reach. */
+/* Reach in image pixels of a kernel stored in other pixels; twin: cell_maps.mapped_reach. */
 static reach mapped_reach(const double *map, reach stored) {
     double area = map[0] * map[3] - map[1] * map[2];
     double inverse[2][2] = {{map[3] / area, -map[1] / area}, {-map[2] / area, map[0] / area}};
@@ -43,7 +43,7 @@ static reach mapped_reach(const double *map, reach stored) {
     return (reach){sides[0], sides[1], sides[2], sides[3]};
 }
 
-/* Where the pixels of a row read along one axis: first texel, and shares of so many. */
+/* Texels that the pixels of a row read along one axis: the first one, and their shares. */
 #define MOST_TAPS PAD_TEXELS
 #define LONGEST_ROW (2 * LONGEST_REACH_PX + 1)
 
@@ -52,7 +52,8 @@ typedef struct {
     float shares[MOST_TAPS][LONGEST_ROW];
 } row_reads;
 
-/* Shares of stored texels that pixels cover: middles `start + step * n`, half a side. */
+/* Shares of stored texels that pixels cover, with centers `start + step * n` and a side of
+ * 2 * half. */
 INLINE void find_covered(float start, float step, float half, int count, int n_taps,
                          int lowest, int highest, row_reads *reads) {
     for (int n = 0; n < count; ++n) {
@@ -73,8 +74,8 @@ INLINE void find_covered(float start, float step, float half, int count, int n_t
     }
 }
 
-/* Adds a mapped part: each pixel takes the light of the stored ones that its sides
- * cover.  n_taps is 2 or 3; the compiler makes a loop for each. */
+/* Adds a mapped part: each pixel takes the light of the stored ones that it covers.  n_taps
+ * is 2 or 3; the compiler generates a loop for each. */
 INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const float *map,
                             float weight, reach box, int n_taps, float *to) {
     float half_x = 0.5f * fabsf(map[0]);
@@ -102,7 +103,7 @@ INLINE void add_mapped_taps(const float *texels, int stride, reach stored, const
     }
 }
 
-/* Texels between `lowest` and `highest` that lie between two places. */
+/* Texels between `lowest` and `highest` that overlap the range from low to high. */
 INLINE void covered(float low, float high, int lowest, int highest, int *first, int *last) {
     float from = __builtin_floorf(low + 0.5f);
     float to = __builtin_ceilf(high - 0.5f);
@@ -116,8 +117,9 @@ INLINE float share_of(float low, float high, int texel) {
     return to > from ? to - from : 0.0f;
 }
 
-/* The same for pixels that cover more texels than there are zeros between rows: a cell's
- * and a node's pixels differ so much in fields of 90 degrees.  Reads what is there only. */
+/* The same for pixels that cover more texels than there are zeros between rows, as the
+ * pixels of a cell and a node differ that much in fields of 90 degrees.  Reads only within
+ * the kernel. */
 static void add_mapped_wide(const float *texels, int stride, reach stored, const float *map,
                             float weight, reach box, float *to) {
     float half_x = 0.5f * fabsf(map[0]);
@@ -175,7 +177,7 @@ static float largest_of(const float *texels, size_t count) {
     return larger_float(most[0], larger_float(most[1], most[2]));
 }
 
-/* Box of a kernel's end: that of its parts, as they are mapped. */
+/* Box of a kernel's end: the union of the boxes of its mapped parts. */
 static reach end_box(const frame *f, int kernel, const int *recipes, int r) {
     const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
     reach box = {0, 0, 0, 0};
@@ -187,7 +189,7 @@ static reach end_box(const frame *f, int kernel, const int *recipes, int r) {
     return box;
 }
 
-/* Makes the kernel of a cell at one layer, unless that is what it holds. */
+/* Computes the kernel of a cell at one layer, unless `end` already holds it. */
 static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *end) {
     const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
     const double *maps = f->part_maps + 4 * FIELD_CORNERS * (size_t)kernel;
@@ -214,7 +216,7 @@ static void make_end(const frame *f, int kernel, int is_far, int r, kernel_end *
     end->level_count = 1;
 }
 
-/* Sums of the level below over 2 x 2 squares, up to a level. */
+/* Computes sums of the level below over 2 x 2 squares, up to a level. */
 static void make_levels(kernel_end *end, int level) {
     for (; end->level_count <= level; ++end->level_count) {
         int step = 1 << (end->level_count - 1);

@@ -1,4 +1,4 @@
-/* Kernels as fragments read them: both ends of an interval of layers in steps of 15 bits. */
+/* Kernels in the format that fragments read: both ends of an interval of layers, 15 bits. */
 
 #include <math.h>
 
@@ -9,7 +9,7 @@
 
 INLINE int level_extent(int level) { return (1 << level) - 1; }
 
-/* Places the levels of all kernels that fragments use, one behind the other. */
+/* Lays out the levels of all kernels that fragments use, consecutively. */
 static void place_kernels(frame *f) {
     uint64_t texel = 1;
     uint64_t largest = 0;
@@ -41,14 +41,14 @@ static void place_kernels(frame *f) {
         }
     }
     f->kernel_texel_count = texel + 1;
-    /* both ends of a kernel at all levels, four floats a texel */
+    /* both ends of a kernel at all levels, four floats per texel */
     uint64_t floats = 2 * (MAX_LEVEL + 1) * 4 * (largest + 64);
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;
 }
 
-/* One texel of four as steps of 15 bits.  What is added before the fraction is cut off
- * differs from texel to texel, in an order of 4 x 4: rounding alone loses all of a tail
- * that is darker than half a step, 1e-3 of the light of a wide kernel. */
+/* Ordered dither of 4 x 4 texels, added before truncation to steps of 15 bits.  Rounding
+ * alone loses all of a tail that is darker than half a step, 1e-3 of the light of a wide
+ * kernel. */
 static const float before_cut[4][4] = {{0.03125f, 0.53125f, 0.15625f, 0.65625f},
                                        {0.78125f, 0.28125f, 0.90625f, 0.40625f},
                                        {0.21875f, 0.71875f, 0.09375f, 0.59375f},
@@ -82,7 +82,7 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
     float near = ends[0]->largest[own];
     float far = ends[1]->largest[own];
     float most = larger_float(larger_float(near, far), 1e-30f);
-    /* A coarse pixel sends the light of as many pixels as it is then spread over. */
+    /* A coarse pixel carries the light of as many pixels as it is later spread over. */
     image->scale = most / (STEPS_15_BITS * STEPS_15_BITS);
     image->near_ratio = STEPS_15_BITS * near / most;
     image->far_ratio = STEPS_15_BITS * far / most;
@@ -99,8 +99,8 @@ static void write_level(const frame *f, level_image *image, int own, kernel_end 
 
 #define KERNELS_AN_ITEM 8
 
-/* Some kernels in one resolution, of one cell after the other: what is the far end of one
- * is mostly the near end of the next. */
+/* Blends some kernels in one resolution, cell by cell: the far end of one kernel is mostly
+ * the near end of the next. */
 static void blend_some(const frame *f, int first, int last, int r, kernel_end *two) {
     kernel_end *ends[2] = {&two[0], &two[1]};
     two[0].cell = two[1].cell = -1;
@@ -122,7 +122,7 @@ static void blend_some(const frame *f, int first, int last, int r, kernel_end *t
     }
 }
 
-/* Item of the second loop: some kernels in all resolutions. */
+/* Item of the second loop: blends some kernels in all resolutions. */
 static void blend_kernels(void *argument, int item, int thread) {
     const frame *f = argument;
     float *scratch = f->blend_scratch + (size_t)thread * f->blend_scratch_floats;

@@ -1,5 +1,5 @@
-/* The fragments whose light reaches a bin of tiles, in scan order; and nearest first where
- * two surfaces meet.  Twins: count_bins, scatter_fragments and sort_bins. */
+/* Lists of the fragments whose light reaches a bin of tiles: in scan order, or nearest first
+ * where two surfaces meet.  Twins: count_bins, scatter_fragments and sort_bins. */
 
 #include <stdlib.h>
 
@@ -16,10 +16,10 @@ _Static_assert(BIN_TILES_X == 2 && BIN_TILES_Y == 2, "box_tiles counts on it");
 
 typedef struct {
     uint32_t fragment;
-    uint32_t tiles;           /* a bit for each tile of the bin that it lights */
+    uint32_t tiles;           /* bit mask of the tiles that it lights */
 } entry;
 
-/* What one thread needs for a bin; grows as lists do. */
+/* Fragment list of a bin, with the scratch memory of one thread; grows on demand. */
 typedef struct {
     entry *entries, *spare;
     uint32_t *keys, *spare_keys;
@@ -60,17 +60,17 @@ INLINE int gap_between(int first_a, int last_a, int first_b, int last_b) {
     return gap > 0 ? gap : 0;
 }
 
-/* Whether a disc about one of a fragment's pixels meets pixels x0..x1, y0..y1. */
+/* Returns whether a disc about any of a fragment's pixels overlaps pixels x0..x1, y0..y1. */
 INLINE int disc_meets(const fragment *one, int x0, int y0, int x1, int y1) {
     int extent = (1 << (one->state >> LEVEL_SHIFT & 3)) - 1;
     int x = one->x, y = one->y;
     int gap_x = gap_between(x, x + extent, x0, x1);
     int gap_y = gap_between(y, y + extent, y0, y1);
-    int radius = one->radius_px; /* gaps are whole: (r + 0.5)^2 = r^2 + r + 0.25 */
+    int radius = one->radius_px; /* gaps are integers: (r + 0.5)^2 = r^2 + r + 0.25 */
     return gap_x * gap_x + gap_y * gap_y <= radius * radius + radius;
 }
 
-/* Whether a fragment lights them: within the box of its kernel too. */
+/* Returns whether a fragment lights the pixels, which must also overlap its kernel's box. */
 INLINE int lights(const frame *f, uint32_t at, int x0, int y0, int x1, int y1) {
     return f->boxes[BOX_LEFT][at] <= x1 && f->boxes[BOX_RIGHT][at] >= x0
            && f->boxes[BOX_TOP][at] <= y1 && f->boxes[BOX_BOTTOM][at] >= y0
@@ -83,7 +83,7 @@ INLINE i16x16 load_sides(const int16_t *from) {
     return value;
 }
 
-/* Which of the boxes of sixteen fragments meet the bin, a bit for each. */
+/* Bit mask of the fragments, out of sixteen, whose boxes overlap the bin. */
 INLINE uint32_t boxes_meet(const frame *f, uint32_t first, const bin_list *list) {
     i16x16 beside = (load_sides(f->boxes[BOX_LEFT] + first) >= all16(list->x0 + BIN_WIDTH))
                     | (load_sides(f->boxes[BOX_RIGHT] + first) < all16(list->x0))
@@ -92,7 +92,7 @@ INLINE uint32_t boxes_meet(const frame *f, uint32_t first, const bin_list *list)
     return bits_of_lanes(~beside);
 }
 
-/* Lists what reaches the bin of fragments that follow each other; there is room for all. */
+/* Lists those of consecutive fragments that reach the bin; the list has room for all. */
 INLINE void list_some(const frame *f, bin_list *list, uint32_t first, uint32_t end) {
     int x0 = list->x0, y0 = list->y0;
     int x1 = x0 + BIN_WIDTH - 1, y1 = y0 + BIN_HEIGHT - 1;
@@ -114,7 +114,7 @@ INLINE void list_some(const frame *f, bin_list *list, uint32_t first, uint32_t e
     list->any_edge |= (states & EDGE_BIT) != 0;
 }
 
-/* Lists what reaches the bin; false where memory ran out. */
+/* Lists the fragments that reach the bin; false if memory ran out. */
 static int list_fragments(const frame *f, bin_list *list) {
     list->count = 0;
     list->any_edge = 0;
@@ -138,8 +138,8 @@ static int list_fragments(const frame *f, bin_list *list) {
     return 1;
 }
 
-/* Tiles of the bin that the box of a fragment's kernel meets, a bit for each: left and
- * right above, left and right below. */
+/* Bit mask of the tiles that the box of a fragment's kernel overlaps: upper left and right,
+ * lower left and right. */
 INLINE uint32_t box_tiles(const frame *f, const bin_list *list, uint32_t at) {
     int middle_x = list->x0 + TILE_SIZE_PX, middle_y = list->y0 + TILE_SIZE_PX;
     uint32_t columns = (uint32_t)(f->boxes[BOX_LEFT][at] < middle_x)
@@ -149,8 +149,8 @@ INLINE uint32_t box_tiles(const frame *f, const bin_list *list, uint32_t at) {
     return (columns & above) | (columns & below) << BIN_TILES_X;
 }
 
-/* Notes which tiles each entry may light, and in which order matters: where light from
- * beside an edge arrives. */
+/* Marks the tiles that each entry may light, and the tiles in which order matters, which
+ * light from next to an edge reaches. */
 static void mark_tiles(const frame *f, bin_list *list) {
     list->ordered = 0;
     for (int i = 0; i < list->count; ++i) {
@@ -166,13 +166,13 @@ static void mark_tiles(const frame *f, bin_list *list) {
     }
 }
 
-/* Bits of a float that order like it. */
+/* Maps a float to bits with the same order. */
 INLINE uint32_t ordered_bits(float value) {
     uint32_t bits = bits_of(value);
     return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
 }
 
-/* Sorts nearest first; equal depths keep scan order. */
+/* Sorts nearest first; equal depths keep their scan order. */
 static void sort_list(const frame *f, bin_list *list) {
     for (int i = 0; i < list->count; ++i)
         list->keys[i] = ordered_bits(f->lights[list->entries[i].fragment].depth);

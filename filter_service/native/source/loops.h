@@ -1,4 +1,4 @@
-/* All loops of a frame, compiled once for each kind of processor; see variants below. */
+/* All loops of a frame, compiled once for each processor variant (loops_any.c, ...). */
 
 #include "frame.h"
 #include "psf_job.h"
@@ -88,7 +88,7 @@ static void all_shrinks(shrink_job *job) {
     pool_run(job->threads, items, shrink_some, job);
 }
 
-/* Computes the PSFs of a job; 0 without memory.  `take_all_psfs` ends it. */
+/* Computes the PSFs of a job; 0 if out of memory.  `take_all_psfs` must follow. */
 static int all_psfs(psf_job *job) {
     size_t n_threads = (size_t)pool_size(job->threads), count = (size_t)job->count;
     psf_results *results = calloc(1, sizeof *results);
@@ -103,7 +103,7 @@ static int all_psfs(psf_job *job) {
     return 1;
 }
 
-/* Copies the kernels, one after the other, and frees what the job held; NULL: only that. */
+/* Copies the kernels, concatenated, and frees the job's memory; with NULL, only frees. */
 static void take_all_psfs(psf_job *job, uint16_t *words) {
     psf_results *results = job->results;
     job->results = NULL;

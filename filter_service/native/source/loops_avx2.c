@@ -1,4 +1,4 @@
-/* For x86-64 processors of the last ten years: eight floats at a time. */
+/* Variant for x86-64 processors of the last ten years: eight floats at a time. */
 #if defined(__x86_64__)
 #if defined(__clang__)
 #pragma clang attribute push(__attribute__((target("avx2,fma"))), apply_to = function)

@@ -1,14 +1,14 @@
-/* Pixels to fragments, block by block. */
+/* Conversion of pixels to fragments, block by block. */
 
 #include <math.h>
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Pixels of a square whose first is pixel 0. */
+/* Bit masks of the pixels of a square that starts at pixel 0. */
 static const uint64_t square_pixels[MAX_LEVEL + 1] = {1, 0x0303u, 0x0F0F0F0Fu, ~(uint64_t)0};
 
-/* What one pixel or square becomes. */
+/* Values of a pixel or square that becomes a fragment. */
 typedef struct {
     f32x4 color;              /* linear RGB, dpt */
     float place;
@@ -28,7 +28,7 @@ INLINE origin origin_of(const block *b, const block_squares *all, int i, int lev
                     (b->edges & square_pixels[level] << i) != 0};
 }
 
-/* Smaller is nearer. */
+/* Sort depth; smaller is nearer. */
 INLINE float sort_depth(const frame *f, int x, int y, float dpt) {
     if (!f->paper_rule) return -dpt;
     float distance_m = dpt > 0.0f ? fminf(1.0f / dpt, PAPER_FAR_M) : PAPER_FAR_M;
@@ -37,7 +37,7 @@ INLINE float sort_depth(const frame *f, int x, int y, float dpt) {
     return distance_m + PAPER_TIE_BREAK_M * scan;
 }
 
-/* Coarse light is spread over half a pixel of its own, and over one between middles. */
+/* Coarse light extends over half a coarse pixel, and over one by interpolation. */
 INLINE int spread_beyond(int resolution) { return resolution ? 2 << resolution : 0; }
 
 INLINE void write_box(const frame *f, uint32_t at, reach r, int beyond, int extent) {
@@ -71,7 +71,8 @@ INLINE void write_fragment(const block *b, int i, const origin *from, uint32_t a
         __atomic_fetch_or(&shape->levels_used, used, __ATOMIC_RELAXED);
 }
 
-/* Whether an edge of what is seen is so close that light from a hidden block may pass. */
+/* Returns whether an edge of the visible surface is so close that light of a hidden block may
+ * pass. */
 static int edge_in_reach(const frame *f, int column, int row) {
     int search = 2 * ((int)f->largest_reach_px / TILE_SIZE_PX + 1);
     int left = clamped_int(column - search, 0, f->block_columns);
@@ -91,8 +92,7 @@ static int edge_in_reach(const frame *f, int column, int row) {
     return 0;
 }
 
-/* Leaves of each set of squares what is part of no larger one; returns the pixels that
- * are part of none. */
+/* Removes squares that are part of larger ones; returns the pixels that are part of none. */
 INLINE uint64_t largest_squares(const block *b, block_squares *all) {
     uint64_t pixels = b->held;
     for (int level = 1; level <= MAX_LEVEL; ++level) {
@@ -122,10 +122,10 @@ static void write_block(const block *b, block_squares *all, block_info *info) {
     }
 }
 
-/* Writes the fragments of a block from place `first` on. */
+/* Writes the fragments of a block from index `first` on. */
 static block_info merge_block(const frame *f, int surface, int column, int row, uint32_t first) {
     block_info info = {first, first, 0, 0, 0};
-    block b;                  /* neither is cleared: 6 KB */
+    block b;                  /* both are 6 KB and not cleared */
     block_squares all;
     if (surface == 0 || edge_in_reach(f, column, row)) {
         read_block(&b, f, surface, column, row);

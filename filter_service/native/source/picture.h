@@ -1,10 +1,11 @@
-/* Sums become the picture: light over coverage, encoded.  Twins: encode_srgb, encode_half. */
+/* Conversion of sums to the output image: light over coverage, encoded.  Twins: encode_srgb,
+ * encode_half. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Light of two pixels over their coverage: what they are, where light is missing the
- * pixels' own.  Pixels before `left` and from `right` on are not of the image. */
+/* Light of two pixels over their coverage; without coverage, the pixels' own light.  Pixels
+ * before `left` and from `right` on are outside the image. */
 INLINE f32x8 seen_light(const frame *f, const pixel_pair *sums, int x, int y, int left,
                         int right) {
     f32x8 least = all8(MIN_COVERAGE);
@@ -24,7 +25,7 @@ INLINE size_t pixel_bytes(int kind) {
     return RGB * (kind == COLOR_SRGB8 ? 1 : kind == COLOR_LINEAR ? sizeof(float) : 2);
 }
 
-/* Two pixels as the caller wants them. */
+/* Writes two pixels in the caller's encoding. */
 INLINE void encode_pair(int kind, f32x8 light, uint8_t *to) {
     if (kind == COLOR_SRGB8) {
         uint8_t bytes[8];

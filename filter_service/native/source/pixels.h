@@ -1,12 +1,12 @@
-/* Depth of every pixel to vergence at the cornea and layer position, and which pairs of cell
- * and layer interval the frame uses.  Twin: build_fragments.comp.glsl. */
+/* Conversion of each pixel's depth to vergence at the cornea and layer position, and the
+ * pairs of cell and layer interval that the frame uses.  Twin: build_fragments.comp.glsl. */
 
 #include <math.h>
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Whether the pair has been noted already is asked first: most pixels find it so. */
+/* Marks a pair as used; reads first, because most pixels find it marked. */
 INLINE void note_use(uint8_t *mark) {
     if (!__atomic_load_n(mark, __ATOMIC_RELAXED)) __atomic_store_n(mark, 1, __ATOMIC_RELAXED);
 }
@@ -15,8 +15,8 @@ INLINE int clamped_int(int value, int low, int high) {
     return value < low ? low : value > high ? high : value;
 }
 
-/* The interval of layers that holds a distance, between the first and the last; looked for
- * about the one where the last distance was found. */
+/* Interval of layers that contains a distance, clamped to the first and last; tries the
+ * interval of the previous distance first. */
 INLINE int find_interval(const frame *f, float dpt, int at) {
     const float *layers = f->layer_dpt;
     int last = f->layer_count - 2;
@@ -30,7 +30,7 @@ INLINE int find_interval(const frame *f, float dpt, int at) {
     return first;
 }
 
-/* Layer position of a distance; `at` is where the last one was found. */
+/* Layer position of a distance; `at` is the interval of the previous one. */
 INLINE float layer_position(const frame *f, float dpt, int *at) {
     if (f->layer_count < 2) return 0.0f;
     int low = *at = find_interval(f, dpt, *at);
@@ -48,7 +48,7 @@ INLINE float vergence_dpt(const frame *f, float distance_m) {
     return f->vergence_scale / (kept_m + f->vergence_offset_m);
 }
 
-/* Vergences of a row of pixels, not clamped; missing depth gives what it gives. */
+/* Vergences of a row of pixels, not clamped; arbitrary for missing depth. */
 INLINE void row_vergences(const frame *f, const float *depth_m, int y, float *dpt) {
     int width = f->width;
     if (!f->depth_is_planar) {
@@ -65,8 +65,8 @@ INLINE void row_vergences(const frame *f, const float *depth_m, int y, float *dp
     }
 }
 
-/* Empties a row of the hidden surface where it holds nothing, or blurs like what lies
- * before it. */
+/* Empties a row of the hidden surface where there is no depth, or the blur is that of the
+ * surface in front of it. */
 INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt,
                      float *dpt) {
     for (int x = 0; x < f->width; ++x) {
@@ -76,7 +76,7 @@ INLINE void hide_row(const frame *f, const float *depth_m, const float *seen_dpt
     }
 }
 
-/* Change of defocus over the field in the middle of a row, at the edges of its cells. */
+/* Change of defocus over the field at the center of a row, at the edges of its cells. */
 INLINE void row_changes(const frame *f, int y, float *change_dpt) {
     int place = clamped_int(y - f->border_px, 0, f->image_height - 1);
     int row = place >> __builtin_ctz((unsigned)f->cell_px);
@@ -87,7 +87,7 @@ INLINE void row_changes(const frame *f, int y, float *change_dpt) {
         change_dpt[column] = above[column] + down * (below[column] - above[column]);
 }
 
-/* Positions and used pairs of one row of one surface, from its clamped vergences. */
+/* Computes positions and used pairs of a row of a surface from its clamped vergences. */
 static void row_positions(const frame *f, const float *dpt, int y, float *change_dpt,
                           float *position) {
     int found = 0;
@@ -114,7 +114,7 @@ static void row_positions(const frame *f, const float *dpt, int y, float *change
     }
 }
 
-/* Whether all of a pixel's light is a number. */
+/* Returns whether all channels of a pixel are finite. */
 INLINE int is_finite_pixel(const frame *f, int surface, size_t pixel) {
     for (size_t c = 3 * pixel; c < 3 * pixel + RGB; ++c) {
         if (f->color_kind == COLOR_LINEAR) {
@@ -126,7 +126,8 @@ INLINE int is_finite_pixel(const frame *f, int surface, size_t pixel) {
     return 1;
 }
 
-/* Pixels of a row of the image whose light is not all numbers, and which count. */
+/* Number of pixels in a row of the image with non-finite light; hidden pixels without depth
+ * do not count. */
 static int64_t bad_colors(const frame *f, int surface, size_t first, const float *depth_m) {
     if (f->color_kind == COLOR_SRGB8) return 0;
     int64_t count = 0;
@@ -136,7 +137,7 @@ static int64_t bad_colors(const frame *f, int surface, size_t first, const float
     return count;
 }
 
-/* One row of all surfaces. */
+/* Item: one row of all surfaces. */
 static void pixel_row(void *argument, int y, int thread) {
     frame *f = argument;
     float *change_dpt = f->row_scratch + (size_t)thread * (size_t)(f->cell_columns + 1);

@@ -7,7 +7,7 @@
 #include <unistd.h>
 
 struct pool {
-    pid_t owner;              /* a child that was forked has none of the threads */
+    pid_t owner;              /* a forked child has none of the threads */
     int n_threads, n_wanted;
     pthread_t *threads;
     pthread_mutex_t lock;
@@ -23,7 +23,7 @@ struct pool {
     pool_between between;
     double interval_s, due_s;
     pthread_cond_t resume;
-    atomic_int rests;         /* threads but the caller wait */
+    atomic_int rests;         /* all threads but the caller wait */
 };
 
 typedef struct {
@@ -37,7 +37,7 @@ static double now_s(void) {
     return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
-/* The caller of a loop: does what is to be done in between, if that is due. */
+/* Runs the callback in the thread of the loop's caller, if it is due. */
 static void come_between(pool *p) {
     if (p->between == NULL || now_s() < p->due_s) return;
     atomic_store(&p->rests, 1);
@@ -103,7 +103,7 @@ static void start(pool *p) {
         own->thread = thread;
         if (pthread_create(&p->threads[thread], NULL, serve, own) != 0) {
             free(own);
-            break; /* go on with those that there are */
+            break; /* continue with fewer threads */
         }
         p->n_threads = thread + 1;
     }
@@ -115,7 +115,7 @@ pool *pool_new(int n_threads) {
     p->threads = calloc((size_t)n_threads, sizeof *p->threads);
     p->n_wanted = n_threads;
     start(p);
-    p->n_wanted = p->n_threads; /* what callers have prepared for */
+    p->n_wanted = p->n_threads; /* the number that callers prepare for */
     return p;
 }
 

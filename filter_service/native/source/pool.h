@@ -1,23 +1,23 @@
-/* A few threads that wait for loops to share. */
+/* Thread pool that shares loops. */
 #ifndef OCU_POOL_H
 #define OCU_POOL_H
 
 typedef struct pool pool;
 
-/* One item of a loop, done by one thread; `thread` counts from 0. */
+/* Runs one item of a loop in one thread; `thread` counts from 0. */
 typedef void (*pool_item)(void *job, int item, int thread);
 
-/* n_threads counts the caller; NULL where threads or memory are lacking. */
+/* Starts a pool; n_threads includes the caller.  NULL if out of memory. */
 pool *pool_new(int n_threads);
 void pool_free(pool *p);
 int pool_size(const pool *p);
 
-/* Has something done now and then in the middle of loops, by the caller of the loop, while
- * its other threads rest; not sooner than interval_s after the last time.  NULL: nothing. */
+/* Sets a callback that the caller of a loop runs within it while the other threads pause, not
+ * sooner than interval_s after the last time.  NULL: none. */
 typedef void (*pool_between)(void);
 void pool_set_between(pool *p, pool_between between, double interval_s);
 
-/* Runs items 0..n_items-1, the caller takes part; returns when all are done. */
+/* Runs items 0..n_items-1, partly in the caller; returns when all are done. */
 void pool_run(pool *p, int n_items, pool_item item, void *job);
 
 #endif

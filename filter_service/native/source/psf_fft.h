@@ -1,10 +1,10 @@
-/* Fourier transforms of sixteen columns at a time, by Stockham's steps of 2, 3, 4 and 5. */
+/* Stockham FFTs of sixteen columns at a time, with radices 2, 3, 4 and 5. */
 
 #define STRIP 16
 
 typedef struct { f32x8 re[2], im[2]; } strip_row; /* one row of a strip */
 
-/* Eight vectors of eight: rows become columns. */
+/* Transposes eight vectors of eight. */
 INLINE void turn8(f32x8 v[8]) {
     f32x8 a[8], b[8];
     for (int i = 0; i < 8; i += 2) {
@@ -27,8 +27,8 @@ INLINE void turned(strip_row *to, int h, f32x8 re, f32x8 im, float cosine, float
     to->im[h] = re * all8(sine) + im * all8(cosine);
 }
 
-/* A step of the radix: from rows q + s (p + k m) to rows q + s (radix p + k); tw holds
- * exp(-2 pi i p / n) for the whole length, of which the step takes every s-th. */
+/* A step of a radix, from rows q + s (p + k m) to rows q + s (radix p + k); tw holds
+ * exp(-2 pi i p / n) for the whole length, of which the step uses every s-th. */
 static void fft_step2(const strip_row *from, strip_row *to, int m, int s, const float *tw) {
     for (int p = 0; p < m; ++p) {
         const float *w = tw + 2 * p * s;
@@ -122,7 +122,7 @@ static void fft_step5(const strip_row *from, strip_row *to, int m, int s, const 
         }
 }
 
-/* Transforms n rows; returns where the result is, in one of both. */
+/* Transforms n rows; returns the buffer that has the result, one of the two. */
 static strip_row *fft_strip(strip_row *rows, strip_row *other, int n, const float *tw) {
     int left = n, s = 1;
     while (left > 1) {
@@ -141,7 +141,7 @@ static strip_row *fft_strip(strip_row *rows, strip_row *other, int n, const floa
     return rows;
 }
 
-/* A strip's rows as columns: floats (STRIP, 2, padded), real before imaginary. */
+/* Transposes a strip to columns: floats (STRIP, 2, padded), real before imaginary. */
 static void turn_strip(const strip_row *rows, int n, size_t padded, float *to) {
     for (int first = 0; first < n; first += 8) /* lengths are multiples of eight */
         for (int h = 0; h < 2; ++h)

@@ -1,4 +1,4 @@
-/* What a call for PSFs takes and gives; records.py mirrors the layout. */
+/* Arguments and results of computing PSFs; records.py mirrors the layout. */
 #ifndef OCU_PSF_JOB_H
 #define OCU_PSF_JOB_H
 
@@ -9,29 +9,29 @@
 #define N_TERMS 28            /* of a wavefront: degree 6 */
 #define N_POWERS 7
 #define N_EDGE 48             /* points of a survey on the pupil's edge */
-#define N_SURVEY 193          /* points of a survey in all, padded to */
+#define N_SURVEY 193          /* all points of a survey, padded to SURVEY_STRIDE */
 #define SURVEY_STRIDE 200
 #define ELLIPSE_COLUMNS 5
 #define LOG_AMPLITUDES 6
 
-/* Tables of the modules of estimator/psf, so that a number stands in one place. */
+/* Tables of the modules of estimator/psf, so that each number is defined once. */
 typedef struct {
     const double *monomials;        /* (28, 28): row j, the monomials of Zernike term j */
     const double *zernike_terms;    /* its inverse */
     const double *node_xy;          /* (2, 28): points that fix a polynomial */
-    const double *from_nodes;       /* (28, 28): row k, what value k adds to each term */
+    const double *from_nodes;       /* (28, 28): row k, effect of value k on each term */
     const float *slope_x, *slope_y; /* (28, SURVEY_STRIDE): of monomials at points */
     const float *edge_xy;           /* (2, N_EDGE) */
     const double *passed_powers;    /* (6, n_rings * n_ring) */
     const double *ring_weights;     /* (n_rings - 1,); the last ring is the edge */
     const float *fresnel;           /* (fresnel_count, 2) from -limit to limit: values,
-                                     * and what to add for the next */
+                                     * and differences to the next */
     const float *edge_response;     /* (2 half_width steps + 1, 2), likewise */
-    const float *pixel_filters;     /* rows of filter_stride, for k = 1, 2 ... in turn */
+    const float *pixel_filters;     /* rows of filter_stride, for k = 1, 2 ... */
     const int32_t *lengths;         /* (length_count,) of FFTs, ascending */
     const int32_t *twiddle_first;   /* (length_count,) pairs */
     const float *twiddles;          /* exp(-2 pi i p / n), n pairs for each length */
-    float cosine[N_POWERS], sine[N_POWERS]; /* of turns, in squares */
+    float cosine[N_POWERS], sine[N_POWERS]; /* polynomials of turns, in squares */
     double fresnel_limit;
     double least_margin_px;
     double base_db, per_rms_db, per_pixel_db, per_narrow_db, rays_from_db, fade_db;
@@ -46,7 +46,7 @@ typedef struct {
 
 enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
 
-/* Wavefronts of nodes, (groups, 3, primaries, ...), and the PSFs that are asked for. */
+/* Wavefronts of nodes, (groups, 3, primaries, ...), and the requested PSFs. */
 typedef struct {
     pool *threads;
     const psf_tables *tables;
@@ -58,14 +58,14 @@ typedef struct {
     const double *wavelength_nm;      /* (3, primaries) */
     const double *apodisation_per_mm2; /* (3, primaries), or none */
     double apodisation_center_mm[2];
-    /* Rings in the pupils; none where there is no table. */
-    const double *ring_offset_mm;     /* (..., 2): of the pupil's middle from the rings' */
-    const double *ring_reach_mrad;    /* (...): how much farther they send light */
+    /* Rings in the pupils; none if there is no table. */
+    const double *ring_offset_mm;     /* (..., 2): of the pupil's center from the rings' */
+    const double *ring_reach_mrad;    /* (...): reach of their light beyond the rays */
     const float *ring_tables;         /* (3, primaries, ring_count, 2): complex amplitude
                                        * by squared distance */
     double ring_steps_per_mm2;
     double ring_lattice_mm[3];        /* of a honeycomb: pitch, inner and outer radius */
-    double cut_ratio;                 /* share of the light that is left out */
+    double cut_ratio;                 /* share of the light that is cropped */
     double oversampling, margin;
     const int64_t *groups, *channels; /* (count,) */
     const double *total_dpt;          /* (count,) */
@@ -73,8 +73,8 @@ typedef struct {
     int64_t *radius_px;
     int64_t *sizes;                   /* texels */
     double *peak_ratio, *spread_px, *lost_ratio, *rays_ratio;
-    int32_t *outcome;                 /* PSF_DONE, or why there is no kernel */
-    void *results;                    /* of the threads, until they are taken */
+    int32_t *outcome;                 /* PSF_DONE, or the reason for no kernel */
+    void *results;                    /* of the threads, until take_all_psfs */
     int32_t count, primaries;
     int32_t max_radius_px, is_diffracting;
     int32_t min_samples_per_px, ring_count;

@@ -1,5 +1,5 @@
-/* The pupil of a PSF in the coordinates of its pixels, and a survey of its wavefront:
- * estimator/psf/pupil.py, survey.py and switch.py, which say why. */
+/* The pupil of a PSF in pixel coordinates, and a survey of its wavefront; derived in
+ * estimator/psf/pupil.py, survey.py and switch.py. */
 
 #include <math.h>
 
@@ -14,18 +14,18 @@ typedef struct {
     double narrow_ratio, passed_ratio, edge_um, rays_ratio;
     double weight;            /* share of the kernel */
     int is_apodised;
-    const float *rings;       /* a table, or none */
-    double from_box_mm[6];    /* rows: place against the rings, of x, y and 1 */
+    const float *rings;       /* a table, or NULL */
+    double from_box_mm[6];    /* rows: position relative to the rings, of x, y and 1 */
 } pupil;
 
-/* Memory of a thread that grows. */
+/* Growing scratch memory of a thread. */
 typedef struct {
     void *at;
     size_t size;
 } scratch;
 
-/* Room for so many floats, aligned for vectors; NULL without memory.  What was in it is
- * lost where it grows. */
+/* Buffer for `count` floats, aligned for vectors; NULL if out of memory.  Growing discards
+ * the content. */
 INLINE void *room_for(scratch *s, size_t count) {
     size_t size = sizeof(float) * count;
     if (size <= s->size) return s->at;
@@ -36,7 +36,7 @@ INLINE void *room_for(scratch *s, size_t count) {
     return s->at;
 }
 
-/* Rounds downwards; numbers are small. */
+/* Rounds down; numbers are small. */
 INLINE f32x8 floor8(f32x8 value) {
     f32x8 whole = __builtin_convertvector(__builtin_convertvector(value, i32x8), f32x8);
     i32x8 is_above = whole > value; /* -1 where it is */
@@ -49,7 +49,7 @@ INLINE double square(double value) { return value * value; }
 INLINE double larger_double(double a, double b) { return a > b ? a : b; }
 INLINE double smaller_double(double a, double b) { return a < b ? a : b; }
 
-/* Exponent of y of term t, and the sum of both; terms go by degree. */
+/* Exponents of x and y of term t; terms are ordered by degree. */
 INLINE void exponents(int t, int *x, int *y) {
     int degree = 0;
     while ((degree + 1) * (degree + 2) / 2 <= t) ++degree;
@@ -89,7 +89,7 @@ static void substitute(const psf_tables *tables, const double *source,
     out[0] = 0.0;
 }
 
-/* Half sides, shear, and the wavefront over box and disc. */
+/* Computes half sides, shear, and the wavefront over box and disc. */
 static void frame_pupil(const psf_tables *tables, const double *zernike_um,
                         double radius_mm, const double *ellipse, const double *jacobian,
                         pupil *own) {
@@ -123,7 +123,7 @@ static void frame_pupil(const psf_tables *tables, const double *zernike_um,
     substitute(tables, own->box, lower, none, own->disc);
 }
 
-/* Apodisation -k |u - u0|^2 over the box, and the light that it passes. */
+/* Computes the apodization -k |u - u0|^2 over the box, and the light that passes. */
 static void apodise_pupil(const psf_tables *tables, double per_mm2, const double *center_mm,
                           const double *ellipse, const double *jacobian, pupil *own) {
     double matrix[2][2], offset[2];
@@ -173,14 +173,14 @@ INLINE double sum8(f32x8 v) {
     return sum;
 }
 
-/* Slopes of the wavefront, in pixels. */
+/* Evaluates slopes of the wavefront, in pixels. */
 static void survey_pupil(const psf_tables *tables, pupil *own) {
     float sheared = (float)(own->shear / own->root), terms[N_TERMS];
     f32x8 per_x = all8((float)(1.0 / own->half[0]));
     f32x8 per_y = all8((float)(1.0 / (own->root * own->half[1])));
     for (int t = 0; t < N_TERMS; ++t) terms[t] = (float)own->disc[t];
-    /* Moments are about the first point, as float32 sums of distant slopes would lose
-     * what distinguishes them. */
+    /* Moments are about the first point, as float32 sums of large slopes would lose their
+     * differences. */
     f32x8 low_x = all8(INFINITY), low_y = low_x, high_x = -low_x, high_y = -low_x;
     f32x8 zero = all8(0.0f), largest = zero, mx = zero, my = zero, mxx = zero, mxy = zero,
           myy = zero, about_x = zero, about_y = zero;
@@ -231,7 +231,7 @@ static void survey_pupil(const psf_tables *tables, pupil *own) {
     own->narrow_ratio = sqrt(larger_double(0.0, least)) * 2.0 / own->wavelength_um;
 }
 
-/* Share of ray optics by the predicted error of rays alone. */
+/* Share of ray optics, from the predicted error of rays alone. */
 static double share_of_rays(const psf_tables *tables, const pupil *own) {
     double terms[N_TERMS], rms = 0.0;
     times_matrix(own->disc, tables->zernike_terms, terms);

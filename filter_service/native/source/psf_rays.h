@@ -1,8 +1,9 @@
-/* Ray optics with Fresnel's edge: estimator/psf/geometric_kernels.py, which says why. */
+/* Ray optics with Fresnel diffraction at the edge; derived in
+ * estimator/psf/geometric_kernels.py. */
 
 typedef float f32x2 __attribute__((vector_size(8)));
 
-/* Part of a kernel's plane: pixel (x, y), y upwards, is row top - y, column x - left. */
+/* Part of a kernel's plane: pixel (x, y), y upward, is row top - y, column x - left. */
 typedef struct {
     float *pixels;
     int left, top, width, height;
@@ -19,8 +20,8 @@ INLINE void add_pair(float *to, const float *pair) {
     memcpy(to, &sum, sizeof sum);
 }
 
-/* Adds eight squares of two pixels each way: left and right in the row of `at`, and in
- * that of `at` plus `other`. */
+/* Adds eight squares of 2 x 2 pixels: left and right in the row of `at`, and in the row of
+ * `at` plus `other`. */
 INLINE void add_squares(float *pixels, int other, i32x8 at, uint32_t lit, f32x8 left,
                         f32x8 right, f32x8 other_left, f32x8 other_right) {
     float pairs[2 * LANES], other_pairs[2 * LANES];
@@ -48,7 +49,7 @@ INLINE void add_squares(float *pixels, int other, i32x8 at, uint32_t lit, f32x8 
     }
 }
 
-/* Coefficients in x of W, dW/dy and d^2W/dy^2 at each of some y. */
+/* Coefficients in x of W, dW/dy and d^2W/dy^2 at several y. */
 typedef struct {
     float of_w[N_POWERS][MOST_CELLS], of_dy[N_POWERS][MOST_CELLS],
         of_dyy[N_POWERS][MOST_CELLS];
@@ -73,7 +74,7 @@ static void fill_cell_terms(double dense[N_POWERS][N_POWERS], const double *y, i
     }
 }
 
-/* Spreads a weight over the pixels that a box covers, by their areas. */
+/* Distributes a weight over the pixels that a box covers, by area. */
 static void add_wide_box(const canvas *c, float x0, float y0, float wide, float high,
                          float weight) {
     double x1 = (double)x0 + wide + 1e-9, y1 = (double)y0 + high + 1e-9;
@@ -93,8 +94,8 @@ static void add_wide_box(const canvas *c, float x0, float y0, float wide, float 
     }
 }
 
-/* A vector of footprints: those of at most two pixels each way by four additions, those
- * of three by nine; the plane has spare pixels behind its last. */
+/* Adds a vector of footprints: those of at most 2 x 2 pixels by four additions, those of
+ * 3 x 3 by nine; the plane has spare pixels after its last. */
 INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x8 high,
                            f32x8 per_wide, f32x8 per_high, f32x8 weight) {
     f32x8 half = all8(0.5f), one = all8(1.0f), none = all8(0.0f);
@@ -137,7 +138,7 @@ INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x
     }
 }
 
-/* What a row of cells needs to know. */
+/* Data shared by a row of cells. */
 typedef struct {
     const canvas *c;
     float w[N_POWERS], d[N_POWERS], e[N_POWERS]; /* in x */
@@ -167,7 +168,7 @@ INLINE void splat_cells(const pupil_row *r, f32x8 x, f32x8 weight) {
 }
 #undef SIX
 
-/* Weights of cells that the pupil's edge may cross: their area inside, the edge straight. */
+/* Weights of cells that the pupil's edge may cross: their area inside a straight edge. */
 INLINE f32x8 edge_weights(const pupil *own, f32x8 x, float y, float cell) {
     f32x8 zero = all8(0.0f), one = all8(1.0f), v = all8(y);
     float room = (float)square(own->root);
@@ -188,7 +189,7 @@ INLINE f32x8 apodised(const pupil *own, f32x8 x, double y, f32x8 weight) {
     return weight;
 }
 
-/* Footprints of all cells of the pupil; returns their weight. */
+/* Adds the footprints of all cells of the pupil; returns their weight. */
 static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], int n_cells,
                           const canvas *c) {
     double cell = 2.0 / n_cells, room = square(own->root), shear = own->shear;
@@ -198,7 +199,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
     r.per_cell_x = 1.0f / r.cell_x;
     r.per_cell_y = 1.0f / r.cell_y;
     f32x8 zero = all8(0.0f), one = all8(1.0f), half = all8(0.5f), total = zero;
-    /* Within this the whole cell lies inside: the ellipse is least curved-in there. */
+    /* Cells within this radius lie completely inside the ellipse. */
     double inner = larger_double(0.0, 1.0 - 0.75 * cell / sqrt(1.0 - fabs(shear)));
     double ys[MOST_CELLS];
     cell_terms rows;
@@ -219,8 +220,8 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
             r.d[a] = rows.of_dy[a][j];
             r.e[a] = rows.of_dyy[a][j];
         }
-        /* The lanes are far from each other: neighbours share pixels, and a load would
-         * have to wait for the store before it. */
+        /* The lanes are far from each other: neighbors share pixels, and a load would have
+         * to wait for the preceding store. */
         int span = (core_end - core_first + LANES - 1) / LANES;
         f32x8 number = NUMBERS8 * all8((float)span) + all8((float)core_first);
         for (int step = 0; step < span; ++step, number += one) {
@@ -230,7 +231,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
             total += weight;
             splat_cells(&r, x, weight);
         }
-        /* Both ends in turn. */
+        /* Both ends of the row. */
         int before = core_first - first, count = before + larger_int(0, end - core_end);
         span = (count + LANES - 1) / LANES;
         number = NUMBERS8 * all8((float)span);
@@ -251,7 +252,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
     return sum;
 }
 
-/* Integral of Fresnel's straight edge less its step, from the dark to v. */
+/* Integral, from the dark side to v, of Fresnel's straight edge minus the step. */
 INLINE f32x8 fresnel_integral(const psf_tables *tables, f32x8 v) {
     float limit = (float)tables->fresnel_limit, last = (float)(tables->fresnel_count - 1);
     f32x8 place = (v + all8(limit)) * all8(last / (2.0f * limit));
@@ -270,7 +271,8 @@ static const float profile_ends[PROFILE_STEPS + 1] = {
     -6.25f, -5.25f, -4.25f, -3.25f, -2.25f, -1.75f, -1.25f, -0.75f, -0.25f,
     0.25f,  0.75f,  1.25f,  1.75f,  2.25f,  3.25f,  4.25f,  5.25f,  6.25f};
 
-/* Spreads light over the four pixels that boxes of 1 / per_size px about (x, y) meet. */
+/* Distributes light over the four pixels that boxes of 1 / per_size px about (x, y)
+ * overlap. */
 INLINE void add_boxes(const canvas *c, f32x8 x, f32x8 y, float per_size, f32x8 light) {
     f32x8 half = all8(0.5f), zero = all8(0.0f), one = all8(1.0f);
     f32x8 at_x = x - all8((float)c->left), at_y = all8((float)c->top) - y;
@@ -302,8 +304,8 @@ INLINE f32x8 sine8(const psf_tables *tables, f32x8 t, f32x8 z) {
     return t * sum;
 }
 
-/* What diffraction at the pupil's edge changes in the spot, for eight edge points at a
- * time that are far from each other. */
+/* Adds the effect of diffraction at the pupil's edge to the spot, for eight distant edge
+ * points at a time. */
 static void add_edge_light(const psf_tables *tables, const pupil *own,
                            double dense[N_POWERS][N_POWERS], const canvas *c) {
     double extent = larger_double(own->high[0] - own->low[0], own->high[1] - own->low[1]);
@@ -379,7 +381,7 @@ static void add_edge_light(const psf_tables *tables, const pupil *own,
     }
 }
 
-/* Brings pixels up to the mean light of the edge: those at least from_px away from it. */
+/* Raises pixels at least from_px away from the edge to its mean light. */
 static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
     f32x8 border2 = all8(from_px * from_px), brightest = all8(t->brightest);
     for (int row = 0; row < c->height; ++row) {
@@ -402,7 +404,7 @@ static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
     }
 }
 
-/* A spot in shares of the light that the pupil passes. */
+/* Computes a spot, in shares of the light that the pupil passes. */
 static void spot_of_rays(const psf_tables *tables, const pupil *own, int is_diffracting,
                          const canvas *c) {
     double dense[N_POWERS][N_POWERS] = {{0.0}};

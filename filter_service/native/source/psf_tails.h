@@ -1,4 +1,4 @@
-/* Mean light far outside a spot, which the pupil's edge sends: estimator/psf/tail.py. */
+/* Mean light of the pupil's edge far outside a spot; derived in estimator/psf/tail.py. */
 
 #define TAIL_EDGES (N_EDGE / 4)
 #define LANES 8
@@ -7,7 +7,7 @@ typedef struct {
     float edge_x[TAIL_EDGES], edge_y[TAIL_EDGES];
     float center_x, center_y;
     float xx, yy, xy, at_center, factor;
-    float brightest;          /* no pixel as far as far_px from the edge has more */
+    float brightest;          /* upper limit of pixels at least far_px from the edge */
 } tail;
 
 static tail tail_of(const psf_tables *tables, const pupil *own) {
@@ -34,7 +34,7 @@ static tail tail_of(const psf_tables *tables, const pupil *own) {
     return t;
 }
 
-/* Squared distances of eight pixels to the nearest and the farthest of the edge. */
+/* Squared distances of eight pixels to the nearest and farthest point of the edge. */
 INLINE void tail_distances8(const tail *t, f32x8 x, float y, f32x8 *nearest,
                             f32x8 *farthest) {
     f32x8 near = all8(1e30f), far = all8(0.0f);
@@ -64,7 +64,7 @@ INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 nearest, f32x8 f
 }
 
 /* Light of the pupil's edge beyond the line x = end (axis 0) or y = end (axis 1), on the
- * side of the sign, as share of the whole: an edge element sends strength / d^2 along its
+ * side of the sign, as a share of all light: an edge element sends strength / d^2 along its
  * normal, to both sides; see needed_radius_px in survey.py. */
 static double light_beyond(const pupil *own, int axis, double sign, double end) {
     f32x8 sum = all8(0.0f), s = all8((float)sign), e = all8((float)end);
@@ -73,7 +73,7 @@ static double light_beyond(const pupil *own, int axis, double sign, double end) 
     return own->edge_um / (2.0 * M_PI * M_PI * N_EDGE) * sum8(sum);
 }
 
-/* The same beyond the box x0, x1, y0, y1, whose ends are pixels that are inside. */
+/* The same outside the box x0, x1, y0, y1 (inclusive). */
 static double light_outside(const pupil *own, const int box[4]) {
     f32x8 sum = all8(0.0f), tiny = all8(1e-12f);
     for (int i = 0; i < N_EDGE; i += 8)

@@ -1,15 +1,15 @@
-/* Wave optics: estimator/psf/fourier.py and fourier_kernels.py, which say why.  Fields are
- * filled, transformed and summed up in strips of sixteen columns that stay in the cache. */
+/* Wave optics, derived in estimator/psf/fourier.py and fourier_kernels.py.  Fields are
+ * filled, transformed and summed in strips of sixteen columns that fit in the cache. */
 
 /* Sampling of one PSF, x before y. */
 typedef struct {
     int length_number[2], length[2], per_px[2], size[2];
     double samples[2];        /* of the pupil, across its box */
     int center[2];            /* of the window, in samples */
-    int window[4];            /* pixels x0, x1, y0, y1 that it fills */
+    int window[4];            /* pixels x0, x1, y0, y1 (inclusive) that it fills */
 } grid;
 
-/* What a thread keeps between PSFs. */
+/* Memory of a thread, kept between PSFs. */
 typedef struct {
     scratch mask;             /* (strips, rows, STRIP) */
     scratch first, second;    /* rows of a strip */
@@ -29,7 +29,7 @@ static void free_wave_work(wave_work *w) {
     free(w->line.at);
 }
 
-/* Smallest grid whose window holds the spot and its margins; 0 where no FFT does. */
+/* Plans the smallest grid whose window holds the spot and its margins; 0 if no FFT does. */
 static int plan_grid(const psf_job *job, const pupil *own, grid *g) {
     const psf_tables *tables = job->tables;
     for (int axis = 0; axis < 2; ++axis) {
@@ -65,7 +65,7 @@ static int plan_grid(const psf_job *job, const pupil *own, grid *g) {
     return 1;
 }
 
-/* First and last column, as reals, of an ellipse scaled by r in the row at y. */
+/* First and last column (real numbers) of an ellipse scaled by r, in the row at y. */
 static void chord_of(double y, double r, const pupil *own, double samples, double middle,
                   double *first, double *last) {
     double inside = (r * r - y * y) * square(own->root);
@@ -77,7 +77,7 @@ static void chord_of(double y, double r, const pupil *own, double samples, doubl
     *last = at + half;
 }
 
-/* The smoothed pupil, strip by strip; kept while it is the same. */
+/* Computes the smoothed pupil, strip by strip, unless it is unchanged. */
 static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
                      wave_work *w) {
     int columns = g->size[0], rows = g->size[1];
@@ -145,7 +145,7 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
     return 1;
 }
 
-/* Squared distance from the nearest center of a honeycomb; infinite where none is near. */
+/* Squared distance from the nearest center of a honeycomb; infinite outside its annulus. */
 INLINE f32x8 lattice_distance8(f32x8 u, f32x8 v, const double lattice[3]) {
     float pitch = (float)lattice[0], high = 1.7320508075688772f * pitch;
     f32x8 half = all8(0.5f), per_pitch = all8(1.0f / pitch), per_high = all8(1.0f / high);
@@ -165,7 +165,7 @@ INLINE f32x8 lattice_distance8(f32x8 u, f32x8 v, const double lattice[3]) {
                    | ((i32x8)all8(INFINITY) & ~is_there));
 }
 
-/* Multiplies a strip by what rings do to the light. */
+/* Multiplies a strip by the complex transmission of the rings. */
 static void apply_rings(const psf_job *job, const pupil *own, const grid *g,
                         int first_column, strip_row *rows) {
     const double *m = own->from_box_mm;
@@ -190,7 +190,7 @@ static void apply_rings(const psf_job *job, const pupil *own, const grid *g,
     }
 }
 
-/* Mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
+/* Computes mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
 static void fill_strip(const psf_tables *tables, const grid *g, const float *mask,
                        float (*phase_terms)[N_POWERS], int first_column, strip_row *to) {
     float x[STRIP];
@@ -215,7 +215,7 @@ static void fill_strip(const psf_tables *tables, const grid *g, const float *mas
     memset(to + g->size[1], 0, sizeof *to * (size_t)(g->length[1] - g->size[1]));
 }
 
-/* Adds the intensity of the strip's rows to those pixels along x that they meet. */
+/* Adds the intensity of the strip's rows to the pixels along x that they overlap. */
 static void sum_strip(const psf_tables *tables, const grid *g, const strip_row *rows,
                       int x0, int x1, float *sums, size_t stride) {
     int k = g->per_px[0], n = g->length[0], half = n / 2;
@@ -256,20 +256,20 @@ static void fill_phase_terms(double turns[N_POWERS][N_POWERS], const grid *g,
             for (int j = 0; j < BLOCK; ++j) value[j] = 0.0;
             for (int b = N_POWERS - 1 - a; b >= 0; --b)
                 for (int j = 0; j < BLOCK; ++j) value[j] = value[j] * y[j] + turns[b][a];
-            /* Whole turns go before the cast, which keeps 1e-6 of the rest. */
+            /* Whole turns are removed before the cast, which keeps 1e-6 of the rest. */
             for (int j = 0; j < count; ++j)
                 terms[first + j][a] = (float)(a == 0 ? value[j] - floor(value[j]) : value[j]);
         }
     }
 }
 
-/* A spot in shares of the light that the pupil passes; 0 without memory. */
+/* Computes a spot, in shares of the light that the pupil passes; 0 if out of memory. */
 static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wave_work *w,
                          const canvas *c) {
     const psf_tables *tables = job->tables;
     int columns = g->size[0], rows = g->size[1], n_x = g->length[0], n_y = g->length[1];
     size_t padded = ((size_t)n_y + STRIP - 1) / STRIP * STRIP;
-    /* Only pixels of the canvas. */
+    /* Only pixels within the canvas. */
     int x0 = larger_int(g->window[0], c->left);
     int x1 = smaller_int(g->window[1], c->left + c->width - 1);
     int y0 = larger_int(g->window[2], c->top - c->height + 1);
@@ -323,8 +323,8 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
         const strip_row *done = fft_strip(rows_of, other, n_x, tw_x);
         sum_strip(tables, g, done, x0, x1, sums + first, padded);
     }
-    /* |sum|^2 (area of a pupil sample)^2 / (lambda^2 A) (angle of a sample)^2: areas and
-     * angles multiply to lambda^2 / N^2, which leaves 1 / N^2 over A in samples. */
+    /* |sum|^2 (area of a pupil sample)^2 / (lambda^2 A) (angle of a sample)^2: areas times
+     * angles are lambda^2 / N^2, which leaves 1 / N^2 over A in samples. */
     double area = M_PI / 4.0 * own->root * g->samples[0] * g->samples[1];
     float scale = (float)(1.0 / (area * n_x * n_y) / own->passed_ratio);
     const float *filter = tables->pixel_filters + (size_t)(k - 1) * tables->filter_stride;

@@ -1,18 +1,18 @@
-/* From wavefronts to packed kernels: each PSF by the method that holds for it, cut to the
- * box that keeps its light, in sixteen bits a weight (filter_service/psfs/pack.py).  Only
- * texels that are kept, and the spot with its surroundings, are computed. */
+/* From wavefronts to packed kernels: each PSF by the method valid for it, cropped to the box
+ * that keeps its light, with 16 bits per weight (filter_service/psfs/pack.py).  Only texels
+ * that are kept, and the spot with its surroundings, are computed. */
 
 #define MOST_PRIMARIES 16
 #define MOST_REACH_PX 255
 #define WEIGHT_MAX 65535.0
 #define PSFS_AN_ITEM 8
-#define RAYS_MARGIN_PX 7.5    /* the edge's light is laid up to 6.25 px, over two pixels */
+#define RAYS_MARGIN_PX 7.5    /* the edge's light extends 6.25 px, over two pixels */
 #define SIDES 4               /* left, right, up, down, as reaches are stored */
 
 static const int side_axis[SIDES] = {0, 0, 1, 1};
 static const double side_sign[SIDES] = {-1.0, 1.0, 1.0, -1.0};
 
-/* What a thread keeps. */
+/* Memory of a thread. */
 typedef struct {
     wave_work waves;
     scratch plane, part, kept;
@@ -21,7 +21,7 @@ typedef struct {
 } psf_work;
 
 typedef struct {
-    psf_work *work;           /* one a thread */
+    psf_work *work;           /* one per thread */
     int64_t *first;           /* (count,) in the words of the thread */
     int32_t *thread;          /* (count,) */
 } psf_results;
@@ -30,7 +30,7 @@ INLINE int clamp_int(int value, int low, int high) {
     return value < low ? low : value > high ? high : value;
 }
 
-/* A pupil of one primary. */
+/* Prepares the pupil of one primary. */
 static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) {
     const psf_tables *tables = job->tables;
     int64_t group = job->groups[psf], channel = job->channels[psf];
@@ -58,7 +58,7 @@ static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) 
     own->rings = NULL;
     if (job->ring_tables == NULL) return;
     own->rings = job->ring_tables + color * 2 * job->ring_count;
-    own->rays_ratio = 0.0; /* only waves know rings */
+    own->rays_ratio = 0.0; /* only wave optics models rings */
     double farther_px = 0.0;
     for (int axis = 0; axis < 2; ++axis) {
         double reach_px = job->ring_reach_mrad[node]
@@ -73,7 +73,7 @@ static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) 
     own->blur_px += farther_px;
 }
 
-/* Widens a box x0, x1, y0, y1 so that it holds what a pupil's engines compute. */
+/* Extends a box x0, x1, y0, y1 to the pixels that a pupil's methods compute. */
 static void widen_box(const pupil *own, const grid *g, int is_diffracting, int box[4]) {
     double margin = is_diffracting ? RAYS_MARGIN_PX : 1.5;
     for (int axis = 0; axis < 2; ++axis) {
@@ -89,7 +89,7 @@ static void widen_box(const pupil *own, const grid *g, int is_diffracting, int b
     }
 }
 
-/* Brings what a wave window does not reach up to the mean light of the edge. */
+/* Sets pixels outside a wave window to the mean light of the edge. */
 static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
     for (int row = 0; row < c->height; ++row) {
         int y = c->top - row, is_done = y >= g->window[2] && y <= g->window[3];
@@ -107,14 +107,14 @@ static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
     }
 }
 
-/* What choosing the box reads of a plane: light by side, from the outermost pixel on. */
+/* Light of a plane, by column and row, for choosing the box. */
 typedef struct {
     const pupil *pupils;
     int primaries, is_diffracting;
-    const double *lines[2];   /* light of columns from the left, and of rows from below */
+    const double *lines[2];   /* columns from the left, and rows from the bottom */
     int box[4];
     double total, center[2];
-    double strength[2], source[2]; /* of the tail: sum, and mean place, along an axis */
+    double strength[2], source[2]; /* of the tail: sum, and mean position, along an axis */
 } light_of_plane;
 
 static double all_light_beyond(const light_of_plane *l, int axis, double sign, double end) {
@@ -125,23 +125,23 @@ static double all_light_beyond(const light_of_plane *l, int axis, double sign, d
     return sum;
 }
 
-/* Smallest reach on a side beyond which there is no more than the share; its light, and
- * the light's moment about the middle along the axis, whose part from infinity is left
- * out: the other side has the same. */
+/* Smallest reach on a side beyond which there is no more light than the share; also returns
+ * that light and its moment about the center along the axis.  The moment omits the part at
+ * infinity, which is equal on the other side. */
 static int reach_of_side(const light_of_plane *l, int side, double share, int most,
                          double *cut, double *moment) {
     int axis = side_axis[side];
     double sign = side_sign[side], allowed = share * l->total;
     const double *lines = l->lines[axis];
     int low = l->box[2 * axis], high = l->box[2 * axis + 1];
-    int end = sign > 0.0 ? high : -low; /* of the plane, outwards */
+    int end = sign > 0.0 ? high : -low; /* of the plane, outward */
     double beyond = all_light_beyond(l, axis, sign, end + 0.5);
     double middle = sign * l->center[axis], source = sign * l->source[axis];
     int at = end;
     double added = 0.0;
     if (beyond > allowed) {
         int step = 1, far;
-        while (at < most) {   /* outwards: doubled steps, then halved */
+        while (at < most) {   /* outward: doubled steps, then bisection */
             far = smaller_int(at + step, most);
             double light = all_light_beyond(l, axis, sign, far + 0.5);
             if (light <= allowed) {
@@ -185,7 +185,7 @@ static int reach_of_side(const light_of_plane *l, int side, double share, int mo
     return at;
 }
 
-/* Reaches that cut a share of the light, less where that moved the kernel's middle. */
+/* Chooses reaches that crop a share of the light, less if that shifts the centroid. */
 static void choose_box(const psf_job *job, const light_of_plane *l, double spread_px,
                        int most, int reaches[SIDES]) {
     const psf_tables *tables = job->tables;
@@ -207,7 +207,7 @@ static void choose_box(const psf_job *job, const light_of_plane *l, double sprea
     }
 }
 
-/* Room for so many more words; NULL without memory. */
+/* Buffer for `count` more words; NULL if out of memory. */
 static uint16_t *more_words(psf_work *w, int64_t count) {
     if (w->count + count > w->room) {
         int64_t room = 2 * (w->count + count);
@@ -242,7 +242,7 @@ static row_light light_of_row(const float *from, int count) {
     return (row_light){sum8(sum), sum8(squares), (double)-least8(-peak)};
 }
 
-/* Cuts a plane to its box, adds the tail where the box is larger, and brings it to steps
+/* Crops a plane to its box, adds the tail where the box is larger, and quantizes it in steps
  * of its peak. */
 static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
                           const tail *tails, const canvas *c, psf_work *w) {
@@ -292,7 +292,7 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
     float *kept = room_for(&w->kept, (size_t)(width * height) + LANES);
     uint16_t *words = more_words(w, (int64_t)width * height);
     if (kept == NULL || words == NULL) return PSF_NO_MEMORY;
-    double sum = 0.0, peak = 0.0, inside = 0.0; /* inside: of the plane's own pixels */
+    double sum = 0.0, peak = 0.0, inside = 0.0; /* inside: light of the plane's own pixels */
     squares = 0.0;
     for (int row = 0; row < height; ++row) {
         int y = up - row, x = -left;
@@ -363,7 +363,7 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
     pupil pupils[MOST_PRIMARIES];
     tail tails[MOST_PRIMARIES];
     grid grids[MOST_PRIMARIES];
-    int box[4] = {0, 0, 0, 0}; /* the chief ray is in it */
+    int box[4] = {0, 0, 0, 0}; /* contains the chief ray */
     double rays_ratio = 0.0;
     for (int p = 0; p < job->primaries; ++p) {
         pupil *own = pupils + p;

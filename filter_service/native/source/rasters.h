@@ -1,15 +1,15 @@
-/* Pixels whose light is being added up, in pairs side by side. */
+/* Accumulation buffers: pixels in horizontal pairs. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Sums of two pixels side by side: red, green, blue and nothing of each. */
+/* Sums of two adjacent pixels: red, green, blue and an unused lane of each. */
 typedef struct { f32x8 light, coverage; } pixel_pair;
 
 #define PAIRS_ACROSS (BIN_WIDTH / 2)
 
-/* Pixels of one size whose light is being added up.  Those of 2 and 4 px go one beyond
- * the window on each side, as light is interpolated between their middles. */
+/* Accumulated pixels of one size.  Those of 2 and 4 px extend one pixel beyond the window on
+ * each side, as light is interpolated between their centers. */
 typedef struct {
     int x0, y0, width, height;  /* in their own size */
     int stride;                 /* pairs from row to row */
@@ -17,8 +17,7 @@ typedef struct {
     pixel_pair *pairs;
 } raster;
 
-/* Pixels of a bin or a tile: of the depth that is open in each size, and of the depths
- * before it. */
+/* Pixels of a bin or a tile: of the open depth in each size, and of the nearer depths. */
 typedef struct {
     int x0, y0, width, height;
     raster open[RESOLUTIONS];
@@ -35,7 +34,7 @@ INLINE void clear_raster(raster *own) {
     own->is_lit = 0;
 }
 
-/* Sums of a bin in all sizes; a tile uses the first of each. */
+/* Sums of a bin in all sizes; a tile uses the first elements of each. */
 typedef struct {
     pixel_pair near[BIN_HEIGHT * PAIRS_ACROSS];
     pixel_pair open[BIN_HEIGHT * PAIRS_ACROSS];

@@ -1,5 +1,5 @@
-/* How far kernels reach from their centre: columns to the left and right, rows up and down
- * (image rows grow downwards). */
+/* Reach of kernels from their center: columns to the left and right, rows up and down (image
+ * rows increase downward). */
 
 #include "frame.h"
 #include "vectors.h"

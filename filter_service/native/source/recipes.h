@@ -8,9 +8,9 @@
 #include "vectors.h"
 
 #define RECIPE_WORDS (3 * RECIPE_TAPS)
-#define PAD_TEXELS 3          /* zeros between rows, as many as a mapped pixel may read */
+#define PAD_TEXELS 3          /* zeros between rows, the most that a mapped pixel reads */
 
-/* Resolution in which a level of a kernel is made: what is blurred enough is coarse. */
+/* Resolution in which a level of a kernel is computed: coarse if it is blurred enough. */
 INLINE int resolution_of(const frame *f, const kernel_shape *shape, int level) {
     float spread = smaller_float(shape->spread_px[0], shape->spread_px[1]);
     for (int r = RESOLUTIONS - 1; r > 0; --r)
@@ -18,7 +18,7 @@ INLINE int resolution_of(const frame *f, const kernel_shape *shape, int level) {
     return 0;
 }
 
-/* Resolutions, a bit each, that the used levels of a kernel need. */
+/* Bit mask of the resolutions that the used levels of a kernel need. */
 static int resolutions_used(const frame *f, int kernel) {
     const kernel_shape *shape = f->shapes + kernel;
     int bits = 0;
@@ -27,7 +27,7 @@ static int resolutions_used(const frame *f, int kernel) {
     return bits;
 }
 
-/* Recipes of a kernel's ends; -1 where a part weighs nothing. */
+/* Recipes of a kernel's end; -1 for parts of zero weight. */
 INLINE void kernel_recipes(const frame *f, int kernel, int is_far, int *recipes) {
     const int64_t *parts = f->kernel_parts + FIELD_CORNERS * (size_t)kernel;
     const double *weights = f->part_weights + FIELD_CORNERS * (size_t)kernel;
@@ -35,7 +35,7 @@ INLINE void kernel_recipes(const frame *f, int kernel, int is_far, int *recipes)
         recipes[j] = weights[j] > 0.0 ? (int)(is_far ? f->node_far : f->node_near)[parts[j]] : -1;
 }
 
-/* Reach of what a recipe is blended from. */
+/* Reach of the kernels that a recipe blends. */
 static reach recipe_reach(const frame *f, int recipe, int r) {
     reach all = {0, 0, 0, 0};
     for (int channel = 0; channel < RGB; ++channel) {
@@ -47,7 +47,7 @@ static reach recipe_reach(const frame *f, int recipe, int r) {
     return all;
 }
 
-/* Places recipes one behind the other, in the resolutions that kernels need. */
+/* Lays out recipes consecutively, in the resolutions that kernels need. */
 static void place_recipes(frame *f) {
     memset(f->recipe_images, 0, sizeof(recipe_image) * RESOLUTIONS * (size_t)f->recipe_count);
     for (int k = 0; k < f->kernel_count; ++k) {
@@ -79,7 +79,7 @@ static void place_recipes(frame *f) {
     f->blend_scratch_floats = RGB * largest;
 }
 
-/* Adds a weighted row of steps. */
+/* Adds a weighted row of quantized weights. */
 INLINE void add_row(float *to, const uint16_t *from, int count, float weight) {
     f32x8 factor = all8(weight);
     int x = 0;
@@ -95,7 +95,7 @@ INLINE void add_row(float *to, const uint16_t *from, int count, float weight) {
 static void blend_channel(const frame *f, const uint32_t *words, int r, reach box, int stride,
                           float *plane) {
     memset(plane, 0, sizeof(float) * (size_t)stride * (size_t)reach_height(box));
-    float pixels = (float)(1 << 2 * r); /* steps of a coarse kernel are means */
+    float pixels = (float)(1 << 2 * r); /* texels of a coarse kernel are means */
     for (int tap = 0; tap < RECIPE_TAPS; ++tap) {
         float weight = pixels * float_of(words[2 * RECIPE_TAPS + tap]);
         if (!(weight > 0.0f)) continue;
@@ -108,7 +108,7 @@ static void blend_channel(const frame *f, const uint32_t *words, int r, reach bo
     }
 }
 
-/* Item of the first loop: one recipe in one resolution. */
+/* Item of the first loop: blends one recipe in one resolution. */
 static void blend_recipe(void *argument, int item, int thread) {
     const frame *f = argument;
     const recipe_image *image = f->recipe_images + item;

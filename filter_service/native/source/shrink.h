@@ -1,25 +1,25 @@
-/* Cached kernels in pixels of 2 and 4 px, made once for each. */
+/* Downsampling of cached kernels to pixels of 2 and 4 px, once for each kernel. */
 
 #include "frame.h"
 #include "vectors.h"
 
 #define LONGEST_ROW_PX (2 * LONGEST_REACH_PX + 16)
 
-/* Share of a pixel in a coarse one: those half-way between two middles are halved. */
+/* Share of a pixel in a coarse one: pixels half-way between two centers are split. */
 INLINE float share_in(int at, int middle, int half) {
     int off = at > middle ? at - middle : middle - at;
     return off < half ? 1.0f : off == half ? 0.5f : 0.0f;
 }
 
-/* All light of a kernel; of those that are kept as one coarse pixel. */
+/* Total light of a kernel, for kernels that become one coarse pixel. */
 static float whole_light(const uint16_t *from, int count) {
     float sum = 0.0f;
     for (int i = 0; i < count; ++i) sum += (float)from[i];
     return sum;
 }
 
-/* Means over coarse pixels, in steps of the same size.  The middle coarse pixel has its
- * middle where the kernel has it. */
+/* Computes means over coarse pixels, in steps of the same size.  The central coarse pixel
+ * has the same center as the kernel. */
 static void shrink_kernel(const shrink_job *job, int64_t kernel) {
     int size = 1 << job->resolution;
     int half = size / 2;

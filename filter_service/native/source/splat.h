@@ -1,4 +1,4 @@
-/* From fragments to the picture, bin by bin: list, order, light, encoding.  Twin:
+/* From fragments to the output image, bin by bin: list, sort, splat, encode.  Twin:
  * splat_tiles of shaders/passes. */
 
 #include "frame.h"
@@ -7,10 +7,10 @@
 typedef struct {
     frame *f;
     int columns, rows;        /* of bins */
-    bin_list *lists;          /* one a thread */
+    bin_list *lists;          /* one per thread */
 } splat_job;
 
-/* Light of a bin or of one tile of it, in which order matters everywhere or nowhere. */
+/* Splats a bin, or one tile of it, in which order matters everywhere or nowhere. */
 static void splat_window(const frame *f, const bin_list *list, uint32_t tiles, int x0, int y0,
                          int width, int height, bin_sums *s) {
     window w = open_window(x0, y0, width, height, s);

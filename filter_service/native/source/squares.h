@@ -1,22 +1,22 @@
-/* Squares of 2, 4 and 8 pixels alike where the blur hides the difference.  Twin:
+/* Merging of squares of 2, 4 and 8 similar pixels where blur hides the difference.  Twin:
  * merge_fragments.comp.glsl. */
 
 #include "frame.h"
 #include "vectors.h"
 
-/* Squares side by side, in eight lanes: those of 2^n pixels fill 2^n lanes each. */
+/* Adjacent squares in eight lanes: those of 2^n pixels fill 2^n lanes each. */
 typedef struct {
     f32x8 mean[RGB], low[RGB], high[RGB];    /* linear light */
     f32x8 dpt, least_dpt, most_dpt;
     f32x8 place, nearest, farthest;          /* in layers */
-    f32x8 spread_px;                         /* least */
+    f32x8 spread_px;                         /* smallest */
 } square_row;
 
-/* The squares of a block.  Sets are bits at their first pixels. */
+/* The squares of a block.  Sets are bit masks of their first pixels. */
 typedef struct {
     square_row rows[MAX_LEVEL][TILE_SIZE_PX / 2];  /* of level 1 and higher */
     uint64_t merged[MAX_LEVEL + 1];
-    uint32_t kernel[BLOCK_PIXELS];           /* of the highest square that starts there */
+    uint32_t kernel[BLOCK_PIXELS];           /* of the largest square that starts there */
 } block_squares;
 
 INLINE square_row pixel_row_of(const block *b, int y) {
@@ -45,7 +45,7 @@ INLINE f32x8 mean_of(f32x8 a, f32x8 b, int level) {
     return (both + across8(both, level)) * all8(0.25f);
 }
 
-/* Two rows of the level below to one of this. */
+/* Joins two rows of the level below to one of this level. */
 INLINE void join_rows(const square_row *a, const square_row *b, int level, square_row *to) {
     for (int c = 0; c < RGB; ++c) {
         to->mean[c] = mean_of(a->mean[c], b->mean[c], level);
@@ -61,8 +61,8 @@ INLINE void join_rows(const square_row *a, const square_row *b, int level, squar
     to->spread_px = least_of(a->spread_px, b->spread_px, level);
 }
 
-/* Difference of light in one colour: where the picture will be encoded for a screen, as
- * much as it would be in a midtone. */
+/* Difference of light in one color; if the output is encoded for a display, the equivalent
+ * difference in a midtone. */
 INLINE f32x8 seen_contrast(const frame *f, const square_row *s, int c) {
     f32x8 contrast = s->high[c] - s->low[c];
     if (!f->is_encoded) return contrast;
@@ -70,8 +70,8 @@ INLINE f32x8 seen_contrast(const frame *f, const square_row *s, int c) {
     return contrast / root8(smaller8(larger8(light, all8(MERGE_DARKEST)), all8(1.0f)));
 }
 
-/* Which squares the blur lets be one fragment, a bit for each lane.  Seen from a blur of
- * half the size, a square of the next level looks the same: so does its error. */
+/* Bit mask of the squares that blur allows to merge into one fragment.  Relative to twice
+ * the blur, a square of the next level looks the same, and so does its error. */
 INLINE uint32_t similar_lanes(const frame *f, const square_row *s, int level) {
     f32x8 spread = s->spread_px * all8(1.0f / (float)(1 << (level - 1)));
     f32x8 contrast = seen_contrast(f, s, 0);
@@ -86,14 +86,14 @@ INLINE uint32_t similar_lanes(const frame *f, const square_row *s, int level) {
 
 INLINE float lane_of(const f32x8 *lanes, int lane) { return ((const float *)lanes)[lane]; }
 
-/* Whether the kernel of a square merges so far; notes it. */
+/* Returns whether the kernel of a square allows this level; stores the kernel. */
 INLINE int take_square(const block *b, block_squares *all, const square_row *s, int i, int level) {
     const frame *f = b->f;
     int lane = i % TILE_SIZE_PX;
     uint32_t kernel = kernel_at(b, i, lane_of(&s->place, lane));
     const kernel_shape *shape = f->shapes + kernel;
     if (shape->highest_level < level) return 0;
-    /* What is brighter than white would show how coarse pixels are. */
+    /* Coarse pixels would be visible in light brighter than white. */
     if (resolution_of(f, shape, level) > 0)
         for (int c = 0; c < RGB; ++c)
             if (lane_of(&s->high[c], lane) > f->white_level) return 0;
@@ -101,7 +101,7 @@ INLINE int take_square(const block *b, block_squares *all, const square_row *s, 
     return 1;
 }
 
-/* Of the pixels, or squares of the level below, those with three more beside them. */
+/* Pixels, or squares of the level below, that start a group of 2 x 2. */
 INLINE uint64_t starts_of_four(uint64_t below, int level) {
     static const uint64_t grid[MAX_LEVEL + 1] = {0, 0x0055005500550055u, 0x0000001100000011u, 1};
     int side = 1 << (level - 1);
@@ -109,7 +109,7 @@ INLINE uint64_t starts_of_four(uint64_t below, int level) {
     return pairs & pairs >> (side * TILE_SIZE_PX) & grid[level];
 }
 
-/* Merges what is below a level, of a block; the compiler makes a loop for each level. */
+/* Merges squares of the level below; the compiler generates a loop for each level. */
 INLINE uint64_t merge_level(const block *b, block_squares *all, uint64_t below, int level) {
     uint64_t starts = starts_of_four(below, level);
     if (starts == 0) return 0;

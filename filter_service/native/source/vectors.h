@@ -1,4 +1,4 @@
-/* Vectors of eight (two texels) and four, without a word on which machine has them. */
+/* Portable vectors of eight (two texels) and four. */
 #ifndef OCU_VECTORS_H
 #define OCU_VECTORS_H
 
@@ -38,11 +38,11 @@ INLINE f32x8 all8(float value) {
 
 INLINE f32x4 all4(float value) { return (f32x4){value, value, value, value}; }
 
-/* Not those of the library, which it would call. */
+/* Not fmaxf and fminf, which would be library calls. */
 INLINE float larger_float(float a, float b) { return a > b ? a : b; }
 INLINE float smaller_float(float a, float b) { return a < b ? a : b; }
 
-/* Of each pair of numbers the larger or the smaller; the second where one is none. */
+/* Lane-wise maximum and minimum; the second value if either is NaN. */
 #if defined(__x86_64__)
 INLINE f32x4 larger4(f32x4 a, f32x4 b) { return __builtin_ia32_maxps(a, b); }
 INLINE f32x4 smaller4(f32x4 a, f32x4 b) { return __builtin_ia32_minps(a, b); }
@@ -73,7 +73,7 @@ INLINE f32x8 smaller8(f32x8 a, f32x8 b) {
 }
 #endif
 
-/* Whether any lane is true (all bits set). */
+/* Returns whether any lane is true (all bits set). */
 INLINE int any8(i32x8 lanes) {
 #ifdef OCU_AVX2
     return __builtin_ia32_movmskps256((f32x8)lanes) != 0;
@@ -89,7 +89,7 @@ INLINE i16x16 all16(int value) {
     return (i16x16){v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v};
 }
 
-/* A bit for each of 16 lanes that is true. */
+/* Bit mask of the 16 lanes that are true. */
 INLINE uint32_t bits_of_lanes(i16x16 lanes) {
     uint32_t bits = 0;
 #ifdef OCU_AVX2
@@ -106,7 +106,7 @@ INLINE uint32_t bits_of_lanes(i16x16 lanes) {
     return bits;
 }
 
-/* A bit for each of eight lanes that is true. */
+/* Bit mask of the eight lanes that are true. */
 INLINE uint32_t bits_of8(i32x8 lanes) {
 #ifdef OCU_AVX2
     return (uint32_t)__builtin_ia32_movmskps256((f32x8)lanes);
@@ -117,7 +117,7 @@ INLINE uint32_t bits_of8(i32x8 lanes) {
 #endif
 }
 
-/* Without signs. */
+/* Absolute values. */
 INLINE f32x8 size8(f32x8 value) {
     i32x8 sign = {INT32_MIN, INT32_MIN, INT32_MIN, INT32_MIN,
                   INT32_MIN, INT32_MIN, INT32_MIN, INT32_MIN};
@@ -151,7 +151,7 @@ INLINE void pairs8(const float *table, i32x8 at, f32x8 *first, f32x8 *second) {
     *second = MIXED((f32x8)low, (f32x8)high, 1, 3, 9, 11, 5, 7, 13, 15);
 }
 
-/* One over the square root, to 2^-22; of no number but zero. */
+/* Reciprocal square root of positive values, to 2^-22. */
 INLINE f32x8 inverse_root8(f32x8 value) {
 #ifdef OCU_AVX2
     f32x8 guess = __builtin_ia32_rsqrtps256(value);
@@ -161,10 +161,10 @@ INLINE f32x8 inverse_root8(f32x8 value) {
 #endif
 }
 
-/* Whole part of what is not negative. */
+/* Integer part of nonnegative values. */
 INLINE i32x8 whole8(f32x8 value) { return __builtin_convertvector(value, i32x8); }
 
-/* Lanes changed for their neighbours: one (level 1), two or four (level 3) on. */
+/* Swaps lanes with their neighbors: one (level 1), two or four (level 3) lanes away. */
 INLINE f32x8 across8(f32x8 value, int level) {
 #if defined(__clang__)
     if (level == 1) return __builtin_shufflevector(value, value, 1, 0, 3, 2, 5, 4, 7, 6);
@@ -182,7 +182,7 @@ INLINE f32x8 floats_of(u16x8 words) {
     return __builtin_convertvector(__builtin_convertvector(words, i32x8), f32x8);
 }
 
-/* For each pair of 16-bit numbers a * c + b * d, exactly. */
+/* Exact a * c + b * d for each pair of 16-bit numbers. */
 INLINE i32x8 pair_sums(i32x8 pairs, i32x8 factors) {
 #ifdef OCU_AVX2
     return (i32x8)__builtin_ia32_pmaddwd256((i16x16)pairs, (i16x16)factors);

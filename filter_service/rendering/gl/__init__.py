@@ -1,17 +1,17 @@
-"""The frame engine of OpenGL compute shaders.
+"""Frame engine of OpenGL compute shaders.
 
-renderer         the engine: stores, frames, the answer
-frame_run        a view begun, and finished later
-strips           a frame cut so that its buffers fit
-strip            a frame or strip: size and buffers
-fragment_passes  pixels to fragments
-list_passes      lists, order, splat
-frame_passes     all of them, and the picture
-kernel_passes    a frame's kernels
-expected_pairs   kernels told from the frame before
-kept_eyes        what of two eyes is kept between frames
-list_bands       lists in bands that fit a buffer
-compile_passes   every pass compiled before the first frame
+renderer         the engine: stores, frames, results
+frame_run        one view, from start to result
+strips           division of a frame into strips that fit the buffers
+strip            size and buffers of a frame or strip
+fragment_passes  passes from pixels to fragments
+list_passes      passes that build, sort and splat the lists
+frame_passes     all passes of a strip, and the output image
+kernel_passes    passes that blend a frame's kernels
+expected_pairs   prediction of kernels from the previous frame
+kept_eyes        state of two eyes kept between frames
+list_bands       division of lists into bands that fit a buffer
+compile_passes   compilation of every pass before the first frame
 """
 
 import lazy_loader

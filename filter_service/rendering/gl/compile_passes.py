@@ -1,7 +1,7 @@
-"""Compiles every pass before the first client comes, by filtering a few pixels.
+"""Warm-up: compile every pass before the first client by filtering a few pixels.
 
-A software renderer translates a shader at its first dispatch; without this, the first
-frames through a new service stall by half a second.
+A software renderer compiles a shader at its first dispatch; without this, the first
+frames of a new service stall by half a second.
 """
 
 from filter_service.rendering.gl.renderer import FilterRenderer
@@ -9,11 +9,11 @@ from filter_service.rendering.perfect_eye import change_by_perfect_eye
 
 
 def compile_passes(renderer: FilterRenderer) -> float:
-    """Render a tiny frame in every variant that clients may ask for.
+    """Render a tiny frame in every variant that clients may request.
 
     Returns
     -------
     float
-        The largest change of a pixel's value, which a perfect eye leaves as it is.
+        Largest change of a pixel's value; ideally zero.
     """
     return change_by_perfect_eye(renderer)

@@ -1,9 +1,10 @@
-"""The kernels that a frame will ask for, told from the frame before.
+"""Prediction of a frame's kernels from the previous frame.
 
-To ask the GPU which pairs of cell and layer interval a frame uses is to wait for it in
-the middle of the frame.  A scene that stays uses, in another state of the eye, what its
-pixels' places among the layers say; one that moves also what its neighbours used.  What
-was told wrongly is seen when the frame is fetched, and the frame done again.
+Reading back which pairs of cell and layer interval a frame uses would make the
+processor wait for the GPU in the middle of the frame.  In another state of the eye, the
+pairs of a static scene follow from its pixels' positions among the layers; a moving
+scene also uses the pairs of neighboring cells.  A wrong prediction is detected when the
+frame is fetched, and the frame is filtered again.
 """
 
 from typing import NamedTuple
@@ -16,21 +17,21 @@ from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 
 MARGIN_DPT = 1e-3
-"""A pixel's place among the layers is a float of 32 bits on the GPU."""
+"""Margin for the 32-bit float of a pixel's position among the layers on the GPU."""
 
 MOVING_FRAMES = 8
-"""After a frame that its neighbours would have told, so many count on them, too."""
+"""Frames after a wrong prediction for which neighboring cells are included."""
 
 
 class FrameState(NamedTuple):
-    """What a frame's pairs are numbered by.
+    """Layers and cells that a frame's pairs refer to.
 
     Attributes
     ----------
     layers : FrameLayers
     image : ImageCells
     change_dpt : (rows + 1, columns + 1), float32
-        Of defocus at the corners of the cells.
+        Change of defocus at the corners of the cells.
     """
 
     layers: FrameLayers
@@ -39,7 +40,7 @@ class FrameState(NamedTuple):
 
 
 def part_edges_dpt(layers: FrameLayers) -> NDArray[np.float64]:
-    """Return where the parts of the intervals begin, and the last ends."""
+    """Return the edges of the parts of the intervals, from the first to the last."""
     ends_dpt = layers.layer_dpt
     if ends_dpt.size == 1:
         return np.full(USED_PARTS + 1, ends_dpt[0])
@@ -52,19 +53,19 @@ def _is_same(one: FrameState, other: FrameState) -> bool:
 
 
 class ExpectedPairs:
-    """Used pairs (n_cells, n_intervals) of an eye's next frame."""
+    """Predictor of the used pairs (n_cells, n_intervals) of an eye's next frame."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Know of no frame."""
+        """Discard the previous frame."""
         self._last: tuple[FrameState, NDArray[np.uint32]] | None = None
         self._told: tuple[FrameState, NDArray[np.bool_]] | None = None
         self._moving = 0
 
     def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
-        """Take what a frame used, (n_cells, n_words) of parts of intervals."""
+        """Record the parts of intervals (n_cells, n_words) that a frame used."""
         from filter_service.rendering.pair_loops import used_pairs
 
         if self._told is not None and self._told[0] is state:
@@ -74,11 +75,11 @@ class ExpectedPairs:
             self._moving = MOVING_FRAMES if is_wrong else max(self._moving - 1, 0)
         last = self._last
         if last is not None and _is_same(last[0], state):
-            words = words | last[1]  # of another view of the eye, or a scene that moves
+            words = words | last[1]  # another view of the eye, or a moving scene
         self._last, self._told = (state, words), None
 
     def at(self, state: FrameState) -> NDArray[np.bool_] | None:
-        """Return what a frame will use; None where nothing is known of its cells."""
+        """Return the predicted pairs of a frame, or None if its cells are new."""
         from filter_service.rendering.pair_loops import carry_over, spread
 
         if self._last is None or self._last[0].image is not state.image:

@@ -1,4 +1,4 @@
-"""The passes that turn one frame or strip of it into fragments."""
+"""Passes that turn a frame, or a strip of it, into fragments."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ COLOR_VARIANTS = {
     "float32": {"COLOR_IS_LINEAR": 1},
     "float16": {"COLOR_IS_HALF": 1},
 }
-"""How `build_fragments` reads colour, by its dtype."""
+"""Defines of `build_fragments` by the dtype of the color image."""
 
 
 class FragmentPasses:
@@ -41,30 +41,31 @@ class FragmentPasses:
     corner_change_dpt : (rows + 1, columns + 1), float32
         Change of defocus at the corners of the cells.
     tolerance : float
-        Of merging, against the usual; 0: nothing merges.
+        Merging error relative to the default; at 0 nothing merges.
     first_row : int
-        Of the strip within the frame.
+        First row of the strip within the frame.
     frame_pixel_count : int, optional
-        Of the whole frame, where it is larger than the strip.
+        Pixel count of the whole frame, if it is larger than the strip.
     image_size_px : (width, height), optional
-        Of the whole image, where the frame has a border around it.
+        Size of the whole image, if the frame has a border around it.
     border_px : int
-        Columns and rows around the image.
+        Columns and rows added on each side of the image.
     counted_px : (left, top, right, bottom), optional
-        Part of the strip whose pixels are counted; all where it is None.
+        Part of the strip whose pixels are counted; all by default.
     object_range_dpt : (low, high)
-        Distances that were prepared; others are counted.
+        Prepared distances; pixels at others are counted.
     white_level : float
-        Light against which the contrast of a merged quad counts.
+        Reference light for the contrast of a merged quad.
     is_encoded : bool
-        The picture is for a screen: dark parts are seen finer.
+        Whether the image is for a display, where dark parts need finer steps.
 
     Attributes
     ----------
     search_blocks : int
-        How far a bin must look for fragments that reach it; known once they are merged.
+        Distance at which a bin searches for fragments that reach it; known after
+        merging.
     stats : (STAT_LANES, STAT_WORDS), uint32
-        What the passes count; filled when the frame is fetched.
+        Counters of the passes; filled when the frame is fetched.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class FragmentPasses:
         self.used_words = np.zeros((0, 0), np.uint32)
 
     def upload(self) -> None:
-        """Send the strip; bytes are padded to whole words."""
+        """Upload the strip; bytes are padded to whole words."""
         colors, depths_m = (
             self.strip.view.surface_colors,
             self.strip.view.surface_depths_m,
@@ -121,7 +122,7 @@ class FragmentPasses:
             )
 
     def build_fragments(self) -> None:
-        """Linear light, dioptres and layers, and which pairs are used."""
+        """Compute linear light, vergence and layer of pixels, and the used pairs."""
         n_words = words_per_cell(self.strip.layers)
         self.used_words = np.zeros((self.image.count, n_words), np.uint32)
         n_pixels = self.strip.surface_count * self.strip.pixel_count
@@ -154,14 +155,14 @@ class FragmentPasses:
             )
 
     def wait_for_used(self) -> NDArray[np.bool_]:
-        """Read the used pairs in the middle of the frame."""
+        """Read back the used pairs in the middle of the frame."""
         with self.strip.timer.wall("psf_plan_ms"):
             self.strip.gpu.read_into((self.strip.buffers["USED"], 0, self.used_words))
             return self.used
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Return the used pairs (n_cells, n_intervals), once they were read."""
+        """Return the used pairs (n_cells, n_intervals), once they have been read."""
         from filter_service.rendering.pair_loops import used_pairs
 
         return used_pairs(self.used_words, interval_count(self.strip.layers))
@@ -216,7 +217,7 @@ class FragmentPasses:
 
     @property
     def _max_level(self) -> int:
-        """Level up to which fragments merge; the paper merges once."""
+        """Highest merging level; the paper merges once."""
         if self.tolerance == 0.0:
             return 0
         most = 1 if self.strip.paper_rule else MAX_LEVEL
@@ -224,7 +225,7 @@ class FragmentPasses:
         return min(most, cell_px.bit_length() - 1) if cell_px else most
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name, once the frame was fetched."""
+        """Return counts of `FilteredView` by name, once the frame has been fetched."""
         stats = self.stats.sum(axis=0, dtype=np.int64).tolist()
         return {
             "missing_depth_count": stats[STAT_MISSING],

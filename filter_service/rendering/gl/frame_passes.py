@@ -1,4 +1,4 @@
-"""All passes of one frame or strip of it: what runs when, and the picture."""
+"""All passes of a frame, or a strip of it, in order, and the output image."""
 
 from collections.abc import Callable
 
@@ -22,11 +22,11 @@ ENCODERS = {
     "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
     "linear": ("encode_float", 1, np.float32),
 }
-"""How a picture is packed: pass, pixels a thread (for RGB words), dtype."""
+"""Encoding of the image: pass, pixels per thread (for RGB words), dtype."""
 
 
 PASSES = "buffers of the passes"
-"""Claimed by whoever runs them, see `Gpu.claim`."""
+"""Name under which a caller claims the buffers, see `Gpu.claim`."""
 
 
 class FramePasses:
@@ -36,7 +36,7 @@ class FramePasses:
     ----------
     strip : Strip
     fragments : FragmentPasses
-        Of the same strip.
+        Fragments of the same strip.
     """
 
     def __init__(self, strip: Strip, fragments: FragmentPasses):
@@ -55,18 +55,18 @@ class FramePasses:
         expected: Callable[[], KernelSet | None] = lambda: None,
         used: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Filter the strip; `read_back` fetches the picture.
+        """Filter the strip; `read_back` fetches the image.
 
         Parameters
         ----------
         kernels : callable
-            From the used (cell, interval) pairs to the kernels for them.
+            Function that returns the kernels of used (cell, interval) pairs.
         expected : callable, optional
-            To kernels that may serve, if there are some: then nothing is read in the
-            middle of the frame, and in the end it is seen whether they did.  They are
-            made while the GPU has something to do.
+            Function that returns predicted kernels, or None.  With them nothing is
+            read back in the middle of the frame, and the prediction is checked at its
+            end.  They are computed while the GPU is busy.
         used : (n_cells, n_intervals), optional
-            Which pairs are, where that is known.
+            Used pairs, if known.
         """
         self.strip.gpu.claim(PASSES, self)
         self.fragments.upload()
@@ -81,12 +81,12 @@ class FramePasses:
         self.lists.run()
 
     def read_back(self, output: str, room: NDArray | None = None) -> NDArray:
-        """Fetch the filtered picture, encoded as asked, and all that was counted."""
+        """Fetch the filtered image in the requested encoding, and all counters."""
         self.begin_read(output, room)
         return self.end_read()
 
     def begin_read(self, output: str, room: NDArray | None = None) -> None:
-        """Have the picture and the counts sent, the picture to ``room`` if given."""
+        """Start the readback of the image (into ``room`` if given) and the counts."""
         self._output = output
         name, pixels_per_thread, dtype = ENCODERS[output]
         self._encode(name, pixels_per_thread)
@@ -104,9 +104,9 @@ class FramePasses:
             )
 
     def end_read(self) -> NDArray | None:
-        """Return the picture; None where the strip must be done again.
+        """Return the image, or None if the strip must be filtered again.
 
-        That is where a kernel was lacking, or where the lists did not fit and other
+        That is the case if a kernel was missing, or if the lists did not fit and other
         passes have run since.
         """
         with self.strip.timer.wall("readback_ms"):
@@ -128,7 +128,7 @@ class FramePasses:
             threads = group_count(self.strip.pixel_count, pixels_per_thread)
             self.strip.reserve(
                 COLOR_IN=threads * RGB * BYTES_PER_WORD
-            )  # its light is used
+            )  # the input is no longer needed
             self.strip.run(
                 name,
                 grid_of(group_count(threads, THREADS)),

@@ -1,6 +1,6 @@
-"""One view on its way through the GPU: begun, and finished when its picture is wanted.
+"""One view on the GPU: started first, and finished when its image is needed.
 
-Between the two the processor is free for another view.
+In between, the processor is free for another view.
 """
 
 from collections import Counter
@@ -37,7 +37,7 @@ Counts = dict[str, int]
 
 @dataclass(frozen=True)
 class _Plan:
-    """What all strips of a frame share."""
+    """Plan shared by all strips of a frame."""
 
     whole: RgbdView
     border_px: int
@@ -47,17 +47,17 @@ class _Plan:
 
 
 class FrameRun:
-    """A view of an eye in a state.
+    """Filtering of one view through an eye in one state.
 
-    The GPU counts the pixels without depth.  A frame that turns out to have some is
-    done again with their depth filled in.
+    The GPU counts the pixels without depth.  If a frame has some, it is filtered again
+    with their depth filled in.
 
     Parameters
     ----------
     room : (height, width, 3) array
-        Where the picture goes, of the type of the output.
+        Output array, of the type of the output.
     fill_depth : bool
-        Look for them first, as the frame before had some.
+        Whether to fill missing depth first, because the previous frame had some.
 
     Attributes
     ----------
@@ -95,11 +95,11 @@ class FrameRun:
 
     @property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth of the view, filled where some was missing."""
+        """Depth of the view, with missing pixels filled."""
         return self._view.depth_m
 
     def finish(self) -> tuple[NDArray, Counts]:
-        """Return picture and counts."""
+        """Return the image and the counts."""
         picture, counts = self._begun_or_whole()
         if self._missing_count is None and counts["missing_depth_count"]:
             self._fill_depth()
@@ -114,7 +114,7 @@ class FrameRun:
             self._view = replace(self._view, depth_m=depth_m)
 
     def _begin(self) -> "_StripRun | None":
-        """Begin a frame of one strip; others are done when they are wanted."""
+        """Start a frame of one strip; frames of several strips run in `finish`."""
         plan = self._plan()
         if len(plan.strips) > 1:
             return None
@@ -136,7 +136,7 @@ class FrameRun:
         return self._whole()
 
     def _whole(self) -> tuple[NDArray, Counts]:
-        """Do the frame; with larger cells where kernels take too much memory."""
+        """Filter the frame, with larger cells if its kernels take too much memory."""
         while True:
             plan = self._plan()
             runs = [_StripRun(self, plan, rows) for rows in plan.strips]
@@ -167,7 +167,7 @@ class FrameRun:
         )
 
     def _joined(self, plan: _Plan, runs: "list[_StripRun]") -> tuple[NDArray, Counts]:
-        """Finish strips, and put their pictures together."""
+        """Finish the strips and join their images."""
         counts = Counter[str]()
         shape = (plan.state.image.count, words_per_cell(self.layers))
         used_words = np.zeros(shape, np.uint32)
@@ -186,7 +186,7 @@ class FrameRun:
             np.copyto(self._room, picture[rows, columns])
         return self._room, dict(counts)
 
-    # ----- what its strips ask for
+    # ----- used by its strips
 
     def passes_of(self, plan: _Plan, rows: Rows) -> FramePasses:
         """Return the passes of a strip."""
@@ -215,34 +215,34 @@ class FrameRun:
         return FramePasses(strip, fragments)
 
     def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
-        """Return kernels for used pairs."""
+        """Return the kernels of used pairs."""
         return self._kept.kernels.kernels(
             self._kept.handle, self.layers, image, used, self.timer, self._fill
         )
 
     def expected(self, state: FrameState) -> KernelSet | None:
-        """Return kernels that will serve, it seems."""
+        """Return the predicted kernels, or None."""
         return self._kept.kernels.expected(
             self._kept.handle, state, self.timer, self._fill
         )
 
     def _fill(self, psfs: NDArray[np.int64]) -> None:
-        """Compute the PSFs that a frame lacks, as one of its stages."""
+        """Compute the missing PSFs of a frame, as one of its stages."""
         with self.timer.wall("psf_compute_ms"):
             self._kept.handle.store.fill(psfs, until_s=self._until_s)
 
     def room_of(self, plan: _Plan) -> NDArray | None:
-        """Return where a strip's picture goes at once, if it is the whole's."""
+        """Return the output array if a strip's image is the whole image, else None."""
         return None if plan.border_px or len(plan.strips) > 1 else self._room
 
     @property
     def output(self) -> str:
-        """How the picture is encoded."""
+        """Encoding of the output image."""
         return self._options.output
 
 
 class _StripRun:
-    """A strip with the kernels that one expects; once more where some lack."""
+    """A strip filtered with the predicted kernels; repeated if some are missing."""
 
     def __init__(self, frame: FrameRun, plan: _Plan, rows: Rows):
         self._frame, self.plan, self.rows = frame, plan, rows
@@ -250,13 +250,13 @@ class _StripRun:
         self._is_begun = False
 
     def begin(self) -> None:
-        """Have the GPU do it, and send the picture."""
+        """Start the passes on the GPU and the readback of the image."""
         self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
         self.passes.begin_read(self._frame.output, self._room)
         self._is_begun = True
 
     def finish(self) -> NDArray:
-        """Return the picture."""
+        """Return the image."""
         if not self._is_begun:
             self.begin()
         picture = self.passes.end_read()
@@ -277,7 +277,7 @@ class _StripRun:
 
 
 def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
-    """Object distances that a store is for, with room for rounding."""
+    """Return the prepared object distances of a store, with a margin for rounding."""
     low_dpt, high_dpt = store.spec.object_range_dpt
     margin = 1e-6 * max(high_dpt, 1.0)
     return low_dpt - margin, high_dpt + margin

@@ -1,4 +1,4 @@
-"""What is kept of each eye between frames on the GPU, so that two take turns."""
+"""State of each eye kept between frames on the GPU, so that two eyes can alternate."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.gl.kernel_passes import KernelMaker
 
 MAX_KEPT = 2
-"""Eyes: those of a stereo frame.  Each has an atlas of kernels of its own."""
+"""The two eyes of a stereo frame; each has its own kernel atlas."""
 
 
 class Released(Protocol):
-    """A loaded store that knows whether it was given up."""
+    """A loaded store that records whether it was released."""
 
     is_released: bool
 
 
 @dataclass(eq=False)
 class KeptEye:
-    """What of an eye's last frame serves the next in the same state."""
+    """State of an eye's last frame that the next frame in the same state reuses."""
 
     handle: Released
     kernels: KernelMaker
@@ -29,14 +29,14 @@ class KeptEye:
 
 
 class KeptEyes:
-    """The eyes used last; what was made for others gives them its place."""
+    """Cache of the most recently used eyes; older ones are evicted."""
 
     def __init__(self, gpu: Gpu) -> None:
         self._free = [KernelMaker(gpu, slot) for slot in range(MAX_KEPT)]
-        self._kept: list[KeptEye] = []  # the one used last at the end
+        self._kept: list[KeptEye] = []  # most recently used last
 
     def of(self, handle: Released) -> KeptEye:
-        """Return what is kept of an eye, which is now the one used last."""
+        """Return the state of an eye, and mark it as most recently used."""
         self.drop_released()
         found = next((kept for kept in self._kept if kept.handle is handle), None)
         others = [kept for kept in self._kept if kept is not found]
@@ -47,7 +47,7 @@ class KeptEyes:
         return found
 
     def drop_released(self) -> None:
-        """Let go of eyes whose stores were given up."""
+        """Drop the eyes whose stores were released."""
         for kept in [kept for kept in self._kept if kept.handle.is_released]:
             self._kept.remove(kept)
             self._let_go(kept)

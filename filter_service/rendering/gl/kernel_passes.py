@@ -1,4 +1,4 @@
-"""The passes that make a frame's kernels from the cache; kept between frames."""
+"""Passes that blend a frame's kernels from the cache, and keep them between frames."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -37,7 +37,7 @@ from filter_service.rendering.kernel_tables import (
 )
 
 MAX_KERNEL_TEXELS = 24 * 2**20
-"""Of a frame: 400 MB, 16 bytes each."""
+"""Largest texel count of a frame: 400 MB at 16 bytes each."""
 
 _WORD_BYTES = 4
 
@@ -49,7 +49,7 @@ class Handle(Protocol):
     pages: Pages
 
     def sync(self) -> None:
-        """Copy the kernels that were computed since the last time."""
+        """Copy the kernels that were computed since the last call."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class KernelSet:
     ----------
     kernels : FrameKernels
     texel_count : int
-        Of all kernels, at all levels.
+        Total of all kernels, at all levels.
     buffers : dict
         KERNELS and KERNEL_OF.
     atlas : Atlas
-        Their texels.
+        Texels of the kernels.
     have : (n_cells, n_intervals), bool
-        Pairs that there are kernels for.
+        Pairs that have a kernel.
     """
 
     kernels: FrameKernels
@@ -76,18 +76,18 @@ class KernelSet:
     have: NDArray[np.bool_]
 
     def lacks(self, used: NDArray[np.bool_]) -> bool:
-        """Return whether a frame uses pairs that there are no kernels for."""
+        """Return whether a frame uses pairs that have no kernel."""
         return bool(np.any(used & ~self.have))
 
 
 class KernelMaker:
-    """Makes the kernels that a frame uses; the last frame's serve if they can.
+    """Blends the kernels that a frame uses; reuses those of the last frame if possible.
 
     Parameters
     ----------
     gpu : Gpu
     slot : int
-        Of several makers in one context: each has memory of its own.
+        Number of this maker in its context; each has its own memory.
     """
 
     def __init__(self, gpu: Gpu, slot: int = 0):
@@ -97,22 +97,22 @@ class KernelMaker:
         self.forget()
 
     def forget(self) -> None:
-        """Let go of what the last frame's kernels were made for."""
+        """Discard the last frame's kernels and the prediction."""
         self._made_for: tuple | None = None
         self._set: KernelSet | None = None
         self._pairs.forget()
 
     def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
-        """Take what a whole frame used, by which the next is told."""
+        """Record the pairs that a whole frame used, to predict the next."""
         self._pairs.note(state, words)
 
     def expected(
         self, handle: Handle, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
-        """Return kernels that will serve a frame, it seems: the last, or new ones.
+        """Return predicted kernels of a frame: those of the last, or new ones.
 
-        None where nothing is known, or where it pays to ask the GPU: a software
-        renderer does not keep one waiting.
+        Returns None if there is no prediction, or if reading back the used pairs is
+        cheaper, as on a software renderer.
         """
         kept = self.kept(handle, state.layers, state.image)
         if kept is not None or self._gpu.is_software:
@@ -124,14 +124,15 @@ class KernelMaker:
         try:
             return self.kernels(handle, state.layers, state.image, used, timer, fill)
         except KernelsTooLarge:
-            return None  # those that are really used may fit
+            return None  # the pairs that are actually used may fit
 
     def kept(
         self, handle: Handle, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
-        """Return the last frame's kernels, if they were made for the same state.
+        """Return the last frame's kernels if they were made for the same state.
 
-        And are still there: another renderer of this context has memory of that name.
+        They must also still exist: another renderer of this context uses memory of the
+        same name.
         """
         key = (handle, layers, image)
         if not self._gpu.is_owner(self._memory, self):
@@ -151,14 +152,14 @@ class KernelMaker:
         timer: StageTimer,
         fill: Fill,
     ) -> KernelSet:
-        """Return kernels for all used (cell, interval) pairs (n_cells, n_intervals)."""
+        """Return kernels of all used (cell, interval) pairs (n_cells, n_intervals)."""
         kept = self.kept(handle, layers, image)
         if kept is not None and not kept.lacks(used):
             return kept
-        self._made_for = None  # stays so if what follows fails
+        self._made_for = None  # remains None if the following fails
         with timer.wall("psf_plan_ms"):
             planned = None
-            if kept is not None:  # the next frame may use those of the last
+            if kept is not None:  # the next frame may use the last one's pairs
                 planned = _plan_if_they_fit(
                     handle.store, layers, image, used | kept.have, fill
                 )
@@ -215,7 +216,7 @@ class KernelMaker:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Kernels for the used pairs, and how large they are."""
+    """Kernels of the used pairs, and their sizes."""
 
     used: NDArray[np.bool_]
     kernels: FrameKernels
@@ -229,12 +230,12 @@ def _plan(
     used: NDArray[np.bool_],
     fill: Fill,
 ) -> _Plan:
-    """Plan kernels for pairs.
+    """Plan the kernels of pairs.
 
     Raises
     ------
     KernelsTooLarge
-        Larger cells would have fewer texels.
+        There are too many texels; larger cells have fewer.
     """
     kernels = frame_kernels(store, layers, image, used, fill=fill)
     levels = kernel_levels(kernels)
@@ -255,12 +256,12 @@ def _plan_if_they_fit(*arguments) -> _Plan | None:
 
 
 def words_per_cell(layers: FrameLayers) -> int:
-    """Words that note the used parts of a cell's intervals.
+    """Return the number of words for the used parts of a cell's intervals.
 
     Raises
     ------
     GridTooLarge
-        More layers than a frame may have.
+        There are more layers than a frame may have.
     """
     if len(layers.layer_dpt) > MAX_LAYERS:
         raise GridTooLarge(

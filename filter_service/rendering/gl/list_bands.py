@@ -1,4 +1,4 @@
-"""Cuts a frame's lists into bands of bins whose entries fit their buffer; CPU only."""
+"""Division of a frame's lists into bands of bins that fit their buffer; CPU only."""
 
 from dataclasses import dataclass
 
@@ -15,20 +15,21 @@ from filter_service.rendering.gl.strip import MAX_GROUPS
 
 ENTRY_BYTES = 4
 MAX_BAND_ENTRIES = 16 * 2**20
-"""List entries in flight; more go through in bands.  Keeps each list buffer at 64 MB,
-half of the smallest storage block that the service runs on.  Also the most that one
-bin's list may hold: a bin has fewer than 2**19 pixels within the reach of a kernel, so
-that only many surfaces, or a smaller limit, leave some out; they are counted."""
+"""List entries in one band; more are processed in several bands.  Keeps each list
+buffer at 64 MB, half of the smallest storage block that the service supports.  It is
+also the capacity of one bin's list: a bin has fewer than 2**19 pixels within the reach
+of a kernel, so entries are dropped, and counted, only with many surfaces or a smaller
+limit."""
 
 
 @dataclass(frozen=True)
 class ListTotals:
-    """What the scan found.
+    """Totals of the scan.
 
     Attributes
     ----------
     entry_count : int
-        Of all lists; exact below 2**32, to seven digits beyond.
+        Entries of all lists; exact below 2**32, to seven digits beyond.
     overflow_count : int
         Entries that did not fit a bin's list.
     longest : int
@@ -41,7 +42,7 @@ class ListTotals:
 
 
 def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
-    """Totals from the words behind the bins' offsets."""
+    """Return the totals from the words after the bins' offsets."""
     as_float = whole[TOTAL_ENTRIES_FLOAT : TOTAL_ENTRIES_FLOAT + 1].view(np.float32)
     rounded = round(float(as_float[0]))
     return ListTotals(
@@ -52,7 +53,7 @@ def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
 
 
 def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list]:
-    """Cut lists into bands of at most ``limit`` entries and MAX_GROUPS bins.
+    """Divide lists into bands of at most ``limit`` entries and MAX_GROUPS bins.
 
     Returns
     -------

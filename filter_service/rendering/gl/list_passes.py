@@ -1,4 +1,4 @@
-"""The passes that make lists of fragments, order and splat them."""
+"""Passes that build the lists of fragments, sort them and splat them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ SOFTWARE_SPLAT = {
     "GROUP_ROWS": 1,
     "FRAGMENTS_A_TURN": 1,
 }
-"""2.8 times the evaluations a second of one pixel a thread on llvmpipe (8 floats)."""
+"""2.8 times as many evaluations per second as with one pixel per thread on llvmpipe (8
+floats)."""
 
 HARDWARE_SPLAT = {
     "PIXELS_PER_THREAD": 2,
@@ -36,16 +37,16 @@ HARDWARE_SPLAT = {
     "BATCH": 32,
     "HIT_WORDS": 1,
 }
-"""One warp a tile, and little shared memory, so that many tiles are under way at once
-while others wait for their fetches: on an H100 1.4 to 1.9 times as fast as groups of 64
+"""One warp per tile and little shared memory, so that many tiles are in flight while
+others wait for their fetches: on an H100 1.4 to 1.9 times as fast as groups of 64
 threads that stage 128 fragments and fetch one at a time."""
 
 HARDWARE_STRETCH_SLOTS = 16
-"""Slots of a block that a thread walks over at a time, where there are more threads
-than blocks in reach; on a software renderer whole blocks."""
+"""Slots of a block that a thread processes at a time, because there are more threads
+than blocks in reach; a software renderer processes whole blocks."""
 
 SOFTWARE_LIST_THREADS = 8
-"""Threads that make and sort a bin's list on a software renderer: one vector."""
+"""Threads that build and sort a bin's list on a software renderer: one vector."""
 
 
 class ListPasses:
@@ -55,9 +56,9 @@ class ListPasses:
     ----------
     strip : Strip
     search_blocks : int
-        How far a bin looks for fragments that reach it.
+        Distance at which a bin searches for fragments that reach it.
     atlas : Atlas, optional
-        Texels of the kernels that they are splatted with.
+        Texels of the fragments' kernels.
     """
 
     def __init__(self, strip: Strip, search_blocks: int, atlas: Atlas | None = None):
@@ -68,10 +69,10 @@ class ListPasses:
         self.bands: list[tuple[int, int, int]] = []
 
     def run(self) -> None:
-        """Count, list, sort and splat, in the buffers that there are.
+        """Count, list, sort and splat, in the existing buffers.
 
-        Nothing is read: where the lists do not fit, the passes after the count do
-        nothing, and `take_totals` says so.
+        Nothing is read back: if the lists do not fit, the passes after the count do
+        nothing, and `take_totals` returns False.
         """
         self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
@@ -80,13 +81,13 @@ class ListPasses:
 
     @property
     def totals(self) -> tuple[Buffer, int]:
-        """Where the totals stand: a buffer, and a byte of it."""
+        """Location of the totals: a buffer, and the offset in bytes."""
         return self.strip.buffers["BIN_OFFSETS"], 4 * self.strip.bin_count
 
     def take_totals(self, words: NDArray[np.uint32]) -> bool:
-        """Take note of the totals; whether the frame is whole.
+        """Record the totals; return whether the frame is complete.
 
-        If not, `splat_bands` makes it so.
+        If not, `splat_bands` completes it.
         """
         self.lists = list_bands.read_totals(words)
         entries, spare = self._capacities
@@ -99,7 +100,7 @@ class ListPasses:
 
     @property
     def _capacities(self) -> tuple[int, int]:
-        """Entries that the two buffers of lists hold, as one band."""
+        """Capacities of the two list buffers in entries, as one band."""
         return tuple(
             min(
                 self.strip.buffers[name].size // ENTRY_BYTES,
@@ -109,7 +110,7 @@ class ListPasses:
         )
 
     def count_bins(self) -> None:
-        """Lengths and offsets of the lists."""
+        """Compute the lengths and offsets of the lists."""
         self.strip.reserve(
             BIN_COUNTS=16 * self.strip.bin_count,
             WINDOWS=16 * self.strip.bin_count,
@@ -139,7 +140,7 @@ class ListPasses:
 
     @property
     def _walk(self) -> dict:
-        """Uniforms of common/binning.glsl, and where a list ends."""
+        """Uniforms of common/binning.glsl, and the capacity of a list."""
         return {
             "tile_grid": self.strip.grid,
             "search_blocks": self.search_blocks,
@@ -149,12 +150,12 @@ class ListPasses:
 
     @property
     def _list_limit(self) -> int:
-        """Entries of a band, and of the longest list that is kept."""
+        """Capacity of a band, and of a single list, in entries."""
         fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES
         return min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
-        """Bands as (first bin, bin count, entries), once the totals are known."""
+        """Return bands as (first bin, bin count, entries), from the totals."""
         limit = self._list_limit
         if (
             self.lists.entry_count <= limit
@@ -171,7 +172,7 @@ class ListPasses:
         return bands
 
     def reserve_lists(self) -> None:
-        """Cut the lists into bands, and make room for the longest."""
+        """Divide the lists into bands, and reserve buffers for the longest."""
         with self.strip.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
         n_bytes = ENTRY_BYTES * max(entries for _, _, entries in self.bands)
@@ -192,7 +193,7 @@ class ListPasses:
         self._splat(first_bin, bin_count, indirect=indirect)
 
     def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[Buffer, int] | None:
-        """Where the scan has put the size of a dispatch."""
+        """Return the location of a dispatch size that the scan has written."""
         place = self.strip.buffers["DISPATCHES"], DISPATCH_BYTES * index
         return place if indirect else None
 
@@ -232,7 +233,7 @@ class ListPasses:
             )
 
     def _sort(self, first_bin: int, bin_count: int, indirect: bool) -> None:
-        """Sort the lists of a band, a size class at a time."""
+        """Sort the lists of a band, one size class at a time."""
         key_bits = PAPER_SORT_KEY_BITS if self.strip.paper_rule else SORT_KEY_BITS
         longest_before = 1
         for index, capacity in enumerate((*SORT_CAPACITIES, 0)):

@@ -1,4 +1,4 @@
-"""Filters views: checks, stores on the GPU, frames begun and finished."""
+"""The OpenGL frame engine: checks, stores on the GPU, start and result of frames."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,18 +24,18 @@ from filter_service.rendering.image_cells import image_cells
 from filter_service.rgbd_view import RgbdView
 
 FIRST_WORDS = 2**20
-"""Of a store's copy on the GPU: 2 MB; it grows by doubling."""
+"""Initial size of a store's copy on the GPU, 2 MB; it grows by doubling."""
 
 
 class GlStore(FrameStore):
-    """A store whose kernels are on the GPU, as far as `sync` has seen them.
+    """A store with a copy of its kernels on the GPU, updated by `sync`.
 
     Attributes
     ----------
     pages : Pages
         The kernels.
     is_released : bool
-        Nothing is to be kept of it.
+        Whether the store was released and nothing of it may be kept.
     """
 
     def __init__(self, gpu: Gpu, store: PsfStore) -> None:
@@ -47,10 +47,10 @@ class GlStore(FrameStore):
         self._generation = store.generation
         with gpu.context:
             self.sync()
-        _ = store.defocus  # made here and not by the first frame
+        _ = store.defocus  # computed here and not by the first frame
 
     def sync(self) -> None:
-        """Copy the kernels that were computed since the last time, in the context."""
+        """Copy the kernels that were computed since the last call, in the context."""
         words = self.store.kernels
         if words.size > self._capacity or self.pages is None:
             self._free()
@@ -68,7 +68,7 @@ class GlStore(FrameStore):
     def release(self) -> None:
         """Free the GPU copy."""
         self.is_released = True
-        with self._gpu.context:  # without one, the driver frees nothing
+        with self._gpu.context:  # without a context, the driver frees nothing
             self._free()
 
     def _free(self) -> None:
@@ -78,7 +78,7 @@ class GlStore(FrameStore):
 
 
 class FilterRenderer:
-    """Runs the passes for one view at a time; not thread-safe."""
+    """Runs the passes on one view at a time; not thread-safe."""
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
@@ -87,26 +87,26 @@ class FilterRenderer:
 
     @property
     def name(self) -> str:
-        """The OpenGL renderer."""
+        """Name of the OpenGL renderer."""
         return str(self._gpu.info["renderer"])
 
     def load(self, store: PsfStore) -> GlStore:
-        """Take a store, whose kernels may all be computed later."""
+        """Load a store; its kernels may all be computed later."""
         return GlStore(self._gpu, store)
 
     def trim(self) -> None:
-        """Keep what is held: a GPU's buffers are bounded, and dear to make anew.
+        """Drop released eyes only.
 
-        But for eyes that were given up.
+        The buffers of a GPU are bounded, and expensive to allocate again.
         """
         self._kept.drop_released()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Do without: no frame keeps a GPU for long."""
+        """Do nothing and return False: no frame occupies a GPU for long."""
         return False
 
     def render(self, view: RgbdView, handle: GlStore, **options: Any) -> FilteredView:
-        """Filter one view through the eye of a loaded store; options as of `begin`."""
+        """Filter one view through the eye of a loaded store; options as in `begin`."""
         return self.begin(view, handle, **options)()
 
     def begin(
@@ -124,31 +124,31 @@ class FilterRenderer:
         out: NDArray[Any] | None = None,
         until_s: float | None = None,
     ) -> Callable[[], FilteredView]:
-        """Have the GPU begin with a view; call what is returned for the answer.
+        """Start filtering a view; return a function that waits for the result.
 
-        Others may be begun between, the other eye's say.
+        Other views may be started in between, such as that of the other eye.
 
         Parameters
         ----------
         gaze_deg : (h, v), optional
-            Where the eye looks in the image, clamped to what was prepared with a note;
-            the store's where it is None.
+            Gaze in the image, clamped to the prepared range with a note; the store's by
+            default.
         render_tolerance : float
-            Errors of merging and layers against the usual; 0 is exact.
+            Errors of merging and layers relative to the default; 0 is exact.
         out : array, optional
-            Memory for the picture, of its shape and type.
+            Output array of the shape and type of the image.
         until_s : float, optional
-            Time of `time.monotonic` after which no more PSFs are computed.
+            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
 
         Raises
         ------
         BadMessage
-            Arrays or options that cannot be used.
+            Arrays or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
         NotPrepared
-            PSFs that the frame needs were not computed by ``until_s``; what is returned
-            raises it, too.
+            Some PSFs that the frame needs were not computed by ``until_s``; the
+            returned function may raise it, too.
         OutOfGpuMemory, RenderFailed
         """
         options = frame_options(
@@ -160,7 +160,7 @@ class FilterRenderer:
             output=output,
             gaze_deg=gaze_deg,
         )
-        # Another library's context (a renderer of the input) may be current.
+        # Another library's context (that of the input's renderer) may be current.
         with self._gpu.context:
             run = FrameRun(
                 self._gpu,
@@ -200,7 +200,7 @@ class FilterRenderer:
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
-    """Words as whole lines (n, STORE_SIDE); the last is filled up with zeros."""
+    """Return words as whole lines (n, STORE_SIDE); the last is padded with zeros."""
     part = words[first * STORE_SIDE : end * STORE_SIDE]
     missing = -part.size % STORE_SIDE
     if missing:

@@ -1,4 +1,4 @@
-"""One frame, or a strip of it, on its way through the passes: its size, its buffers."""
+"""Size and buffers of a frame, or a strip of it, in the passes."""
 
 from filter_service.constants import BIN_TILES, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
@@ -8,33 +8,33 @@ from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rgbd_view import RgbdView
 
 MAX_GROUPS = 65535
-"""Work groups along one axis that every OpenGL 4.3 allows."""
+"""Work groups along one axis that every OpenGL 4.3 implementation allows."""
 
 
 def group_count(count: int, size: int) -> int:
-    """Return how many groups of a size hold a count."""
+    """Return the number of groups of a size that hold a count."""
     return (count + size - 1) // size
 
 
 def grid_of(groups: int) -> tuple[int, int]:
-    """Return columns and rows of at least so many groups, of those OpenGL allows."""
+    """Return columns and rows of at least this many groups, within OpenGL's limits."""
     columns = min(groups, MAX_GROUPS)
     return columns, group_count(groups, columns)
 
 
 class Strip:
-    """What all passes of a strip share; buffers are the context's named ones.
+    """State shared by all passes of a strip; buffers are the context's named ones.
 
     Parameters
     ----------
     view : RgbdView
-        The strip, with depth filled in; 0 in its hidden depth is nothing.
+        The strip, with depth filled in; hidden depth is 0 where nothing is hidden.
     layers : FrameLayers
     paper_rule : bool
-        Fragments add up as the paper has it.
+        Whether fragments are accumulated by the paper's rule.
     surface_count : int, optional
-        Surfaces whose fragments lie one behind the other in the blocks; those of the
-        view unless a test makes blocks of its own.
+        Surfaces whose fragments follow each other in the blocks; by default those of
+        the view, unless a test makes its own blocks.
     """
 
     def __init__(
@@ -63,12 +63,12 @@ class Strip:
         self.buffers: dict[str, Buffer] = {}
 
     def reserve(self, **n_bytes: int) -> None:
-        """Get buffers of these sizes by name."""
+        """Reserve buffers of these sizes by name."""
         for name, size in n_bytes.items():
             self.buffers[name] = self.gpu.storage(name, size)
 
     def run(self, name: str, groups: tuple[int, ...], *bindings: str, **uniforms):
-        """Dispatch a pass on buffers by name."""
+        """Dispatch a pass on buffers given by name."""
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
         indirect = uniforms.pop("indirect", None)

@@ -1,4 +1,4 @@
-"""A frame cut into strips of rows whose buffers fit the GPU's storage blocks."""
+"""Division of a frame into strips of rows whose buffers fit the storage blocks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,15 +11,15 @@ from filter_service.rendering.frame import IMAGES
 from filter_service.rgbd_view import RgbdView
 
 BYTES_PER_PIXEL = 16
-"""Of the largest buffers, per pixel and surface: a strip's must fit a storage block."""
+"""Bytes per pixel and surface in the largest buffers, which must fit a block."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a frame that go through the passes together.
+    """Rows of a frame that the passes process together.
 
-    ``view`` has the rows that send light to those ``kept``, which are the strip's part
-    of the picture.
+    ``view`` contains all rows that send light to the ``kept`` ones, which are the
+    strip's part of the image.
     """
 
     view: RgbdView
@@ -30,14 +30,16 @@ class Rows:
 def cut_in_strips(
     view: RgbdView, reach_of: Callable[[], int], max_block_bytes: int
 ) -> list[Rows]:
-    """Cut a frame so that each strip's buffers fit a storage block.
+    """Divide a frame so that each strip's buffers fit a storage block.
 
-    Strips start on rows of bins, so that lists and merged squares are the whole's.
+    Strips start on rows of bins, so that lists and merged squares are the same as in
+    the whole frame.
 
     Parameters
     ----------
     reach_of : callable
-        Tells how far light is spread, px, where the frame has to be cut.
+        Function that returns the spread of light, px; called if the frame must be
+        divided.
     """
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
     rows = max_block_bytes // (view.surface_count * BYTES_PER_PIXEL * padded_width)
@@ -67,7 +69,7 @@ def cut_in_strips(
 
 
 def _rows_of(view: RgbdView, first: int, last: int) -> RgbdView:
-    """Rows first..last of a view, with the tangents of their edges."""
+    """Return rows first..last of a view, with the tangents of their edges."""
     left, right, up, down = view.tangents
     per_row = (down - up) / view.height_px
     images = {
@@ -83,7 +85,7 @@ def _rows_of(view: RgbdView, first: int, last: int) -> RgbdView:
 
 
 def counted_px(rows: Rows, view: RgbdView, border_px: int) -> tuple[int, int, int, int]:
-    """Pixels (left, top, right, bottom) of a strip that are its part of the image."""
+    """Return the pixels (left, top, right, bottom) of a strip's part of the image."""
     top, bottom = (
         border_px - rows.first_row,
         border_px + view.height_px - rows.first_row,

@@ -1,4 +1,4 @@
-"""Fills in the record that the compiled loops work on."""
+"""Input record of the compiled loops."""
 
 import math
 from dataclasses import dataclass
@@ -30,13 +30,13 @@ BLOCK_PIXELS = TILE_SIZE_PX**2
 BOXES_READ_BEYOND = 16
 CLAMP_MARGIN_RATIO = 1e-6
 COARSE_MARGIN_PX = 8.0
-"""Light of coarse kernels goes that much farther, see merge.h."""
+"""Additional reach of the light of coarse kernels, see merge.h."""
 
 REACH_MARGIN_PX = 1.5
 
 
 class BlendSizes(NamedTuple):
-    """Sizes of what blending makes, as `place` found them."""
+    """Sizes of the outputs of blending, as determined by `place`."""
 
     recipe_texels: int
     kernel_texels: int
@@ -44,7 +44,7 @@ class BlendSizes(NamedTuple):
 
     @classmethod
     def of(cls, c: Frame) -> "BlendSizes":
-        """Read them off a record."""
+        """Return the sizes in a record."""
         return cls(
             c.recipe_texel_count,
             c.kernel_texel_count,
@@ -54,7 +54,7 @@ class BlendSizes(NamedTuple):
 
 @dataclass
 class FrameRecord:
-    """The record of one frame, with the arrays that it points to.
+    """Record of one frame, with the arrays that it points to.
 
     Attributes
     ----------
@@ -64,18 +64,18 @@ class FrameRecord:
     c: Frame
     n_threads: int
     arrays: Arrays
-    eye_arrays: Arrays  # which the next frame of this eye may find again
+    eye_arrays: Arrays  # may be reused by the next frame of this eye
     kept: list[NDArray]
 
     @classmethod
     def new(
         cls, threads: int, n_threads: int, arrays: Arrays, eye_arrays: Arrays
     ) -> "FrameRecord":
-        """Return an empty record for loops on these threads."""
+        """Return an empty record for loops on the given threads."""
         return cls(Frame(threads=threads), n_threads, arrays, eye_arrays, [])
 
     def _keep(self, array: NDArray) -> int:
-        """Keep an array as long as the record; return where it lies."""
+        """Keep an array alive as long as the record; return its address."""
         self.kept.append(array)
         return int(array.ctypes.data)
 
@@ -83,7 +83,7 @@ class FrameRecord:
         return self.arrays.address(name, count, dtype)
 
     def set_view(self, view: RgbdView, border_px: int) -> None:
-        """Point to the images of a view that has a border around it."""
+        """Set pointers to the images of a view that includes a border."""
         c = self.c
         c.width, c.height = view.width_px, view.height_px
         c.surface_count, c.border_px = view.surface_count, border_px
@@ -109,7 +109,7 @@ class FrameRecord:
         image: ImageCells,
         corner_change_dpt: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
-        """Point to layers and cells; returns where used pairs will be noted."""
+        """Set pointers to layers and cells; return the array that marks used pairs."""
         c = self.c
         far_dpt, near_dpt = layers.vergence_range_dpt
         c.vergence_low_dpt, c.vergence_high_dpt = far_dpt, near_dpt
@@ -139,7 +139,7 @@ class FrameRecord:
         return used
 
     def set_kernels(self, plan: KernelPlan) -> None:
-        """Point to planned kernels and to room for fragments."""
+        """Set pointers to planned kernels and to buffers for fragments."""
         c = self.c
         c.kernel_of = self._keep(plan.kernel_of)
         c.shapes = self._keep(plan.shapes)
@@ -173,7 +173,7 @@ class FrameRecord:
         white_level: float,
         is_encoded: bool,
     ) -> None:
-        """Say how pixels become fragments, and those light; the paper merges once."""
+        """Set the options of merging and accumulation; the paper merges once."""
         c = self.c
         c.paper_rule, c.white_level = paper_rule, white_level
         c.is_encoded = is_encoded and white_level > 0.0
@@ -187,14 +187,14 @@ class FrameRecord:
             c.coarse_spread_px[r] = max(spread_px, COARSE_SPREAD_PX[r])
 
     def set_store(self, handle: NativeStore) -> None:
-        """Point to the cached kernels."""
+        """Set pointers to the cached kernels."""
         for r, stored in enumerate(handle.resolutions):
             self.c.store[r] = self._keep(stored.words)
             self.c.store_first[r] = self._keep(stored.first_texel)
             self.c.store_reach[r] = self._keep(stored.reach)
 
     def set_blend_room(self, sizes: BlendSizes) -> None:
-        """Point to kernels, or room for them."""
+        """Set pointers to blended kernels, or to buffers for them."""
         c = self.c
         room = self.eye_arrays.address
         c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
@@ -204,6 +204,6 @@ class FrameRecord:
         c.blend_scratch = self._room("blend_scratch", n_floats, np.float32)
 
     def set_picture(self, picture: NDArray) -> None:
-        """Point to where the picture goes."""
+        """Set the pointer to the output image."""
         self.c.picture = self._keep(picture)
         self.c.output_kind = COLOR_KINDS[picture.dtype.name]

@@ -1,4 +1,4 @@
-"""What is kept of each eye between frames, so that several take turns without loss."""
+"""State of each eye kept between frames, so that several can alternate without loss."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from filter_service.rendering.native.kernel_plan import KernelPlan
 from filter_service.rendering.native.native_store import NativeStore
 
 MAX_KEPT = 4
-"""Eyes: those of a stereo frame, and of clients that stream at the same time."""
+"""Largest number of eyes: those of a stereo frame, and of clients that stream at the
+same time."""
 
 
 @dataclass(eq=False)
 class KeptState:
-    """What of an eye's last frame serves the next in the same state.
+    """State of an eye's last frame that the next frame in the same state reuses.
 
     Attributes
     ----------
     handle : NativeStore
     states : FrameStates
     arrays : Arrays
-        Of blended kernels.
+        Arrays of blended kernels.
     plan : KernelPlan or None
-    blended : (plan, levels that were made, sizes) or None
+    blended : (plan, computed levels, sizes) or None
     """
 
     handle: NativeStore
@@ -39,13 +40,13 @@ class KeptState:
 
 
 class KeptStates:
-    """States of the eyes used last; those of stores that were released go."""
+    """States of the most recently used eyes; those of released stores are dropped."""
 
     def __init__(self) -> None:
         self._kept: list[KeptState] = []
 
     def of(self, handle: NativeStore) -> KeptState:
-        """Return the state of an eye, which is now the one used last."""
+        """Return the state of an eye, and mark it as most recently used."""
         found = next((kept for kept in self._kept if kept.handle is handle), None)
         others = [
             kept
@@ -58,5 +59,5 @@ class KeptStates:
 
     @property
     def memory_mb(self) -> float:
-        """Memory of all blended kernels."""
+        """Memory of all blended kernels, MB."""
         return sum(kept.arrays.memory_mb for kept in self._kept)

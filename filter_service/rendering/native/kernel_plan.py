@@ -1,4 +1,4 @@
-"""Which kernels a frame needs, as the compiled loops read it; kept between frames."""
+"""Plan of a frame's kernels for the compiled loops, kept between frames."""
 
 from dataclasses import dataclass
 
@@ -28,16 +28,16 @@ class KernelPlan:
     Attributes
     ----------
     state : (NativeStore, FrameLayers, ImageCells)
-        What they are for.
+        State that the kernels are for.
     used : (n_cells, n_intervals), bool
-        Pairs that have one.
+        Pairs that have a kernel.
     kernels : FrameKernels
     kernel_of : (n_cells, n_intervals), uint32
     shapes : (n,), KERNEL_SHAPE
         `levels_used` is filled in by merging.
     sources : tuple of arrays
-        What blending reads, each in one piece: cells, parts, near and far recipes,
-        weights, maps, recipes.
+        Contiguous inputs of blending: cells, parts, near and far recipes, weights,
+        maps, recipes.
     """
 
     state: tuple[NativeStore, FrameLayers, ImageCells]
@@ -48,7 +48,7 @@ class KernelPlan:
     sources: tuple[NDArray, ...]
 
     def serves(self, state: tuple, used: NDArray[np.bool_]) -> bool:
-        """Whether a frame in a state that uses these pairs finds all of them."""
+        """Return whether the plan has all kernels of a frame's state and pairs."""
         if any(own is not other for own, other in zip(self.state, state, strict=True)):
             return False
         return not np.any(used & ~self.used)
@@ -61,12 +61,12 @@ def plan_kernels(
     used: NDArray[np.bool_],
     fill: Fill,
 ) -> KernelPlan:
-    """Plan the kernels of used pairs; compute the PSFs that lack.
+    """Plan the kernels of used pairs, and compute missing PSFs.
 
     Raises
     ------
     KernelsTooLarge
-        With larger cells there would be fewer.
+        There are too many texels; larger cells have fewer.
     NotPrepared
         ``fill`` ran out of time.
     """

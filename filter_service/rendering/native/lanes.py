@@ -1,4 +1,4 @@
-"""Two renderers on one processor: small frames come between parts of large ones."""
+"""Two renderers on one processor, so that small frames can interrupt large ones."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from filter_service.rgbd_view import RgbdView
 
 
 class NativeLanes:
-    """The native engine of a service: what `call_between` calls may use it again.
+    """The native engine of a service; functions of `call_between` may reenter it.
 
-    Everything happens in the caller's thread: while one renderer rests, another may
-    filter a frame or take a store.
+    Everything runs in the caller's thread: while one renderer pauses, the other may
+    filter a frame or load a store.
     """
 
     def __init__(self) -> None:
@@ -25,31 +25,31 @@ class NativeLanes:
 
     @property
     def name(self) -> str:
-        """What the loops are compiled for, and on how many threads they run."""
+        """Instruction set of the compiled loops, and their number of threads."""
         return self._main.name
 
     @property
     def memory_mb(self) -> float:
-        """Memory that frames use again."""
+        """Memory of the buffers that frames reuse, MB."""
         return self._main.memory_mb + self._other.memory_mb
 
     def trim(self) -> None:
-        """Give back the memory that frames use again."""
+        """Release the buffers that frames reuse."""
         self._main.trim()
         self._other.trim()
 
     def close(self) -> None:
-        """End the threads; the engine is of no use after."""
+        """Stop the threads; the engine cannot be used afterwards."""
         self._main.close()
         self._other.close()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Have a function called while frames are filtered; it may filter another."""
+        """Register a function to be called during frames; it may filter another."""
         self._main.call_between(function, interval_s)
         return True
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Take a store, whose kernels may all be computed later."""
+        """Load a store; its kernels may all be computed later."""
         return self._other.load(store)
 
     def render(

@@ -1,4 +1,4 @@
-"""A PSF store as the native engine reads it: with coarse kernels beside it."""
+"""A PSF store of the native engine, with additional coarse kernels."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
 
 COARSE_SPREAD_PX = (0.0, 24.0, 48.0)
-"""Least spread of a kernel whose merged squares may reach pixels of 1, 2 and 4 px.  At
--6 dpt and kernels of 74 px to each side that leaves 77 dB to the picture without, in
-81 % of its time.  From 12 and 24 px on, 37 px took 88 %, but astigmatism and cataract
-were 0.1 dB farther from the truth at 1280x720."""
+"""Smallest spread of a kernel whose merged squares are splatted onto pixels of 1, 2 and
+4 px.  At -6 dpt and kernels of 74 px to each side, the image is within 77 dB of the one
+without, in 81 % of its time.  From 12 and 24 px on, 37 px took 88 %, but astigmatism
+and cataract had 0.1 dB more error at 1280x720."""
 
 KEPT_SPREAD_RATIO = 0.25
-"""Coarse forms are made of cached kernels with that part of the least spread: a kernel
-of the frame is blended from wider and narrower ones.  Narrower ones are one pixel."""
+"""Cached kernels with at least this fraction of the smallest spread have coarse forms,
+because a kernel of the frame is blended from wider and narrower ones.  The coarse form
+of a narrower one is a single pixel."""
 
 
 class StoredKernels(NamedTuple):
@@ -33,7 +34,7 @@ class StoredKernels(NamedTuple):
     ----------
     words : (n_texels,), uint16
     first_texel : (n_psfs,), uint64
-        Where each starts.
+        First texel of each kernel.
     reach : (n_psfs,), uint32
         Four bytes: left, right, up, down.
     """
@@ -43,7 +44,7 @@ class StoredKernels(NamedTuple):
     reach: NDArray[np.uint32]
 
     def with_room(self, count: int) -> StoredKernels:
-        """Return the kernels with room for so many more."""
+        """Return the kernels with space for ``count`` more."""
         return self._replace(
             first_texel=np.append(self.first_texel, np.zeros(count, np.uint64)),
             reach=np.append(self.reach, np.zeros(count, np.uint32)),
@@ -51,14 +52,14 @@ class StoredKernels(NamedTuple):
 
 
 class NativeStore(FrameStore):
-    """A store in all resolutions.
+    """A store with its kernels in all resolutions.
 
     Attributes
     ----------
     resolutions : list of StoredKernels
-        Of the kernels that `sync` has seen.
+        Kernels added so far by `sync`, in each resolution.
     is_released : bool
-        Nothing is to be kept of it.
+        Whether the store was released and nothing of it may be kept.
     """
 
     def __init__(self, store: PsfStore) -> None:
@@ -66,10 +67,10 @@ class NativeStore(FrameStore):
         self._numbers = np.zeros(0, np.uint32)
         self.is_released = False
         self._start_anew()
-        _ = store.defocus  # made here and not by the first frame
+        _ = store.defocus  # computed here and not by the first frame
 
     def _start_anew(self) -> None:
-        """Forget all kernels; whoever still reads those keeps their arrays."""
+        """Discard all kernels; current readers keep references to their arrays."""
         self._generation, self._n_seen = self.store.generation, 0
         self._n_texels = [0] * RESOLUTIONS
         self.resolutions = [
@@ -83,30 +84,31 @@ class NativeStore(FrameStore):
 
     @property
     def tables(self) -> StoreTables:
-        """The store's, with the number of each kernel in the place of its offset."""
+        """Tables of the store, with kernel numbers in place of offsets."""
         if self._numbers.size != self.store.psf_count:
             self._numbers = np.arange(self.store.psf_count, dtype=np.uint32)
         return self.store.tables._replace(offsets=self._numbers)
 
     @property
     def memory_mb(self) -> float:
-        """Memory of kernels in all resolutions."""
+        """Memory of the kernels in all resolutions, MB."""
         return self.store.memory_mb + 2.0 * sum(self._n_texels[1:]) / 1e6
 
     def release(self) -> None:
-        """Let renderers forget it; its memory goes with the last who has it."""
+        """Mark the store as released; its memory is freed with the last reference."""
         self.is_released = True
 
     def sync(self, library: Library, threads: int) -> None:
-        """Take the kernels that were computed since the last time.
+        """Add the kernels that were computed since the last call.
 
-        With the threads of the renderer at hand: the one that loaded it may be gone.
+        This uses the threads of the current renderer, as the one that loaded the store
+        may no longer exist.
         """
         store = self.store
         if store.generation != self._generation:
             self._start_anew()
         more = store.psf_count - self.resolutions[0].reach.size
-        if more:  # nodes of a state that is read for the first time
+        if more:  # nodes of a state that is used for the first time
             self.resolutions = [own.with_room(more) for own in self.resolutions]
         self._n_seen, added = store.added_since(self._n_seen)
         psfs = np.ascontiguousarray(added, np.int64)
@@ -122,9 +124,10 @@ class NativeStore(FrameStore):
     def _shrink_job(
         self, resolution: int, psfs: NDArray[np.int64], threads: int
     ) -> ShrinkJob:
-        """Make room for the coarse forms of kernels (n,); narrow ones have one texel.
+        """Return the job that makes coarse forms of kernels (n,), and allocate them.
 
-        The arrays that the job points to are the store's, and ``psfs``.
+        Narrow kernels have one texel.  The job points to arrays of the store and to
+        ``psfs``.
         """
         store, coarse = self.store, self.resolutions[resolution]
         size_px = 2**resolution

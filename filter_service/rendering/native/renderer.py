@@ -1,4 +1,4 @@
-"""Filters one view on the processor: the stages, and what is kept between frames."""
+"""The native frame engine: stages of a frame, and state kept between frames."""
 
 import time
 import weakref
@@ -35,21 +35,21 @@ from filter_service.rgbd_view import RgbdView
 
 
 class NativeRenderer:
-    """Runs the compiled loops for one view at a time; not thread-safe.
+    """Runs the compiled loops on one view at a time; not thread-safe.
 
-    Python's lock is free while they run.
+    The loops release Python's global interpreter lock.
 
     Parameters
     ----------
     loops : Library, optional
-        Others than those that this machine runs best.
+        Compiled loops; by default the fastest for this machine.
     n_threads : int, optional
-        Instead of one a core.
+        Number of threads; by default one per core.
 
     Raises
     ------
     RenderFailed
-        The loops were not built here.
+        The loops were not built on this machine.
     """
 
     def __init__(self, loops: Library | None = None, n_threads: int | None = None):
@@ -60,40 +60,40 @@ class NativeRenderer:
         self._between: object = None
         self._rest_between: Callable[[], None] | None = None
         self._is_syncing = False
-        self._rested_s = 0.0  # in all
+        self._rested_s = 0.0  # total
         self._kept = KeptStates()
         self._arrays = Arrays()
 
     @property
     def name(self) -> str:
-        """What the loops are compiled for, and on how many threads they run."""
+        """Instruction set of the compiled loops, and their number of threads."""
         return f"native ({self._loops.variant}, {self._n_threads} threads)"
 
     @property
     def memory_mb(self) -> float:
-        """Memory that frames use again."""
+        """Memory of the buffers that frames reuse, MB."""
         return self._arrays.memory_mb + self._kept.memory_mb
 
     def trim(self) -> None:
-        """Give back the memory that frames use again; the next one takes what it needs.
+        """Release the buffers that frames reuse; the next frame allocates its own.
 
-        A frame of 4096x4096 leaves a gigabyte, which nobody else has use for.
+        After a frame of 4096x4096 they take a gigabyte.
         """
         self._arrays = Arrays()
         self._kept = KeptStates()
 
     def close(self) -> None:
-        """End the threads; the renderer is of no use after."""
+        """Stop the threads; the renderer cannot be used afterwards."""
         self._end()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> None:
-        """Have a function called now and then in the middle of a frame.
+        """Register a function to be called during frames, at most every ``interval_s``.
 
         It must neither raise nor use this renderer.
         """
 
         def rest() -> None:
-            if self._is_syncing:  # a frame between would find half of a store
+            if self._is_syncing:  # a frame would find an incomplete store
                 return
             started_s = time.perf_counter()
             function()
@@ -103,7 +103,7 @@ class NativeRenderer:
         self._rest_between = rest
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Take a store, whose kernels may all be computed later."""
+        """Load a store; its kernels may all be computed later."""
         return NativeStore(store)
 
     def render(
@@ -126,23 +126,24 @@ class NativeRenderer:
         Parameters
         ----------
         gaze_deg : (h, v), optional
-            Where the eye looks in the image, clamped to what was prepared with a note;
-            the store's where it is None.
+            Gaze in the image, clamped to the prepared range with a note; the store's by
+            default.
         render_tolerance : float
-            Errors of merging, coarse kernels and layers against the usual; 0 is exact.
+            Errors of merging, coarse kernels and layers relative to the default; 0 is
+            exact.
         out : array, optional
-            Memory for the picture, of its shape and type.
+            Output array of the shape and type of the image.
         until_s : float, optional
-            Time of `time.monotonic` after which no more PSFs are computed.
+            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
 
         Raises
         ------
         BadMessage
-            Arrays or options that cannot be used.
+            Arrays or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
         NotPrepared
-            PSFs that the frame needs were not computed by ``until_s``.
+            Some PSFs that the frame needs were not computed by ``until_s``.
         RenderFailed
             Memory ran out.
         """
@@ -236,7 +237,7 @@ class NativeRenderer:
         layers,
         image: ImageCells,
     ) -> tuple[int, NDArray[np.bool_]]:
-        """Distances, positions and used pairs; pixels whose depth was filled in."""
+        """Compute the pixels; return the count of filled depths and the used pairs."""
         with timer.wall("prepare_ms"):
             filled_m, missing_count = fill_missing_depth(view.depth_m)
             whole = replace(view, depth_m=filled_m)
@@ -252,10 +253,10 @@ class NativeRenderer:
         return missing_count, used
 
     def _planned(self, kept: KeptState, layers, image, used, fill: Fill) -> KernelPlan:
-        """Plan kernels, or return the last frame's if they serve."""
+        """Return the last frame's kernels if they suffice; otherwise plan new ones."""
         state = (kept.handle, layers, image)
         if kept.plan is None or not kept.plan.serves(state, used):
-            kept.plan = None  # stays so if what follows fails
+            kept.plan = None  # remains None if the following fails
             kept.plan = plan_kernels(kept.handle, layers, image, used, fill)
             self._is_syncing = True
             try:
@@ -271,14 +272,14 @@ class NativeRenderer:
         until_s: float | None,
         psfs: NDArray[np.int64],
     ) -> None:
-        """Compute the PSFs that a frame lacks, as one of its stages."""
+        """Compute the missing PSFs of a frame, as one of its stages."""
         with timer.inner("psf_compute_ms"):
             handle.store.fill(psfs, until_s=until_s, between=self._rest_between)
 
     def _blend(
         self, timer, frame: FrameRecord, plan: KernelPlan, kept: KeptState
     ) -> BlendSizes:
-        """Make what fragments use of the kernels, unless it is there."""
+        """Blend the kernels that fragments use, unless they already exist."""
         levels = plan.shapes["levels_used"]
         if kept.blended is not None:
             of_plan, made, sizes = kept.blended
@@ -296,7 +297,7 @@ class NativeRenderer:
 
 
 class StageTimes:
-    """Wall times of named stages, ms, and of the rests between their parts."""
+    """Wall times of named stages, ms, without the pauses between their parts."""
 
     def __init__(self, rested_s: Callable[[], float]) -> None:
         self._ms: dict[str, float] = {}
@@ -306,7 +307,7 @@ class StageTimes:
 
     @contextmanager
     def wall(self, name: str):
-        """Time a stage; entering a name twice adds up."""
+        """Time a stage; times of the same name add up."""
         started_s, inner_ms = time.perf_counter() - self._rested_s(), self._inner_ms
         yield
         elapsed_ms = 1e3 * (time.perf_counter() - self._rested_s() - started_s)
@@ -315,13 +316,13 @@ class StageTimes:
 
     @contextmanager
     def inner(self, name: str):
-        """Time a stage within another, whose time is then without it."""
+        """Time a stage within another, and exclude it from the outer stage's time."""
         before_ms = sum(self._ms.values())
         with self.wall(name):
             yield
         self._inner_ms += sum(self._ms.values()) - before_ms
 
     def result_ms(self) -> dict[str, float]:
-        """Return times by stage."""
+        """Return times by stage, and the total of the pauses if there were any."""
         rests_ms = 1e3 * (self._rested_s() - self._before_s)
         return dict(self._ms) | ({"rests_ms": rests_ms} if rests_ms else {})
