@@ -12,13 +12,16 @@ NONE := test $$? -eq 5 # ARGS may choose none of these tests
 BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf layers render live follow levels crops kernels field occlusion sequence cost peers switch headset host abuse files overload devices restart batch roundtrip web
 
 .DEFAULT_GOAL := help
-.PHONY: demo web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-web setup-witness
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness
 
 demo: setup  ## stream two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
 
 web: setup-page  ## a page in your browser: your prescription, your photo
 	$(PYTHON) -m filter_service web $(ARGS)
+
+docs: setup-docs  ## the documentation, checked strictly; writes out/docs/
+	$(PYTHON) -m mkdocs build --quiet --strict $(ARGS)
 
 test: setup-test  ## all tests but the slow ones and those for a hardware GPU
 	$(PYTHON) -m pytest $(USUAL) $(BESIDE) tests/unit tests/numerical $(ARGS) || $(NONE)
@@ -100,6 +103,9 @@ setup-examples:
 
 setup-page:
 	@sh setup.sh page
+
+setup-docs:
+	@sh setup.sh docs
 
 setup-web:
 	@sh setup.sh web

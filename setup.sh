@@ -8,6 +8,7 @@
 #   sh setup.sh examples  an environment of its own that has the package and Jupyter
 #   sh setup.sh page    the first, and what `ocufilter web` needs
 #   sh setup.sh web     the same, and a browser for its tests
+#   sh setup.sh docs    the first, and what builds the documentation
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
 # Running it again costs a fraction of a second: the environment is installed anew
@@ -35,6 +36,7 @@ STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
 PAGE_STAMP=$VENV/.ocufilter-page-installed
+DOCS_STAMP=$VENV/.ocufilter-docs-installed
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
@@ -149,7 +151,7 @@ install_packages() {
     wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
-    rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP
+    rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP $DOCS_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
     $pip install -c constraints.txt $COMPILER_PACKAGES
@@ -197,6 +199,14 @@ install_page() { # what `ocufilter web` needs; make test does not
     $VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt --no-build-isolation -e '.[web]'
     cp $STAMP $PAGE_STAMP
+}
+
+install_docs() { # what builds the documentation
+    if [ "$(cat $DOCS_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
+    say "installing the packages of the documentation"
+    $VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt --no-build-isolation -e '.[docs]'
+    cp $STAMP $DOCS_STAMP
 }
 
 install_browser() { # and what drives it
@@ -257,6 +267,7 @@ if [ "${1:-}" = test ]; then
 fi
 if [ "${1:-}" = batch-ray ]; then install_ray; fi
 if [ "${1:-}" = page ]; then install_page; fi
+if [ "${1:-}" = docs ]; then install_docs; fi
 if [ "${1:-}" = web ]; then
     install_page
     install_browser

@@ -1,8 +1,8 @@
-"""Values checked against their annotated types, with errors that help.
+"""Validation of values against annotated types, with informative errors.
 
-`msgspec` does the checking; here its refusal becomes a `BadMessage` that names the
-field's path, the offending value and what is allowed.  Types are dataclasses and
-``Annotated[float, Meta(ge=..., le=...)]``; numbers that must not fall are marked
+`msgspec` validates; here its error becomes a `BadMessage` that names the field's path,
+the offending value and the allowed values.  Types are dataclasses and
+``Annotated[float, Meta(ge=..., le=...)]``; numbers that must not decrease are marked
 ``Meta(extra=RISING)``.
 """
 
@@ -39,7 +39,7 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = MAX_SHOWN_CHARACTERS
 
 
 def show(value: object) -> str:
-    """Return a short printable form of a value from outside, however large it is."""
+    """Return a short printable form of an untrusted value of any size."""
     try:
         text = _SHORT.repr(value)
     except ValueError:  # an integer of thousands of digits
@@ -50,10 +50,10 @@ def show(value: object) -> str:
 
 
 class Record:
-    """A frozen dataclass that travels as a map of its fields."""
+    """A frozen dataclass that is sent as a map of its fields."""
 
     def fields(self) -> dict[str, Any]:
-        """Return the map, with lists for tuples; what is None does not travel."""
+        """Return the map, with lists for tuples, without fields that are None."""
         return {
             name: _plain(value)
             for name, value in vars(self).items()
@@ -68,15 +68,15 @@ def _plain(value: Any) -> Any:
 
 
 def checked(value: object, kind: type[_T], path: str = "") -> _T:
-    """Return a value as an annotated type, its nested fields as theirs.
+    """Return a value converted to an annotated type, including nested fields.
 
-    Maps become dataclasses, lists tuples, integers floats where the type asks for it;
-    fields that the type does not know are left out.
+    Maps become dataclasses, lists become tuples and integers become floats if the type
+    requires it; unknown fields are dropped.
 
     Parameters
     ----------
     path : str
-        Of the value itself, as errors should name it.
+        Path of the value in error messages.
 
     Raises
     ------
@@ -86,13 +86,13 @@ def checked(value: object, kind: type[_T], path: str = "") -> _T:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         native = _native(value)
-        if native is not value:  # numpy's numbers are as good as Python's
+        if native is not value:  # NumPy numbers are accepted like Python's
             return checked(native, kind, path)
         raise _explained(error, value, kind, path) from None
 
 
 def _native(value: object) -> object:
-    """Return a value without numpy's numbers; itself where it has none."""
+    """Return a value with NumPy numbers converted, or itself if it has none."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):
@@ -107,7 +107,7 @@ def _native(value: object) -> object:
 def _explained(
     error: msgspec.ValidationError, value: object, kind: Any, path: str
 ) -> BadMessage:
-    """Say what a refusal is about: where, what is there, what is allowed."""
+    """Return an error that names the place, the value and the allowed values."""
     found = _AT_PATH.fullmatch(str(error))
     text, where = found.groups() if found else (str(error), "")
     described: kinds.Type | None = _described(kind)
@@ -115,7 +115,7 @@ def _explained(
         value, described = _step(value, described, name, number)
         path += f"[{number}]" if number else f".{name}" if path else name
     own = error.__cause__
-    if isinstance(own, BadMessage):  # what a type says of itself when it is made
+    if isinstance(own, BadMessage):  # raised by the type's own constructor
         at = ".".join(part for part in (path, own.field) if part)
         return BadMessage(own.message, field=at, allowed=own.allowed)
     missing = _MISSING.fullmatch(text)
@@ -127,16 +127,16 @@ def _explained(
 
 @cache
 def _described(kind: Any) -> kinds.Type:
-    """Return what a type is made of; for a frame that takes most of a millisecond."""
+    """Return the description of a type; for a frame it takes most of a millisecond."""
     return kinds.type_info(kind)
 
 
 def _step(
     value: Any, described: kinds.Type | None, name: str, number: str
 ) -> tuple[Any, kinds.Type | None]:
-    """Go down one step of a path, in the type and, where that is possible, the value.
+    """Follow one step of a path, in the type and, if possible, in the value.
 
-    Of a map's values msgspec does not say which it means; the map is shown then.
+    msgspec does not name the key of a map's value; the whole map is shown then.
     """
     described = _bare(described) if described is not None else None
     if name:
@@ -152,7 +152,7 @@ def _step(
 
 
 def _bare(described: kinds.Type) -> kinds.Type:
-    """Take the type out of its annotations and of ``None`` beside it."""
+    """Return a type without its annotations and without an optional ``None``."""
     if isinstance(described, kinds.Metadata):
         return _bare(described.type)
     if isinstance(described, kinds.UnionType):
@@ -168,8 +168,13 @@ def _extras(described: kinds.Type) -> Iterator[dict[str, Any]]:
         yield from _extras(described.type)
 
 
+def allowed_values(kind: Any) -> str:
+    """Return what an annotated type accepts, in words."""
+    return _allowed(_described(kind)) or ""
+
+
 def _allowed(described: kinds.Type | None) -> str | None:
-    """Say in words what a type accepts."""
+    """Return what a type accepts, in words, or None if it is unknown."""
     if described is None:
         return None
     kind = _bare(described)
@@ -187,6 +192,9 @@ def _allowed(described: kinds.Type | None) -> str | None:
         case kinds.TupleType():
             count = len(kind.item_types)
             words = _NUMBERS.get(count, f"a list of {count} items")
+            item = _bare(kind.item_types[0])
+            if isinstance(item, kinds.FloatType) and item.ge is not None:
+                words += f" of {item.ge:g} to {item.le:g}"
             is_rising = any(extra == RISING for extra in _extras(described))
             return f"{words}, lowest first" if is_rising else words
         case kinds.ListType() | kinds.VarTupleType():
@@ -202,7 +210,7 @@ def _is_rising(kind: Any) -> bool:
 
 
 def check_rising(value: Any, kind: Any, path: str) -> None:
-    """Refuse numbers that fall, where their type is marked as `RISING`."""
+    """Reject decreasing numbers if their type is marked as `RISING`."""
     if not _is_rising(kind):
         return
     if any(first > last for first, last in pairwise(value)):

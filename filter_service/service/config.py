@@ -153,7 +153,7 @@ class ServiceConfig:
                 )
         checked_gl_device(self.gl_device)
         check_devices(self.devices, engine=self.engine, gl_device=self.gl_device)
-        for name, (low, high) in _RANGES.items():
+        for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}; allowed: {low} to {high}")
@@ -206,7 +206,7 @@ class ServiceConfig:
         return max(limits.max_part_bytes, limits.max_profile_bytes)
 
 
-_RANGES: dict[str, tuple[float, float]] = {
+RANGES: dict[str, tuple[float, float]] = {
     "credit": (1, 16),
     "max_sessions": (1, 64),
     "max_width_px": (1, 16384),

@@ -1,20 +1,10 @@
-"""The README's Python example and the smallest client run as printed."""
-
-import re
+"""The smallest client, `clients/hello.py`, gets a filtered picture."""
 
 import numpy as np
 from PIL import Image
 
 from clients.service_process import ServiceProcess
 from tests.end_to_end.printed_script import printed_by
-from tests.source_tree import ROOT
-
-
-def test_the_python_example_prints_a_frame_of_the_size_it_has(tmp_path):
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    example = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
-    printed = printed_by("-c", example, cwd=tmp_path)
-    assert re.fullmatch(r"\(270, 480, 3\) [\d.]+ ms\n", printed)
 
 
 def test_the_smallest_client_writes_a_blurred_picture(tmp_path):

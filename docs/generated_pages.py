@@ -1,0 +1,125 @@
+"""MkDocs hook: pages generated from the code that they describe.
+
+``reference/settings.md`` lists `FilterSettings` and `ServiceConfig`, and
+``reference/command-line.md`` the help text of every command.  Figures are taken from
+the results of the benchmarks.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from filter_service.checked import allowed_values
+from filter_service.service.config import RANGES, ServiceConfig
+from filter_service.settings import DEFAULTS, setting_help, setting_types
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ("field.png", "live.png")
+RESULTS = "tests/benchmarks/results"
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the generated pages and the figures of the benchmarks."""
+    for uri, text in (
+        ("reference/settings.md", _settings_page()),
+        ("reference/command-line.md", _command_line_page()),
+    ):
+        files.append(File.generated(config, uri, content=text))
+    for name in FIGURES:
+        source = str(ROOT / RESULTS / name)
+        files.append(File.generated(config, f"images/{name}", abs_src_path=source))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Point links of the checkout to the copies in the built pages."""
+    return markdown.replace(f"](../{RESULTS}/", "](images/")
+
+
+def _settings_page() -> str:
+    lines = [
+        "# Settings",
+        "",
+        "## Filter",
+        "",
+        "Fields of `FilterSettings`, of `settings` on the wire, and options "
+        "of `ocufilter filter`.",
+        "",
+        "| setting | default | allowed | meaning |",
+        "|---|---|---|---|",
+    ]
+    for name, kind in setting_types().items():
+        default = _shown(getattr(DEFAULTS, name))
+        allowed = allowed_values(kind)
+        meaning = " ".join(setting_help(name).split())
+        lines.append(f"| `{name}` | {default} | {allowed} | {meaning} |")
+    lines += [
+        "",
+        "## Service",
+        "",
+        "Fields of the file that `ocufilter serve --config FILE.toml` reads.",
+        "",
+        "| setting | default | allowed | meaning |",
+        "|---|---|---|---|",
+    ]
+    meanings = _attributes_of(ServiceConfig.__doc__ or "")
+    for field in fields(ServiceConfig):
+        low_high = RANGES.get(field.name)
+        allowed = "" if low_high is None else f"{low_high[0]:g} to {low_high[1]:g}"
+        default = _shown(field.default)
+        lines.append(
+            f"| `{field.name}` | {default} | {allowed} | {meanings[field.name]} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _shown(value: object) -> str:
+    if value is None or value in ("", ()):
+        return "none"
+    return f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+def _attributes_of(docstring: str) -> dict[str, str]:
+    """Return the meaning of each attribute that a numpydoc docstring lists."""
+    meanings: dict[str, str] = {}
+    section = docstring.partition("Attributes")[2]
+    for names, text in re.findall(
+        r"^    (\w[\w, ]*) : .*\n((?:^        .*\n|^\n)+)", section, re.MULTILINE
+    ):
+        for name in names.split(", "):
+            meanings[name] = " ".join(text.replace("``", "`").split())
+    return meanings
+
+
+def _command_line_page() -> str:
+    lines = [
+        "# Command line",
+        "",
+        "Every command explains itself with `--help`; `--json` makes it print one JSON "
+        "object.  Exit codes: 0 done, 1 failure, 2 bad input.",
+        "",
+    ]
+    main = _help()
+    names = re.findall(r"^  ([a-z]+)  ", main.partition("Commands:")[2], re.MULTILINE)
+    for name in names:
+        lines += [f"## ocufilter {name}", "", "```text", _help(name), "```", ""]
+    return "\n".join(lines)
+
+
+def _help(*command: str) -> str:
+    finished = subprocess.run(
+        [sys.executable, "-m", "filter_service", *command, "--help"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return finished.stdout.rstrip()

@@ -1,0 +1,46 @@
+"""The Python examples of each page run as printed, one after the other."""
+
+import re
+
+import pytest
+
+from tests.end_to_end.printed_script import printed_by
+from tests.source_tree import ROOT
+
+PAGES = sorted(
+    path
+    for path in (ROOT / "docs").rglob("*.md")
+    if "```python\n" in path.read_text(encoding="utf-8")
+)
+
+
+def example_of(path) -> str:
+    """Return the examples of a page as one script; fragments are marked ``py``."""
+    text = path.read_text(encoding="utf-8")
+    return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_the_examples_of_a_page_run(path, tmp_path):
+    script = tmp_path / "example.py"
+    script.write_text(example_of(path), encoding="utf-8")
+    printed = printed_by(script, cwd=tmp_path)
+    if path.stem == "python":
+        lines = printed.splitlines()
+        assert lines[0].startswith("(90, 160, 3) 1 True")
+        assert lines[1] in ("1", "2")
+        assert f"print(error)  # {lines[3]}\n" in path.read_text(encoding="utf-8")
+    if path.stem == "stereo":
+        assert printed == "[(90, 160, 3), (90, 160, 3)]\n"
+    if path.stem == "stream":
+        assert re.fullmatch(r"\(90, 160, 3\) [\d.]+ ms\n", printed)
+    if path.stem == "measurements":
+        eye_length_mm, error_um = map(float, printed.splitlines()[0].split())
+        assert 20.0 < eye_length_mm < 30.0
+        assert error_um < 1e-3
+
+
+def test_the_readme_s_example_prints_what_it_shows(tmp_path):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", readme, re.DOTALL)
+    assert printed_by("-c", example[1], cwd=tmp_path) == example[2]

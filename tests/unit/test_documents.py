@@ -1,0 +1,140 @@
+"""Documents name files, links, targets, commands and profiles that exist."""
+
+import json
+import re
+import shlex
+from functools import cache
+
+import pytest
+from typer.testing import CliRunner
+
+from estimator.profiles.parse import parse_profile, preset_names
+from filter_service.__main__ import app
+from tests.source_tree import ROOT
+
+DOCUMENTS = sorted(
+    path.relative_to(ROOT).as_posix()
+    for folder in ("", "docs", "filter_service", "shaders", "training", "examples")
+    for path in (
+        (ROOT / folder).rglob("*.md")
+        if folder == "docs"
+        else (ROOT / folder).glob("*.md")
+    )
+)
+GENERATED = {"docs/reference/settings.md", "docs/reference/command-line.md"}
+"""Pages that only the built documentation has."""
+
+OWN_OPTIONS = ("batch", "bench", "headset", "report", "web")
+"""Commands whose programs parse their options themselves."""
+
+
+def text_of(document: str) -> str:
+    return (ROOT / document).read_text(encoding="utf-8")
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z][a-z-]*):", text_of("Makefile"), re.MULTILINE))
+
+
+@cache
+def help_of(*arguments: str) -> str:
+    result = CliRunner().invoke(app, [*arguments, "--help"])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def indented_commands() -> list[tuple[str, list[str]]]:
+    found = []
+    for document in DOCUMENTS:
+        text = text_of(document).replace("\\\n", " ")
+        for line in re.findall(r"^    (ocufilter .*)$", text, re.MULTILINE):
+            words = shlex.split(line, comments=True)[1:]
+            found.append((document, words))
+    return found
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_links_lead_to_files(document):
+    folder = (ROOT / document).parent
+    for link in re.findall(r"\]\(([^)\s]+)\)", text_of(document)):
+        target = link.partition("#")[0]
+        if not target or "://" in link:
+            continue
+        path = (folder / target).resolve()
+        if path.relative_to(ROOT).as_posix() not in GENERATED:
+            assert path.exists(), link
+
+
+@pytest.mark.parametrize(
+    "document", [name for name in DOCUMENTS if "CHANGE" not in name]
+)
+def test_files_that_are_named_exist(document):
+    named = re.findall(
+        r"`((?:clients|docs|estimator|examples|filter_service|shaders|tests|training)"
+        r"/[\w/.]+)`",
+        text_of(document),
+    )
+    homes = (ROOT, (ROOT / document).parent)
+    assert not [n for n in named if not any((home / n).exists() for home in homes)]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_make_targets_exist(document):
+    named = set(
+        re.findall(r"(?:^    |`)make ([a-z-]+)", text_of(document), re.MULTILINE)
+    )
+    assert named <= make_targets()
+
+
+def test_every_public_make_target_is_phony_and_explained():
+    makefile = text_of("Makefile")
+    phony = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
+    assert make_targets() == phony
+    explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
+    assert {name for name in phony if not name.startswith("setup")} == explained
+
+
+@pytest.mark.parametrize(("document", "words"), indented_commands())
+def test_commands_and_their_options_are_known_to_help(document, words):
+    text = help_of(words[0])
+    if words[0] in OWN_OPTIONS:
+        return
+    options = [w.partition("=")[0] for w in words if re.match(r"--?[a-z]", w)]
+    if words[0] in ("keys", "eyes"):
+        text = help_of(*words[:2])
+    assert not [o for o in options if o not in re.split(r"[\s,]", text)], document
+
+
+def test_the_readme_is_short():
+    assert len(text_of("README.md").split()) <= 800
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_profiles_that_are_shown_are_accepted(document):
+    blocks = re.findall(r'^    (\{"kind".*?\})$', text_of(document), re.M | re.DOTALL)
+    for body in blocks:
+        if "..." not in body:
+            parse_profile(json.loads(body))
+
+
+def test_the_presets_are_those_that_exist():
+    page = text_of("docs/reference/profiles.md")
+    sentence = re.search(r"A preset's name alone is a profile, too: ([^.]*)\.", page)[1]
+    assert tuple(re.findall(r"`(\w+)`", sentence)) == preset_names()
+
+
+def test_the_readme_shows_what_was_measured():
+    live = json.loads(text_of("tests/benchmarks/results/live.json"))
+    found = {
+        (row["case"], row["setting"]): row
+        for row in live["rows"]
+        if row["method"] == "frame"
+    }
+    for eye in preset_names():
+        cells = []
+        for size in ("480x270", "1280x720"):
+            row = found[eye, f"{size} 2 cores"]
+            cells.append(f"{row['median_ms']:.0f} ms, {row['error']:.1f} dB")
+        name = eye.replace("_", ".")
+        pattern = rf"^\| {name}.* \| " + r" \| ".join(cells) + r" \|"
+        assert re.search(pattern, text_of("README.md"), re.M | re.I), (eye, cells)
