@@ -160,6 +160,7 @@ class Ours(Method):
     mode: str = "dynamic"
     grid: str = "planned"
     accumulation: str = "coverage"
+    tolerance: str = "normal"
 
     def settings(self, state: State) -> dict:
         """Settings of its store."""
@@ -171,7 +172,8 @@ class Ours(Method):
                 "pupil_range_mm": (state.pupil_mm,) * 2,
                 "focus_range_dpt": (state.focus_dpt,) * 2,
             }
-        return {"mode": self.mode, "grid": self.grid, **ranges}
+        how = {"mode": self.mode, "grid": self.grid, "tolerance": self.tolerance}
+        return how | ranges
 
     def run(self, bench: EyeBench, view: RgbdView, state: State, repeats: int) -> list:
         """Filter ``repeats`` times after a warm-up; list of `Filtered`."""
@@ -231,6 +233,7 @@ class Baseline(Method):
 
 
 QUALITY_WIDE = "ours quality wide"
+QUALITY_FINE = "ours quality wide fine"
 CLAMP_RULE = (("rule", "clamp"),)
 PAPER_RULE = (("rule", "paper"),)
 
@@ -249,6 +252,8 @@ OURS = (
     Ours(QUALITY_WIDE, on_axis=False, any_state=True, mode="quality"),
     Ours("ours dynamic", on_axis=False, any_state=True),
     Ours("ours paper grid", on_axis=False, any_state=True, grid="paper"),
+    Ours("ours dynamic fine", on_axis=False, any_state=True, tolerance="fine"),
+    Ours(QUALITY_FINE, on_axis=False, any_state=True, mode="quality", tolerance="fine"),
 )
 CONVOLVED = (
     Baseline("Barsky", True, False, barsky),
