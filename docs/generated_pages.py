@@ -1,12 +1,15 @@
 """MkDocs hook: pages generated from the code that they describe.
 
-``reference/settings.md`` lists `FilterSettings` and `ServiceConfig`, and
-``reference/command-line.md`` the help text of every command.  Figures are taken from
-the results of the benchmarks.
+``reference/api.md`` documents the public names of three packages from their
+docstrings and types, ``reference/settings.md`` lists `FilterSettings` and
+`ServiceConfig`, and ``reference/command-line.md`` the help text of every command.
+Figures are taken from the results of the benchmarks.
 """
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -15,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 from filter_service.checked import allowed_values
@@ -22,6 +26,11 @@ from filter_service.service.config import RANGES, ServiceConfig
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {
+    "filter_service": "Filters frames in your process.",
+    "clients": "Talks to a service.",
+    "estimator": "Turns a profile into an eye, its wavefronts and its PSFs.",
+}
 FIGURES = ("field.png", "live.png")
 RESULTS = "tests/benchmarks/results"
 
@@ -29,6 +38,7 @@ RESULTS = "tests/benchmarks/results"
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the generated pages and the figures of the benchmarks."""
     for uri, text in (
+        ("reference/api.md", _api_page()),
         ("reference/settings.md", _settings_page()),
         ("reference/command-line.md", _command_line_page()),
     ):
@@ -42,6 +52,25 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Point links of the checkout to the copies in the built pages."""
     return markdown.replace(f"](../{RESULTS}/", "](images/")
+
+
+def _api_page() -> str:
+    lines = [
+        "# Python API",
+        "",
+        "Three packages have public names. Everything else may change without notice.",
+        "",
+    ]
+    for package, purpose in PACKAGES.items():
+        lines += [f"## `{package}`", "", purpose, ""]
+        module = importlib.import_module(package)
+        for name in sorted(module.__all__, key=str.lower):
+            found = getattr(module, name)
+            is_code = inspect.isclass(found) or inspect.isroutine(found)
+            if is_code and not inspect.getdoc(found):
+                raise PluginError(f"{package}.{name} has no docstring")
+            lines += [f"::: {package}.{name}", ""]
+    return "\n".join(lines)
 
 
 def _settings_page() -> str:

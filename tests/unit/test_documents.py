@@ -21,7 +21,9 @@ DOCUMENTS = sorted(
         else (ROOT / folder).glob("*.md")
     )
 )
-GENERATED = {"docs/reference/settings.md", "docs/reference/command-line.md"}
+GENERATED = {
+    f"docs/reference/{name}.md" for name in ("api", "command-line", "settings")
+}
 """Pages that only the built documentation has."""
 
 OWN_OPTIONS = ("batch", "bench", "headset", "report", "web")
