@@ -21,7 +21,7 @@ web: setup-page  ## a page in your browser: your prescription, your photo
 	$(PYTHON) -m filter_service web $(ARGS)
 
 docs: setup-docs  ## the documentation, checked strictly; writes out/docs/
-	$(PYTHON) -m mkdocs build --quiet --strict $(ARGS)
+	NO_MKDOCS_2_WARNING=1 .docs/bin/python -m mkdocs build --quiet --strict $(ARGS)
 
 test: setup-test  ## all tests but the slow ones and those for a hardware GPU
 	$(PYTHON) -m pytest $(USUAL) $(BESIDE) tests/unit tests/numerical $(ARGS) || $(NONE)
@@ -79,7 +79,7 @@ check: setup  ## lint, formatting, types, and every shader through glslang
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove what the other targets made, .venv included; out/ stays
-	rm -rf .venv .witness .batch_ray .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules
+	rm -rf .venv .witness .batch_ray .docs .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -28,7 +28,10 @@ WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
 WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
 WITNESS_VENV=.witness
 RAY_VENV=.batch_ray
+DOCS_VENV=.docs
 EXAMPLES_VENV=.examples
+# of `make docs`
+DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
 # of `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
@@ -36,7 +39,6 @@ STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
 TRAINING_STAMP=$VENV/.ocufilter-training-installed
 PAGE_STAMP=$VENV/.ocufilter-page-installed
-DOCS_STAMP=$VENV/.ocufilter-docs-installed
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
@@ -151,7 +153,7 @@ install_packages() {
     wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
-    rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP $DOCS_STAMP
+    rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
     $pip install -c constraints.txt $COMPILER_PACKAGES
@@ -185,10 +187,7 @@ install_ray() { # in an environment of its own that sees the first
     if [ -x $RAY_VENV/bin/python ] &&
         $RAY_VENV/bin/python -c 'import ray, clients' 2>/dev/null; then return; fi
     say "installing Ray into $RAY_VENV (half a minute)"
-    $VENV/bin/python -m venv --clear $RAY_VENV
-    where='import sysconfig; print(sysconfig.get_path("purelib"))'
-    echo "import site; site.addsitedir('$($VENV/bin/python -c "$where")')" \
-        >"$($RAY_VENV/bin/python -c "$where")/ocufilter.pth"
+    beside_venv $RAY_VENV
     $RAY_VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt ray
 }
@@ -201,12 +200,20 @@ install_page() { # what `ocufilter web` needs; make test does not
     cp $STAMP $PAGE_STAMP
 }
 
-install_docs() { # what builds the documentation
-    if [ "$(cat $DOCS_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
-    say "installing the packages of the documentation"
-    $VENV/bin/python -m pip -qq --disable-pip-version-check \
-        install -c constraints.txt --no-build-isolation -e '.[docs]'
-    cp $STAMP $DOCS_STAMP
+beside_venv() { # an environment of its own that sees the packages of the first
+    $VENV/bin/python -m venv --clear "$1"
+    where='import sysconfig; print(sysconfig.get_path("purelib"))'
+    echo "import site; site.addsitedir('$($VENV/bin/python -c "$where")')" \
+        >"$("$1/bin/python" -c "$where")/ocufilter.pth"
+}
+
+install_docs() { # MkDocs
+    if cmp -s constraints.txt $DOCS_VENV/constraints.txt; then return; fi
+    say "installing MkDocs into $DOCS_VENV"
+    beside_venv $DOCS_VENV
+    $DOCS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $DOCS_PACKAGES
+    cp constraints.txt $DOCS_VENV/constraints.txt
 }
 
 install_browser() { # and what drives it

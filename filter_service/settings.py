@@ -158,9 +158,8 @@ class FilterSettings(Record):
     accuracy: Annotated[
         Accuracy,
         _doc(
-            "Of a traced eye.  exact: everything ray-traced; fast: networks, 0.03 to "
-            "0.4 um off over the field; balanced: a refined eye, and networks where "
-            "they save 0.1 s, which few eyes do.  Both take longer than exact."
+            "Deprecated, without effect: eyes are traced exactly; goes with version "
+            "0.3."
         ),
     ] = "exact"
     age_years: Annotated[

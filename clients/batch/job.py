@@ -88,13 +88,8 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
     Raises
     ------
     ValueError
-        An unknown setting, or one with which pictures would depend on the machine.
+        A setting is unknown or out of range.
     """
-    if given.get("accuracy") == "balanced":
-        raise ValueError(
-            "--settings: accuracy is 'balanced', which goes by the speed of the "
-            "machine; allowed in a batch: 'exact' or 'fast'"
-        )
     try:
         settings = FilterSettings(**given)
     except TypeError as error:

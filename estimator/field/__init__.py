@@ -2,9 +2,7 @@
 
 eye_optics       interface between the PSF cache and any eye
 aberration_grid  wavefronts traced at the nodes of a grid
-network_grid     the same grid computed by network
 few_colors       one wavelength traced densely, the others sparsely
-grid_source      choice between tracing and network, by cost and error
 interpolation    interpolation between the nodes
 peripheral_rest  difference between people's periphery and the model's
 trace_range      traced part of the field

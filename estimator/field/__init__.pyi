@@ -1,5 +1,4 @@
 from .aberration_grid import AberrationGrid as AberrationGrid
 from .eye_optics import EyeOptics as EyeOptics
-from .grid_source import GridSource as GridSource
 from .prepare import prepare_eye as prepare_eye
 from .traced_eye import TracedEye as TracedEye

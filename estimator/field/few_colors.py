@@ -47,7 +47,7 @@ def few_colors_grid(
     v_deg: ArrayLike,
     accommodations_dpt: ArrayLike,
     wavelengths_nm: ArrayLike,
-    states: Sequence[FocusedEye],
+    states: Sequence[FocusedEye] | None = None,
     progress: Callable[[float], None] | None = None,
     **sampling: ArrayLike,
 ) -> AberrationGrid:
@@ -62,8 +62,8 @@ def few_colors_grid(
     accommodations_dpt : (n_accommodations,)
     wavelengths_nm : (n_wavelengths,)
         Ascending; the middle one is traced at every node.
-    states : (n_accommodations,)
-        Eye at each accommodation.
+    states : (n_accommodations,), optional
+        Eye at each accommodation, if already computed.
     progress : callable, optional
         Callback with the completed fraction after each accommodation; may raise to
         cancel.
@@ -78,6 +78,7 @@ def few_colors_grid(
     nm, used_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
     place = {"h_deg": np.atleast_1d(h_deg), "v_deg": np.atleast_1d(v_deg)}
     middle = nm.size // 2
+    known = eye.accommodating.states_at(used_dpt) if states is None else states
 
     def traced(
         of_nm: NDArray, at: dict[str, NDArray], some: NDArray, *shares: float
@@ -87,7 +88,7 @@ def few_colors_grid(
             **at,
             accommodations_dpt=used_dpt[some],
             wavelengths_nm=of_nm,
-            states=[states[k] for k in some.tolist()],
+            states=[known[k] for k in some.tolist()],
             progress=share_of(progress, *shares),
             **sampling,
         )

@@ -1,19 +1,16 @@
 """Preparation of a profile's eye for PSFs: measured wavefront or traced model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimator.estimate.estimation import EstimatedEye, estimate_eye
+from estimator.estimate.estimation import estimate_eye
 from estimator.field.eye_optics import EyeOptics
-from estimator.field.grid_source import GridSource
+from estimator.field.few_colors import few_colors_grid
 from estimator.field.notes import eye_notes, periphery_note
 from estimator.field.trace_range import ON_AXIS_DEG, FieldRange
 from estimator.field.traced_eye import TracedEye
-from estimator.networks.card import NetworkUnavailable
-from estimator.networks.inference import load_network
 from estimator.optics.units import RGB_WAVELENGTHS_NM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile
@@ -24,22 +21,7 @@ ESTIMATION_SHARE = 0.5
 """Progress at the end of the estimation."""
 
 
-@dataclass(frozen=True)
-class _Way:
-    """Source of each part of an eye for one accuracy, in the estimator's terms."""
-
-    method: str
-    starts: tuple[str, ...]
-    focus: str
-    aberrations: str
-
-
-WAYS = {
-    "fast": _Way("network", ("table",), "network", "network"),
-    "balanced": _Way("refined", ("table", "network"), "traced", "cheaper"),
-    "exact": _Way("refined", ("table",), "traced", "traced"),
-}
-"""A part whose network is unavailable is traced instead, with a note."""
+ACCURACIES = ("fast", "balanced", "exact")
 
 
 def prepare_eye(
@@ -69,10 +51,8 @@ def prepare_eye(
         Estimate a 45-parameter eye and trace every wavefront; or use the measurement
         in closed form, which costs nothing but models no larger pupil and no change
         of shape with accommodation.
-    accuracy : {"fast", "balanced", "exact"}
-        Accuracy of the traced model: "fast" uses the networks; "balanced" refines the
-        eye and uses the cheaper source of wavefronts; "exact" traces everything, most
-        colors over the field by `few_colors_grid`.
+    accuracy : {"exact", "fast", "balanced"}
+        Deprecated, without effect: everything is traced.  Goes with version 0.3.
     progress : callable, optional
         Callback with the completed fraction and a stage; may raise to cancel.
 
@@ -85,8 +65,8 @@ def prepare_eye(
         raise ValueError(
             f"eye_model '{eye_model}': allowed are {', '.join(EYE_MODELS)}"
         )
-    if accuracy not in WAYS:
-        raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(WAYS)}")
+    if accuracy not in ACCURACIES:
+        raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(ACCURACIES)}")
     if eye_model == "wavefront" and profile.eye is None:
         return MeasuredWavefront.from_profile(profile), profile.notes
 
@@ -95,9 +75,7 @@ def prepare_eye(
             progress(fraction, stage)
 
     report(0.0, "eye")
-    way = WAYS[accuracy]
-    estimated, network_reason = _estimated(profile, way)
-    source = GridSource(aberrations=way.aberrations, focus=way.focus)
+    estimated = estimate_eye(profile, starts=("table",))
     report(ESTIMATION_SHARE, "aberrations")
     eye = TracedEye.trace(
         estimated,
@@ -105,24 +83,14 @@ def prepare_eye(
         focus_range_dpt=focus_range_dpt,
         wavelengths_nm=wavelengths_nm,
         field_range_deg=field_range_deg,
-        make_grid=source,
+        field_grid=few_colors_grid,
         progress=lambda done: report(
             ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"
         ),
     )
-    notes = eye_notes(estimated, source, network_reason=network_reason)
+    notes = eye_notes(estimated)
+    if accuracy != "exact":
+        notes = (*notes, f"accuracy {accuracy!r} has no effect: the eye is traced")
     if np.any(field_range_deg):
         notes = (*notes, periphery_note(eye))
     return eye, (*notes, *profile.notes)
-
-
-def _estimated(profile: EyeProfile, way: _Way) -> tuple[EstimatedEye, str]:
-    """Return the eye, and the reason for a fallback from its network."""
-    try:
-        found = estimate_eye(profile, method=way.method, starts=way.starts)
-        if found.method == "network":
-            error_um = found.mean_abs_error_um
-            load_network("eye").card.check_error(error_um, "in its eye")
-        return found, ""
-    except NetworkUnavailable as error:
-        return estimate_eye(profile, starts=("table",)), str(error)

@@ -59,7 +59,7 @@ def trace_field(
     eye: EstimatedEye,
     axis: FieldInterpolation,
     field_range_deg: FieldRange,
-    make_grid: Callable[..., AberrationGrid],
+    field_grid: Callable[..., AberrationGrid],
     **axes,
 ) -> tuple[FieldInterpolation, FieldRange]:
     """Trace a range of fields, shrunk toward the axis until light passes all of it."""
@@ -68,7 +68,7 @@ def trace_field(
     while share > SMALLEST_SHARE:
         (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
         field = FieldInterpolation(
-            make_grid(
+            field_grid(
                 eye,
                 h_deg=field_nodes_deg(h_low, h_high),
                 v_deg=field_nodes_deg(v_low, v_high),

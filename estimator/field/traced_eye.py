@@ -2,8 +2,7 @@
 
 It has the interface of `measured_wavefront.MeasuredWavefront` without its limits:
 pupils larger than the measured one are traced, not extrapolated; accommodation changes
-the lens and with it all aberrations; and every field has its own wavefront.  Its grids
-may be computed by network instead, see `grid_source`.
+the lens and with it all aberrations; and every field has its own wavefront.
 """
 
 from collections.abc import Callable
@@ -132,7 +131,7 @@ class TracedEye(FocusingEye):
         focus_range_dpt: tuple[float, float],
         wavelengths_nm: ArrayLike,
         field_range_deg: FieldRange = ON_AXIS_DEG,
-        make_grid: Callable[..., AberrationGrid] = aberration_grid,
+        field_grid: Callable[..., AberrationGrid] = aberration_grid,
         progress: Callable[[float], None] | None = None,
     ) -> "TracedEye":
         """Trace the wavefronts for a range of pupils, foci and fields.
@@ -144,8 +143,9 @@ class TracedEye(FocusingEye):
             or two smaller ones, from which all others are interpolated.
         field_range_deg : ((h_low, h_high), (v_low, v_high))
             Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
-        make_grid : callable, optional
-            Alternative source of the grids: a `grid_source.GridSource`.
+        field_grid : callable, optional
+            Traces the grid over the field; `few_colors.few_colors_grid` takes half the
+            time of the default.
         progress : callable, optional
             Callback with the completed fraction; may raise to cancel.
 
@@ -167,7 +167,7 @@ class TracedEye(FocusingEye):
         }
         on_axis_only = not np.any(field_range_deg)
         axis_share = 1.0 if on_axis_only else AXIS_PROGRESS
-        axis_grid = make_grid(
+        axis_grid = aberration_grid(
             eye,
             pupil_diameters_mm=pupils_mm,
             **states,
@@ -180,7 +180,7 @@ class TracedEye(FocusingEye):
             eye,
             axis,
             field_range_deg,
-            make_grid,
+            field_grid,
             pupil_diameters_mm=field_pupils_mm(
                 axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
             ),

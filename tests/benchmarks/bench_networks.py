@@ -1,12 +1,10 @@
-"""Networks against tracing: every step of an eye, its first guess, and the service.
+"""Networks against tracing: every step of an eye, and its first guess.
 
     python -m tests.benchmarks.bench_networks [--quick] [--json] [--plot]
 
-The paper's tables 4 and 5 anew (`network_steps`), with its figures beside; random eyes
-refined from a table and from the network's guess (`first_guess`); from a profile to the
-eye at each accuracy of the service (`accuracy_rows`); and what comes of it: where a
-network is worth having (`network_verdict`).  A whole run writes results/networks.json
-and .png, the quick one with --plot out/networks.png.
+Tables 4 and 5 of the paper (`network_steps`), with its figures beside; random eyes
+refined from a table and from the network's guess (`first_guess`).  A whole run writes
+results/networks.json and .png, the quick one with --plot out/networks.png.
 """
 
 import argparse
@@ -14,12 +12,10 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 
 from estimator.networks.card import DamagedWeights, WeightsMissing
 from estimator.networks.inference import load_network
-from tests.benchmarks.accuracy_rows import AccuracyRow, accuracy_rows, dynamic_spec
 from tests.benchmarks.first_guess import GuessRow, guess_rows
 from tests.benchmarks.harness import (
     OUT,
@@ -31,16 +27,13 @@ from tests.benchmarks.harness import (
 )
 from tests.benchmarks.network_plot import plot_steps
 from tests.benchmarks.network_steps import StepRow, condition_rows
-from tests.benchmarks.network_verdict import Verdict, verdicts
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.published_networks import HARDWARE
 
 REPEATS, QUICK_REPEATS = 20, 3
 SEARCH_S, QUICK_SEARCH_S = 8.0, 1.0
 N_RANDOM_EYES, N_QUICK_EYES = 1000, 50
-ACCURACY_REPEATS, QUICK_ACCURACY_REPEATS = 5, 1
 QUICK_CONDITIONS = ("emmetropia", "keratoconus")
-QUICK_ACCURACY_CONDITIONS = ("emmetropia",)
 ASKED = ("eye", "focus", "aberration")
 """Networks that are measured; the discriminator only serves the training."""
 
@@ -78,11 +71,6 @@ def run(*, quick: bool, say=lambda text: None) -> list[Row]:
         )
     say("first guess")
     rows += guess_rows(N_QUICK_EYES if quick else N_RANDOM_EYES)
-    spec = dynamic_spec()
-    for case in QUICK_ACCURACY_CONDITIONS if quick else CONDITIONS:
-        say(f"service, {case}")
-        repeats = QUICK_ACCURACY_REPEATS if quick else ACCURACY_REPEATS
-        rows += accuracy_rows(case, repeats=repeats, spec=spec)
     return rows
 
 
@@ -121,37 +109,14 @@ def print_guesses(rows: Sequence[GuessRow]) -> None:
         )
 
 
-def print_accuracies(rows: Sequence[AccuracyRow]) -> None:
-    """From a profile to the eye."""
-    print("\nfrom a profile to the eye")
-    for row in rows:
-        print(
-            f"{row.method:<20}{row.case:<13}{row.setting:<20}{row.median_ms:>9.1f} ms"
-            f"{row.error:>10.2g} um"
-        )
-        print(*(f"    {note}" for note in row.notes), sep="\n")
-
-
-def print_verdicts(found: Sequence[Verdict]) -> None:
-    """Where a network is worth having."""
-    print("\nworth having?")
-    for verdict in found:
-        print(f"{verdict.step:<12}{verdict.method:<24}{verdict.text}")
-
-
-def print_all(rows: Sequence[Row], found: Sequence[Verdict]) -> None:
-    """Every table, and the verdict at the end."""
-    for kind, print_kind in (
-        (StepRow, print_steps),
-        (GuessRow, print_guesses),
-        (AccuracyRow, print_accuracies),
-    ):
-        print_kind([row for row in rows if isinstance(row, kind)])
-    print_verdicts(found)
+def print_all(rows: Sequence[Row]) -> None:
+    """Print both tables."""
+    print_steps([row for row in rows if isinstance(row, StepRow)])
+    print_guesses([row for row in rows if isinstance(row, GuessRow)])
 
 
 def main() -> None:
-    """Print tables and the verdict, or only JSON; a whole run is also written."""
+    """Print tables, or only JSON; a whole run is also written."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="two eyes, few repeats")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -166,14 +131,13 @@ def main() -> None:
         quick=arguments.quick,
         say=lambda text: print(f"{text} ...", file=sys.stderr, flush=True),
     )
-    found = verdicts(rows)
     machine = {**machine_info(), "onnxruntime": version("onnxruntime")}
     content = report(rows, machine=machine)
-    content |= {"networks": measured, "verdict": [asdict(one) for one in found]}
+    content |= {"networks": measured}
     if arguments.json:
         print(json.dumps(content))
     else:
-        print_all(rows, found)
+        print_all(rows)
     folder = OUT if arguments.quick else RESULTS
     if arguments.plot or not arguments.quick:
         plot_steps([row for row in rows if isinstance(row, StepRow)], folder / PICTURE)

@@ -366,10 +366,6 @@ def test_profiles_may_be_json_and_photographs_are_turned_upright(tmp_path, rng):
         (("{room}", "-p", "myopia", "-p", "myopia"), "the name 'myopia' is taken"),
         (("{room}", "-p", "myopia", "--focus-dpt", "near"), "--focus-dpt 'near'"),
         (("{room}", "-p", "myopia", "--workers", "0"), "--workers 0: allowed is 1"),
-        (
-            ("{room}", "-p", "myopia", "--settings", '{"accuracy": "balanced"}'),
-            "accuracy is 'balanced'",
-        ),
         (("{room}", "-p", "myopia", "--half"), "--half: allowed with --format npy"),
     ],
 )

@@ -349,14 +349,14 @@ def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
     assert "capped" in finished.stdout
 
 
-def test_a_traced_eye_is_as_accurate_as_asked(scene):
+def test_a_traced_eye_says_how_it_was_found(scene):
     folder, _ = scene
     traced = filter_arguments(folder, "--eye-model", "traced")
-    notes = run_json(*traced, "--accuracy", "exact")["notes"]
+    notes = run_json(*traced)["notes"]
     assert "refined from a table's eye" in notes[0]
-    assert not any("network" in note for note in notes)
+    assert not any("network" in note or "accuracy" in note for note in notes)
     notes = run_json(*traced, "--accuracy", "fast")["notes"]
-    assert "network" in notes[0]
+    assert "accuracy 'fast' has no effect: the eye is traced" in notes
     assert "fast" in refusal(*traced, "--accuracy", "high")
 
 

@@ -33,7 +33,7 @@ for sphere_dpt in (0.0, -6.0):
             "axis_deg": 30.0}
     for settings in (dict(), dict(mode="on-axis", eye_model="wavefront"),
                      dict(mode="quality", lateral_color=True), dict(diffraction=False),
-                     dict(chromatic=False), dict(accuracy="fast"),
+                     dict(chromatic=False),
                      dict(stiles_crawford=True),
                      dict(gaze_range_deg=(5.0, 5.0))):
         settings = FilterSettings(**dict(tolerance="loose") | settings)

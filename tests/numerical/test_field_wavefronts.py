@@ -7,7 +7,7 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.field.aberration_grid import aberration_grid
-from estimator.field.grid_source import GridSource
+from estimator.field.few_colors import few_colors_grid
 from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.prescription import power_vector, zernike_from_power_vector
@@ -329,8 +329,8 @@ def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, allow
         "field_range_deg": ranges,
     }
     eyes = [
-        TracedEye.trace(source, make_grid=grid, **axes)
-        for grid in (aberration_grid, GridSource())
+        TracedEye.trace(source, field_grid=grid, **axes)
+        for grid in (aberration_grid, few_colors_grid)
     ]
     rng = np.random.default_rng(5)
     n_states = 300

@@ -1,4 +1,4 @@
-"""The network benchmark's own parts: nodes, references, errors, domains, the verdict.
+"""The network benchmark's own parts: nodes, references, errors, domains.
 
 Networks here trace each row, see `traced_networks`: their answers are perfect, or off
 by a known amount, whatever weights there are.
@@ -14,28 +14,13 @@ from PIL import Image
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import EyeParameters, mean_vector
-from estimator.field.traced_eye import TracedEye
 from estimator.networks.card import WeightsMissing
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
-from filter_service.camera import Camera
-from filter_service.planning.grid import pupil_nodes_mm
 from tests.benchmarks import bench_networks, network_nodes, network_steps
-from tests.benchmarks.accuracy_rows import (
-    asked_states,
-    dynamic_spec,
-    mean_difference_um,
-)
 from tests.benchmarks.bench_networks import print_all
 from tests.benchmarks.first_guess import guess_row
 from tests.benchmarks.network_plot import plot_steps
-from tests.benchmarks.network_verdict import (
-    LARGEST_CHEAP_DPT,
-    Pair,
-    judge,
-    step_verdicts,
-    verdicts,
-)
 from tests.benchmarks.published_networks import ERRORS, SECONDS, published_step
 from tests.numerical.traced_networks import (
     TracedNetwork,
@@ -164,9 +149,6 @@ def test_nodes_outside_of_the_training_are_counted(monkeypatch, few_nodes, vecto
     none = rows[0]
     assert (none.n_nodes, none.error_name, none.error) == (0, "n_outside", 12.0)
     assert none.median_ms == 0.0 and "eye_length_mm" in none.setting
-    verdict = step_verdicts(rows)[0]
-    assert (verdict.method, verdict.n_answered, verdict.n_cases) == ("network", 0, 1)
-    assert not verdict.is_worth
 
 
 def row(step, method, case, *, ms, error, n_nodes=10, **more):
@@ -192,47 +174,6 @@ ROWS = [
     row("off-axis", "network", "keratoconus", ms=0.0, error=10, n_nodes=0),
 ]
 ROWS[-1] = replace(ROWS[-1], error_name=network_steps.N_OUTSIDE)
-
-
-def test_the_verdict_weighs_time_at_the_same_nodes_against_error():
-    (verdict,) = step_verdicts(ROWS)
-    assert (verdict.step, verdict.method) == ("off-axis", "network")
-    assert (verdict.n_answered, verdict.n_cases) == (2, 3)
-    assert verdict.time_ratio == pytest.approx((400 / 10 + 300 / 10) / 2)
-    assert verdict.saved_ms == pytest.approx((390 + 290) / 2)
-    assert (verdict.error, verdict.worst_error) == pytest.approx((0.02, 0.03))
-    assert verdict.is_worth and verdict.text.endswith("2 of 3: worth it")
-
-
-def test_time_is_saved_against_fewer_rays_if_those_are_good_enough():
-    for error_um, saved_ms in ((1e-4, 110.0), (0.1, 390.0)):
-        fewer = row("off-axis", "fewer rays", "myopia", ms=120.0, error=error_um)
-        by_network, by_fewer = step_verdicts([*ROWS[:2], fewer])
-        assert by_network.time_ratio == 40.0
-        assert by_network.saved_ms == pytest.approx(saved_ms)
-        assert by_fewer.saved_ms == pytest.approx(280.0)
-
-
-@pytest.mark.parametrize(
-    ("pair", "reasons"),
-    [
-        (Pair(10.0, 200.0, 0.01), ()),
-        (Pair(10.0, 100.0, 0.01), ("saves less than 100 ms",)),
-        (Pair(10.0, 200.0, 0.1), ("error above 0.05",)),
-        (Pair(10.0, 5.0, 0.1), ("saves less than 100 ms", "error above 0.05")),
-    ],
-)
-def test_what_saves_little_or_is_seen_is_not_worth_it(pair, reasons):
-    bounds = {"error_name": "mean_abs_um", "largest_error": 0.05}
-    verdict = judge("eye", "network", [pair], n_cases=1, **bounds)
-    assert verdict.is_worth == (not reasons)
-    for reason in ("saves less than 100 ms", "error above 0.05"):
-        assert (reason in verdict.text) == (reason in reasons)
-
-
-def test_the_bound_of_focus_is_a_blur_as_wide_as_that_of_wavefronts():
-    # all 27 terms at 0.05 um: an RMS of 0.26 um, which is M = 4 sqrt(3) C / r^2
-    assert pytest.approx(0.147, abs=1e-3) == LARGEST_CHEAP_DPT
 
 
 def test_published_figures_stand_beside_their_methods():
@@ -267,34 +208,10 @@ def test_a_refinement_that_ends_badly_or_not_at_all_has_failed():
     assert found.setting == "from table or network"
 
 
-def traced(sphere_dpt, spec):
-    body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "higher_order": "none"}
-    return TracedEye.trace(
-        estimate_eye(parse_profile(body), starts=("table",)),
-        pupil_diameters_mm=pupil_nodes_mm(spec.settings.pupil_range_mm),
-        focus_range_dpt=spec.settings.focus_range_dpt,
-        wavelengths_nm=spec.wavelengths_nm,
-        field_range_deg=spec.field_range_deg,
-    )
-
-
-def test_eyes_of_other_power_differ_by_their_defocus():
-    spec = dynamic_spec(pupil_range_mm=(4.0, 5.0), focus_range_dpt=(0.0, 0.5))
-    spec = replace(spec, camera=Camera(64, 36, (-0.02, 0.02, 0.01, -0.01)))
-    exact, other = traced(-2.0, spec), traced(-2.25, spec)
-    assert mean_difference_um(exact, exact, spec)[0] == 0.0
-    found_um, n_states = mean_difference_um(other, exact, spec)
-    states = asked_states(spec, max_pupil_mm=5.0)
-    assert n_states == len(states) == 7 * 5 * 4 * 4 * 3
-    # both stay relaxed; other terms of the two eyes are hardly different
-    defocus_um = 0.25 * (states[:, 2] / 2.0) ** 2 / (4.0 * np.sqrt(3.0))
-    assert found_um == pytest.approx(defocus_um.mean() / 27, rel=0.1)
-
-
-def test_tables_verdict_and_plot_show_every_method(capsys, tmp_path):
-    print_all(ROWS, verdicts(ROWS))
+def test_tables_and_plot_show_every_method(capsys, tmp_path):
+    print_all(ROWS)
     text = capsys.readouterr().out
-    assert "Ryzen 7 1700" in text and "n_outside" in text and "worth it" in text
+    assert "Ryzen 7 1700" in text and "n_outside" in text
     plot_steps(ROWS, tmp_path / "networks.png")
     with Image.open(tmp_path / "networks.png") as picture:
         assert picture.size[0] > 300

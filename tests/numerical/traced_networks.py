@@ -5,14 +5,13 @@ import numpy as np
 from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import EyeParameters
-from estimator.field import grid_source, network_grid
 from estimator.networks import inference as networks
 from estimator.networks.card import INPUTS, OUTPUTS, Card, ExpectedError
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import rim_from_ellipse
 
 FAR = 1e9
-USERS = (networks, network_grid, grid_source)
+USERS = (networks,)
 """Modules that load networks by name."""
 
 

@@ -32,7 +32,7 @@ def test_every_setting_says_what_it_means(name):
     ("changes", "field", "allowed"),
     [
         ({"mode": "fast"}, "mode", "one of dynamic, on-axis, quality"),
-        ({"pupil_range_mm": (5.0, 2.0)}, "pupil_range_mm", "two numbers, lowest first"),
+        ({"pupil_range_mm": (5.0, 2.0)}, "pupil_range_mm", "0.5 to 9, lowest first"),
         ({"pupil_range_mm": (0.1, 2.0)}, "pupil_range_mm[0]", "0.5 to 9"),
         ({"pupil_range_mm": 4.0}, "pupil_range_mm", "two numbers"),
         ({"focus_range_dpt": (0.0, float("inf"))}, "focus_range_dpt[1]", "0 to 20"),

@@ -110,6 +110,7 @@ static void take_all_psfs(psf_job *job, uint16_t *words) {
     if (results == NULL) return;
     for (int psf = 0; words != NULL && psf < job->count; ++psf) {
         size_t size = (size_t)job->sizes[psf];
+        if (size == 0) continue; // refused: its thread may hold no words at all
         memcpy(words, results->work[results->thread[psf]].words + results->first[psf],
                sizeof *words * size);
         words += size;
