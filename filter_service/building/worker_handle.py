@@ -132,6 +132,8 @@ class WorkerHandle:
         if self._worker is not None:
             return
         ours, theirs = socket.socketpair()
+        for end_of_pipe in (ours, theirs):  # PsychoPy sets a default timeout
+            end_of_pipe.setblocking(True)
         # A plain subprocess: multiprocessing's spawn would run the main module again,
         # which fails in scripts without a __main__ guard.  Without -P, files in the
         # current folder would shadow modules of the same name.

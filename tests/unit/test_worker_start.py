@@ -1,5 +1,6 @@
 """Where the worker process imports from: where this one does, and nowhere else."""
 
+import socket
 import sys
 import time
 from pathlib import Path
@@ -35,3 +36,20 @@ def test_an_entry_of_the_path_that_is_no_text_is_skipped_as_imports_skip_it(
 ):
     monkeypatch.setattr(sys, "path", [*sys.path, Path("anywhere")])
     assert gets_ready()
+
+
+def test_a_default_timeout_of_sockets_does_not_end_the_worker():
+    """Such as PsychoPy sets: sockets are then not blocking, on both ends of a pair."""
+    socket.setdefaulttimeout(5.0)
+    try:
+        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+        worker.start()
+        end_s = time.monotonic() + 3.0
+        while time.monotonic() < end_s:
+            worker.poll()
+            time.sleep(0.02)
+        assert worker._is_ready
+        assert not worker.n_restarts
+        worker.close()
+    finally:
+        socket.setdefaulttimeout(None)
