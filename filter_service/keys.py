@@ -117,6 +117,11 @@ class KeyRing:
             Other users may write to the folder or read the service's key, or the public
             key does not match the secret one.
         """
+        if not (self.folder / "server.toml").is_file():
+            raise ValueError(
+                f"{self.folder} has no server.toml; expected a folder that "
+                "`ocufilter keys add NAME` has made"
+            )
         for path, bad_bits, what in (
             (self.folder, 0o022, "other users may change it"),
             (self.folder / "server.toml", 0o077, "other users may read it"),

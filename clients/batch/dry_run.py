@@ -1,6 +1,6 @@
-"""What a batch would do, how long it would take, and what a million frames would cost.
+"""Estimate of a batch's work, its time, and the cost of a million frames.
 
-The first frames are filtered for it on one core and thrown away.
+The first frames are filtered on one core, and their pictures are discarded.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from clients.batch.run import Batch, missing_units
 from clients.batch.work import Unit, UnitRunner
 
 MEASURED_FRAMES = 6
-"""Of each profile, the first of them to warm up."""
+"""Frames per profile; the first one is a warm-up."""
 
 SECONDS_PER_HOUR = 3600.0
 MILLION = 1_000_000
@@ -27,7 +28,7 @@ MILLION = 1_000_000
 def dry_run(
     batch: Batch, *, n_cores: int, price_per_core_hour: float | None
 ) -> dict[str, Any]:
-    """Return what `ocufilter batch --dry-run` says."""
+    """Return the report of `ocufilter batch --dry-run`."""
     n_all = len(batch.frames) * len(batch.job.profiles)
     n_missing = n_all
     if (batch.out / LINES).is_file():
@@ -38,7 +39,7 @@ def dry_run(
     ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
     mean_ms = float(np.mean(ms)) if ms else math.nan
     sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
-    # a helper beside each worker makes PSFs, once for a profile
+    # a helper process of each worker builds the PSFs, once per profile
     builds_s = sum(one["build_s"] for one in measured) if n_missing else 0.0
     core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
     report = {
@@ -65,7 +66,7 @@ def _known(value: float, digits: int) -> float | None:
 
 
 def _measured(batch: Batch, profile: str) -> dict[str, Any]:
-    """Filter the first frames through a profile, on this process's one thread."""
+    """Filter the first frames through a profile, on this process's only thread."""
     frames = batch.frames[:MEASURED_FRAMES]
     times_ms, sizes, errors = [], [], []
     notes: Notes = {}
@@ -101,7 +102,7 @@ def _measured(batch: Batch, profile: str) -> dict[str, Any]:
 
 
 def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[str]:
-    """Return the report as lines for a person."""
+    """Format the report as lines of text."""
     lines = [
         f"{report['frames']} frames of the layout {report['layout']}, "
         f"{len(report['profiles'])} profiles: {report['pictures']} pictures, "
@@ -116,7 +117,9 @@ def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[
             f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
         )
         lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
-        lines += [f"    error: {text}" for text in one["errors"]]
+        for text, count in Counter(one["errors"]).items():
+            times = f" ({count} of {MEASURED_FRAMES} frames)" if count > 1 else ""
+            lines.append(f"    error: {text}{times}")
         lines += [f"    note: {note_line(note)}" for note in one["notes"]]
     if report["seconds"] is not None:
         lines.append(

@@ -1,4 +1,4 @@
-"""`ocufilter batch`: data sets of colour and depth through people's eyes."""
+"""Filtering of color and depth data sets: `ocufilter batch`."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ INSTALL = f"{sys.executable} -m pip install"
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Do the batch; return its summary.
+    """Run the batch; return its summary.
 
     Raises
     ------
     ValueError
-        Bad input; names it.
+        Invalid input; the message names it.
     EngineUnusable
         The engine does not work here.
     """
@@ -74,7 +74,7 @@ def _pool(
 
 
 def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[str]:
-    """Return the summary as lines for a person."""
+    """Format the summary as lines of text."""
     this_run = summary["this_run"]
     n_all, n_failed = summary["frames"], len(summary["failures"])
     lines = [
@@ -89,7 +89,7 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
 
 
 def failure_lines(summary: dict[str, Any]) -> list[str]:
-    """Return what failed, the first of many."""
+    """Format the first failures, and their number."""
     failures = summary.get("failures", [])
     lines = [
         f"batch: {one['profile']}, {one['frame']}: {one['error']}"
@@ -131,6 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     else:
         lines = report_lines(summary, options)
     sys.stdout.write("\n".join(lines) + "\n")
+    if options.dry_run and all(p["errors"] for p in summary["profiles"]):
+        return 1
     failures = failure_lines(summary)
     sys.stderr.writelines(f"{line}\n" for line in failures)
     return 1 if failures else 0

@@ -1,4 +1,4 @@
-"""What `ocufilter headset` is told: its command line, read and checked."""
+"""Command line of `ocufilter headset`, parsed and checked."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from filter_service import FilterSettings
 
 
 def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Namespace:
-    """Return the command line."""
+    """Return the parsed command line."""
     parser = argparse.ArgumentParser(
         prog="ocufilter headset",
         description=description,
@@ -84,6 +84,9 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         help="a running service, as tcp://127.0.0.1:5577; else in this process",
     )
     where.add_argument(
+        "--key", type=Path, metavar="FILE", help="the client's key file, for --service"
+    )
+    where.add_argument(
         "--simulated",
         action="store_true",
         help="no headset: a head that looks around, and pictures for --out",
@@ -115,7 +118,7 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
 
 
 def _settle_where(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse what the place cannot heed, and fill in what was left open."""
+    """Reject options that do not apply to the runtime, and fill in defaults."""
     defaults = {"size": "448x504", "rate_hz": 72.0, "scale": 1.0, "validate": False}
     elsewhere = ("scale", "validate") if options.simulated else ("size", "rate_hz")
     for name in elsewhere:
@@ -133,7 +136,7 @@ def settings_of(options: argparse.Namespace) -> FilterSettings:
     Raises
     ------
     ValueError
-        Names the option or the setting.
+        The message names the option or the setting.
     """
     given = read_object("--settings", options.settings)
     if options.gaze_range is not None:
@@ -163,7 +166,7 @@ def profiles_of(options: argparse.Namespace) -> dict[Eye, Mapping[str, Any]]:
 
 
 def check_limits(options: argparse.Namespace) -> None:
-    """Refuse limits that are none, and a folder that cannot be written to."""
+    """Check the limits, and create the output folder."""
     if not 0.1 <= options.scale <= 2.0:
         raise ValueError(f"--scale is {options.scale}; allowed: 0.1 to 2")
     for name in ("frames", "seconds"):

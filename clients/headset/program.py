@@ -1,12 +1,12 @@
-"""See a scene through two people's eyes, or one's, in an OpenXR headset.
+"""View a scene through one or two people's eyes in an OpenXR headset.
 
     ocufilter headset --left myopia --right keratoconus
     ocufilter headset --scene kitchen.glb --service tcp://127.0.0.1:5577
     ocufilter headset --simulated --seconds 10 --out out/headset
 
-Each eye is filtered through its own profile, pupil, focus and gaze: in this process, or
-through a running service.  Gaze comes from the headset's eye tracker where it has one;
-focus follows what is looked at, and pupils the light of the scene, as people's do.
+Each eye is filtered through its own profile, pupil, focus and gaze, in this process or
+by a running service. Gaze comes from the headset's eye tracker if it has one; focus
+follows the point of fixation, and pupils adapt to the light of the scene.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ CORE_VALIDATION = "XR_APILAYER_LUNARG_core_validation"
 
 
 def say(line: str) -> None:
-    """Tell the user something, beside what a program reads from stdout."""
+    """Print a message for the user to stderr; stdout is for results."""
     print(f"headset: {line}", file=sys.stderr, flush=True)
 
 
 def gaze_range_of(
     settings: FilterSettings, runtime: Runtime, *, is_told: bool
 ) -> tuple[float, float]:
-    """Return how far eyes turn in deg: as is told, else as far as is tracked."""
+    """Return the gaze range in deg: as set, otherwise the range of a tracker."""
     if runtime.tracks_eyes and not is_told and not any(settings.gaze_range_deg):
         return TRACKED_RANGE_DEG
     return settings.gaze_range_deg
 
 
 def scenery_of(options: argparse.Namespace, context) -> Any:
-    """Return what renders both eyes' pictures: ours, or the user's.
+    """Return the renderer of both eyes' pictures: ours, or the user's.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def scenery_of(options: argparse.Namespace, context) -> Any:
 
 
 def scene_of(name: str):
-    """Return a scene of ours by its name, or that of a file; and where to stand."""
+    """Return a built-in scene or that of a file, and the viewer's pose in it."""
     from clients.headset.gltf_scene import load_gltf
     from clients.headset.viewpoint import viewpoint
 
@@ -106,7 +106,7 @@ def scene_of(name: str):
 
 @dataclass
 class _Eyes:
-    """Both eyes, as they are asked for and as they look."""
+    """Both eyes: requested profiles, and where they look."""
 
     settings: FilterSettings
     is_range_told: bool
@@ -116,13 +116,13 @@ class _Eyes:
     is_begun: bool = False
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Ask for another eye."""
+        """Request another eye."""
         self.look.change(eye)
         self.seeing.change(eye, profile)
         say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
 
     def begin(self, runtime: Runtime) -> None:
-        """Ask for both once it is known how far they turn, and when that changes."""
+        """Request both eyes once the gaze range is known, and when it changes."""
         reach_deg = gaze_range_of(self.settings, runtime, is_told=self.is_range_told)
         if self.is_begun and reach_deg == self.look.gaze_range_deg:
             return
@@ -134,7 +134,7 @@ class _Eyes:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Show the scene until the end; return what became of the frames."""
+    """Show the scene until the end; return a report on the frames."""
     from clients.headset.keys import TerminalKeys
 
     settings, profiles = settings_of(options), profiles_of(options)
@@ -173,16 +173,16 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> float:
-    """Show until the end, or until a signal.
+    """Show frames until the end, or until a signal.
 
-    Returns how long it took from the first filtered frame on, in s.
+    Return the time since the first filtered frame, in s.
     """
     if sys.stdin is not None and sys.stdin.isatty():
         say(HELP)
     started_s = time.monotonic()
 
     def end(*_: object) -> None:
-        # Not by an exception: one that is raised in a call from C is lost.
+        # No exception here: one that is raised in a callback from C is lost.
         controls.is_over = True
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)  # again: at once
@@ -206,7 +206,7 @@ def _runtime(
     size_px: tuple[int, int],
     pictures: _Pictures,
 ) -> Runtime:
-    """Return the headset, or what stands for it."""
+    """Return the headset's runtime, or the simulated one."""
     if not options.simulated:
         return _open_xr(context, options)
     from clients.headset.simulated_runtime import SimulatedRuntime
@@ -215,8 +215,8 @@ def _runtime(
 
 
 def _openxr(name: str) -> Any:
-    """Return a module that needs pyopenxr."""
-    # The loader says much on stderr while there is no runtime; we say it once.
+    """Import and return a module that needs pyopenxr."""
+    # Without a runtime the loader repeats messages on stderr; we print one.
     os.environ.setdefault("XR_LOADER_DEBUG", "none")
     try:
         return importlib.import_module(f"clients.headset.{name}")
@@ -228,7 +228,7 @@ def _openxr(name: str) -> Any:
 
 
 def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
-    """Return the OpenGL context that everything is drawn in."""
+    """Return the OpenGL context for all drawing."""
     if not options.simulated:
         return stack.enter_context(_openxr("openxr_gl").open_context())
     import moderngl
@@ -250,23 +250,26 @@ def _open_xr(context, options: argparse.Namespace) -> Runtime:
 
 def _seeing(options: argparse.Namespace, settings: FilterSettings) -> Seeing:
     if options.service is not None:
-        return SeeingByService(options.service, settings, say)
+        seeing = SeeingByService(options.service, settings, say, key_file=options.key)
+        if options.frames is not None or options.seconds is not None:
+            seeing.wait_for_service()  # a run that counts frames needs one
+        return seeing
     return SeeingHere(settings, say)
 
 
 class _Pictures:
-    """The last filtered pictures that were shown."""
+    """The last filtered pictures shown."""
 
     def __init__(self) -> None:
         self._shown: Sequence[ShownView] = ()
 
     def keep(self, due: object, shown: Sequence[ShownView]) -> None:
-        """Keep what is shown, where it is filtered."""
+        """Keep the views shown if they are filtered."""
         if shown and all(view.plain is not None for view in shown):
             self._shown = shown
 
     def write(self, folder: Path) -> None:
-        """Write one PNG of each eye into a folder that is there."""
+        """Write one PNG per eye into an existing folder."""
         from PIL import Image
 
         if not self._shown:

@@ -1,10 +1,11 @@
-"""What a person sees in a headset, filtered by a service."""
+"""Filtering of headset frames through a service."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from clients.filter_client import FilterClient, FilteredFrame
@@ -17,59 +18,84 @@ from filter_service.messages import Dropped, ErrorReply, Ready, Result, ResultVi
 RETRY_S = 1.0
 SAY_AGAIN_S = 10.0
 ASK_AGAIN = ("worker_crashed", "no_profile")
-"""Errors after which a profile is sent once more."""
+"""Errors after which a profile is sent again."""
 
 WAIT_SHARE = 0.6
-"""Of a frame's period: so long the answer to the newest frame is waited for, so that a
-quick filter's picture is shown in the frame that it was rendered for."""
+"""Part of a frame's period for which the viewer waits for the result of the newest
+frame, so that a fast filter's picture is shown in the frame that it was rendered
+for."""
 
 PATIENCE_S = 0.4
-"""A filter that took no longer for the frame before is waited for in any case: where
-frames are late anyway, half the age is worth more than a few more of them.  On two
-cores that both share, frames of 896x1007 were 0.8 s old without, and not more."""
+"""If the previous frame took no longer than this, the viewer always waits for the
+filter: where frames are late anyway, half the age is worth more than a few more frames.
+On two shared cores, frames of 896x1007 were 0.8 s old without it, and no more
+frequent."""
 
 _OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
 
 
 class SeeingByService:
-    """Filters through a service: what is seen is the newest that has come back.
+    """Filter that sends frames to a service and shows the newest result.
 
     Parameters
     ----------
     endpoint : str
     settings : FilterSettings
     say : callable
-        Told in a line what happens.
+        Called with each message for the user, one line.
     """
 
-    def __init__(self, endpoint: str, settings: FilterSettings, say: Say) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        settings: FilterSettings,
+        say: Say,
+        *,
+        key_file: Path | None = None,
+    ) -> None:
         self._say_once = SayOnce(say)
         self._say = say
         self.settings = settings
-        self._client = FilterClient(endpoint, client_name="headset", timeout_s=5.0)
+        self._endpoint = endpoint
+        self._client = FilterClient(
+            endpoint, client_name="headset", key_file=key_file, timeout_s=5.0
+        )
         self._wanted: dict[Eye, dict[str, Any]] = {}
         self._asked: dict[Eye, tuple[int, dict[str, Any]]] = {}
-        self._retry_s = 0.0  # when a profile that is sent again may be
+        self._retry_s = 0.0  # no profile is sent before this time
         self._on_way: dict[int, LookedAt] = {}
         self._newest: Seen | None = None
         self._is_there = True
-        self._trip_s = math.inf  # of the last frame that came back
+        self._trip_s = math.inf  # round trip of the last result
         self.n_dropped: dict[str, int] = {}
 
+    def wait_for_service(self) -> None:
+        """Wait until the service answers.
+
+        Raises
+        ------
+        FilterError
+            It does not answer, or refuses this client.
+        """
+        self._client.hello()
+
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Ask for another eye, as soon as there is a service."""
+        """Request another eye, as soon as there is a service."""
         self._wanted[eye] = dict(profile)
 
     def see(self, frame: LookedAt) -> Seen | None:
-        """Send a frame, the newest counts; return the newest that has come back.
+        """Send a frame and return the newest result.
 
-        None while there is none, or none of the service that is there now.
+        None while there is no result, or none from the current service.
         """
         client = self._client
         self._take_events()
         if client.welcome is None:
             if self._is_there:
-                self._say("no filter service: the scene is shown as it is; trying on")
+                self._say(
+                    f"no filter service at {self._endpoint}: the scene is shown "
+                    "unfiltered; still trying"
+                )
             self._is_there, self._newest = False, None
             return None
         if not self._is_there:
@@ -129,14 +155,14 @@ class SeeingByService:
                 self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
 
     def _take_error(self, reply: ErrorReply) -> None:
-        """Say what is wrong, once; ask again for eyes that are lost by no fault."""
+        """Report an error once; request again the profiles that the service lost."""
         if reply.code == "build_cancelled":
             return
         self._say_once(str(reply.exception()))
         if reply.code not in ASK_AGAIN:
             return
         for eye, (profile_id, profile) in self._asked.items():
-            # Frames are answered with what their eye has failed with, again and again.
+            # The service repeats an eye's error for each of its frames.
             if eye not in self._wanted and reply.profile_id in (None, profile_id):
                 self._wanted[eye] = profile
                 self._retry_s = time.monotonic() + RETRY_S
@@ -170,8 +196,8 @@ class SeeingByService:
         )
 
     def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
-        """Return a view's focus, if it is that of the eye that is wanted."""
-        if view.profile_id is None:  # a service that knows one eye alone
+        """Return a view's focus if the requested eye was used, otherwise None."""
+        if view.profile_id is None:  # a service with one eye only
             return header.focus_dpt if header.is_complete else None
         asked = self._asked.get(view.eye)
         if asked is None or asked[0] != view.profile_id or not view.is_complete:
@@ -179,7 +205,7 @@ class SeeingByService:
         return view.focus_dpt
 
     def restart(self) -> None:
-        """Forget what was seen, and what is on its way."""
+        """Discard the results and the frames in flight."""
         self._newest = None
         self._on_way = {}
 
@@ -189,14 +215,14 @@ class SeeingByService:
 
 
 class SayOnce:
-    """Says the same line now and then only."""
+    """Callable that suppresses a line repeated within `SAY_AGAIN_S`."""
 
     def __init__(self, say: Say) -> None:
         self._say = say
         self._said_s: dict[str, float] = {}
 
     def __call__(self, line: str) -> None:
-        """Say a line, unless it was said just now."""
+        """Say a line, unless it was said a moment ago."""
         now_s = time.monotonic()
         self._said_s = {
             said: at_s
@@ -209,5 +235,5 @@ class SayOnce:
 
 
 def _added_ms(stages_ms: Mapping[str, float]) -> float:
-    """Return what the service's own stages took, beside the filter."""
+    """Return the time of the service's own stages, without the filter."""
     return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)

@@ -230,8 +230,10 @@ class TracedEye(FocusingEye):
         )
         if abs(used_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
             return ()
-        said = f"focus {focus_dpt:g} dpt is outside what was prepared: {used_dpt:.3g}"
-        return (f"{said} dpt used",)
+        return (
+            f"focus {focus_dpt:g} dpt is outside what was prepared "
+            f"(settings.focus_range_dpt): {used_dpt:.3g} dpt used",
+        )
 
     def accommodation_nodes_dpt(
         self,

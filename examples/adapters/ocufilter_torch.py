@@ -30,7 +30,7 @@ class SeenThrough:
         Of pictures that come without depth; infinity is far away.
     pupil_diameter_mm, focus_dpt : float
         State of the eye.
-    settings : FilterSettings, optional
+    settings : FilterSettings or dict, optional
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class SeenThrough:
         focus_dpt=0.0,
         settings=None,
     ):
-        self.profile, self.settings = profile, settings
+        self.profile, self.settings = profile, settings or {}
         self.vertical_fov_deg, self.distance_m = vertical_fov_deg, distance_m
         self.state = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
         self._filters, self._pid = {}, None

@@ -10,11 +10,15 @@ with `sudo modprobe v4l2loopback`; on Windows and macOS the virtual camera of OB
 import argparse
 import sys
 
-import av
 import numpy as np
-import pyvirtualcam
 
 from filter_service import Camera, EyeFilter
+
+try:
+    import av
+    import pyvirtualcam
+except ModuleNotFoundError as error:
+    sys.exit(f"virtual_camera: {error.name} is missing: pip install av pyvirtualcam")
 
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 parser.add_argument("video")
@@ -35,7 +39,11 @@ def frames():
                 yield frame.to_ndarray(format="rgb24")
 
 
-with av.open(options.video) as container:
+try:
+    container = av.open(options.video)
+except (OSError, ValueError) as error:
+    sys.exit(f"virtual_camera: {error}")
+with container:
     stream = container.streams.video[0]
     size, rate_hz = (stream.width, stream.height), float(stream.average_rate or 30)
 lens = Camera.from_fov(options.fov_deg, width_px=size[0], height_px=size[1])
@@ -47,8 +55,11 @@ except RuntimeError as error:
     sys.exit(f"virtual_camera: {' '.join(str(error).split())}")
 with device, EyeFilter(options.profile, lens) as eye:
     print(f"{device.device}: {size[0]}x{size[1]}, {rate_hz:g} frames/s; Ctrl-C ends it")
-    for n, frame in enumerate(frames()):
-        if n == options.frames:
-            break
-        device.send(eye.filter(frame, depth_m, **state, whole=n == 0).color)
-        device.sleep_until_next_frame()
+    try:
+        for n, frame in enumerate(frames()):
+            if n == options.frames:
+                break
+            device.send(eye.filter(frame, depth_m, **state, whole=n == 0).color)
+            device.sleep_until_next_frame()
+    except KeyboardInterrupt:
+        print("ended")

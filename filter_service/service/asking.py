@@ -38,6 +38,7 @@ def ask_status(
     except zmq.Again:
         raise ServiceTimeout(
             f"no answer from {endpoint} within {timeout_s:g} s"
+            + (" (a service with keys answers only with --key FILE)" if not key else "")
         ) from None
     except zmq.ZMQError as error:
         raise ValueError(f"endpoint is {endpoint!r}: {error}") from None

@@ -57,6 +57,13 @@ def test_a_transform_takes_arrays_and_pillows_pictures(color):
     )
 
 
+def test_a_transform_needs_no_settings(color):
+    from ocufilter_torch import SeenThrough
+
+    usual = SeenThrough("myopia", vertical_fov_deg=20.0, distance_m=2.0)
+    assert usual(color).shape == color.shape
+
+
 def test_a_transform_takes_floats_as_srgb(color):
     seen = transform()(color.astype(np.float32) / 255.0)
     assert seen.dtype == np.float32

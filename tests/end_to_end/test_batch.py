@@ -329,6 +329,19 @@ def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
     assert report["price_per_million"] == pytest.approx(ms / 7.2, rel=0.02)
 
 
+def test_a_dry_run_of_frames_that_cannot_be_read_fails_with_each_error_once(tmp_path):
+    for name in ("color", "depth"):
+        (tmp_path / name).mkdir()
+        for number in range(3):
+            (tmp_path / name / f"{number}.png").write_bytes(b"no picture")
+    out, _ = run(
+        *(tmp_path, "-p", "myopia", *MODE, "--fov-deg", 20, "--dry-run"),
+        *("-o", tmp_path / "out"),
+        code=1,
+    )
+    assert out.count("error: ") == 3  # each names its file
+
+
 def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
     """Six frames of the measured eye, each with a focus of its own beyond reach."""
     lines = [f"{n:03d},4,{0.1 * n:.2f}" for n in range(COUNT)]
