@@ -60,7 +60,14 @@ def alone(gpu, store, view, state):
     return renderer.render(view, renderer.load(store), **state)
 
 
-@pytest.mark.parametrize("eye_count", [1, 2, 3])
+@pytest.mark.parametrize(
+    "eye_count",
+    [
+        pytest.param(1, marks=pytest.mark.slow),
+        2,
+        pytest.param(3, marks=pytest.mark.slow),
+    ],
+)
 def test_eyes_in_flight_are_as_if_alone(hardware, stores, eye_count):
     """States and scenes that change, so that some frames are done again."""
     views = list(scenes(2 * len(STATES)))

@@ -69,6 +69,7 @@ def fresh_vectors(rows, count, rng):
     return population_eyes(rng.random((count, 45)), rng.random(count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ROWS)
 def test_the_discriminator_has_its_stated_error(rng, rows):
     card = load_network("discriminator").card
@@ -87,6 +88,7 @@ def test_the_discriminator_has_its_stated_error(rng, rows):
     assert np.nanmean(np.concatenate(errors_um)) < WORSE_RATIO * stated.mean_abs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ROWS)
 def test_the_eye_network_s_eyes_have_the_stated_error(rng, rows):
     card = load_network("eye").card
@@ -108,6 +110,7 @@ def test_the_eye_network_s_eyes_have_the_stated_error(rng, rows):
     assert np.mean(errors_um) < WORSE_RATIO * stated.mean_abs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ROWS)
 def test_the_focus_network_has_its_stated_error(rng, rows):
     """Where the lens is at no bound: there any answer beyond it is right."""
@@ -144,6 +147,7 @@ def test_the_focus_network_has_its_stated_error(rng, rows):
     assert error_mm.mean() < WORSE_RATIO * stated.mean_abs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ROWS)
 def test_the_aberration_network_has_its_stated_error(rng, rows):
     card = load_network("aberration").card

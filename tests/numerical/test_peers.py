@@ -44,6 +44,10 @@ PACKAGES = {
 }
 
 
+pytestmark = pytest.mark.slow
+"""They test a benchmark, which `make validate` runs."""
+
+
 @pytest.fixture(scope="module")
 def problem():
     view = scene_view("courtyard", width_px=128, height_px=72)

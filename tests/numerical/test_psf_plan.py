@@ -265,7 +265,9 @@ def test_foci_that_share_the_light_need_fewer_psfs(monkeypatch):
     assert count < 0.7 * planned()
 
 
-@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+@pytest.mark.parametrize(
+    "name", ["emmetropia", pytest.param("keratoconus", marks=pytest.mark.slow)]
+)
 def test_a_part_of_all_ranges_is_planned_as_well_with_a_tenth_of_the_psfs(name):
     whole = spec_for(mode="dynamic", width_px=1280, height_px=720)
     part = whole.with_settings(**BREATHING, object_range_dpt=(0.0, 3.0))
@@ -277,6 +279,7 @@ def test_a_part_of_all_ranges_is_planned_as_well_with_a_tenth_of_the_psfs(name):
     assert counts[1] < 0.1 * counts[0]
 
 
+@pytest.mark.slow
 def test_two_planes_take_fewer_psfs_than_all_between_them():
     state = {"pupil_range_mm": (3.5, 4.5), "focus_range_dpt": (1.0, 1.5)}
     size = {"width_px": 1280, "height_px": 720, "vertical_fov_deg": 20.0}

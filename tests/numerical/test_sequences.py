@@ -48,6 +48,7 @@ def test_flicker_is_the_change_of_the_error(rng):
     assert quiet.popping_ratio < 1.0
 
 
+@pytest.mark.slow
 def test_windows_see_what_the_whole_frame_sees():
     moment = path("static", 0, 1)[0]
     whole = dense_reference(
