@@ -1,1 +1,1 @@
-"""Training of the networks; torch lives only here."""
+"""Training of the networks; the only package that imports torch."""

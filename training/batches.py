@@ -28,14 +28,15 @@ from training.run_file import Run
 from training.tasks import N_EYE, TASKS
 
 SCALING_ROWS = 200_000
-"""Rows from which means and deviations are taken."""
+"""Rows from which means and deviations are computed."""
 
 FRESH_SEED = 7919
-"""Added to the run's seed, so that fresh rows are never those of the shards."""
+"""Added to the run's seed, so that fresh rows never equal those of the shards."""
 
 FRESH_STEPS = 8
-"""So many steps' rows are traced at once: some ten thousand operations a call, however
-many rows.  On a GPU, where nobody has measured it, launching them should cost most."""
+"""Steps whose rows are traced at once: a call takes some ten thousand operations,
+however many rows. On a GPU, where nobody has measured it, launching them should cost
+most."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,10 @@ class Rows:
     validation_index: NDArray[np.int64]
 
     def fit_scaling(self, network: Network) -> None:
-        """Take scales, and a baseline, from training rows.
+        """Fit scales, and a baseline, to training rows.
 
-        The eye estimator's outputs are scaled to the ranges of Table 2, or to what its
-        features say.
+        The eye estimator's outputs are scaled to the ranges of Table 2, or to those of
+        its features.
         """
         step = -(-len(self.training_index) // SCALING_ROWS)
         chosen = torch.as_tensor(self.training_index[::step])
@@ -69,16 +70,16 @@ class Rows:
 
     @property
     def validation(self) -> tuple[Tensor, Tensor]:
-        """Inputs and targets that training does not see."""
+        """Return inputs and targets that training does not see."""
         chosen = torch.as_tensor(self.validation_index)
         return self.x[chosen], self.y[chosen]
 
 
 def task_rows(task: str, shard: Shard) -> tuple[Tensor, Tensor]:
-    """Return inputs and targets of a task, from labelled rows of its domain."""
+    """Return inputs and targets of a task, from labeled rows of its domain."""
     inputs, targets = torch.from_numpy(shard.inputs), torch.from_numpy(shard.targets)
     if task == "focus":
-        # The lens was given and its focus traced; the network is asked the other way.
+        # The lens was given and its focus traced; the network learns the inverse.
         known = torch.cat([inputs[:, : N_EYE + 1], targets[:, :1]], dim=1)
         return known, targets[:, 1:]
     if task != "eye":
@@ -93,7 +94,7 @@ def load_rows(run: Run, folder: Path) -> Rows:
     Raises
     ------
     DataError
-        It is not there, not whole, or another one than the run file says.
+        It is missing, incomplete, or does not match the run file.
     """
     found = recipe_of(read_manifest(folder))
     if found != run.recipe:
@@ -107,7 +108,7 @@ def load_rows(run: Run, folder: Path) -> Rows:
 
 
 class Batches:
-    """The batch of every step, a function of the run's seed and the step alone.
+    """The batch of every step, a function of only the run's seed and the step.
 
     Parameters
     ----------
@@ -159,7 +160,7 @@ class Batches:
         return self._rows.x[chosen], self._rows.y[chosen]
 
     def _fresh(self, step: int) -> tuple[Tensor, Tensor]:
-        """Rows traced for this step and its neighbours, the next ones' in a thread."""
+        """Return the step's rows; trace blocks of steps, the next one in a thread."""
         block, place = divmod(step, FRESH_STEPS)
         for number in (block, block + 1):
             if number not in self._coming:
@@ -181,7 +182,7 @@ class Batches:
 
     def _fresh_recipe(self, n_repeats: int) -> Recipe:
         per_shard = -(-self._size * FRESH_STEPS // n_repeats) * n_repeats
-        n_blocks = -(-self.n_steps // FRESH_STEPS) + 1  # one is always begun ahead
+        n_blocks = -(-self.n_steps // FRESH_STEPS) + 1  # one is always started ahead
         n_rows = per_shard * self._n_ranks * n_blocks
         return replace(
             self._run.recipe,

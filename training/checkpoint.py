@@ -1,4 +1,4 @@
-"""A network with its settings in one file, and how to make it again."""
+"""Checkpoints: a network with its settings in one file."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -24,7 +24,7 @@ def make_network(task: str, settings: ModelSettings) -> Network:
 
 
 def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None:
-    """Write a network and everything needed to go on; whole, whatever interrupts."""
+    """Write a network and the state needed to resume, atomically."""
     partial = file.with_suffix(".partial")
     torch.save(
         {
@@ -39,12 +39,12 @@ def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None
 
 
 def load_finished(file: Path) -> tuple[Network, dict]:
-    """As `load_checkpoint`, of a training that came to its end.
+    """Load a checkpoint whose training is finished, as `load_checkpoint`.
 
     Raises
     ------
     DataError
-        There is none, or its training is to go on.
+        There is no checkpoint, or its training is not finished.
     """
     network, state = load_checkpoint(file)
     if state["step"] != state["n_steps"]:
@@ -56,12 +56,12 @@ def load_finished(file: Path) -> tuple[Network, dict]:
 
 
 def load_checkpoint(file: Path) -> tuple[Network, dict]:
-    """Network and the rest of a checkpoint, on the CPU.
+    """Load a network and the rest of a checkpoint, on the CPU.
 
     Raises
     ------
     DataError
-        There is none.
+        There is no checkpoint.
     """
     if not file.exists():
         raise DataError(f"checkpoint {file}: not there")

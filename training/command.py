@@ -1,4 +1,4 @@
-"""What the commands of the training share: their help, and errors in one line."""
+"""Common parts of the training commands: help, and errors in one line."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from training.run_file import RunFileError
 
 
 def make_parser(module: str, documentation: str) -> argparse.ArgumentParser:
-    """Return the parser of ``python -m training.<module>``, its docstring the help."""
+    """Return the parser of ``python -m training.<module>``; the docstring is help."""
     return argparse.ArgumentParser(
         prog=f"python -m training.{module}",
         description=documentation,
@@ -22,9 +22,9 @@ def run_command(
     work: Callable[[argparse.Namespace], None],
     arguments: list[str] | None,
 ) -> int:
-    """Do the work of a command; the exit code, 2 where data or a run file are at fault.
+    """Run a command; return the exit code, 2 for errors in data or run files.
 
-    ``arguments`` are those of the command line when None.
+    ``arguments`` defaults to the command line.
     """
     options = parser.parse_args(arguments)
     try:

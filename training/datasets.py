@@ -1,7 +1,7 @@
-"""Samples of a domain: drawn by seed, labelled, kept in shards with a manifest.
+"""Samples of a domain: drawn by seed, labeled, stored in shards with a manifest.
 
-Row i of a data set depends on the domain, the sampling and the seed alone, so shards
-can be made in any order, by several processes, and made again.
+Row i of a data set depends only on the domain, the sampling and the seed, so shards can
+be made in any order, by several processes, and made again.
 """
 
 import json
@@ -21,31 +21,31 @@ FORMAT = 1
 MANIFEST = "manifest.json"
 SAMPLINGS = ("random", "sobol")
 N_MORE_AXES = 3
-"""Of a population: whether an eye belongs to it, its refraction, what it uses of its
-accommodation."""
+"""Axes of a population: whether an eye belongs to it, its refraction, and the part of
+its accommodation in use."""
 
 
 class DataError(ValueError):
-    """A data set that cannot be made or read as asked."""
+    """A data set that cannot be made or read as requested."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a data set is made of.
+    """Parameters of a data set.
 
     Attributes
     ----------
     domain : str
         Name in `tasks.DOMAINS`.
     n_rows : int
-        Rows drawn; those that light does not pass are left out of the shards.
+        Rows drawn; rows through which light does not pass are left out of the shards.
     rows_per_shard : int
     seed : int
     sampling : {"random", "sobol"}
         Uniform and independent, or a scrambled low-discrepancy sequence.
     population_ratio : float
-        Share of rows whose eyes are drawn as people have them (`population`) instead
-        of from the box of Table 2.
+        Share of rows whose eyes are drawn from the population (`population`) instead of
+        from the box of Table 2.
     """
 
     domain: str
@@ -75,13 +75,13 @@ class Recipe:
 
     @property
     def n_shards(self) -> int:
-        """Number of shards; the last one may be shorter."""
+        """Return the number of shards; the last one may be shorter."""
         return -(-self.n_rows // self.rows_per_shard)
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Rows that were labelled; float32, as networks read them.
+    """Labeled rows; float32, as networks read them.
 
     ``inputs`` (n, n_inputs), ``targets`` (n, n_targets), ``n_rejected`` rows left out.
     """
@@ -94,8 +94,8 @@ class Shard:
 def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
     """Draw the inputs (n, n_inputs) of one shard.
 
-    In a Cartesian product every eye comes with ``n_repeats`` values of the last input,
-    one in each part of its range (the paper's focus set), at a place of its own there.
+    In a Cartesian product every eye has ``n_repeats`` values of the last input, one in
+    each part of its range (the paper's focus set), at a random position in it.
     """
     domain, n_repeats = DOMAINS[recipe.domain], DOMAINS[recipe.domain].n_repeats
     first = shard * recipe.rows_per_shard
@@ -118,7 +118,7 @@ def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
 
 
 def _populate(recipe: Recipe, domain: Domain, rows: NDArray, unit: NDArray) -> None:
-    """Exchange a share of the eyes of rows (n, n_inputs) for such as people have."""
+    """Replace a share of the eyes of rows (n, n_inputs) by population eyes."""
     choice, refraction, used = unit[:, -N_MORE_AXES:].T
     chosen = choice < recipe.population_ratio
     eyes = population_eyes(unit[chosen, :N_EYE], refraction[chosen])
@@ -128,7 +128,7 @@ def _populate(recipe: Recipe, domain: Domain, rows: NDArray, unit: NDArray) -> N
 
 
 def input_ranges(domain: Domain, population_ratio: float) -> NDArray[np.float64]:
-    """Ranges (n_inputs, 2) that hold all inputs of a data set."""
+    """Return the ranges (n_inputs, 2) of all inputs of a data set."""
     ranges = domain.ranges.copy()
     if population_ratio:
         wider = population_ranges(is_focused=domain.is_focused)
@@ -146,7 +146,7 @@ def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray:
     if first:
         sequence.fast_forward(first)
     with warnings.catch_warnings():
-        # A shard is one part of the sequence, which as a whole is balanced.
+        # A shard is one part of the sequence, which is balanced as a whole.
         warnings.filterwarnings("ignore", message="The balance properties")
         return sequence.random(n)
 
@@ -154,9 +154,9 @@ def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray:
 def label(
     domain: Domain, inputs: NDArray[np.float64], *, labels: Labels | None = None
 ) -> Shard:
-    """Trace a block of inputs; rows that light does not pass are left out.
+    """Trace a block of inputs; rows through which light does not pass are left out.
 
-    ``labels`` stands in for the domain's own tracer.
+    ``labels`` replaces the domain's own tracer.
     """
     targets = (labels or domain.label)(inputs)
     with np.errstate(invalid="ignore"):
@@ -169,12 +169,12 @@ def label(
 
 
 def shard_file(folder: Path, shard: int) -> Path:
-    """Where a shard lies."""
+    """Return the path of a shard."""
     return folder / f"shard-{shard:05d}.npz"
 
 
 def write_shard(folder: Path, number: int, shard: Shard) -> None:
-    """Write one shard; a file of that name is whole, whatever interrupts."""
+    """Write one shard atomically."""
     target = shard_file(folder, number)
     partial = target.with_suffix(".partial")
     with partial.open("wb") as file:
@@ -188,7 +188,7 @@ def write_shard(folder: Path, number: int, shard: Shard) -> None:
 
 
 def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
-    """Write what is in a folder: settings, ranges, counts of what was rejected."""
+    """Write the manifest of a folder: settings, ranges, counts of rejected rows."""
     domain = DOMAINS[recipe.domain]
     done = [k for k in range(recipe.n_shards) if shard_file(folder, k).exists()]
     counts = []
@@ -225,7 +225,7 @@ def read_manifest(folder: Path) -> dict:
     Raises
     ------
     DataError
-        There is none, or it is of another format.
+        There is no manifest, or it has another format.
     """
     file = folder / MANIFEST
     if not file.exists():
@@ -243,7 +243,7 @@ def recipe_of(manifest: dict) -> Recipe:
 
 
 def load_shards(folder: Path) -> Iterator[Shard]:
-    """Shards of a folder, in order.
+    """Yield the shards of a folder, in order.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def load_shards(folder: Path) -> Iterator[Shard]:
 
 
 def load(folder: Path) -> Shard:
-    """All rows of a data set."""
+    """Return all rows of a data set."""
     shards = list(load_shards(folder))
     return Shard(
         np.concatenate([s.inputs for s in shards]),
@@ -275,9 +275,9 @@ def load(folder: Path) -> Shard:
 def split(
     inputs: NDArray[np.float32], *, share: float, seed: int
 ) -> tuple[NDArray, NDArray]:
-    """Return indices of training and validation rows, drawn with ``share``.
+    """Return indices of training rows and, with probability ``share``, validation rows.
 
-    Rows (n, n_inputs) of one eye follow each other and go the same way: in a product
+    Rows (n, n_inputs) of one eye are consecutive and go to the same set: in a product
     of eyes and distances, a network knows an eye that it saw at another distance.
     """
     is_new = np.r_[True, np.any(inputs[1:, :N_EYE] != inputs[:-1, :N_EYE], axis=1)]

@@ -1,4 +1,4 @@
-"""Labels on a GPU: the domains of `tasks` by the tracer in torch, for fresh rows."""
+"""Labels of fresh rows on a GPU: the domains of `tasks`, by the tracer in torch."""
 
 import numpy as np
 import torch
@@ -20,14 +20,15 @@ from training.tracer.field import field_aberrations_of_eyes
 def label_on_device(
     domain: Domain, inputs: NDArray[np.float64], device: torch.device
 ) -> NDArray[np.float64]:
-    """Label inputs (n, n_inputs) as ``domain.label`` does: targets (n, n_targets).
+    """Label inputs (n, n_inputs) like ``domain.label``: targets (n, n_targets).
 
-    A row that light does not pass as a whole is nan.  Rays are traced in float64.
+    A row through which light does not pass completely is nan. Rays are traced in
+    float64.
 
     Raises
     ------
     ValueError
-        A domain that has no tracer here.
+        The domain has no tracer here.
     """
     columns = torch.as_tensor(inputs, dtype=torch.float64, device=device)
     makers = {"on_axis": _on_axis, "field": _field, "focus": _focus, "lens": _lens}
@@ -56,7 +57,7 @@ def _field(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
 
 
 def _focus(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-    """Eyes come in runs of ``n_repeats`` rows, as `datasets.draw` makes them."""
+    """Label focus rows; each eye has ``n_repeats`` rows, as in `datasets.draw`."""
     eyes = columns[:: domain.n_repeats]
     focus_dpt = columns[:, -1].reshape(len(eyes), domain.n_repeats)
     found = focus_of_eyes(eyes[:, :N_EYE], eyes[:, N_EYE], focus_dpt)

@@ -1,10 +1,10 @@
-"""Judge trained networks by ray tracing, and put them in one table.
+"""Evaluate trained networks by ray tracing, in one table.
 
     python -m training.evaluate RUN.toml [RUN.toml ...] [--rows N] [--json OUT.json]
 
-Every run's checkpoint is judged on the same rows, traced anew; the eye estimator by
-tracing the eyes that it finds.  The table is the paper's Table 3, by radial order, with
-the paper's figures of its 72 M and 221 M parameters beside ours.
+Every run's checkpoint is evaluated on the same newly traced rows; the eye estimator by
+tracing the eyes that it finds. The table is the paper's Table 3, by radial order, with
+the paper's figures for its 72 M and 221 M parameters beside ours.
 """
 
 import argparse
@@ -41,13 +41,13 @@ PUBLISHED = {
     ("aberration", "resnet", ""): 0.037234,
     ("aberration", "ours", ""): 0.015308,
 }
-"""Csoba & Kunkli 2023.  Their eyes were judged by their discriminator, not by tracing,
-and over 27 terms with tilt; their circles are some 13 % larger than ours."""
+"""Csoba & Kunkli 2023. Their eyes were evaluated by their discriminator, not by
+tracing, and over 27 terms with tilt; their circles are some 13 % larger than ours."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One row: a network, what it cost and what it is worth."""
+    """One row: a network, its cost and its error."""
 
     run: str
     task: str
@@ -63,12 +63,12 @@ class Judged:
 
 
 def judge(run: Run, x, y) -> Judged:
-    """Judge the checkpoint of a run on rows (n, n_inputs), (n, n_targets).
+    """Evaluate the checkpoint of a run on rows (n, n_inputs), (n, n_targets).
 
     Raises
     ------
     DataError
-        There is no checkpoint, or its training is to go on.
+        There is no checkpoint, or its training is not finished.
     """
     network, state = load_finished(run.output_folder / CHECKPOINT)
     found = predict(network, torch.from_numpy(x), torch.device("cpu"))
@@ -94,7 +94,7 @@ def _published(task: str, kind: str, loss: str) -> str:
 
 
 def format_row(row: Judged) -> str:
-    """Render one row as text."""
+    """Format one row as text."""
     orders = "  ".join(
         f"n{n} {value:.4f}" for n, value in row.error["by_radial_order"].items()
     )
@@ -108,14 +108,14 @@ def format_row(row: Judged) -> str:
 
 
 def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judged]:
-    """Judge every run on the same fresh rows of its task; printed as they come.
+    """Evaluate every run on the same fresh rows of its task; print rows as they come.
 
-    The table goes into ``file``, too, as JSON with the commit.
+    The table is also written to ``file`` as JSON, with the commit.
 
     Raises
     ------
     DataError
-        A run is not trained to its end.
+        A run's training is not finished.
     """
     rows, samples = [], {}
     for run in runs:
@@ -130,7 +130,7 @@ def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judg
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("evaluate", __doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN.toml")
     parser.add_argument("--rows", type=int, default=JUDGED_ROWS)

@@ -1,11 +1,12 @@
-"""Write a trained network as ONNX, with a card that says what it is worth.
+"""Export a trained network as ONNX, with a card that states its accuracy.
 
     python -m training.export RUN.toml [--out DIR] [--half]
 
-Reads the run's checkpoint.  Physical units go in and out; scaling and optics are part
-of the graph.  ``--half`` stores the weights in 16 bits; arithmetic stays in 32.  The
-card, JSON beside the file, holds settings, ranges, data, parity with the checkpoint on
-1,000 samples, and the error of the *written* file on samples that are traced anew.
+Reads the run's checkpoint. Inputs and outputs are in physical units; scaling and optics
+are part of the graph. ``--half`` stores the weights in 16 bits; arithmetic stays in 32.
+The card, a JSON file beside the network, holds settings, ranges, data, parity with the
+checkpoint on 1,000 samples, and the error of the *written* file on newly traced
+samples.
 """
 
 import argparse
@@ -49,17 +50,17 @@ CARD_FORMAT = 1
 PARITY_ROWS = 1_000
 JUDGED_ROWS = 20_000
 JUDGE_SEED = 20_001
-"""Fresh rows: no data set has this seed."""
+"""Seed of fresh rows: no data set uses it."""
 
 SMALLEST_HALVED = 256
 """Smaller tensors stay in 32 bits."""
 
 LARGEST_PARITY_RATIO = 0.25
-"""Mean difference from the trained network, over the error: beyond, it is no copy."""
+"""Largest allowed mean difference from the trained network, over the error."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("export", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--out", type=Path, default=WEIGHTS_FOLDER)
@@ -75,15 +76,15 @@ def _work(options: argparse.Namespace) -> None:
 
 
 def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) -> dict:
-    """Write ``<task>.onnx`` and its card; the card.
+    """Write ``<task>.onnx`` and its card; return the card.
 
     Raises
     ------
     DataError
-        There is no checkpoint, or its training is to go on; or the written network
+        There is no checkpoint, or its training is not finished; or the written network
         differs from it by more than a share of its error.
     RunFileError
-        The checkpoint is of another run file.
+        The checkpoint belongs to another run file.
     """
     network, state = load_finished(run.output_folder / CHECKPOINT)
     if state["run"] != run.text:
@@ -121,7 +122,7 @@ def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) 
         "precision": "float16" if is_half else "float32",
         "bytes": len(written),
         "parity": _parity(task, network, session, x[:: max(1, len(x) // PARITY_ROWS)]),
-        # what is said of an eye is of eyes as people have them
+        # the error stated for an eye is that of population eyes
         "error": errors.get("population", errors["table_2"]),
         "error_by_rows": errors,
     }
@@ -132,7 +133,7 @@ def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) 
 
 def _check_parity(card: dict) -> None:
     unit, error = card["error"]["unit"], card["error"]["mean_abs"]
-    gap = card["parity"]["mean_abs"].get(unit, 0.0)  # of an eye's light it says nothing
+    gap = card["parity"]["mean_abs"].get(unit, 0.0)  # none for the light of an eye
     if gap > LARGEST_PARITY_RATIO * error:
         raise DataError(
             f"the written network differs from the trained one by {gap:.2g} {unit} in "
@@ -142,7 +143,7 @@ def _check_parity(card: dict) -> None:
 
 
 def _write_both(file: Path, written: bytes, card: dict) -> None:
-    """Write network and card; until both are whole, those before stay."""
+    """Write network and card; the previous ones stay until both are complete."""
     text = json.dumps(card, indent=1) + "\n"
     contents = {file: written, file.with_suffix(".json"): text.encode()}
     partials = {
@@ -157,9 +158,9 @@ def _write_both(file: Path, written: bytes, card: dict) -> None:
 def fresh_rows(
     task: Task, n_rows: int, *, population_ratio: float = 0.0
 ) -> tuple[NDArray, NDArray]:
-    """Return inputs and targets, float32, that no training saw.
+    """Return float32 inputs and targets that no training saw.
 
-    Of the box of Table 2, or with a share of eyes as people have them.
+    They are drawn from the box of Table 2, with a share of population eyes.
     """
     domain = task.judged_domain
     n_rows = -(-n_rows // domain.n_repeats) * domain.n_repeats
@@ -174,7 +175,7 @@ def fresh_rows(
 
 
 def column_ranges(run: Run, x: NDArray) -> list[dict]:
-    """Range of every input: as sampled or, for coefficients, as they came out."""
+    """Return the range of every input: as sampled or, for coefficients, as observed."""
     task = TASKS[run.task]
     domain = task.judged_domain
     ranges = input_ranges(domain, run.recipe.population_ratio)
@@ -197,12 +198,12 @@ def _data(run: Run) -> dict:
 
 
 def evaluate(session, x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return outputs of a written network, in physical units."""
+    """Return the outputs of a written network, in physical units."""
     return session.run(None, {"features": x})[0]
 
 
 def _parity(task: Task, network: Network, session, x: NDArray) -> dict:
-    """Largest and mean difference of the written network from the trained one."""
+    """Return largest and mean difference between written and trained network."""
     with torch.no_grad():
         wanted = network(torch.from_numpy(x)).numpy()
     gap = np.abs(evaluate(session, x) - wanted)
@@ -216,7 +217,7 @@ def _parity(task: Task, network: Network, session, x: NDArray) -> dict:
 
 
 def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
-    """Errors against ray tracing, as a card holds them."""
+    """Return errors against ray tracing, in the form of a card."""
     if task.name == "eye":
         error = misfit_of_eyes(found.astype(np.float64), x.astype(np.float64))
     else:
@@ -224,7 +225,7 @@ def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
     names = error_columns(task.name)
     n_main = sum(name.endswith(f"_{task.unit}") for name in names)
     asked = np.ones(len(error), dtype=bool)
-    if task.name == "focus":  # at a bound any answer beyond it is right
+    if task.name == "focus":  # at a bound any answer beyond it is correct
         asked = is_within_reach(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     everywhere = float(np.abs(error).mean())
     error = error[asked]
@@ -253,12 +254,12 @@ def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
 
 
 def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
-    """Serialise a network; one input ``features``, one output ``values``."""
+    """Serialize a network; one input ``features``, one output ``values``."""
     example = torch.rand(4, n_inputs)
     network = with_one_exponential(network)
     rows = torch.export.Dim("rows", min=1)
     with warnings.catch_warnings():
-        # torch's exporter warns of what torch itself does
+        # torch's exporter warns about torch's own code
         warnings.simplefilter("ignore", FutureWarning)
         warnings.simplefilter("ignore", DeprecationWarning)
         program = torch.onnx.export(
@@ -271,7 +272,7 @@ def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
             verbose=False,
         )
     model = program.model_proto
-    # Where a layer was made is nobody's business, and half of the file's text.
+    # Source locations of layers are not needed, and are half of the file's text.
     for node in model.graph.node:
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
@@ -313,7 +314,7 @@ def with_one_exponential(network: Network) -> Network:
 def _halve_weights(graph) -> None:
     """Store the layers' weights in 16 bits, cast back when the file is loaded.
 
-    Optics and quadratic form stay as they are: what they lose no layer makes good.
+    Optics and quadratic form keep 32 bits: no layer compensates for their loss.
     """
     casts = []
     for tensor in graph.initializer:

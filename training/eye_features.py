@@ -1,6 +1,6 @@
-"""The eye as optics sees it: closed forms of the 45 parameters, as a layer.
+"""Optical features of an eye: closed forms of the 45 parameters, as a layer.
 
-Turned and shifted offsets, curvatures, paraxial vergence.  Used by `features`.
+Rotated and shifted offsets, curvatures, paraxial vergence. Used by `features`.
 """
 
 import math
@@ -33,10 +33,10 @@ PUPIL_MM = 6.0
 """Pupil to which coefficients are scaled; any constant would do."""
 
 ENTRANCE_PUPIL_RATIO = 0.86
-"""Depth of the entrance pupil over that of the stop, about."""
+"""Approximate depth of the entrance pupil over that of the stop."""
 
 DEFOCUS = index_from_nm(2, 0) - 1
-"""Place of C(2,0) in terms from j = 1 on."""
+"""Index of C(2,0) in terms from j = 1 on."""
 
 INDEX_RANGE_NM = (450.0, 900.0)
 
@@ -46,10 +46,10 @@ def _orders(first: int = 1) -> list[tuple[int, int]]:
 
 
 class Turn(nn.Module):
-    """Turn Zernike coefficients j = 1 to 27 about the axis.
+    """Rotate Zernike coefficients j = 1 to 27 about the axis.
 
-    A term (n, m) at an angle phi mixes with (n, -m) by cos and sin of m phi; both share
-    their norm, so the rule is the same for normalised and for plain polynomials.
+    A term (n, m) at an angle phi mixes with (n, -m) by cos and sin of m phi; both have
+    the same norm, so the rule holds for normalized and for plain polynomials.
     """
 
     def __init__(self):
@@ -65,7 +65,7 @@ class Turn(nn.Module):
         self.register_buffer("sign", torch.tensor(signs), persistent=False)
 
     def forward(self, terms: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-        """Terms (N, 27) turned by the angle whose cosine and sine (N,) are given."""
+        """Rotate terms (N, 27) by the angle whose cosine and sine (N,) are given."""
         cosines, sines = [torch.ones_like(cosine)], [torch.zeros_like(sine)]
         for _ in range(6):
             c, s = cosines[-1], sines[-1]
@@ -79,12 +79,12 @@ class Turn(nn.Module):
 def turned_pair(
     x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Turn vectors (N,), (N,) by the angle whose cosine and sine are given."""
+    """Rotate vectors (N,), (N,) by the angle whose cosine and sine are given."""
     return x * cosine - y * sine, x * sine + y * cosine
 
 
 class Shift(nn.Module):
-    """The corneal offsets as the light of one field meets them.
+    """The corneal offsets at the footprint of one field's light.
 
     On the pupil's circle, at (x + a u, b v) of the disc on which the offsets are given,
     their sum is again a polynomial of degree 6 in (u, v): coefficients (N, 27) of it.
@@ -117,7 +117,7 @@ class Shift(nn.Module):
             self.register_buffer(name, values, persistent=False)
 
     def forward(self, offsets: Tensor, x: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        """Terms (N, 27), un-normalised in, normalised out; ``x``, ``a``, ``b`` (N,)."""
+        """Map unnormalized terms (N, 27) to normalized; ``x``, ``a``, ``b`` (N,)."""
         n = self.DEGREE + 1
         grid = (offsets @ self.to_grid).reshape(-1, n, n)
         moved = self.binomials * _powers(x)[:, self.gap] * _powers(a)[:, :, None]
@@ -126,7 +126,7 @@ class Shift(nn.Module):
 
 
 def _powers(x: Tensor) -> Tensor:
-    """Powers 0 to 6 (N, 7)."""
+    """Return the powers 0 to 6 (N, 7)."""
     powers = [torch.ones_like(x)]
     for _ in range(MAX_RADIAL_ORDER):
         powers.append(powers[-1] * x)
@@ -134,11 +134,11 @@ def _powers(x: Tensor) -> Tensor:
 
 
 class EyeFeatures(nn.Module):
-    """The eye as optics sees it, (N, 49), in axes turned by minus a given angle.
+    """Optical features (N, 49) of eyes, in axes rotated by minus a given angle.
 
     Curvatures, thicknesses, fourth-order terms of the conics, posterior astigmatism and
-    lens position turned to the eye's axes, the paraxial vergence of light from the
-    retina (mean, along, across), and the offsets where the pupil's light meets them.
+    lens position rotated to the eye's axes, the paraxial vergence of light from the
+    retina (mean, along, across), and the offsets at the footprint of the pupil's light.
     """
 
     N_FEATURES = 8 + 11 + 3 + 27
@@ -156,9 +156,10 @@ class EyeFeatures(nn.Module):
         sine: Tensor,
         tangent: Tensor,
     ) -> Tensor:
-        """Eyes (N, 45); ``cosine``, ``sine`` (N,) of the angle of the new x axis.
+        """Return features of eyes (N, 45).
 
-        ``tangent`` (N,) of the field's eccentricity, towards the new x axis.
+        ``cosine``, ``sine`` (N,) are those of the angle of the new x axis; ``tangent``
+        (N,) that of the field's eccentricity, toward the new x axis.
         """
         cornea, lens = _cornea(eye, cosine, sine), _lens(eye, cosine, sine)
         offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, cosine, sine))
@@ -170,11 +171,12 @@ class EyeFeatures(nn.Module):
         return torch.cat([columns, met / self.scale(pupil_mm)], dim=1)
 
     def vergence_of(self, eye: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor):
-        """Return what gives eyes that differ in their lenses their vergence, 1/mm.
+        """Return functions that give eyes with other lenses their vergence, 1/mm.
 
-        Of light from the retina, outside of the eye, its mean (N,): paraxial; and what
-        is to be added over the pupil by least squares: of the offsets, to first order,
-        and the spherical aberration of the centred eye.
+        Both return the mean (N,) for light from the retina, outside of the eye. The
+        first is paraxial; the second is the least-squares excess over the pupil: that
+        of the offsets, to first order, and the spherical aberration of the centered
+        eye.
         """
         one, zero = torch.ones_like(wavelength_nm), torch.zeros_like(wavelength_nm)
         cornea, indices = _cornea(eye, one, zero), _indices(wavelength_nm)
@@ -244,7 +246,7 @@ def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
     about_x = torch.deg2rad(named(eye, "lens_tilt_about_x_deg"))
     about_y = torch.deg2rad(named(eye, "lens_tilt_about_y_deg"))
     shift = (named(eye, "lens_decentration_x_mm"), named(eye, "lens_decentration_y_mm"))
-    # of the lens' axis; degrees do not turn as a vector does
+    # of the lens axis; degrees do not rotate as a vector does
     lean = (torch.sin(about_y) * torch.cos(about_x), -torch.sin(about_x))
     x, y = turned_pair(*shift, cosine, -sine)
     lean_x, lean_y = turned_pair(*lean, cosine, -sine)
@@ -264,7 +266,7 @@ def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
 
 
 def lens_thickness_mm(diameter_mm: Tensor, volume_mm3: Tensor) -> Tensor:
-    """Thickness (N,) of the lens, as `estimator.eye.lens_shape.lens_shape` has it."""
+    """Return the lens thickness (N,), as in `estimator.eye.lens_shape.lens_shape`."""
     caps_mm3 = CAP_VOLUME_RATIO * volume_mm3
     return RIM_THICKNESS_MM + 8.0 * caps_mm3 / (math.pi * diameter_mm**2)
 
@@ -273,7 +275,7 @@ Tensor3 = tuple[Tensor, Tensor, Tensor]
 
 
 def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
-    """Vergence (mean, along, across) after a way of ``reduced_mm``: V / (1 - d V)."""
+    """Return the vergence (mean, along, across) after ``reduced_mm``: V / (1 - d V)."""
     mean, along, across = vergence
     square = along**2 + across**2
     scale = 1.0 / ((1.0 - reduced_mm * mean) ** 2 - reduced_mm**2 * square)
@@ -282,7 +284,7 @@ def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
 
 
 def _vergence(cornea: dict, lens: dict, apex: Sequence, indices: Sequence) -> Tensor3:
-    """Paraxial vergence, 1/mm, of the light from the retina outside the eye."""
+    """Return the paraxial vergence, 1/mm, of light from the retina outside the eye."""
     n_cornea, n_aqueous, n_lens, n_vitreous = indices
     zero = torch.zeros_like(n_lens)
     rear = (n_lens - n_vitreous) * lens["rear"] - n_vitreous / lens["vitreous"]
@@ -299,14 +301,14 @@ def _vergence(cornea: dict, lens: dict, apex: Sequence, indices: Sequence) -> Te
 
 
 def _apex(offsets: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Curvature, 1/mm, of the offsets at the apex (mean, along, across); height, mm."""
+    """Return the offsets' apical curvature, 1/mm (mean, along, across); height, mm."""
     matrix = torch.as_tensor(_apex_matrix(), dtype=offsets.dtype)
     return tuple((offsets @ matrix.to(offsets.device)).unbind(dim=1))
 
 
 @cache
 def _apex_matrix() -> np.ndarray:
-    """From offsets (27) to the apex: mean curvature, along, across, height."""
+    """Return the map from offsets (27) to mean curvature, along, across, height."""
     terms = offset_monomials(np.eye(N_TERMS), offset_radius_mm=OFFSET_RADIUS_MM)
     terms = terms[1:, np.argsort(horner_order())]
     place = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
@@ -315,7 +317,7 @@ def _apex_matrix() -> np.ndarray:
 
 
 def _centred(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
-    """Surfaces of the eye without tilts and offsets, from the retina outwards."""
+    """Return the surfaces without tilts and offsets, from the retina outward."""
     before_mm = cornea["thickness"] + lens["aqueous"]
     surfaces = (
         ("lens_posterior", before_mm + lens["thickness"], -lens["rear"]),
@@ -334,7 +336,7 @@ def _pupil_depth_mm(cornea: dict, lens: dict) -> Tensor:
 
 
 def _indices(wavelength_nm: Tensor) -> list[Tensor]:
-    """Refractive indices (N,) of cornea, aqueous, lens and vitreous: a cubic fit."""
+    """Return indices (N,) of cornea, aqueous, lens and vitreous: a cubic fit."""
     t = (500.0 / wavelength_nm) ** 2
     return [((c[0] * t + c[1]) * t + c[2]) * t + c[3] for c in _index_coefficients()]
 
@@ -350,10 +352,10 @@ def _index_coefficients() -> list[list[float]]:
 
 
 def _footprint(cornea: dict, lens: dict, tangent: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the chief ray of a field meets the cornea, mm, and the pupil's stretch.
+    """Return where a field's chief ray meets the cornea, mm, and the pupil's stretch.
 
-    The ray aims at the entrance pupil; where the cornea leans, the light of a pupil
-    covers more of it along the field.
+    The ray aims at the entrance pupil; where the cornea is inclined, the light of a
+    pupil covers more of it along the field.
     """
     depth_mm = _pupil_depth_mm(cornea, lens)
     x = torch.zeros_like(tangent)
@@ -361,7 +363,7 @@ def _footprint(cornea: dict, lens: dict, tangent: Tensor) -> tuple[Tensor, Tenso
         x = (depth_mm - 0.5 * x * x * cornea["front"]) * tangent
     sine = x * cornea["front"]
     cosine = torch.sqrt(1.0 - torch.clamp(sine * sine, max=0.99))
-    # cos(lean) / cos(eccentricity - lean)
+    # cos(inclination) / cos(eccentricity - inclination)
     stretch = cosine * torch.sqrt(1.0 + tangent**2) / (cosine + sine * tangent)
     return x, stretch
 
@@ -375,5 +377,5 @@ class PupilPowers(nn.Module):
         self.register_buffer("order_n", orders, persistent=False)
 
     def forward(self, pupil_mm: Tensor) -> Tensor:
-        """Powers for pupils (N,)."""
+        """Return the powers for pupils (N,)."""
         return _powers(pupil_mm / PUPIL_MM)[:, self.order_n]

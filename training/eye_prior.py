@@ -1,7 +1,7 @@
-"""The prior of the estimation in torch: what eyes of a refraction are like.
+"""Prior of the estimation in torch: distribution of eyes with a given refraction.
 
-See `estimator.estimate.prior`.  25 coefficients leave 20 of the 45 parameters open;
-an estimator that is only judged by them turns corneas and tilts lenses at random.
+See `estimator.estimate.prior`. 25 coefficients leave 20 of the 45 parameters open; an
+estimator trained on coefficients alone rotates corneas and tilts lenses at random.
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ from estimator.optics.units import SPHERE_PER_C20
 
 
 def mean_eyes(x: Tensor) -> Tensor:
-    """Mean eyes (N, 45) of measurements (N, 27): 25 coefficients, pupil, wavelength."""
+    """Return mean eyes (N, 45) for (N, 27): 25 coefficients, pupil, wavelength."""
     refraction_dpt = -SPHERE_PER_C20 * x[:, C20 - FIRST_TERM] / (x[:, 25] / 2.0) ** 2
     low, high = estimation_prior.REFRACTION_LIMITS_DPT
     clipped_dpt = torch.clamp(refraction_dpt, low, high)
@@ -27,14 +27,14 @@ def mean_eyes(x: Tensor) -> Tensor:
 
 @cache
 def _constants(dtype, device) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean eye at 0 dpt, its change with 1 dpt, and the deviations from it (45,)."""
+    """Return the mean eye at 0 dpt, its change per dpt, and the deviations (45,)."""
     start, one = estimation_prior.mean_eyes(np.array([0.0, 1.0]))
     values = (start, one - start, estimation_prior.deviations())
     return tuple(torch.as_tensor(v, dtype=dtype, device=device) for v in values)
 
 
 def squared_deviation(eyes: Tensor, x: Tensor) -> Tensor:
-    """Mean over the 45 parameters (N,) of the squared deviation from the mean eye."""
+    """Return the mean squared deviation (N,) of the 45 parameters from the mean eye."""
     *_, deviations = _constants(x.dtype, x.device)
     unit = (eyes - mean_eyes(x)) / deviations
     return torch.mean(unit**2, dim=1)

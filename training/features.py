@@ -1,10 +1,10 @@
-"""What is known of the optics, put before and behind a network.
+"""Known optics as layers before and after a network.
 
-A plain network must learn from examples that turning the cornea turns its offsets, that
-a lens of a diameter and a volume has such radii, that a coefficient of order n grows
-with the n-th power of the pupil, and that an eye turned about its axis sees the field
-turned.  All four are closed forms.  Layers here apply them, so that the network learns
-the rest; they are part of the exported graph.
+A plain network must learn from examples that rotating the cornea rotates its offsets,
+that diameter and volume of a lens determine its radii, that a coefficient of order n
+grows with the n-th power of the pupil, and that an eye rotated about its axis sees the
+field rotated. All four are closed forms. Layers here apply them, so that the network
+learns only the rest; they are part of the exported graph.
 """
 
 import numpy as np
@@ -23,16 +23,16 @@ from training.eye_prior import mean_eyes
 from training.focus_features import FocusFeatures
 
 SMALLEST_SINE = 1e-6
-"""Nearer to the axis than this the direction of the field means nothing."""
+"""Closer to the axis than this, the direction of the field is undefined."""
 
 
 def _size_and_color(pupil_mm: Tensor, wavelength_nm: Tensor) -> list[Tensor]:
-    """Smooth functions of pupil and wavelength."""
+    """Return smooth functions of pupil and wavelength."""
     return [pupil_mm, pupil_mm**2, (500.0 / wavelength_nm) ** 2, wavelength_nm / 500.0]
 
 
 class OnAxisFeatures(nn.Module):
-    """Inputs (N, 47) of the discriminator to features; coefficients by pupil."""
+    """Features of the discriminator's inputs (N, 47); coefficients scaled by pupil."""
 
     n_features = EyeFeatures.N_FEATURES + 4
     n_encoded = 27
@@ -49,20 +49,20 @@ class OnAxisFeatures(nn.Module):
         return torch.cat([eye, more], dim=1)
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """From scaled coefficients (N, 27) to those of the pupil."""
+        """Convert scaled coefficients (N, 27) to those of the pupil."""
         return y * self.scale(x[:, 45])
 
     def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """Undo `decode`."""
+        """Invert `decode`."""
         return y / self.scale(x[:, 45])
 
 
 class FieldFeatures(nn.Module):
-    """Inputs (N, 49) of the aberration estimator; the field is turned onto +x.
+    """Features of the aberration estimator's inputs (N, 49), with the field on +x.
 
     With u the direction to the source, at an angle alpha about the axis and an
-    eccentricity of sine s and cosine c, the pupil's axes ex = u × y, ey = ex × u stand
-    at the angle beta to those of the turned eye: tan beta = c tan alpha.
+    eccentricity of sine s and cosine c, the pupil's axes ex = u × y, ey = ex × u are at
+    the angle beta to those of the rotated eye: tan beta = c tan alpha.
     """
 
     n_features = EyeFeatures.N_FEATURES + 4 + 3
@@ -98,14 +98,14 @@ class FieldFeatures(nn.Module):
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """From scaled values in turned axes (N, 33) to those asked for."""
+        """Convert scaled values in rotated axes (N, 33) to the requested axes."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
         zernike = self.turn(y[:, :27] * self.scale(x[:, 45]), c, s)
         return torch.cat([zernike, self._rim(y[:, 27:] * x[:, 45:46], c, s)], dim=1)
 
     def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """Undo `decode`."""
+        """Invert `decode`."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
         zernike = self.turn(y[:, :27], c, -s) / self.scale(x[:, 45])
@@ -113,7 +113,7 @@ class FieldFeatures(nn.Module):
 
     @staticmethod
     def _rim(rim: Tensor, c: Tensor, s: Tensor) -> Tensor:
-        """Turn radius, centre and symmetric matrix (N, 6)."""
+        """Rotate radius, center and symmetric matrix (N, 6)."""
         radius, x, y, xx, xy, yy = rim.unbind(dim=1)
         x, y = turned_pair(x, y, c, s)
         mean, along, across = 0.5 * (xx + yy), 0.5 * (xx - yy), xy
@@ -122,9 +122,9 @@ class FieldFeatures(nn.Module):
 
 
 class MeasurementFeatures(nn.Module):
-    """Inputs (N, 27) of the eye estimator: coefficients over their powers of pupil.
+    """Features of the eye estimator's inputs (N, 27): coefficients over pupil powers.
 
-    The network says by how much an eye differs from the mean eye of its refraction.
+    The network predicts the difference of an eye from the mean eye of its refraction.
     """
 
     n_features = 25 + 25 + 4
@@ -145,22 +145,22 @@ class MeasurementFeatures(nn.Module):
 
     @staticmethod
     def output_ranges() -> NDArray[np.float64]:
-        """Ranges (45, 2) of differences, even about the mean eye."""
+        """Return the ranges (45, 2) of differences, symmetric about the mean eye."""
         mean = mean_vector()[:, None]
         half = np.abs(allowed_ranges() - mean).max(axis=1)
         return np.stack([-half, half], axis=1)
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """From differences (N, 45) to an eye within its allowed ranges."""
+        """Convert differences (N, 45) to an eye within its allowed ranges."""
         return torch.minimum(torch.maximum(y + mean_eyes(x), self.low), self.high)
 
     def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """Undo `decode` within the ranges."""
+        """Invert `decode` within the ranges."""
         return y - mean_eyes(x)
 
 
 class RawFeatures(nn.Module):
-    """The inputs as they come, as in the paper."""
+    """The unchanged inputs, as in the paper."""
 
     def __init__(self, n_inputs: int, n_outputs: int):
         super().__init__()
@@ -171,7 +171,7 @@ class RawFeatures(nn.Module):
         return x
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """Nothing to undo."""
+        """Return the outputs."""
         return y
 
     encode = decode
@@ -186,7 +186,7 @@ PHYSICAL = {
 
 
 def make_features(kind: str, *, task: str, n_inputs: int, n_outputs: int) -> nn.Module:
-    """Layers of a task; ``kind`` is ``raw`` or ``physical``."""
+    """Return the feature layers of a task; ``kind`` is ``raw`` or ``physical``."""
     if kind == "raw":
         return RawFeatures(n_inputs, n_outputs)
     if kind == "physical":

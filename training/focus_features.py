@@ -1,8 +1,9 @@
-"""Focusing in closed forms, before and behind the focused-eye estimator.
+"""Focusing in closed form, before and after the focused-eye estimator.
 
 The lens that focuses an eye's light is found by Newton steps, as a layer: paraxially,
-with the spherical aberration of the centred eye.  What is left to learn is what tilts,
-decentration and offsets add, some hundredths of a dioptre and smooth in everything.
+with the spherical aberration of the centered eye. The network learns the remainder, the
+effect of tilts, decentration and offsets: some hundredths of a diopter, and smooth in
+all inputs.
 """
 
 import torch
@@ -15,24 +16,25 @@ from training.eye_features import EyeFeatures, lens_thickness_mm, named
 from training.tracer.accommodation import smallest_diameters_mm
 
 BOUND_MARGIN_MM = 1e-4
-"""Changes of the lens nearer to a bound than this count as bounded."""
+"""Changes of the lens closer to a bound than this count as bounded."""
 
 N_STEPS = 2
 STEP_MM = -0.2
-"""For the slope of the vergence: shorter steps lose it in the rounding of 32 bits."""
+"""Step for the slope of the vergence; shorter steps lose it in the rounding of 32
+bits."""
 
 SLOPE_SHARES = (0.5, 2.0)
 """Least and greatest slope of the vergence over the paraxial one."""
 
 WIDEST_RATIO = 1.03
-"""Of the relaxed lens: so far it may stretch while it is sought."""
+"""Limit on the lens diameter during the search, over the relaxed one."""
 
 
 class FocusFeatures(nn.Module):
     """Inputs (N, 47) of the focused-eye estimator.
 
-    The network says by how much the lens so found misses, and may leave what a lens can
-    do: it is bounded here, and the aqueous follows from the lens.
+    The network predicts the error of the lens found here and may leave the range of the
+    lens: it is bounded here, and the aqueous follows from the lens.
     """
 
     n_features = EyeFeatures.N_FEATURES + 5
@@ -47,7 +49,7 @@ class FocusFeatures(nn.Module):
             self.register_buffer(f"{name}_column", one, persistent=False)
 
     def _accommodated(self, eye: Tensor, change_mm: Tensor) -> Tensor:
-        """Eyes (N, 45) whose lens diameter is changed by (N,), their volume kept."""
+        """Return eyes (N, 45) with lens diameters changed by (N,), volume kept."""
         aqueous_mm = _aqueous_change_mm(eye, change_mm)
         return (
             eye
@@ -56,7 +58,7 @@ class FocusFeatures(nn.Module):
         )
 
     def _centred(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Change of the lens, mm, its slope, mm/dpt, and the focus missed, dpt (N,)."""
+        """Return lens change, mm, its slope, mm/dpt, and the focus error, dpt (N,)."""
         eye, focus_dpt = x[:, :45], x[:, 46]
         lowest_mm, highest_mm = _room_mm(eye)
         highest_mm = highest_mm + (WIDEST_RATIO - 1.0) * named(eye, "lens_diameter_mm")
@@ -73,7 +75,7 @@ class FocusFeatures(nn.Module):
                 break
             change_mm = change_mm + slope * missed_dpt
             change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
-        # Spherical aberration changes the slope, but may not turn it.
+        # Spherical aberration changes the slope, but must not change its sign.
         share = 1.0 + slope * (1e3 * excess(beside) - more_dpt) / STEP_MM
         return change_mm, slope / torch.clamp(share, *SLOPE_SHARES), missed_dpt
 
@@ -88,7 +90,7 @@ class FocusFeatures(nn.Module):
         return torch.cat([eye, torch.stack(more, dim=1)], dim=1)
 
     def decode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """From what is missed (N, 1) to the changes of lens and aqueous (N, 2), mm."""
+        """Convert the error (N, 1) to the changes of lens and aqueous (N, 2), mm."""
         features = self(x) if features is None else features
         found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
         change_mm = found_mm + slope * missed_dpt + y[:, 0]
@@ -97,21 +99,21 @@ class FocusFeatures(nn.Module):
         return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
 
     def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
-        """Undo `decode`, for changes beyond what a lens can do as well."""
+        """Invert `decode`, also for changes beyond the range of the lens."""
         features = self(x) if features is None else features
         found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
         return (y[:, 0] - found_mm - slope * missed_dpt)[:, None]
 
 
 def is_within_reach(x: Tensor, y: Tensor) -> Tensor:
-    """Rows (N,) whose change of the lens (N, 2) is not at a bound."""
+    """Return the rows (N,) whose change of the lens (N, 2) is not at a bound."""
     lowest_mm, highest_mm = _room_mm(x)
     above = y[:, 0] > lowest_mm + BOUND_MARGIN_MM
     return above & (y[:, 0] < highest_mm - BOUND_MARGIN_MM)
 
 
 def _room_mm(eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest change (N,) of the lens' diameter."""
+    """Return the least and greatest change (N,) of the lens diameter."""
     lowest_mm = smallest_diameters_mm(eye[:, :45]) - named(eye, "lens_diameter_mm")
     return lowest_mm, torch.zeros_like(lowest_mm)
 

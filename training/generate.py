@@ -3,9 +3,9 @@
     python -m training.generate RUN.toml [--folder DIR]
     torchrun --nproc-per-node 2 -m training.generate RUN.toml
 
-Reads the table ``[data]`` of the run file.  What is already there is kept, so that an
-interrupted run goes on; under `torchrun` each process makes its share of the shards.
-Prints the statistics of the paper's Table 11 at the end.
+Reads the table ``[data]`` of the run file. Existing shards are kept, so that an
+interrupted run can be resumed; under `torchrun` each process makes its share of the
+shards. Prints the statistics of the paper's Table 11 at the end.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from training.versions import commit_id
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("generate", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--folder", type=Path, help="instead of the run file's")
@@ -66,12 +66,12 @@ def _n_ranks() -> int:
 
 
 def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -> None:
-    """Make the shards ``rank``, ``rank + n_ranks``, ... that are not there yet.
+    """Make the missing ones of the shards ``rank``, ``rank + n_ranks``, ...
 
     Raises
     ------
     DataError
-        The folder holds a data set of another recipe.
+        The folder contains a data set of another recipe.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / MANIFEST).exists() and recipe_of(read_manifest(folder)) != recipe:
@@ -104,7 +104,7 @@ def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -
 
 
 def _commits(recipe: Recipe, folder: Path) -> str:
-    """Say of which commits the shards are, those still to be made included."""
+    """Return the commits of all shards, including those still to be made."""
     is_made = [shard_file(folder, k).exists() for k in range(recipe.n_shards)]
     is_begun = any(is_made) and (folder / MANIFEST).exists()
     before = read_manifest(folder)["commit"].split(", ") if is_begun else []

@@ -4,8 +4,9 @@
 
 Trains the modified ResNet on physical features with a quadratic form, on the data of
 `table3`, for several numbers of rows at one width and for several widths at one number
-of rows; judged by ray tracing on fresh rows of the paper's Table 2.  What would more
-data, or more weights, be good for?  What is already trained is kept.
+of rows, and evaluates by ray tracing on fresh rows of the paper's Table 2. The curves
+show the effect of more data and of more weights. Networks that are already trained are
+kept.
 """
 
 import argparse
@@ -22,17 +23,18 @@ ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
 WIDTHS = (32, 64, 128, 256)
 VARIANT = "ours, quadratic"
 LOSSES = {"discriminator": "physical", "aberration": "physical", "focus": "standard"}
-"""As in the run files: in standard units the smallest terms weigh as the largest."""
+"""As in the run files: in standard units the smallest terms weigh as much as the
+largest."""
 
 
 def sizes(rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS):
-    """Width and rows seen of every point, each once."""
+    """Return width and rows seen of every point, each once."""
     points = [(WIDTH, n) for n in rows] + [(width, ROWS_SEEN) for width in widths]
     return list(dict.fromkeys(points))
 
 
 def plot(rows: list[Judged], file: Path) -> None:
-    """Draw both curves of every task; dashed what the paper's networks reach."""
+    """Plot both curves of every task; dashed lines: the paper's networks."""
     from matplotlib import pyplot as plt
     from matplotlib.ticker import LogLocator
 
@@ -70,7 +72,7 @@ def _of_one_budget(rows: list[Judged]) -> list[Judged]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("learning_curve", __doc__)
     parser.add_argument("--tasks", nargs="+", choices=LOSSES, default=list(LOSSES))
     parser.add_argument("--rows", type=int, nargs="+", default=ROWS)

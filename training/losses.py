@@ -1,4 +1,4 @@
-"""Losses: direct, and of an estimated eye judged by what it does to light."""
+"""Losses: direct, and of an estimated eye by its effect on light."""
 
 import torch
 from torch import Tensor, nn
@@ -13,16 +13,16 @@ RIM_WEIGHT = 0.1
 """Weight of an error of a pupil's rim in mm against one of the wavefront in um."""
 
 LARGEST_MISFIT_UM = 20.0
-"""A traced coefficient farther off counts as this: rays of a hopeless eye scatter."""
+"""Errors of traced coefficients are clipped here: rays of a hopeless eye scatter."""
 
 
 def standard_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
-    """Mean absolute error of targets (N, n) in standard units."""
+    """Return the mean absolute error of targets (N, n) in standard units."""
     return torch.mean(torch.abs(model.standard_error(x, y)))
 
 
 def physical_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
-    """Mean absolute error in physical units; the rim counts little."""
+    """Return the mean absolute error in physical units; the rim has a small weight."""
     error = torch.abs(model(x) - y)
     if error.shape[1] <= N_ZERNIKE:
         return error.mean()
@@ -30,7 +30,7 @@ def physical_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
 
 
 def parameter_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
-    """Mean absolute error of the 45 parameters: the naive loss of the paper's 7.1.3.
+    """Return the mean absolute error of the 45 parameters: naive loss (paper, 7.1.3).
 
     ``y`` (N, 45 + 27): the eye, and its coefficients, which this loss does not read.
     """
@@ -38,7 +38,7 @@ def parameter_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
 
 
 class DiscriminatorLoss(nn.Module):
-    """The estimated eye's coefficients by a trained discriminator (paper, 5.4)."""
+    """Loss of an estimated eye's coefficients by the discriminator (paper, 5.4)."""
 
     def __init__(self, discriminator: Network, *, prior_weight: float = 0.0):
         super().__init__()
@@ -46,7 +46,7 @@ class DiscriminatorLoss(nn.Module):
         self.discriminator = discriminator.eval().requires_grad_(False)
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """Mean absolute error (um) of the 25 terms without tilt, and the prior."""
+        """Return mean absolute error (um) of the 25 terms without tilt, plus prior."""
         eyes = model(x)
         found_um = self.discriminator(torch.cat([eyes, x[:, -2:]], dim=1))[:, 2:]
         misfit_um = torch.mean(torch.abs(found_um - x[:, :-2]))
@@ -54,14 +54,14 @@ class DiscriminatorLoss(nn.Module):
 
 
 class TracerLoss(nn.Module):
-    """The estimated eye's coefficients by ray tracing, to 1e-4 um (float32 rays)."""
+    """Loss of an estimated eye's coefficients by ray tracing, to 1e-4 um (float32)."""
 
     def __init__(self, *, prior_weight: float = 0.0):
         super().__init__()
         self.prior_weight = prior_weight
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """As `DiscriminatorLoss`; eyes that light does not pass are left out."""
+        """Return the loss as `DiscriminatorLoss`, without eyes that block light."""
         eyes = model(x)
         found_um, is_traced = zernike_of_eyes(
             eyes.double(), x[:, -2].double(), x[:, -1].double(), ray_dtype=torch.float32
@@ -72,5 +72,5 @@ class TracerLoss(nn.Module):
 
 
 def _prior(eyes: Tensor, x: Tensor, weight: float) -> Tensor | float:
-    """Loss of eyes (N, 45) that differ from what eyes of that refraction are like."""
+    """Return the loss of eyes (N, 45) that differ from their refraction's mean eye."""
     return weight * squared_deviation(eyes, x).mean() if weight else 0.0

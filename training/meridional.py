@@ -1,8 +1,8 @@
-"""Spherical aberration of a centred eye, by a few rays in closed form, as a layer.
+"""Spherical aberration of a centered eye, by a few rays in closed form, as a layer.
 
-Rays leave the axial point of the retina in one meridian, are refracted at four conics
-exactly, and their slopes outside are integrated to the least-squares vergence over the
-pupil.  No offsets, no tilts: what those add is left to a network.
+Rays leave the axial point of the retina in one meridian, are refracted exactly at four
+conics, and their slopes outside are integrated to the least-squares vergence over the
+pupil. Offsets and tilts are ignored: their effect is left to a network.
 """
 
 import math
@@ -20,13 +20,14 @@ MOMENTS = (1.0, 0.5, 0.3)
 """Integrals of 6 q (1 - q) q^k over 0..1."""
 
 NODAL_DISTANCE_MM = 22.3
-"""Height in the pupil over the slope at the retina, about."""
+"""Approximate height in the pupil over the slope at the retina."""
 
 LARGEST_EXCESS = 0.015
-"""Rays of an eye beyond it, 15 dpt, have crossed or missed a surface."""
+"""Beyond it, 15 dpt, rays of an eye have crossed or missed a surface."""
 
 LEAST_ROOT = 1e-4
-"""Of squares under a root: a ray that misses a surface grazes it instead."""
+"""Lower bound of squares under a root: a ray that misses a surface grazes it
+instead."""
 
 
 class Conic(NamedTuple):
@@ -51,7 +52,7 @@ def _root(square: Tensor) -> Tensor:
 
 
 def _refracted(rays: Rays, surface: Conic, ratio: Tensor) -> Rays:
-    """Rays behind a surface; ``ratio`` (N,) is the index before over that behind."""
+    """Return rays behind a surface; ``ratio`` (N,) is the index before over behind."""
     vertex_mm, c, conic, ratio = (v[:, None] for v in (*surface, ratio))
     shape, z = 1.0 + conic, rays.z - vertex_mm
     a = c * (rays.across**2 + shape * rays.along**2)
@@ -80,20 +81,20 @@ def excess_vergence(
     radius_mm: Tensor,
     pupil_z_mm: Tensor,
 ) -> Tensor:
-    """Least-squares vergence over the pupil less the paraxial one (N,), 1/mm.
+    """Return least-squares vergence over the pupil minus the paraxial (N,), 1/mm.
 
-    With the direction s(r) towards the axis, s = r g(q), q = r²/R²: the coefficient of
+    With the direction s(r) toward the axis, s = r g(q), q = r²/R²: the coefficient of
     Z(2,0) is sqrt(3) R times the integral of s (ρ² - ρ⁴) over ρ, and so the vergence is
-    that of 6 q (1 - q) g(q) over q.  g is the parabola through three rays.
+    that of 6 q (1 - q) g(q) over q. g is the parabola through three rays.
 
     Parameters
     ----------
     surfaces : of Conic
-        In the order that light from the retina meets them.
+        In the order in which light from the retina meets them.
     indices : of (N,)
         From the vitreous to air, one more than surfaces.
     radius_mm, pupil_z_mm : (N,)
-        Of the entrance pupil, and its plane.
+        Radius and plane of the entrance pupil.
     """
     slopes = [math.sqrt(node) / NODAL_DISTANCE_MM for node in NODES]
     slope = torch.stack([radius_mm * one for one in slopes], dim=1)
@@ -108,7 +109,7 @@ def excess_vergence(
     first_01 = (g[1] - g[0]) / (q[1] - q[0])
     first_12 = (g[2] - g[1]) / (q[2] - q[1])
     second = (first_12 - first_01) / (q[2] - q[0])
-    # Newton's form of g: its integral less its value at the axis
+    # Newton's form of g: its integral minus its value at the axis
     linear = first_01 * MOMENTS[1]
     excess = linear + second * (MOMENTS[2] - (q[0] + q[1]) * MOMENTS[1])
     return torch.clamp(excess, -LARGEST_EXCESS, LARGEST_EXCESS)

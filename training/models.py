@@ -1,7 +1,7 @@
-"""The networks: the paper's modified ResNet, the one it came from, and a plain one.
+"""Networks: the paper's modified ResNet, the original one, and a plain network.
 
-Csoba & Kunkli 2023, section 5.3 and Table 3.  A network stands between two scalings,
-so that physical units go in and come out.
+Csoba & Kunkli 2023, section 5.3 and Table 3. A network is enclosed by two scalings, so
+that inputs and outputs are in physical units.
 """
 
 from dataclasses import dataclass
@@ -19,26 +19,28 @@ LAYER_NORM_EPSILON = 1e-3
 SMALL_WEIGHT = 1e-3
 FIT_CHUNK = 8192
 FIT_RIDGE = 1e-7
-"""Of the quadratic form, against features that nearly repeat each other."""
+"""Ridge of the quadratic form, against nearly collinear features."""
 
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """What a network is made of.
+    """Architecture of a network.
 
     Attributes
     ----------
     kind : {"ours", "resnet", "ffn"}
-        Mish, and layer norm after it and before the shortcut joins; ReLU and batch
-        norm before it (Chen et al.); dense layers with batch norm and ReLU in a row.
+        Mish, followed by layer norm, which also precedes the shortcut's addition; ReLU
+        preceded by batch norm (Chen et al.); a sequence of dense layers with batch norm
+        and ReLU.
     width : int
         Neurons of every hidden layer.
     n_stacks : int
-        Of one dense and two identity blocks each; a plain network has as many layers.
+        Stacks of one dense and two identity blocks each; a plain network has as many
+        layers.
     features : {"raw", "physical"}
         See `features`.
     baseline : {"none", "quadratic"}
-        Whether the layers learn what a quadratic form of the features leaves.
+        Whether the layers learn the residual of a quadratic form of the features.
     """
 
     kind: str = "ours"
@@ -74,7 +76,7 @@ def _dense(n_in: int, n_out: int) -> nn.Linear:
 class MishBlock(nn.Module):
     """{dense, Mish, norm} twice, {dense, norm}, plus the shortcut; then Mish, norm.
 
-    The shortcut is {dense, norm} where ``is_dense``, else the input itself.
+    The shortcut is {dense, norm} if ``is_dense``, otherwise the input itself.
     """
 
     def __init__(self, n_in: int, width: int, *, is_dense: bool):
@@ -94,7 +96,7 @@ class MishBlock(nn.Module):
         self.head = nn.Sequential(nn.Mish(), norm())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Block (N, n_in) to (N, width)."""
+        """Map (N, n_in) to (N, width)."""
         return self.head(self.body(x) + self.shortcut(x))
 
 
@@ -115,12 +117,12 @@ class ReluBlock(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Block (N, n_in) to (N, width)."""
+        """Map (N, n_in) to (N, width)."""
         return torch.relu(self.body(x) + self.shortcut(x))
 
 
 def _residual(block, n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
-    """Stacks of a block with a dense shortcut and two with an identity."""
+    """Return stacks of a block with a dense shortcut and two with an identity."""
     return [
         block(width if stack or k else n_in, width, is_dense=k == 0)
         for stack in range(n_stacks)
@@ -129,7 +131,7 @@ def _residual(block, n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
 
 
 def _plain(n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
-    """As many dense layers as the residual networks have, shortcuts included."""
+    """Return as many dense layers as the residual networks have, shortcuts included."""
     n_layers = n_stacks * (BLOCKS_PER_STACK * LAYERS_PER_BLOCK + 1) - 1
     layers = []
     for k in range(n_layers):
@@ -139,9 +141,9 @@ def _plain(n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
 
 
 class Quadratic(nn.Module):
-    """A quadratic form of standardised features, fitted by least squares.
+    """A quadratic form of standardized features, fitted by least squares.
 
-    It is not trained further: 27 outputs of 53 features take 40,000 weights, which a
+    It is not trained further: 27 outputs of 53 features take 40,000 weights, which
     training would move slowly and least squares find at once.
     """
 
@@ -159,12 +161,12 @@ class Quadratic(nn.Module):
         return torch.cat([torch.ones_like(x[:, :1]), x, products], dim=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return outputs (N, n_outputs) of standardised features (N, n_features)."""
+        """Return outputs (N, n_outputs) for standardized features (N, n_features)."""
         return self.terms(x) @ self.weight
 
     @torch.no_grad()
     def fit(self, x: Tensor, y: Tensor) -> None:
-        """Least squares on rows (N, n_features), (N, n_outputs)."""
+        """Fit by least squares to rows (N, n_features), (N, n_outputs)."""
         n_terms = len(self.weight)
         square = torch.zeros(n_terms, n_terms, dtype=torch.float64)
         right = torch.zeros(n_terms, y.shape[1], dtype=torch.float64)
@@ -177,7 +179,7 @@ class Quadratic(nn.Module):
 
 
 class Network(nn.Module):
-    """A network in physical units: features, standardised, layers, scaled outputs.
+    """A network in physical units: features, standardization, layers, scaled outputs.
 
     Parameters
     ----------
@@ -186,12 +188,12 @@ class Network(nn.Module):
     n_inputs, n_outputs : int
     settings : ModelSettings
     is_bounded : bool
-        A last tanh, so that outputs stay in a range: the eye estimator's.
+        Final tanh, so that outputs stay in a range: for the eye estimator.
 
     Attributes
     ----------
     is_mixed : bool
-        In training, let the layers compute in bfloat16 where that is safe.
+        In training, compute the layers in bfloat16 where that is safe.
     """
 
     def __init__(
@@ -217,7 +219,7 @@ class Network(nn.Module):
         self.layers = nn.Sequential(*layers, _dense(width, n_encoded))
         self.is_mixed = False
         self.bound = nn.Tanh() if is_bounded else nn.Identity()
-        if is_bounded:  # it starts in the middle of its range, far from where tanh ends
+        if is_bounded:  # start at the center of the range, where tanh is not saturated
             nn.init.uniform_(self.layers[-1].weight, -SMALL_WEIGHT, SMALL_WEIGHT)
         is_quadratic = settings.baseline == "quadratic"
         self.baseline = Quadratic(n_features, n_encoded) if is_quadratic else None
@@ -227,7 +229,7 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def fit_scaling(self, x: Tensor, y: Tensor) -> None:
-        """Take scales, and the baseline, from rows (N, n_inputs), (N, n_outputs)."""
+        """Fit scales, and the baseline, to rows (N, n_inputs), (N, n_outputs)."""
         self.input_mean.copy_(torch.zeros(()))
         self.input_scale.copy_(torch.ones(()))
         features = self.features(x)
@@ -241,7 +243,7 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def set_output_range(self, low: Tensor, high: Tensor) -> None:
-        """Let -1 and 1 be these outputs (n_outputs,): for a bounded network."""
+        """Map -1 and 1 to these outputs (n_outputs,): for a bounded network."""
         self.output_mean.copy_((low + high) / 2.0)
         self.output_scale.copy_((high - low) / 2.0)
 
@@ -249,7 +251,7 @@ class Network(nn.Module):
         return (features - self.input_mean) / self.input_scale
 
     def _start(self, standard: Tensor) -> Tensor:
-        """Return what the layers' outputs are added to, encoded."""
+        """Return the encoded values to which the layers' outputs are added."""
         if self.baseline is None:
             return self.output_mean
         return self.output_mean + self.baseline(standard)
@@ -260,20 +262,20 @@ class Network(nn.Module):
         return (encoded - self._start(self._standard(features))) / self.output_scale
 
     def to_standard(self, x: Tensor, y: Tensor) -> Tensor:
-        """Targets of the layers (N, n_encoded), in standard units."""
+        """Return the layers' targets (N, n_encoded), in standard units."""
         return self._wanted(x, y, self.features(x))
 
     def standard_error(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return errors (N, n_encoded) of the layers, in standard units."""
+        """Return the layers' errors (N, n_encoded), in standard units."""
         features = self.features(x)
         found = self._through_layers(self._standard(features))
         return found - self._wanted(x, y, features)
 
     def _through_layers(self, standard: Tensor) -> Tensor:
-        """Return what the layers add (N, n_encoded); in training perhaps in 16 bits.
+        """Return the layers' outputs (N, n_encoded); in training optionally in 16 bits.
 
-        They alone: 8 bits of mantissa in the optics before them or in the quadratic
-        form would leave an error that the layers cannot learn.
+        Only the layers: 8 bits of mantissa in the optics before them or in the
+        quadratic form would leave an error that the layers cannot learn.
         """
         if not (self.is_mixed and self.training):
             return self.bound(self.layers(standard))
@@ -282,7 +284,7 @@ class Network(nn.Module):
         return self.bound(found.float())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""
+        """Map physical inputs (N, n_inputs) to physical outputs (N, n_outputs)."""
         features = self.features(x)
         standard = self._standard(features)
         y = self._through_layers(standard) * self.output_scale
@@ -290,13 +292,13 @@ class Network(nn.Module):
 
     @property
     def n_parameters(self) -> int:
-        """Number of fitted weights, those of the baseline included."""
+        """Return the number of fitted weights, including those of the baseline."""
         fitted = 0 if self.baseline is None else self.baseline.weight.numel()
         return fitted + sum(p.numel() for p in self.parameters())
 
 
 def _take(mean: Tensor, scale: Tensor, rows: Tensor) -> None:
-    """Mean and deviation of columns; 1 for a column that is constant."""
+    """Set mean and deviation of columns; 1 for a constant column."""
     rows = rows.double()
     deviation = rows.std(dim=0, correction=0)
     mean.copy_(rows.mean(dim=0))

@@ -1,4 +1,4 @@
-"""Rectified Adam with decoupled weight decay, looking ahead; and its schedule."""
+"""Rectified Adam with decoupled weight decay and lookahead, and its schedule."""
 
 import torch
 from torch.optim import Optimizer, RAdam
@@ -18,7 +18,8 @@ class Lookahead:
     n_steps : int
         Fast steps between slow ones.
     share : float
-        How far the slow weights move towards the fast ones; these start there again.
+        Fraction by which the slow weights move toward the fast ones, which are then
+        reset to them.
     """
 
     def __init__(
@@ -33,12 +34,12 @@ class Lookahead:
         self._slow = [p.detach().clone() for p in self._parameters]
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Clear the gradients."""
         self.fast.zero_grad(set_to_none=True)
 
     @torch.no_grad()
     def step(self) -> None:
-        """Take one fast step and, when it is time, a slow one."""
+        """Take one fast step and, every ``n_steps``, a slow one."""
         self.fast.step()
         self.n_done += 1
         if self.n_done % self.n_steps == 0:
@@ -46,12 +47,12 @@ class Lookahead:
             torch._foreach_copy_(self._parameters, self._slow)
 
     def set_pace(self, *, learning_rate: float, weight_decay: float) -> None:
-        """Set both for the steps to come."""
+        """Set learning rate and weight decay for the next steps."""
         for group in self.fast.param_groups:
             group["lr"], group["weight_decay"] = learning_rate, weight_decay
 
     def state_dict(self) -> dict:
-        """Everything needed to go on exactly."""
+        """Return the state needed to resume exactly."""
         return {
             "fast": self.fast.state_dict(),
             "slow": self._slow,
@@ -59,7 +60,7 @@ class Lookahead:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from `state_dict`."""
+        """Resume from `state_dict`."""
         self.fast.load_state_dict(state["fast"])
         for mine, saved in zip(self._slow, state["slow"], strict=True):
             mine.copy_(saved)
@@ -67,7 +68,7 @@ class Lookahead:
 
 
 def make_optimiser(parameters, *, learning_rate: float, weight_decay: float):
-    """RAdam (Liu et al. 2020) in a `Lookahead`, as in the paper's section 7.1.2."""
+    """Return RAdam (Liu et al. 2020) in a `Lookahead`, as in the paper's 7.1.2."""
     fast = RAdam(
         list(parameters),
         lr=learning_rate,
@@ -82,10 +83,10 @@ def make_optimiser(parameters, *, learning_rate: float, weight_decay: float):
 def pace(
     progress: float, *, n_epochs: float, decay_per_epoch: float, final_ratio: float
 ) -> float:
-    """Share of the first learning rate at ``progress`` (0 to 1) of the training.
+    """Return the factor of the learning rate at ``progress`` (0 to 1) of the training.
 
-    Falls by a factor per epoch, smoothly, and over the last ``final_ratio`` of the
-    training straight to zero.
+    It falls by a factor per epoch, smoothly, and over the last ``final_ratio`` of the
+    training also linearly to zero.
     """
     value = decay_per_epoch ** (progress * n_epochs)
     if progress > 1.0 - final_ratio:

@@ -1,8 +1,8 @@
-"""Eyes as people have them: rows drawn from the prior of the estimation.
+"""Population eyes: rows drawn from the prior of the estimation.
 
-Table 2 is a box: its corners hold eyes that nobody has, and a myope's long eye lies
-outside of it.  The service estimates with a prior (`estimator.estimate.prior`), so
-these are the eyes that its networks are asked about.
+Table 2 is a box: its corners contain eyes that nobody has, and a myope's long eye is
+outside of it. The service estimates with a prior (`estimator.estimate.prior`), so
+these are the eyes for which its networks are used.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ from estimator.eye.lens_change import (
 from estimator.eye.parameters import allowed_ranges
 
 LEAST_PROBABILITY = 1e-4
-"""A normal deviate ends there, at 3.7 deviations."""
+"""Normal deviates are truncated here, at 3.7 deviations."""
 
 RELAXED_RATIO = 0.5
 """Share of eyes that look at their far point, where some accommodate."""
@@ -30,12 +30,12 @@ RELAXED_RATIO = 0.5
 def population_eyes(
     unit: NDArray[np.float64], refraction_unit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Eyes (n, 45) within their allowed ranges.
+    """Return eyes (n, 45) within their allowed ranges.
 
     Parameters
     ----------
     unit : (n, 45)
-        Uniform in 0..1: the probability below each parameter.
+        Uniform in 0..1: the cumulative probability of each parameter.
     refraction_unit : (n,)
         The same for the refraction, uniform over `REFRACTION_LIMITS_DPT`.
     """
@@ -48,10 +48,10 @@ def population_eyes(
 def at_some_focus(
     eyes: NDArray[np.float64], used_unit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Eyes (n, 45), of which half use a part of what their lens can do.
+    """Return eyes (n, 45), half of them accommodated to some degree.
 
-    ``used_unit`` (n,) in 0..1: relaxed up to `RELAXED_RATIO`, then evenly over the
-    lens' diameters.
+    ``used_unit`` (n,) in 0..1: relaxed up to `RELAXED_RATIO`, then evenly distributed
+    over the lens diameters.
     """
     used = np.maximum(used_unit - RELAXED_RATIO, 0.0) / (1.0 - RELAXED_RATIO)
     relaxed_mm = eyes[:, DIAMETER]
@@ -60,7 +60,7 @@ def at_some_focus(
 
 
 def population_ranges(*, is_focused: bool) -> NDArray[np.float64]:
-    """Ranges (45, 2) that such eyes keep to, accommodated ones if asked."""
+    """Return the ranges (45, 2) of such eyes, accommodated ones if requested."""
     ranges = allowed_ranges()
     if is_focused:
         ranges[DIAMETER, 0] *= SMALLEST_DIAMETER_RATIO

@@ -1,10 +1,9 @@
-"""Known properties of the published data sets, to compare with their statistics only.
+"""Known properties of the published data sets, only for comparing their statistics.
 
-What the authors' framework does differently (`lens_shape.compat_lens_shape`
-and the facts in its published sources): circles of the stop's size, another lens rule,
-two offset slots that receive other terms, a narrower range of one conic, and off the
-axis a stretch that multiplies slopes where it should divide them.  Nothing here is
-used for training.
+Differences of the authors' framework (`lens_shape.compat_lens_shape` and the facts in
+its published sources): circles of the stop's size, another lens rule, two offset slots
+that receive other terms, a narrower range of one conic, and off the axis a stretch that
+multiplies slopes where it should divide them. Nothing here is used for training.
 """
 
 from collections.abc import Sequence
@@ -42,7 +41,7 @@ def narrow_posterior_conic(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _miswired(eyes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Offset (4, 0) takes the value of (4, -2), and (4, 2) that of (2, -2)."""
+    """Give offset (4, 0) the value of (4, -2), and (4, 2) that of (2, -2)."""
     wrong = eyes.copy()
     first = OFFSET_SLICE.start - 1  # of j = 0
     wrong[:, first + 12] = eyes[:, first + 11]
@@ -77,14 +76,14 @@ def _traced(inputs: NDArray[np.float64], steps: Sequence[str]) -> FieldResults:
 def label_on_axis_as_published(
     inputs: NDArray[np.float64], steps: Sequence[str]
 ) -> NDArray[np.float64]:
-    """Coefficients (n, 27), um, of eyes whose stop is the pupil, and further steps."""
+    """Return coefficients (n, 27), um, with the published chain's ``steps``."""
     return _traced(inputs, steps).zernike_um[:, 1:]
 
 
 def label_field_as_published(
     inputs: NDArray[np.float64], steps: Sequence[str]
 ) -> NDArray[np.float64]:
-    """Coefficients and, not theirs, rims (n, 33), with `STRETCH` where asked."""
+    """Return coefficients and zero rims (n, 33), with `STRETCH` where requested."""
     found = _traced(inputs, steps)
     zernike_um = found.zernike_um
     if STRETCH in steps:
@@ -104,11 +103,11 @@ def label_field_as_published(
 def stretched(
     zernike_um: NDArray[np.float64], radius_mm: float, ellipse_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coefficients (28,) after the published stretch of the pupil to its major circle.
+    """Return coefficients (28,) after the published stretch to the major circle.
 
-    Points and rays' transverse errors are both drawn out along the minor axis, so that
-    slopes there are multiplied by the axes' ratio, where a wavefront in stretched
-    coordinates has them divided by it.
+    Both the points and the rays' transverse errors are stretched along the minor axis,
+    so that slopes there are multiplied by the ratio of the axes; a wavefront in
+    stretched coordinates has them divided by it.
     """
     if not np.all(np.isfinite(zernike_um)):
         return zernike_um
@@ -139,7 +138,7 @@ def lens_search_as_published(
 ) -> NDArray[np.float64]:
     """Bound the changes (n, 2) of the lens: 9 % of its diameter at most.
 
-    The aqueous changes in proportion, as it nearly does.
+    The aqueous changes in proportion, which is nearly correct.
     """
     lens_mm = inputs[:, column("lens_diameter_mm")]
     lowest_mm = (SMALLEST_DIAMETER_RATIO - 1.0) * lens_mm

@@ -1,4 +1,4 @@
-"""Run files: one TOML per network, everything that decides how it is trained."""
+"""Run files: one TOML per network, with all parameters of its training."""
 
 import tomllib
 from dataclasses import dataclass, field, fields
@@ -14,24 +14,24 @@ DEFAULT_FOLDER = Path("out/training")
 
 
 class RunFileError(ValueError):
-    """A run file that cannot be used; names the key and what is allowed."""
+    """An invalid run file; names the key and what is allowed."""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a network is trained.
+    """Settings of a training.
 
     Attributes
     ----------
     loss : str
-        ``standard``: mean absolute error of standardised targets; ``physical``: of um
-        or mm.  For the eye: ``parameters``, ``discriminator`` or ``tracer``.
+        ``standard``: mean absolute error of standardized targets; ``physical``: of um
+        or mm. For the eye: ``parameters``, ``discriminator`` or ``tracer``.
     n_epochs : float
-        Of the training rows; may be a fraction.
+        Epochs over the training rows; may be a fraction.
     decay_per_epoch : float
         Factor of learning rate and weight decay.
     final_ratio : float
-        Last part of the training in which both fall to zero.
+        Last part of the training, in which both fall to zero.
     validation_ratio : float
     is_mixed : bool
         bfloat16 products in the layers, on a GPU, until the final part.
@@ -40,10 +40,10 @@ class TrainingSettings:
     discriminator : str
         Checkpoint, for the eye's loss ``discriminator``.
     prior_weight : float
-        Of the mean squared deviation from the mean eye of a refraction, in deviations
-        of the prior, against an error in um: for the eye's losses by light.
+        Weight of the mean squared deviation from the mean eye of a refraction, in
+        deviations of the prior, against an error in um: for the eye's losses by light.
     start_from : str
-        Checkpoint of whose weights the network starts.
+        Checkpoint with the initial weights of the network.
     """
 
     loss: str = "standard"
@@ -63,7 +63,7 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Run:
-    """A run file that was read; see the dataclasses of its tables."""
+    """A parsed run file; see the dataclasses of its tables."""
 
     name: str
     task: str
@@ -124,7 +124,7 @@ def read_run(file: Path) -> Run:
 
 
 def default_data_folder(recipe: Recipe) -> Path:
-    """Where a data set lies of which nothing else is said."""
+    """Return the default folder of a data set."""
     kind = "_population" if recipe.population_ratio else ""
     return DEFAULT_FOLDER / "data" / (recipe.domain + kind)
 

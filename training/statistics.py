@@ -34,11 +34,11 @@ PUBLISHED = {
         ),
     },
 }
-"""Csoba & Kunkli 2023, Table 11; their frame turns some signs, see `LOG.md`."""
+"""Csoba & Kunkli 2023, Table 11; their frame flips some signs, see `LOG.md`."""
 
 
 def radial_order_columns(targets: tuple[str, ...]) -> dict[int, list[int]]:
-    """Columns of Zernike coefficients by radial order."""
+    """Return the columns of Zernike coefficients by radial order."""
     orders: dict[int, list[int]] = {}
     for column, name in enumerate(targets):
         if name.startswith("zernike_j"):
@@ -60,7 +60,7 @@ def _groups(domain: Domain) -> dict[str, list[int]]:
 def group_statistics(
     domain: Domain, targets: NDArray[np.floating]
 ) -> dict[str, tuple[float, ...]]:
-    """Statistics (in the order of `ROWS`) of each group of columns (n, n_targets)."""
+    """Return statistics (in the order of `ROWS`) of each group of columns."""
     found = {}
     for name, columns in _groups(domain).items():
         values = targets[:, columns].astype(np.float64).ravel()
@@ -73,7 +73,7 @@ def group_statistics(
 
 
 def format_statistics(domain: str, found: dict[str, tuple[float, ...]]) -> str:
-    """Render a table as text, with the published figures beside ours."""
+    """Format a table as text, with the published figures beside ours."""
     lines = [f"{'':32s}" + "".join(f"{row:>10s}" for row in ROWS)]
     published = PUBLISHED.get(domain, {})
     for group, values in found.items():

@@ -1,11 +1,11 @@
-"""The paper's Table 11: our data, the published figures, and what stands between them.
+"""The paper's Table 11: our data, the published figures, and the causes of differences.
 
     python -m training.table11 [--rows N] [--json OUT.json]
 
-Draws N eyes of Table 2 and labels them several times: as our data sets are, and with
-the known properties of the published chain put back one after the other
-(`published_chain`).  Where the last row of a group meets the paper's, those properties
-explain the difference.
+Draws N eyes of Table 2 and labels them several times: as in our data sets, and with the
+known properties of the published chain restored one after the other
+(`published_chain`). Where the last row of a group agrees with the paper's, those
+properties explain the difference.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from training.versions import commit_id
 ROWS_DRAWN = 6_000
 SEED = 132
 PUBLISHED_FOCUS_DPT = (0.125, 8.125)
-"""The published distances; ours are also behind infinity, and nearer."""
+"""The published distances; ours extend behind infinity and nearer."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def _published(name: str) -> list[Line]:
 
 
 def aberration_lines(name: str, n_rows: int) -> list[Line]:
-    """Our labels, the published chain step by step, and the paper's figures."""
+    """Return our labels, the published chain step by step, and the paper's figures."""
     inputs = draw(Recipe(name, n_rows, n_rows, SEED), 0)
     lines = _lines(name, "ours", DOMAINS[name].label(inputs))
     steps, label = (
@@ -78,7 +78,7 @@ def aberration_lines(name: str, n_rows: int) -> list[Line]:
 
 
 def focus_lines(n_rows: int) -> list[Line]:
-    """Our changes of the lens, and with the bound of the published search."""
+    """Return our lens changes, also with the bound of the published search."""
     repeats = DOMAINS["focus"].n_repeats
     n_rows = -(-n_rows // repeats) * repeats
     inputs = draw(Recipe("focus", n_rows, n_rows, SEED), 0)
@@ -95,7 +95,7 @@ def focus_lines(n_rows: int) -> list[Line]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("table11", __doc__)
     parser.add_argument("--rows", type=int, default=ROWS_DRAWN)
     parser.add_argument("--json", type=Path)

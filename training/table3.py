@@ -2,12 +2,12 @@
 
     python -m training.table3 [--width N] [--rows N] [--tasks NAME ...] [--json FILE]
 
-Trains three architectures on the inputs as they come (the paper's ablation) and the
-modified ResNet on physical features, with and without a quadratic form, for each of
-the four networks; and the eye estimator with each of its losses.  Every network has
-about the same number of weights and sees the same number of rows, of the box of the
-paper's Table 2; all are judged by ray tracing on the same fresh rows of it.  Missing
-data sets are made, what is already trained is kept.  The eye's loss needs the trained
+Trains three architectures on raw inputs (the paper's ablation) and the modified ResNet
+on physical features, with and without a quadratic form, for each of the four networks;
+and the eye estimator with each of its losses. Every network has about the same number
+of weights and sees the same number of rows, from the box of the paper's Table 2; all
+are evaluated by ray tracing on the same fresh rows of it. Missing data sets are made;
+networks that are already trained are kept. The eye's loss requires the trained
 discriminator of ``training/runs``.
 """
 
@@ -53,7 +53,7 @@ EYE_LOSSES = ("parameters", "discriminator", "tracer")
 
 
 def variants(task: str) -> list[tuple[str, ModelSettings, str, float]]:
-    """Name, model, loss and weight of the prior of every row of a task."""
+    """Return name, model, loss and weight of the prior of every row of a task."""
     if task != "eye":
         return [(name, model, "standard", 0.0) for name, model in VARIANTS.items()]
     kinds = [
@@ -76,7 +76,7 @@ def make_run(
     width: int,
     rows: int,
 ) -> Run:
-    """Return the run of one row, on rows of the paper's Table 2."""
+    """Return the run of one table row, on data of the paper's Table 2."""
     domain = TASKS[task].domain.name
     recipe = Recipe(domain, DATA_ROWS[domain])
     judge_file = read_run(RUNS / "discriminator.toml").output_folder / CHECKPOINT
@@ -106,14 +106,14 @@ def make_run(
 
 
 def trained(run: Run) -> Run:
-    """Return the run, trained where that was not done, on data made if missing.
+    """Return the run, trained if necessary, on data made if missing.
 
     Raises
     ------
     DataError
-        The folder holds data of another recipe.
+        The folder contains data of another recipe.
     RunFileError
-        The checkpoint there is of another run.
+        The checkpoint there belongs to another run.
     """
     if not (run.data_folder / MANIFEST).exists():
         generate(run.recipe, run.data_folder)
@@ -122,7 +122,7 @@ def trained(run: Run) -> Run:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("table3", __doc__)
     parser.add_argument("--width", type=int, default=WIDTH)
     parser.add_argument("--rows", type=int, default=ROWS_SEEN, help="seen in training")

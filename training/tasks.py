@@ -1,8 +1,8 @@
-"""What is sampled and what each network learns: columns, ranges, labels.
+"""Domains and tasks: the columns, ranges and labels of each network.
 
 A *domain* is a box of inputs and the ray tracing that labels them; a *task* is a
-network, which takes its columns from one domain.  Ranges are those of the paper's
-Table 2.  Labels come from the service's own tracer, on the CPU, in float64.
+network, which takes its columns from one domain. Ranges are those of the paper's
+Table 2. Labels come from the service's own tracer, on the CPU, in float64.
 """
 
 import os
@@ -35,16 +35,16 @@ COMPARED_NAMES = ZERNIKE_NAMES[2:]
 """Without tilt: the chief ray's zero slope ties it to coma."""
 
 FOCUS_RANGE_DPT = (-6.0, 16.0)
-"""The paper's is 0.125 to 8.125.  A hyperope that accommodates by less than the
+"""The paper's range is 0.125 to 8.125. A hyperope that accommodates by less than the
 refraction is focused behind infinity; a myope of -10 dpt begins at 10."""
 
 LENS_ROOM = np.array([[1.02], [0.99]])
-"""Lenses of the training are drawn a little beyond the widest and the smallest one,
-where a network's answer is cut off."""
+"""Training lenses extend a little beyond the widest and the smallest one, where a
+network's output is clipped."""
 
 MAX_COEFFICIENT_UM = 200.0
-"""Coefficients beyond it belong to eyes that form no image; the published data, too,
-end at 115 um."""
+"""Larger coefficients belong to eyes that form no image; the published data, too, end
+at 115 um."""
 
 N_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 
@@ -58,14 +58,14 @@ class Domain:
     Attributes
     ----------
     inputs, targets : tuple of str
-        Names of columns; the first 45 inputs are the eye.
+        Column names; the first 45 inputs are the eye.
     ranges : (n_inputs, 2)
     label : callable
-        Inputs (n, n_inputs) to targets (n, n_targets); a row is nan where light does
-        not pass.
+        Maps inputs (n, n_inputs) to targets (n, n_targets); a row is nan where light
+        does not pass.
     n_repeats : int
-        How many values the last input takes for each eye: 1, or the length of a
-        Cartesian product.
+        Number of values of the last input per eye: 1, or the length of a Cartesian
+        product.
     is_focused : bool
         Eyes may be accommodated.
     """
@@ -80,13 +80,13 @@ class Domain:
 
 
 def media_indices_of(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Refractive indices (n, 5), one wavelength per row."""
+    """Return refractive indices (n, 5), one wavelength per row."""
     media = [refractive_index(medium, wavelength_nm) for medium in MEDIA_INWARDS]
     return np.stack(np.broadcast_arrays(*media), axis=-1)
 
 
 def label_on_axis(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (n, 27), um, on the filled circle of the pupil."""
+    """Return coefficients (n, 27), um, on the filled circle of the pupil."""
     return _whole_circles(inputs[:, :N_EYE], inputs[:, -2], inputs[:, -1])[:, 1:]
 
 
@@ -95,7 +95,7 @@ def _whole_circles(
     pupil_mm: NDArray[np.float64],
     wavelength_nm: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Coefficients (n, 28), um; nan for an eye that only a part of the light passes."""
+    """Return coefficients (n, 28), um; nan for an eye that is partly vignetted."""
     zernike_um, status_index = on_axis_zernike(
         pack_eyes(eyes),
         media_indices_of(wavelength_nm),
@@ -107,7 +107,7 @@ def _whole_circles(
 
 
 def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (n, 27), um, of whole pupils off the axis, and their rim (n, 6)."""
+    """Return coefficients (n, 27), um, of whole off-axis pupils, and rims (n, 6)."""
     packed = pack_eyes(inputs[:, :N_EYE])
     pupil_mm, wavelength_nm, h_deg, v_deg = inputs[:, N_EYE:].T
     ratios = magnifications(packed, eye_indices(REFERENCE_WAVELENGTH_NM))
@@ -128,15 +128,16 @@ def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         ],
         axis=1,
     )
-    # A vignetted pupil has a kinked rim, which no smooth function follows.
+    # A vignetted pupil has a kinked rim, which no smooth function can fit.
     targets[~usable | (found.open_ratio < 1.0 - 1e-9)] = np.nan
     return targets
 
 
 def ellipse_matrix(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centre and symmetric matrix (n, 5): x, y, xx, xy, yy; smooth at equal axes.
+    """Return center and symmetric matrix (n, 5): x, y, xx, xy, yy.
 
-    From `wavefront.FieldResults.ellipse_mm` (n, 5): centre, semi-axes, angle (rad).
+    From `wavefront.FieldResults.ellipse_mm` (n, 5): center, semi-axes, angle (rad).
+    Unlike these, the matrix is smooth at equal axes.
     """
     x, y, major, minor, angle_rad = ellipse_mm.T
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
@@ -153,9 +154,9 @@ def ellipse_matrix(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def label_focus(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change (n, 2), mm, of lens diameter and aqueous thickness at the focus asked.
+    """Return changes (n, 2), mm, of lens diameter and aqueous thickness at each focus.
 
-    Rows of one eye and pupil must follow each other.
+    Rows of one eye and pupil must be consecutive.
     """
     eyes = inputs[:, : N_EYE + 1]
     starts = np.flatnonzero(np.r_[True, np.any(eyes[1:] != eyes[:-1], axis=1)])
@@ -175,15 +176,15 @@ def _focus_of_one(
         )
     except TraceFailed:
         return np.full((len(focuses_dpt), 2), np.nan)
-    # The network speaks of the refraction at the cornea.
+    # The network uses the refraction at the cornea.
     return eye.changes_mm(eye.accommodations_at_cornea_dpt(-focuses_dpt))
 
 
 def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Focus (dpt) of eyes with a shrunken lens, and its changes (mm): targets (n, 3).
+    """Return focus (dpt) and changes (mm) of eyes with a shrunken lens: targets (n, 3).
 
-    The other way round than `label_focus`: one trace for an answer instead of a search,
-    so that every row can be another eye.
+    The inverse of `label_focus`: it takes one trace per row instead of a search, so
+    that every row can be another eye.
     """
     eyes, pupil_mm, share = inputs[:, :N_EYE], inputs[:, N_EYE], inputs[:, -1]
     relaxed_mm = eyes[:, DIAMETER]
@@ -248,16 +249,16 @@ DOMAINS = {
 
 @dataclass(frozen=True)
 class Task:
-    """A network: columns in, columns out, and where its rows come from.
+    """A network: input columns, output columns, and the source of its rows.
 
     Attributes
     ----------
     domain : Domain
-        That it is trained on.
+        Domain of its training data.
     judged_domain : Domain
-        That its error is stated for.
+        Domain for which its error is stated.
     unit : str
-        Of that error.
+        Unit of that error.
     """
 
     name: str
@@ -279,6 +280,6 @@ TASKS = {
         ("aberration", "field", "field", "um"),
     )
 }
-"""The paper's four networks (Table 1).  The aberration estimator also says on which
-circle its coefficients are, without which they mean nothing.  The focused-eye estimator
-is trained on lenses and their focus, and judged by what a focus needs of the lens."""
+"""The paper's four networks (Table 1). The aberration estimator also returns the circle
+of its coefficients, without which they have no meaning. The focused-eye estimator is
+trained on lenses and their focus, and evaluated on the lens that a focus requires."""

@@ -3,8 +3,8 @@
     python -m training.train RUN.toml [--folder DIR]
     torchrun --nproc-per-node 2 -m training.train RUN.toml
 
-Writes ``checkpoint.pt`` and ``log.jsonl`` into the run's folder; started again, it goes
-on exactly where the last checkpoint stands.  The loop is all here, in `train`.
+Writes ``checkpoint.pt`` and ``log.jsonl`` into the run's folder; when started again, it
+resumes exactly from the last checkpoint. The whole loop is in `train`.
 """
 
 import argparse
@@ -40,7 +40,7 @@ CHECKPOINT_SECONDS = 120.0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return its exit code."""
     parser = make_parser("train", __doc__)
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--folder", type=Path, help="of the data, not the run file's")
@@ -67,14 +67,14 @@ def _loss(run: Run, device: torch.device):
 
 
 def train(run: Run, *, data_folder: Path | None = None) -> dict:
-    """Train the network of a run to the end; the last line of its log.
+    """Train the network of a run to the end; return the last entry of its log.
 
     Raises
     ------
     DataError
-        The data set is not there or not whole.
+        The data set is missing or incomplete.
     RunFileError
-        The run cannot be done as it stands.
+        The run file is invalid, or the checkpoint does not match it.
     """
     done = _finished_log(run)
     if done:
@@ -171,7 +171,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
 
 
 def _finished_log(run: Run) -> dict:
-    """Return the last entry of a run that is at its end already, or nothing."""
+    """Return the last log entry of a finished run, or an empty dict."""
     file = run.output_folder / CHECKPOINT
     if not file.exists():
         return {}
@@ -181,7 +181,7 @@ def _finished_log(run: Run) -> dict:
 
 
 def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:
-    """Put a checkpoint's state into place: step, seconds spent, loss, last entry."""
+    """Restore a checkpoint; return step, seconds spent, loss and last entry."""
     file = run.output_folder / CHECKPOINT
     if not file.exists():
         return 0, 0.0, None, {}
@@ -200,7 +200,7 @@ def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:
 
 
 def _cut_log(file: Path, step: int) -> None:
-    """Drop what was logged after the step from which a training goes on."""
+    """Drop log entries after the step from which training resumes."""
     if not file.exists():
         return
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -209,7 +209,7 @@ def _cut_log(file: Path, step: int) -> None:
 
 
 class _Whole(torch.nn.Module):
-    """Network and loss as one module, so that gradients are shared among processes."""
+    """Network and loss as one module, so that processes share gradients."""
 
     def __init__(self, network, loss_of):
         super().__init__()
@@ -220,9 +220,9 @@ class _Whole(torch.nn.Module):
 
 
 def _join() -> tuple[int, int, torch.device]:
-    """Rank, number of processes and device of this one.
+    """Return rank, number of processes and device of this process.
 
-    On the CPU where the machine has fewer GPUs than processes.
+    The device is the CPU if the machine has fewer GPUs than processes.
     """
     names = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1"}
     rank, n_ranks, local_rank, n_local = (

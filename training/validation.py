@@ -29,7 +29,7 @@ def predict(network: Network, x: torch.Tensor, device) -> NDArray[np.float64]:
 def misfit_of_eyes(
     eyes: NDArray[np.float64], measured: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Traced less measured coefficients (n, 25), um; nan where light does not pass.
+    """Return traced minus measured coefficients (n, 25), um; nan for failed rows.
 
     ``eyes`` (n, 45); ``measured`` (n, 27) is 25 coefficients, pupil and wavelength.
     """
@@ -38,7 +38,7 @@ def misfit_of_eyes(
 
 
 def errors(task: str, network: Network, x, y, device) -> NDArray[np.float64]:
-    """Errors (n, n_columns): of the outputs or, for the eye, of its traced light."""
+    """Return errors (n, n_columns) of outputs or, for the eye, of its traced light."""
     found = predict(network, x, device)
     if task == "eye":
         return misfit_of_eyes(found, x.double().numpy())
@@ -46,12 +46,12 @@ def errors(task: str, network: Network, x, y, device) -> NDArray[np.float64]:
 
 
 def error_columns(task: str) -> tuple[str, ...]:
-    """Names of the columns of `errors`."""
+    """Return the names of the columns of `errors`."""
     return COMPARED_NAMES if task == "eye" else TASKS[task].outputs
 
 
 def summary(task: str, error: NDArray[np.float64]) -> dict[str, float]:
-    """Mean absolute errors: of all, by radial order, of the rim; rows that failed."""
+    """Return mean absolute errors: total, by order, of the rim; and failed rows."""
     names = error_columns(task)
     good = np.all(np.isfinite(error), axis=1)
     size = np.abs(error[good])
@@ -66,7 +66,7 @@ def summary(task: str, error: NDArray[np.float64]) -> dict[str, float]:
 
 
 def validation_error(network: Network, run: Run, rows: Rows, device) -> dict:
-    """`summary` on the validation rows of a run."""
+    """Return the `summary` on the validation rows of a run."""
     limit = TRACED_ROWS if run.task == "eye" else VALIDATION_ROWS
     x, y = rows.validation
     if run.task == "focus":

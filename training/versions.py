@@ -1,4 +1,4 @@
-"""Which code made a file."""
+"""Version of the code that made a file."""
 
 import os
 import subprocess
@@ -6,9 +6,9 @@ from pathlib import Path
 
 
 def commit_id() -> str:
-    """Short hash of the checkout, with "+" where files differ; "none" without git.
+    """Return the checkout's short hash, with "+" if files differ; "none" without git.
 
-    Of a copy without its history OCUFILTER_COMMIT tells.
+    For a copy without history, set OCUFILTER_COMMIT.
     """
     told = os.environ.get("OCUFILTER_COMMIT")
     if told:

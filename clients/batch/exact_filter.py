@@ -1,4 +1,4 @@
-"""Pictures that depend on their frame, eye and settings, and on nothing before them."""
+"""Filter whose pictures depend on frame, eye and settings, not on previous frames."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ BUILD_LIMIT_S = 600.0
 
 
 class EngineUnusable(RuntimeError):
-    """No frame can be filtered on this machine; says what to install."""
+    """No frame can be filtered on this machine; the message says what to install."""
 
 
 class ExactFilter:
-    """Filters frames through the eyes of a job; one eye and camera is kept at a time.
+    """Filters frames through a job's eyes; keeps one eye and camera at a time.
 
-    Not the nearest camera but the very one: a store that serves a camera which differs
-    by a hair would make pictures depend on which of them came first.
+    It requires exactly the camera of the frame, not the nearest one: a cache that
+    serves a slightly different camera would make pictures depend on which of them came
+    first.
     """
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._key: tuple[str, Camera] | None = None
-        self._open: EyeFilter | None = None  # while it is, engine and builder stay
+        self._open: EyeFilter | None = None  # keeps engine and builder alive
         self._filter: EyeFilter | None = None
         self._failure: FilterError | None = None
         self.build_s = 0.0
 
     def close(self) -> None:
-        """Give up what is held."""
+        """Release the eye, the engine and the builder."""
         self._give_up_eye()
         if self._open is not None:
             self._open.close()
@@ -52,7 +53,7 @@ class ExactFilter:
         Raises
         ------
         FilterError
-            The eye cannot be prepared for this camera, or the frame not be filtered.
+            The eye cannot be prepared for this camera, or the frame cannot be filtered.
         """
         if self._key != (profile, view.camera):
             self._prepare(profile, view.camera)
@@ -81,7 +82,7 @@ class ExactFilter:
                 ready = self._filter.wait(BUILD_LIMIT_S)
                 self.build_s += ready.build_ms / 1e3
                 return
-            except WorkerCrashed as error:  # memory was short, maybe
+            except WorkerCrashed as error:  # possibly out of memory
                 self._failure = error
             except FilterError as error:
                 self._failure = error

@@ -1,4 +1,4 @@
-"""What a batch does: everything that decides its pictures, as plain values too."""
+"""Parameters that determine a batch's pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Format = Literal["png", "npy", "exr", "ffv1", "h264"]
 
 @dataclass(frozen=True)
 class Job:
-    """What decides the pictures of a batch, whoever makes them in which order.
+    """Parameters that determine the pictures, independent of workers and order.
 
     Attributes
     ----------
@@ -34,11 +34,11 @@ class Job:
     states : States
     format : one of `FORMATS`
     half : bool
-        Half floats in the place of floats.
+        Half floats instead of floats.
     engine : "native" or "gl"
     render_tolerance : float
     rate_hz : float
-        Of video outputs.
+        Frame rate of video outputs.
     """
 
     profiles: Mapping[str, Mapping[str, Any]]
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def output(self) -> Output:
-        """Return the light that files of the format hold."""
+        """Return the kind of light stored in files of the format."""
         if self.format not in LINEAR_FORMATS:
             return "srgb8"
         return "linear16" if self.half else "linear"
@@ -63,7 +63,7 @@ class Job:
         return self.format in VIDEO_FORMATS
 
     def described(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the parameters as plain values."""
         return {
             "profiles": {name: dict(body) for name, body in self.profiles.items()},
             "settings": self.settings.fields(),
@@ -82,8 +82,8 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
     Parameters
     ----------
     given : mapping
-        Fields of `FilterSettings`; the usual ranges that lack are widened to hold the
-        states.
+        Fields of `FilterSettings`; ranges that are not given are the defaults, widened
+        to include the states.
 
     Raises
     ------

@@ -3,8 +3,8 @@
     calib.txt    cam0=[f 0 cx; 0 f cy; 0 0 1], doffs (px), baseline (mm)
     disp0.pfm    disparity of the left view, px; infinity where it is unknown
 
-depth = f baseline / (disparity + doffs).  The folder is that of a scene, or one with
-those of many.
+depth = f baseline / (disparity + doffs). The folder is that of one scene, or contains
+the folders of many.
 
 References
 ----------
@@ -30,17 +30,17 @@ _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
 
 def is_middlebury(source: Path) -> bool:
-    """Return whether a folder is a scene, or holds scenes."""
+    """Return whether a folder is a scene, or contains scenes."""
     return bool(_scenes(source))
 
 
 def middlebury_frames(source: Path) -> list[SourceFrame]:
-    """Return one frame for each scene, named by its folder.
+    """Return one frame per scene, named by its folder.
 
     Raises
     ------
     InvalidFile
-        A calibration that cannot be read; names the file and what it lacks.
+        A calibration cannot be read; names the file and the missing field.
     """
     frames = []
     for folder in _scenes(source):
@@ -61,7 +61,7 @@ def _scenes(source: Path) -> list[Path]:
 
 
 def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
-    """Return the left camera of a scene, and what its disparities mean.
+    """Return the left camera of a scene, and the conversion of its disparities.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
 
 
 def _number(text: str) -> float:
-    """Return a number; NaN for other text and what no camera has."""
+    """Return a number; NaN for other text and for numbers that are too large."""
     try:
         value = float(text)
     except ValueError:

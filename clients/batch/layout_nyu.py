@@ -1,14 +1,14 @@
-"""NYU depth v2: pairs that somebody extracted, or the raw dumps of its Kinect.
+"""NYU depth v2: extracted pairs, or the raw dumps of its Kinect.
 
-    00001_colors.png, 00001_depth.png      16-bit depth in mm, registered to colour
+    00001_colors.png, 00001_depth.png      16-bit depth in mm, registered to color
     rgb_00001.jpg, sync_depth_00001.png    the same, by other names
-    r-TIME-ID.ppm, d-TIME-ID.pgm           raw: colour and depth with times of their own
+    r-TIME-ID.ppm, d-TIME-ID.pgm           raw: color and depth with separate times
 
-Raw depth is what the Kinect counted, its bytes swapped: 351.3 / (1092.5 - n) m, beyond
-10 m unknown.  It is put where the colour camera sees it by the calibration of the data
-set's toolbox; pixels that it does not reach stay missing.  The bending of the lenses is
-left in both images: some pixels in the corners.  Each colour image takes the depth
-nearest in time.  The .mat file of labelled frames is not read: extract it first.
+Raw depth is the Kinect's count n with swapped bytes: 351.3 / (1092.5 - n) m, unknown
+beyond 10 m. It is registered to the color camera with the calibration of the data
+set's toolbox; pixels that it does not reach are missing. Lens distortion is left in
+both images: some pixels in the corners. Each color image is paired with the depth
+nearest in time. The .mat file of labeled frames is not supported: extract it first.
 
 References
 ----------
@@ -50,8 +50,8 @@ TO_COLOR = np.linalg.inv(
         ]
     )
 )
-"""Of directions from the depth camera's frame to the colour camera's; it turns both
-round, which the projection does not see."""
+"""Maps directions from the depth camera's frame to the color camera's; it also reverses
+them, which the projection cancels."""
 SHIFT_M = np.array(
     [2.5031875059141302e-02, -2.9342312935846411e-04, 6.6238747008330102e-04]
 )
@@ -64,10 +64,10 @@ _EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
 
 @dataclass(frozen=True)
 class KinectCounts:
-    """What the Kinect counted, seen by its depth camera."""
+    """Raw counts of the Kinect, in the view of its depth camera."""
 
     def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth that the colour camera sees, m; 0 where it is unknown."""
+        """Return the depth in the color camera's view, m; 0 where unknown."""
         stored = read_depth(path, depth_scale=1.0, option="")
         width_px, height_px = COLOR_CAMERA.size_px or (0, 0)
         if stored.shape != (height_px, width_px):
@@ -78,19 +78,19 @@ class KinectCounts:
         return self.of_integers(stored.astype(np.uint16))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return it for the numbers of a file as they are read, bytes still swapped."""
+        """Return the depth for the numbers as stored, with bytes still swapped."""
         return registered_m(counted_depth_m(stored.byteswap()))
 
 
 def counted_depth_m(counts: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Return the depth that the depth camera counted, m; 0 where it is unknown."""
+    """Return the depth for counts of the depth camera, m; 0 where unknown."""
     left = COUNT_AT_INFINITY - counts.astype(np.float64)
-    depth_m = COUNT_SCALE_M / left  # never 0: the constant is no integer
+    depth_m = COUNT_SCALE_M / left  # never 0: the constant is not an integer
     return np.where((left > 0.0) & (depth_m <= MAX_DEPTH_M), depth_m, 0.0)
 
 
 def registered_m(depth_m: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return depth as the colour camera sees it; of two points the nearer one."""
+    """Return depth in the color camera's view; of two points the nearer one."""
     y, x = np.nonzero(depth_m > 0.0)
     known_m = depth_m[y, x]
     camera = DEPTH_CAMERA
@@ -121,7 +121,7 @@ def is_nyu(source: Path) -> bool:
 
 
 def nyu_frames(source: Path) -> list[SourceFrame]:
-    """Return the frames of a folder, those of raw dumps named by their times."""
+    """Return the frames of a folder; those of raw dumps are named by their times."""
     times: dict[str, dict[float, Path]] = {"r": {}, "d": {}}
     for path in sorted(source.iterdir()):
         if match := _RAW.match(path.name):

@@ -1,8 +1,8 @@
-"""Folders of colour and depth images that belong together by their names.
+"""Folders of color and depth images, paired by their names.
 
-color/0001.png      depth/0001.exr       any names of folders below
-0001_color.png      0001_depth.npy       beside each other, with a word
-0001.jpg            0001.npy             or told apart by what they are
+color/0001.png      depth/0001.exr       any of the known subfolder names
+0001_color.png      0001_depth.npy       in one folder, with a word in the name
+0001.jpg            0001.npy             or distinguished by file type
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _COLOR_WORD, _DEPTH_WORD = _at_an_end(COLOR_WORDS), _at_an_end(DEPTH_WORDS)
 def pair_frames(
     source: Path, depth: Path | None, optics: Optics, scaled: Scaled
 ) -> list[SourceFrame]:
-    """Return the pairs of a folder, or of it and a folder of depth.
+    """Return the pairs in a folder, or in it and a folder of depth.
 
-    A file without a partner is a frame with a fault.
+    A file without a partner becomes a frame with a fault.
 
     Raises
     ------
     ValueError
-        Which files are depth cannot be told, or two have the same name.
+        Depth files cannot be identified, or two files have the same name.
     """
     colors, depths = _colors_and_depths(source, depth)
     frames = []
@@ -75,7 +75,7 @@ def _colors_and_depths(
     files = images_in(source, (*COLOR_SUFFIXES, *DEPTH_SUFFIXES))
     depths = [path for path in files if _DEPTH_WORD.search(path.stem.lower())]
     colors = [path for path in files if path not in set(depths)]
-    if not depths:  # told apart by what they are
+    if not depths:  # distinguished by file type
         depths = [path for path in files if path.suffix.lower() not in _PICTURES]
         colors = [path for path in files if path.suffix.lower() in _PICTURES]
         if len(depths) != len(colors):
@@ -90,7 +90,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Return the files of a folder with these endings, by name."""
+    """Return the files of a folder with these suffixes, by name."""
     return sorted(
         path
         for path in folder.iterdir()
@@ -103,7 +103,7 @@ def _sub_folder(source: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _named(paths: list[Path], word: re.Pattern) -> dict[str, Path]:
-    """Return files by their names without the word that says what they are."""
+    """Return files by name, without the word for color or depth."""
     found: dict[str, Path] = {}
     for path in paths:
         match = word.search(path.stem.lower())

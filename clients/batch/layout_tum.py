@@ -1,12 +1,12 @@
-"""TUM RGB-D: colour and depth of a Kinect, each with a time, one list of each.
+"""TUM RGB-D: color and depth of a Kinect with separate times, each with a list.
 
     rgb.txt, depth.txt        lines "time path"; "#" begins a comment
-    associations.txt          instead, lines "time path time path", if it is there
+    associations.txt          used instead if present, lines "time path time path"
 
-Depth is 16-bit PNG, 5000 units a metre, 0 where there is none.  Colour and depth belong
-together where their times are nearest, within 20 ms, each used once, as in the data
-set's own `associate.py`.  Depth is registered to colour by the recorder; the data set's
-authors recommend the camera of the driver for it: 525 px, centre (319.5, 239.5).
+Depth is 16-bit PNG, 5000 units per meter, 0 where missing. Color and depth are paired
+by nearest time, within 20 ms, each used once, as in the data set's own
+`associate.py`. The recorder registers depth to color; the data set's authors recommend
+the driver's camera for it: 525 px, center (319.5, 239.5).
 
 References
 ----------
@@ -26,10 +26,10 @@ DEPTH_SCALE_M = 1.0 / 5000.0
 CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
 MAX_APART_S = 0.02
 MAX_LINES = 100_000
-"""Of a list: an hour at 30 Hz.  20 us each."""
+"""Of a list: an hour at 30 Hz. 20 us each."""
 
 MAX_NEAR = 50
-"""Images of depth that are compared to each side: a camera of 30 Hz has one."""
+"""Depth images compared on each side: a camera of 30 Hz has one."""
 
 ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
 
@@ -42,12 +42,12 @@ def is_tum(source: Path) -> bool:
 
 
 def tum_frames(source: Path) -> list[SourceFrame]:
-    """Return the frames of a sequence, named by the time of their colour.
+    """Return the frames of a sequence, named by the time of their color image.
 
     Raises
     ------
     InvalidFile
-        A list that cannot be read; names its line.
+        A list cannot be read; names its line.
     """
     lists = next((source / n for n in ASSOCIATIONS if (source / n).is_file()), None)
     pairs = _associated(source) if lists is None else _listed(lists)
@@ -64,7 +64,7 @@ def tum_frames(source: Path) -> list[SourceFrame]:
 
 
 def _listed(path: Path) -> list[tuple[str, str]]:
-    """Colour and depth of each line, whichever of them comes first."""
+    """Return color and depth of each line, in whichever order they are."""
     pairs: list[tuple[str, str]] = []
     seen: set[str] = set()
     for number, fields in _lines(path, 4):
@@ -98,7 +98,7 @@ def _associated(source: Path) -> list[tuple[str, str]]:
 
 
 def _near(times_s: list[float], at_s: float) -> list[float]:
-    """Return those of ascending times that are near; of a crowd the nearest ones."""
+    """Return the ascending times that are near; if there are many, the nearest."""
     first = bisect_left(times_s, at_s - MAX_APART_S)
     end = bisect_right(times_s, at_s + MAX_APART_S)
     middle = bisect_left(times_s, at_s)

@@ -1,4 +1,4 @@
-"""A video of colour, with depth as a video of 16-bit grey or a folder of images."""
+"""A color video, with depth as a 16-bit gray video or a folder of images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def video_frames(
     Raises
     ------
     ValueError
-        No depth, or not one for each frame; a video that cannot be read.
+        No depth, or not one for each frame; or a video that cannot be read.
     """
     from clients.batch.video_reading import frame_count
 

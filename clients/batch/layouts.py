@@ -1,10 +1,10 @@
-"""Which layout a data set has, and the frames in it.
+"""Detection of a data set's layout, and its frames.
 
-pairs       folders of colour and of depth, or one folder with both
+pairs       folders of color and of depth, or one folder with both
 tum         TUM RGB-D: rgb/, depth/ and their lists
 nyu         NYU depth v2: extracted pairs, or raw dumps
 middlebury  im0.png, disp0.pfm and calib.txt, of one scene or many
-video       a video of colour, with a video or a folder of depth
+video       a color video, with a video or a folder of depth
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from filter_service.camera import read_intrinsics
 
 @dataclass(frozen=True)
 class Told:
-    """What the command line says of a data set, beyond what is in it.
+    """Options of the command line that complement or override the data set.
 
     Attributes
     ----------
     depth : Path, optional
-        Folder or video of depth, where it is not found beside the colour.
+        Folder or video of depth, if it is not beside the color.
     optics : Optics, optional
-        Instead of the layout's own.
+        Overrides the layout's camera.
     depth_scale_m : float, optional
-        Metres per unit of the depth files, instead of the layout's own.
+        Meters per unit of the depth files; overrides the layout's scale.
     """
 
     depth: Path | None = None
@@ -63,7 +63,7 @@ def list_frames(source: Path, layout: str, told: Told) -> tuple[str, list[Source
     Raises
     ------
     ValueError
-        No such folder or file, no frames in it, or no camera known.
+        No such folder or file, no frames in it, or no known camera.
     """
     if not source.exists():
         raise ValueError(f"'{source}': no such file; allowed: a folder or a video")
@@ -119,7 +119,7 @@ def _scaled(told: Told) -> Scaled:
 
 
 def _as_told(frame: SourceFrame, told: Told) -> SourceFrame:
-    """Return a frame with what the command line says in place of its layout's own."""
+    """Return a frame with the overrides of the command line."""
     if told.optics is not None:
         frame = replace(frame, optics=told.optics)
     if told.depth_scale_m is not None:
@@ -142,12 +142,12 @@ def _check_names(frames: Sequence[SourceFrame]) -> None:
 
 
 def optics_of(fov_deg: float | None, intrinsics: str | None) -> Optics | None:
-    """Return the camera that the command line tells of, if it does.
+    """Return the camera given on the command line, or None.
 
     Raises
     ------
     ValueError
-        Both, or numbers that no camera has; names the option.
+        Both are given, or the numbers are not those of a camera; names the option.
     """
     if fov_deg is not None and intrinsics is not None:
         raise ValueError("--fov-deg and --intrinsics: allowed is one of them")

@@ -1,11 +1,11 @@
-"""What a batch did: a line for each frame while it runs, a summary when it is done.
+"""Record of a batch: a line per frame while it runs, and a summary at the end.
 
     manifest.jsonl   the job; then a line for each frame, and again where it was redone:
                      the last one counts
     manifest.json    the job, counts, failures and notes
 
-Lines are appended whole by one process; one that a power cut left unfinished is cut
-off.  A frame without a line is done again, whatever files of it there are.
+Lines are appended whole by one process; a line left unfinished by a power failure is
+cut off. A frame without a line is redone, whatever files of it exist.
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ LINES, SUMMARY = "manifest.jsonl", "manifest.json"
 RESTART = "the same, another folder, or --overwrite"
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
-"""Of a line: a job with states of 200,000 frames, as many as are read, takes half."""
+"""Of a line: a job with states of 200,000 frames, the maximum, takes half of it."""
 
 Notes = dict[str, dict[str, Any]]
 
 SYNC_S = 2.0
-"""So much work may a power cut undo."""
+"""A power failure undoes at most this much work."""
 
 
 class ManifestDiffers(InvalidFile):
-    """The folder holds the results of another job."""
+    """The folder contains the results of another job."""
 
 
 class Manifest:
-    """The lines of an output folder, read and appended to.
+    """The manifest of an output folder, read and appended to.
 
     Parameters
     ----------
     out : Path
-        A folder that is there.
+        An existing folder.
     job : mapping
-        What decides the pictures, as plain values.
+        Parameters that determine the pictures, as plain values.
 
     Raises
     ------
     ManifestDiffers
         The folder's manifest is of another job; names what differs.
     ValueError
-        It is none.
+        The file is not a manifest.
     """
 
     def __init__(self, out: Path, job: Mapping[str, Any]) -> None:
         self._out = out
         self._path = out / LINES
-        self._places: dict[tuple[str, str], int] = {}  # of lines, in bytes
+        self._places: dict[tuple[str, str], int] = {}  # byte offsets of lines
         self._synced_s = time.monotonic()
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
@@ -104,14 +104,14 @@ class Manifest:
             self._write({"kind": "job", "fingerprint": fingerprint(job), **job})
 
     def append(self, record: Record) -> None:
-        """Add a line for a frame."""
+        """Append a line for a frame."""
         self._places[record["profile"], record["frame"]] = self._write(record)
 
     def _write(self, record: Record) -> int:
         place = os.lseek(self._file, 0, os.SEEK_END)
         line = json.dumps(record, allow_nan=False).encode() + b"\n"
         written = os.write(self._file, line)
-        if written != len(line):  # a full disk: no half line stays
+        if written != len(line):  # disk full: remove the partial line
             os.ftruncate(self._file, place)
             raise OSError(
                 f"'{self._path}': {written} of {len(line)} bytes were written"
@@ -123,7 +123,7 @@ class Manifest:
         return place
 
     def record(self, profile: str, frame: str) -> Record | None:
-        """Return the last line of a frame; None where there is none."""
+        """Return the last line of a frame, or None."""
         place = self._places.get((profile, frame))
         return None if place is None else self._at(place)
 
@@ -140,7 +140,7 @@ class Manifest:
             yield self._at(self._places[key])
 
     def is_done(self, profile: str, frame: str, files: tuple[Path, ...]) -> bool:
-        """Return whether a frame has its picture, made from files as they are now."""
+        """Return whether a frame's picture exists and its input files are unchanged."""
         record = self.record(profile, frame)
         if record is None or not record["ok"]:
             return False
@@ -154,7 +154,7 @@ class Manifest:
 
 
 def records_of(path: Path) -> Iterator[Record]:
-    """Yield the lines of a manifest that can be read."""
+    """Yield the readable lines of a manifest."""
     with path.open("rb") as file:
         while line := file.readline(MAX_LINE_BYTES + 1):
             try:
@@ -164,7 +164,7 @@ def records_of(path: Path) -> Iterator[Record]:
 
 
 def below(folder: Path, name: object) -> Path | None:
-    """Return a file of a folder by a name that a manifest tells; None outside of it."""
+    """Return the path of a manifest's file name; None if it is outside the folder."""
     if not isinstance(name, str) or not name or "\0" in name:
         return None
     inner = Path(name)
@@ -204,7 +204,7 @@ _INPUT_FIELDS = {"bytes": int, "mtime_ns": int, "sha256": str}
 
 
 def _check_frame(record: Record, path: Path) -> None:
-    """Refuse a line of a frame that lacks what is read of it."""
+    """Reject a frame's line that lacks a required field."""
     wanted = _FRAME_FIELDS | (_DONE_FIELDS if record.get("ok") else {"error": str})
     wrong = [k for k, kind in wanted.items() if not isinstance(record.get(k), kind)]
     if not wrong and record["ok"]:
@@ -236,7 +236,7 @@ def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
 
 
 def _first_difference(name: str, before: Any, now: Any) -> tuple:
-    """Go down to the field that differs."""
+    """Descend to the field that differs."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in sorted({*before, *now}):
             if before.get(key) != now.get(key):
@@ -251,7 +251,7 @@ def _short(value: Any) -> str:
 
 
 def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
-    """Write the summary, whole."""
+    """Write the summary atomically."""
     text = json.dumps(summary, indent=1, allow_nan=False) + "\n"
 
     def write(path: Path) -> None:
@@ -261,7 +261,7 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 
 
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
-    """Return counts, failures and notes of the frames that are wanted."""
+    """Return counts, failures and notes of the requested frames."""
     n_done, failures = Counter[str](), []
     notes: Notes = {}
     pixels = Counter[str]()
@@ -284,12 +284,12 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
 
 
 def add_notes(notes: Notes, of_frame: Sequence[str]) -> None:
-    """Count the notes of a frame; those alike but for their numbers are one."""
+    """Count the notes of a frame; notes that differ only in numbers count as one."""
     for note in of_frame:
         kind = _NUMBER.sub("#", note)
         notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
 
 
 def note_line(note: Mapping[str, Any]) -> str:
-    """Return a note of some frames as a person reads it."""
+    """Format a note and the number of its frames."""
     return f"{note['frames']} frames, as: {note['example']}"

@@ -1,4 +1,4 @@
-"""What `ocufilter batch` is told: its command line, read and checked."""
+"""Command line of `ocufilter batch`, parsed and checked."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _NAME = re.compile(r"[^\w.+-]+")
 
 
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the command line."""
+    """Return the parsed command line."""
     parser = argparse.ArgumentParser(
         prog="ocufilter batch",
         description=DESCRIPTION,
@@ -181,7 +181,7 @@ def _add_machines(group) -> None:
 
 
 def batch_of(options: argparse.Namespace) -> Batch:
-    """Return the batch that the command line tells of.
+    """Return the batch that the command line describes.
 
     Raises
     ------
@@ -211,10 +211,10 @@ def batch_of(options: argparse.Namespace) -> Batch:
 
 
 def workers_and_threads(options: argparse.Namespace) -> tuple[int, int]:
-    """Return how many processes, and how many threads each.
+    """Return the number of processes, and of threads in each.
 
-    A process for each core: it does more frames than one process with as many threads
-    (`ocufilter bench batch`), for all of a frame's work runs beside that of others.
+    One process per core filters more frames than one process with as many threads
+    (`ocufilter bench batch`), because all of a frame's work runs beside that of others.
     """
     n_cores = thread_count()
     n_workers = options.workers or (1 if options.engine == "gl" else n_cores)
@@ -273,7 +273,7 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     Raises
     ------
     ValueError
-        A profile that is wrong, or two of one name.
+        A profile is invalid, or two have the same name.
     """
     found: dict[str, dict[str, Any]] = {}
     for text in texts:

@@ -1,4 +1,4 @@
-"""Workers on this machine, a process each; one that dies is replaced."""
+"""Worker processes on this machine; one that dies is replaced."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from clients.batch.work import Record, Unit, failed_records
 
 THREADS_VARIABLE = "OCUFILTER_THREADS"
 MAX_DEATHS = 2
-"""Processes that die at the same frame: by then it is the frame."""
+"""Worker deaths at the same frame, after which the frame is considered the cause."""
 
 END_LIMIT_S = 5.0
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the pipe to it, and what it is at."""
+    """A worker process, its pipe, and its current work."""
 
     process: subprocess.Popen[bytes]
     pipe: Connection
@@ -35,7 +35,7 @@ class _Worker:
 
 
 class ProcessPool:
-    """Runs units on processes, each with so many threads of the engine."""
+    """Runs units in processes, each with a given number of engine threads."""
 
     def __init__(self, job: Job, out: Path, *, n_workers: int, n_threads: int) -> None:
         self._setup = job, out
@@ -44,7 +44,7 @@ class ProcessPool:
         self._deaths: Counter[tuple[str, str]] = Counter()
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as frames are done, in no order.
+        """Yield the records of units as frames are done, in any order.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class ProcessPool:
             self.close()
 
     def close(self) -> None:
-        """End the workers: between two frames, or by force after some seconds."""
+        """Stop the workers between two frames, or kill them after some seconds."""
         for worker in self._workers:
             worker.pipe.close()
         for worker in self._workers:
@@ -85,7 +85,7 @@ class ProcessPool:
             worker.unit, worker.pending = unit, [frame.name for frame in unit.frames]
             try:
                 worker.pipe.send(unit)
-            except OSError:  # it died meanwhile: reading from it says so
+            except OSError:  # it died meanwhile: the next read reports it
                 return
 
     def _start(self) -> _Worker:
@@ -94,7 +94,7 @@ class ProcessPool:
             [sys.executable, "-P", "-m", "clients.batch.worker", str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for us, and we end them
+            start_new_session=True,  # Ctrl-C reaches only us, and we stop them
             env={
                 **os.environ,
                 THREADS_VARIABLE: str(self._n_threads),
@@ -122,7 +122,7 @@ class ProcessPool:
             worker.unit, worker.pending = None, []
 
     def _after_death(self, worker: _Worker, waiting: deque[Unit]) -> Iterator[Record]:
-        """Have the rest of a unit done again; give up the frame that kills workers."""
+        """Queue the rest of a unit again; fail a frame that keeps killing workers."""
         worker.pipe.close()
         how = _how_it_ended(worker.process.wait())
         self._workers.remove(worker)
@@ -132,7 +132,7 @@ class ProcessPool:
         key = unit.profile, pending[0]
         self._deaths[key] += 1
         if self._deaths[key] >= MAX_DEATHS:
-            # a segment is whole or not: all of its frames
+            # a segment fails with all of its frames
             names = pending if unit.segment is not None else pending[:1]
             reason = f"the process that filtered it {how}, {MAX_DEATHS} times"
             yield from failed_records(unit, names, reason)

@@ -1,4 +1,4 @@
-"""Workers on many machines, by Ray; they share the folders of input and output."""
+"""Workers on many machines with Ray; input and output folders are shared."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ LOCAL = "local"
 
 @ray.remote
 class _RayWorker:
-    """A process of Ray that runs units."""
+    """A Ray process that runs units."""
 
     def __init__(self, job: Job, out: Path) -> None:
         self._runner = UnitRunner(job, out)
 
     def run(self, unit: Unit) -> list[Record]:
-        """Return the records of a unit; the files are there by then."""
+        """Run a unit, write its files and return its records."""
         return list(self._runner.run(unit))
 
 
@@ -36,11 +36,11 @@ class RayPool:
     Parameters
     ----------
     address : str
-        Of the cluster: ``auto``, as Ray knows it, or ``local`` for one of its own here.
+        Cluster address: ``auto`` for Ray's default, or ``local`` for a new one here.
     n_workers : int, optional
-        Actors; None: as many as the cluster has cores for.
+        Number of actors; None: as many as the cluster has cores for.
     n_threads : int
-        Of each, and cores that it asks for.
+        Threads of each actor, and cores that it requests.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class RayPool:
         self._n_threads = n_threads
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as units are done, in no order."""
+        """Yield the records of units as units are done, in any order."""
         if not units:
             return
         started = not ray.is_initialized()
@@ -69,7 +69,7 @@ class RayPool:
                 log_to_driver=False,
             )
         try:
-            with redirect_stdout(sys.stderr):  # where Ray tells of workers that died
+            with redirect_stdout(sys.stderr):  # Ray prints messages about dead workers
                 yield from self._run(deque((unit, 0) for unit in units))
         finally:
             if started:

@@ -1,4 +1,4 @@
-"""From a list of frames to a folder of pictures: what is missing is done, and told."""
+"""Run a batch: process the missing frames and report on them."""
 
 from __future__ import annotations
 
@@ -28,11 +28,12 @@ from clients.batch.work import Record, Unit
 from estimator import InvalidFile
 
 UNIT_FRAMES = 16
-"""That a worker is given at once: few enough for all to end together, and enough that
-handing out takes no time."""
+"""Frames given to a worker at once: few enough that all workers finish together, and
+enough that distribution takes no time."""
 
 SEGMENT_FRAMES = 48
-"""Of a video; it decides its bytes, so it does not go by the number of workers."""
+"""Frames of a video segment; independent of the number of workers, as it determines the
+video's bytes."""
 
 SEGMENTS = ".segments"
 VIDEO_SUFFIXES = (".mkv", ".mp4")
@@ -40,7 +41,7 @@ LOCK = ".lock"
 
 
 class Pool(Protocol):
-    """What runs units."""
+    """Interface of a pool that runs units."""
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
         """Yield the records of units as frames are done, in any order."""
@@ -48,7 +49,7 @@ class Pool(Protocol):
 
 @dataclass(frozen=True)
 class Batch:
-    """Frames to be filtered, and where to.
+    """Frames to filter, and the output folder.
 
     Attributes
     ----------
@@ -67,7 +68,7 @@ class Batch:
     out: Path
 
     def described(self) -> dict[str, Any]:
-        """Return what decides the pictures, as plain values."""
+        """Return the parameters that determine the pictures, as plain values."""
         return {
             "made_by": code_version(),
             "source": {
@@ -79,7 +80,7 @@ class Batch:
         }
 
     def _videos(self) -> dict[str, str]:
-        """Hashes of the videos that frames come from."""
+        """Return the hashes of the source videos."""
         paths = {
             path
             for frame in self.frames
@@ -90,12 +91,12 @@ class Batch:
 
 
 def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
-    """Make the output folder, or see that it is one of a batch.
+    """Create the output folder, or check that it belongs to a batch.
 
     Raises
     ------
     ValueError
-        It holds other things.
+        It contains other files.
     """
     out = batch.out
     out.mkdir(parents=True, exist_ok=True)
@@ -111,7 +112,7 @@ def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
 
 
 def _remove_results(batch: Batch) -> None:
-    """Remove what an earlier batch made, by its manifest."""
+    """Remove the results of an earlier batch, as listed in its manifest."""
     for record in records_of(batch.out / LINES):
         names = [record.get("file")]
         profiles = record.get("profiles", ())
@@ -128,12 +129,12 @@ def _remove_results(batch: Batch) -> None:
 
 @contextmanager
 def only_one(out: Path) -> Iterator[None]:
-    """Keep a second batch out of a folder.
+    """Lock a folder against a second batch.
 
     Raises
     ------
     ValueError
-        There is one at work.
+        Another batch is running there.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     try:
@@ -150,7 +151,7 @@ def only_one(out: Path) -> Iterator[None]:
 
 
 def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
-    """Return what is to be done, profile by profile."""
+    """Return the missing work, profile by profile."""
     units: list[Unit] = []
     for profile in batch.job.profiles:
         for segment, frames in _parts(batch, profile):
@@ -160,7 +161,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
                 if not manifest.is_done(profile, frame.name, frame.files)
             ]
             if missing and segment is not None:
-                missing = list(frames)  # whole, or not at all
+                missing = list(frames)  # segments are redone completely
             step = SEGMENT_FRAMES if segment is not None else UNIT_FRAMES
             for start in range(0, len(missing), step):
                 some = tuple(missing[start : start + step])
@@ -171,7 +172,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
 def _parts(
     batch: Batch, profile: str
 ) -> list[tuple[Path | None, Sequence[SourceFrame]]]:
-    """Return the frames of a profile, of a video in its segments."""
+    """Return the frames of a profile, grouped into segments for a video."""
     if not batch.job.is_video:
         return [(None, batch.frames)]
     return [
@@ -190,12 +191,12 @@ def run_batch(
     *,
     on_done: Callable[[int, int], None] = lambda n_done, n_all: None,
 ) -> dict[str, Any]:
-    """Do what is missing; return the summary that is written beside the pictures.
+    """Process the missing frames; return the summary, which is also written.
 
     Parameters
     ----------
     on_done : callable
-        Told how many frames there are, and of how many.
+        Called with the number of finished frames and the total.
     """
     remove_parts(batch.out)
     started_s = time.monotonic()
@@ -205,7 +206,7 @@ def run_batch(
     n_done = len(wanted) - n_missing
     on_done(n_done, len(wanted))
     for profile in {unit.profile for unit in units}:
-        video_of(batch, profile).unlink(missing_ok=True)  # it is to be another
+        video_of(batch, profile).unlink(missing_ok=True)  # it will be rewritten
     cpu_s, n_failed = 0.0, 0
     for record in pool.run(units):
         manifest.append(record)
@@ -213,7 +214,7 @@ def run_batch(
         cpu_s += record.get("cpu_ms", 0.0) / 1e3
         n_done += 1
         on_done(n_done, len(wanted))
-    remove_parts(batch.out)  # of workers that were killed on the way
+    remove_parts(batch.out)  # left by workers that were killed
     if batch.job.is_video:
         _join_videos(batch, manifest)
     took_s = time.monotonic() - started_s
@@ -232,15 +233,15 @@ def run_batch(
 
 
 def video_of(batch: Batch, profile: str) -> Path:
-    """Return where the video of a profile is."""
+    """Return the path of a profile's video."""
     suffix = ".mp4" if batch.job.format == "h264" else ".mkv"
     return batch.out / f"{profile}{suffix}"
 
 
 def _join_videos(batch: Batch, manifest: Manifest) -> None:
-    """Put each profile's segments together, where its video is not there.
+    """Join the segments of each profile whose video is missing.
 
-    They are kept: what was bad and is mended needs only its own segment again.
+    Segments are kept: after a bad frame is fixed, only its segment is redone.
     """
     from clients.batch.video_writing import VIDEO_KINDS, join_segments
 

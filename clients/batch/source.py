@@ -1,6 +1,6 @@
-"""What one frame of a data set is: where its files are, and how they are to be read.
+"""One frame of a data set: its files, camera and depth format.
 
-Layouts list such frames; nothing is read before a worker needs it.
+Layouts list frames; nothing is read before a worker needs it.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ Tangents = tuple[float, float, float, float]
 
 
 class Optics(Protocol):
-    """What is known of the camera."""
+    """Interface of a camera model."""
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return those to the left, right, upper and lower edge of an image."""
+        """Return the tangents to the left, right, upper and lower edge of an image."""
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """A symmetric camera with square pixels, by its vertical field of view."""
+    """A symmetric camera with square pixels, given by its vertical field of view."""
 
     fov_deg: float
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return those to the edges."""
+        """Return the tangents to the edges."""
         return tangents_from_fov(self.fov_deg, width_px, height_px)
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A calibrated camera; pixel (0, 0) has its centre at (0, 0).
+    """A calibrated camera; the center of pixel (0, 0) is at (0, 0).
 
-    Where the size of its images is known, others are refused.
+    If the size of its images is known, other sizes are rejected.
     """
 
     focal_x_px: float
@@ -51,12 +51,12 @@ class Pinhole:
     size_px: tuple[int, int] | None = None
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return those to the edges, half a pixel beyond the last centres.
+        """Return the tangents to the edges, half a pixel beyond the outermost centers.
 
         Raises
         ------
         ValueError
-            The camera is that of images of another size.
+            The camera is for images of another size.
         """
         if self.size_px not in (None, (width_px, height_px)):
             raise ValueError(
@@ -75,18 +75,18 @@ class Pinhole:
 
 
 class DepthForm(Protocol):
-    """What the numbers of a depth file mean."""
+    """Interface of a depth format."""
 
     def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth in a file, m; 0, negative and NaN are missing."""
+        """Return the depth in a file, m; 0, negative and NaN mean missing."""
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a frame of a video, m."""
+        """Return the depth in a video frame, m."""
 
 
 @dataclass(frozen=True)
 class Scaled:
-    """Multiples of a unit: without a scale mm for integers, m for floats."""
+    """Multiples of a unit; without a scale, integers are in mm and floats in m."""
 
     depth_scale_m: float | None = None
 
@@ -95,7 +95,7 @@ class Scaled:
         return read_depth(path, depth_scale=self.depth_scale_m, option="")
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a frame of a video, m."""
+        """Return the depth in a video frame, m."""
         scale_m = self.depth_scale_m or METRES_PER_INTEGER_STEP
         with np.errstate(over="ignore"):
             return (stored * np.float64(scale_m)).astype(np.float32)
@@ -103,9 +103,9 @@ class Scaled:
 
 @dataclass(frozen=True)
 class Disparity:
-    """Disparities of a stereo pair in px, of which infinity is unknown.
+    """Disparities of a stereo pair in px; infinity means unknown.
 
-    depth = focal length x baseline / (disparity + offset), as Middlebury has it.
+    depth = focal length x baseline / (disparity + offset), as in Middlebury.
     """
 
     focal_px: float
@@ -117,14 +117,14 @@ class Disparity:
         return self._depth_m(read_depth(path, depth_scale=1.0, option=""))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a frame of a video, m."""
+        """Return the depth in a video frame, m."""
         return self._depth_m(stored.astype(np.float32))
 
     def _depth_m(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
         apart_px = disparity_px.astype(np.float64) + self.offset_px
         known = np.isfinite(apart_px) & (apart_px > 0.0)
         depth_m = np.zeros(disparity_px.shape)
-        with np.errstate(over="ignore"):  # what float32 cannot hold is infinitely far
+        with np.errstate(over="ignore"):  # values beyond float32 become infinity
             depth_m[known] = self.focal_px * self.baseline_m / apart_px[known]
             return depth_m.astype(np.float32)
 
@@ -136,15 +136,15 @@ class SourceFrame:
     Attributes
     ----------
     name : str
-        What it is called in the results: unique, a relative path without a suffix.
+        Its name in the results: unique, a relative path without a suffix.
     color, depth : Path
         Files of one image, or videos.
     optics, depth_form
-        How they are to be understood.
+        Camera and depth format.
     color_index, depth_index : int, optional
-        Numbers of the frame in videos.
+        Frame numbers in videos.
     fault : str, optional
-        Why it cannot be used, where that is known before it is read.
+        Why it cannot be used, if that is known before it is read.
     """
 
     name: str
@@ -158,19 +158,19 @@ class SourceFrame:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Return the images that it is read from, without videos."""
+        """Return its image files, without videos."""
         parts = ((self.color, self.color_index), (self.depth, self.depth_index))
         return tuple(path for path, index in parts if index is None)
 
 
 class BadFrame(ValueError):
-    """A frame that cannot be used: the error names its file."""
+    """A frame that cannot be used; the message names its file."""
 
 
 def check_sizes(
     frame: SourceFrame, color: NDArray, depth_m: NDArray[np.float32]
 ) -> None:
-    """Refuse colour and depth of different sizes.
+    """Reject color and depth of different sizes.
 
     Raises
     ------
@@ -184,10 +184,10 @@ def check_sizes(
 
 
 def center_depth_m(depth_m: NDArray[np.float32]) -> float:
-    """Return the median depth of what the middle of an image shows.
+    """Return the median depth at the center of an image.
 
-    The middle is a tenth of the image's sides; where no depth is known in it, twice
-    and again twice as much; infinity where there is none at all.
+    The center covers a tenth of the image's sides; if it has no known depth, twice and
+    again twice as much; infinity if there is none at all.
     """
     height_px, width_px = depth_m.shape
     for part in (0.1, 0.2, 0.4, 0.8, 1.0):
@@ -200,6 +200,6 @@ def center_depth_m(depth_m: NDArray[np.float32]) -> float:
         ]
         known_m = middle_m[middle_m > 0.0]
         if known_m.size:
-            # the lower of the two in the middle: never between a wall and the sky
+            # the lower of two medians: never between a wall and the sky
             return float(np.sort(known_m, axis=None)[(known_m.size - 1) // 2])
     return math.inf

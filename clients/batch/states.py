@@ -1,4 +1,4 @@
-"""Pupil and focus of each frame: fixed, from a list, or by what the frame shows."""
+"""Pupil and focus of each frame: fixed, from a list, or from the frame's depth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
 
 CENTER = "center"
 CENTER_RANGE_DPT = (0.0, 10.0)
-"""Focus that is chosen by depth: nobody looks at what is nearer than 10 cm."""
+"""Range of a focus chosen by depth: nobody focuses closer than 10 cm."""
 
 COLUMNS = ("frame", "pupil_mm", "focus_dpt")
 
@@ -31,9 +31,9 @@ class States:
     ----------
     pupil_mm : float
     focus_dpt : float, optional
-        None: at the depth of the frame's middle.
-    listed : mapping of frames' names to (pupil_mm, focus_dpt)
-        Of a list; None where its columns lack, which the two above are for.
+        None: focus at the depth of the frame's center.
+    listed : mapping of frame names to (pupil_mm, focus_dpt)
+        From a list; None where a column is missing, for which the two above are used.
     """
 
     pupil_mm: float
@@ -41,13 +41,13 @@ class States:
     listed: dict[str, tuple[float | None, float | None]] | None = None
 
     def of(self, name: str, depth_m: NDArray[np.float32]) -> tuple[float, float]:
-        """Return pupil in mm and focus in dpt of a frame."""
+        """Return a frame's pupil in mm and focus in dpt."""
         pupil_mm, focus_dpt = (self.listed or {}).get(name, (None, None))
         if focus_dpt is None:
             focus_dpt = self.focus_dpt
         if focus_dpt is None:
             low_dpt, high_dpt = CENTER_RANGE_DPT
-            nearest_m = 1.0 / high_dpt  # so that no depth is too small to divide by
+            nearest_m = 1.0 / high_dpt  # avoids a division by a tiny depth
             focus_dpt = max(1.0 / max(center_depth_m(depth_m), nearest_m), low_dpt)
         return self.pupil_mm if pupil_mm is None else pupil_mm, focus_dpt
 
@@ -69,17 +69,17 @@ class States:
         return (min(known), max(known)) if known else usual
 
     def described(self) -> dict[str, Any]:
-        """Return what decides the states, as plain values."""
+        """Return the parameters that determine the states, as plain values."""
         focus = CENTER if self.focus_dpt is None else self.focus_dpt
         return {"pupil_mm": self.pupil_mm, "focus_dpt": focus, "listed": self.listed}
 
     def check(self, names: Sequence[str]) -> None:
-        """Refuse a list that lacks frames.
+        """Reject a list that lacks frames.
 
         Raises
         ------
         ValueError
-            Names the first.
+            Names the first missing frame.
         """
         if self.listed is None:
             return
@@ -96,8 +96,8 @@ def read_states(
 ) -> dict[str, tuple[float | None, float | None]]:
     """Read a list of states: CSV with the columns frame, pupil_mm and focus_dpt.
 
-    One of the last two may be left out.  A frame of a video may be given by its
-    number alone.
+    One of the last two may be omitted. A frame of a video may be given by its number
+    alone.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Frames of videos by their numbers, exactly, whatever was read before.
+"""Exact random access to video frames, independent of previous reads.
 
 A frame is found by its time: the times of all packets are listed first, without
-decoding; then the decoder goes to the key frame before it and on from there.
+decoding; then the decoder seeks to the preceding key frame and decodes from there.
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ from estimator.bounded_files import InvalidFile, reason_of
 GREY = ("gray16le", "gray16be")
 
 MAX_VIDEO_PIXELS = 1 << 25
-"""Of a frame, as 8K is: a decoder holds up to 17 of them, and one as sRGB beside."""
+"""Pixels of a frame, as in 8K: a decoder holds up to 17 frames, and one more in
+sRGB."""
 
 MAX_VIDEO_FRAMES = 1_000_000
-"""Nine hours at 30 Hz; the times of all are held, 40 bytes each."""
+"""Nine hours at 30 Hz; all times are kept in memory, 40 bytes each."""
 
 MAX_PACKETS_AHEAD = 10_000
-"""Without a picture of those that were asked for: a key frame is some hundred back."""
+"""Packets without a requested picture: a key frame is some hundred back."""
 
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
-"""What may be in a file, whatever its name: no playlists, which name other files."""
+"""Allowed formats, whatever the file name: no playlists, which reference other
+files."""
 
 OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
 
 
 def frame_count(path: Path) -> int:
-    """Return how many frames a video has.
+    """Return the number of frames of a video.
 
     Raises
     ------
@@ -57,12 +59,12 @@ def frames_per_second(path: Path) -> float:
 
 
 class VideoReader:
-    """One video; frames in order cost no more than to decode them.
+    """Reader of one video; frames in order cost no more than their decoding.
 
     Raises
     ------
     InvalidFile
-        It cannot be read, has no pictures, too many, or too large ones.
+        It cannot be read, has no pictures, too many, or pictures that are too large.
     """
 
     def __init__(self, path: Path) -> None:
@@ -80,7 +82,7 @@ class VideoReader:
             self.close()
             raise
         self._decoded: Iterator[av.VideoFrame] = iter(())
-        self._next = -1  # number of the frame that is decoded next
+        self._next = -1  # number of the next frame to be decoded
 
     def __enter__(self) -> VideoReader:
         """Return the reader."""
@@ -96,12 +98,12 @@ class VideoReader:
 
     @property
     def count(self) -> int:
-        """Return how many frames there are."""
+        """Return the number of frames."""
         return len(self._times)
 
     @property
     def rate_hz(self) -> float:
-        """Return the mean rate, or 30 where the file does not tell."""
+        """Return the mean rate, or 30 if the file does not state it."""
         try:
             return float(self._stream.average_rate or 30)
         except (ZeroDivisionError, OverflowError):
@@ -117,7 +119,7 @@ class VideoReader:
         return self._array(self._frame(index), format="rgb24")
 
     def integers(self, index: int) -> NDArray[np.uint16]:
-        """Return a frame of 16-bit grey as it is stored, (height, width).
+        """Return a frame of 16-bit gray as stored, (height, width).
 
         Raises
         ------
@@ -144,9 +146,9 @@ class VideoReader:
         context = stream.codec_context
         if context is None:
             raise InvalidFile(self._path, "no decoder for it", "a known codec")
-        # One thread: the machine's cores have frames of their own.
+        # One thread: the other cores process other frames.
         context.thread_count = 1
-        # Frames of another size may follow: the decoder itself refuses larger ones.
+        # Frames of another size may follow; the decoder itself rejects larger ones.
         context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
         if context.width * context.height > MAX_VIDEO_PIXELS:
             found = f"frames of {context.width}x{context.height} px"
@@ -200,7 +202,7 @@ class VideoReader:
         )
 
     def _decoded_frames(self) -> Iterator[av.VideoFrame]:
-        """Yield frames from here on, as long as packets lead to some."""
+        """Yield frames from here on, until too many packets yield none."""
         n_without = 0
         for packet in self._container.demux(self._stream):
             for frame in packet.decode():

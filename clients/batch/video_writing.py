@@ -1,4 +1,4 @@
-"""Videos in segments: each is written by one worker; then they are put together."""
+"""Videos in segments, each written by one worker and then joined."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_DENOMINATOR = 1001
-"""Of a rate: that of NTSC, 30000/1001, is exact."""
+"""Of a frame rate, so that NTSC's, 30000/1001, is exact."""
 
 BIT_EXACT = {"fflags": "+bitexact"}
-"""No names of versions, no random numbers in the file."""
+"""No version names and no random numbers in the file."""
 
 
 @dataclass(frozen=True)
 class VideoKind:
-    """How a video is encoded; one thread, so that its bytes are always the same."""
+    """Encoding of a video; uses one thread, so that its bytes are always the same."""
 
     codec: str
     pixels: str
@@ -41,7 +41,7 @@ VIDEO_KINDS = {
         True,
     ),
 }
-"""FFV1 keeps every bit; H.264 is smaller and plays anywhere."""
+"""FFV1 is lossless; H.264 is smaller and plays anywhere."""
 
 
 def write_segment(
@@ -51,17 +51,17 @@ def write_segment(
     kind: VideoKind,
     rate_hz: float,
 ) -> None:
-    """Write frames as a Matroska file of their own.
+    """Write frames as a separate Matroska file.
 
     Parameters
     ----------
     frames : pairs of (number in the segment, sRGB image)
-        A number that is left out leaves the frame before it standing for longer.
+        A missing number extends the previous frame.
 
     Raises
     ------
     ValueError
-        Sides that the kind of video cannot have.
+        The kind of video does not support the size.
     """
     rate = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
     with av.open(str(path), "w", format="matroska", options=BIT_EXACT) as container:
@@ -87,7 +87,7 @@ def _add_stream(container, shape: Sequence[int], kind: VideoKind, rate: Fraction
 
 
 def check_sides(width_px: int, height_px: int, kind: VideoKind) -> None:
-    """Refuse a size that a kind of video cannot have.
+    """Reject a size that a kind of video does not support.
 
     Raises
     ------
@@ -103,12 +103,12 @@ def check_sides(width_px: int, height_px: int, kind: VideoKind) -> None:
 def join_segments(
     path: Path, segments: Sequence[tuple[int, Path]], *, kind: VideoKind, rate_hz: float
 ) -> None:
-    """Put segments together, packet by packet.
+    """Join segments, packet by packet.
 
     Parameters
     ----------
     segments : pairs of (number of the first frame, file)
-        In order; one without frames is left out.
+        In order; a segment without frames is skipped.
     """
     rate = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
     container_format = {".mkv": "matroska", ".mp4": "mp4"}[kind.suffix]

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and what they hold."""
+"""Atomic writes of files, and file hashes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 
 PART = ".part"
 MAX_STEM = 180
-"""Of a name, so that with what is added it is one that a file system takes."""
+"""Of a name, so that the name with its additions is valid in a file system."""
 
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _BLOCK_BYTES = 1 << 20
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
-    """Have a file written under another name beside it, then give it its own.
+    """Write a file under a temporary name beside the target, then rename it.
 
     A process that is killed leaves a file ``.NAME.RANDOM.part.SUFFIX`` at most, which
     `remove_parts` finds.
@@ -31,11 +31,11 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
     path.parent.mkdir(parents=True, exist_ok=True)
     random = secrets.token_hex(8)
     part = path.with_name(f".{path.stem[:MAX_STEM]}.{random}{PART}{path.suffix}")
-    os.close(os.open(part, _NEW_FILE, 0o666))  # no link that is there is followed
+    os.close(os.open(part, _NEW_FILE, 0o666))  # follows no existing link
     try:
         write(part)
         with part.open("rb") as file:
-            os.fsync(file.fileno())  # its content before its name, also in a power cut
+            os.fsync(file.fileno())  # content before name, even in a power failure
         told = content_of(part)
         os.replace(part, path)
     except BaseException:
@@ -45,7 +45,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
 
 
 def content_of(path: Path) -> dict[str, Any]:
-    """Return how many bytes a file has, and their SHA-256."""
+    """Return the size of a file in bytes and its SHA-256."""
     digest, size_bytes = hashlib.sha256(), 0
     with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):
@@ -55,7 +55,7 @@ def content_of(path: Path) -> dict[str, Any]:
 
 
 def remove_parts(folder: Path) -> int:
-    """Remove what killed processes left; return how many files."""
+    """Remove the temporary files of killed processes; return their number."""
     parts = [path for path in folder.rglob(".*") if PART in path.suffixes]
     for path in parts:
         path.unlink(missing_ok=True)
@@ -63,7 +63,7 @@ def remove_parts(folder: Path) -> int:
 
 
 def input_of(path: Path) -> dict[str, Any]:
-    """Return name, size, time and hash of a file that was read."""
+    """Return name, size, time and hash of an input file."""
     status = path.stat()
     return {
         "name": path.name,
@@ -73,7 +73,7 @@ def input_of(path: Path) -> dict[str, Any]:
 
 
 def is_unchanged(path: Path, told: dict[str, Any]) -> bool:
-    """Return whether a file is what it was; read again only where its time differs."""
+    """Return whether a file is unchanged; it is read only if its time differs."""
     try:
         status = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""One worker's part: frames in, files and records out."""
+"""Work of one worker: frames in, files and records out."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ Record = dict[str, Any]
 """A line of the manifest."""
 
 PNG_LEVEL = 1
-"""A file is a fifth larger than usual and takes a quarter of the time to pack."""
+"""Files are a fifth larger than usual and take a quarter of the time to compress."""
 
 FAILURES = (ValueError, FilterError, OSError, MemoryError)
-"""What a frame may end with, without an end to the others."""
+"""Exceptions that fail a frame but not the batch."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Frames that follow each other, through one profile.
+    """Consecutive frames through one profile.
 
     Attributes
     ----------
     number : int
-        Of the unit among all of the run.
+        Number of the unit in the run.
     profile : str
     frames : tuple of SourceFrame
     segment : Path, optional
-        Where they become a piece of a video, relative to the output folder.
+        Video segment to write, relative to the output folder.
     """
 
     number: int
@@ -53,7 +53,7 @@ class Unit:
 
 @dataclass
 class Seen:
-    """A filtered frame on its way to its file."""
+    """A filtered frame to be written to its file."""
 
     filtered: Filtered
     record: Record
@@ -68,7 +68,7 @@ class UnitRunner:
         self._readers: dict[Path, VideoReader] = {}
 
     def close(self) -> None:
-        """Give up what is held."""
+        """Release the filter and the video readers."""
         self._filter.close()
         for reader in self._readers.values():
             reader.close()
@@ -76,16 +76,16 @@ class UnitRunner:
 
     @property
     def build_s(self) -> float:
-        """Return the time that eyes took so far."""
+        """Return the total build time of eyes so far."""
         return self._filter.build_s
 
     def run(self, unit: Unit, is_wanted: Callable[[], bool] = lambda: True) -> Iterator:
-        """Yield a record for each frame, as soon as its file is there.
+        """Yield a record for each frame once its file is written.
 
         Parameters
         ----------
         is_wanted : callable
-            Asked before each frame; the unit ends where it says no.
+            Called before each frame; the unit stops if it returns False.
         """
         if unit.segment is not None:
             yield from self._segment(unit, is_wanted)
@@ -116,7 +116,7 @@ class UnitRunner:
         return {**seen.record, "file": file.as_posix(), **told}
 
     def _segment(self, unit: Unit, is_wanted: Callable[[], bool]) -> Iterator[Record]:
-        """Write a piece of a video; its records come when it is whole."""
+        """Write a video segment; yield its records once it is complete."""
         from clients.batch.video_writing import VIDEO_KINDS, write_segment
 
         records: list[Record] = []
@@ -132,7 +132,7 @@ class UnitRunner:
                     image = seen.filtered.color
                     shape = shape or image.shape
                     if image.shape == shape:
-                        yield number, image  # encoded between
+                        yield number, image  # encoded before the next line
                         records.append(seen.record | {"cpu_ms": _cpu_ms_since(cpu_s)})
                         continue
                     seen = _failed(unit.profile, frame, BadFrame("another size"))
@@ -141,7 +141,7 @@ class UnitRunner:
         def write(path: Path) -> None:
             kind, rate_hz = VIDEO_KINDS[self._job.format], self._job.rate_hz
             write_segment(path, images(), kind=kind, rate_hz=rate_hz)
-            path.touch()  # where there was no frame to write
+            path.touch()  # if there was no frame to write
 
         try:
             told = write_whole(self._out / unit.segment, write)
@@ -214,11 +214,11 @@ class UnitRunner:
 
 
 class Unwanted(Exception):
-    """Nobody waits for the unit any more."""
+    """The unit is no longer needed."""
 
 
 def failed_records(unit: Unit, names: Sequence[str], reason: str) -> list[Record]:
-    """Return records of frames that came to nothing, with the reason."""
+    """Return records of frames that failed, with the reason."""
     return [
         _failed(unit.profile, frame, BadFrame(reason))
         for frame in unit.frames
@@ -243,5 +243,5 @@ def _ms_since(start_s: float) -> float:
 
 
 def _cpu_ms_since(start_s: float) -> float:
-    """Of all threads of this process; PSFs are built in another."""
+    """Return the time of all threads of this process; PSFs are built in another."""
     return round(1e3 * (time.process_time() - start_s), 2)

@@ -1,8 +1,8 @@
-"""A worker's process: units come through a pipe, records go back.
+"""Worker process: receives units through a pipe and returns records.
 
     python -m clients.batch.worker DESCRIPTOR
 
-It ends when the pipe does, between two frames at the latest.
+It exits when the pipe closes, at the latest between two frames.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from clients.batch.work import UnitRunner
 
 
 def main(descriptor: int) -> None:
-    """Serve a pipe until it ends."""
+    """Serve a pipe until it closes."""
     pipe = Connection(descriptor)
     try:
         runner = UnitRunner(*pipe.recv())
         while True:
             unit = pipe.recv()
-            # while a unit runs nothing is sent: what can be read is the pipe's end
+            # while a unit runs nothing is sent: a readable pipe has been closed
             for record in runner.run(unit, lambda: not pipe.poll()):
                 pipe.send(("record", record))
             pipe.send(("done", unit.number))

@@ -1,33 +1,33 @@
-"""A scene through a person's two eyes in an OpenXR headset: `ocufilter headset`.
+"""Scenes through a person's two eyes in an OpenXR headset: `ocufilter headset`.
 
 program            the command
-options            what it is told
-viewer             its loop: render, look, filter, show, whatever the headset does
-controls           what it can be told while it runs
+options            its command line
+viewer             the main loop: render, follow the eyes, filter, show
+controls           switches that keys and controller buttons set at run time
 keys               single keys from a terminal
-runtime            what it asks of a headset, real or simulated
-openxr_runtime     a real one
-openxr_gl          its OpenGL
-openxr_swapchains  its images, and the layers made of them
-openxr_actions     its controllers and its eye tracker
-simulated_runtime  one that is not there
+runtime            interface of a headset runtime, real or simulated
+openxr_runtime     OpenXR runtime
+openxr_gl          OpenGL contexts for OpenXR
+openxr_swapchains  swapchain images and projection layers
+openxr_actions     controller buttons and the eye tracker
+simulated_runtime  simulated runtime, without a headset
 poses              positions and orientations
 look               gaze, focus and pupils of both eyes
-seeing             what eyes are given, and what they see of it
-seeing_here        filtered in this process
-seeing_by_service  or by a service
-scenery            both eyes' pictures of a scene
-presenting         pictures into a headset's images
-scene_view         a scene's colour and depth in an OpenGL context
-scene_buffers      what that keeps there
+seeing             frames before and after the filter; interface of the filters
+seeing_here        filter in this process
+seeing_by_service  filter through a service
+scenery            renders a scene for both eyes
+presenting         draws pictures into the headset's images
+scene_view         renders a scene's color and depth in an OpenGL context
+scene_buffers      its OpenGL objects
 projection         its matrices
-built_scene        our own scenes, built in a process apart
-gltf_container     a glTF file's header and buffers
+built_scene        the built-in scenes, built in a child process
+gltf_container     header and buffers of a glTF file
 gltf_arrays        its arrays
-gltf_nodes         where its meshes stand
-gltf_file          all of it, in parts
-gltf_scene         as a scene
-viewpoint          where a viewer stands in it
+gltf_nodes         its node tree
+gltf_file          its triangles, part by part
+gltf_scene         a glTF file as a scene
+viewpoint          the viewer's initial position in a scene
 
-Nothing here may import PyOpenGL or pyrender: pyopenxr makes PyOpenGL use GLX.
+Modules here must not import PyOpenGL or pyrender: pyopenxr makes PyOpenGL use GLX.
 """

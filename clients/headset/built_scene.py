@@ -1,6 +1,7 @@
-"""One of our own scenes, built in a process apart.
+"""Built-in scenes, built in a child process.
 
-Their light is baked with pyrender, whose OpenGL and OpenXR's cannot share a process.
+Their lighting is baked with pyrender, whose OpenGL cannot share a process with
+OpenXR's.
 """
 
 import pickle
@@ -16,23 +17,23 @@ from clients.scenes.scene import Scene
 
 TIMEOUT_S = 300.0
 _CHECKOUT = Path(__file__).resolve().parents[2]
-# There `-m` finds our packages whatever the folder; installed ones are found anyway.
+# From the checkout `-m` finds our packages; installed packages are found anyway.
 _FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
 
 
 class SceneNotBuilt(Exception):
-    """The process that builds a scene has failed; the text says why."""
+    """The process that builds a scene failed; the message says why."""
 
 
 def built_scene(name: str) -> Scene:
-    """Build a scene, with nothing of pyrender or PyOpenGL in this process.
+    """Build a scene without loading pyrender or PyOpenGL into this process.
 
     Raises
     ------
     ValueError
         No scene has that name.
     SceneNotBuilt
-        A package is missing, which the text says how to install, or OpenGL failed.
+        A package is missing (the message says how to install it), or OpenGL failed.
     """
     if name not in PATHS:
         raise ValueError(f"scene {name!r} is unknown; choose from {sorted(PATHS)}")
@@ -60,7 +61,7 @@ def built_scene(name: str) -> Scene:
 
 
 def main(name: str, file: str) -> None:
-    """Build a scene and write it to a file; that is the child's part."""
+    """Build a scene and write it to a file, in the child process."""
     try:
         from clients.scenes.catalogue import build_scene
     except ModuleNotFoundError as error:

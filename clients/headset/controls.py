@@ -1,4 +1,4 @@
-"""What a viewer can be told while it runs: by keys, or by a controller's buttons."""
+"""The viewer's run-time switches, set by keys or by controller buttons."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Controls:
     ----------
     profiles : of each eye
     change : callable
-        ``change(eye, profile)`` is told of another eye.
+        ``change(eye, profile)`` is called when an eye changes.
     say : callable
-        Told in a line what was switched.
+        Called with each message for the user, one line.
     is_on : bool
-        False: the scene as it is.
+        False: the scene is shown unfiltered.
     is_split : bool
-        The left half as it is, the right half as it is seen.
+        Left half unfiltered, right half filtered.
     is_over : bool
     """
 
@@ -51,7 +51,7 @@ class Controls:
     _numbers: dict[Eye, int] = field(default_factory=lambda: {e: -1 for e in EYES})
 
     def press(self, keys: str, buttons: Sequence[str] = ()) -> None:
-        """Do what keys, and buttons of a controller, ask for."""
+        """Handle pressed keys and controller buttons."""
         for key in keys:
             if key in "123456":
                 for eye in EYES:

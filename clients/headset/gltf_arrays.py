@@ -1,4 +1,4 @@
-"""The arrays that a glTF file's accessors describe: counted first, then read."""
+"""Arrays of glTF accessors: element counts without reading, and elements."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def accessor_count(file: Container, index: object) -> int:
-    """Return how many elements an accessor has."""
+    """Return the number of elements of an accessor."""
     accessor = file.entry("accessors", index)
     return file.whole(accessor, "count", f"accessors[{index}]")
 
 
 def accessor_array(file: Container, index: object, *, kinds: str) -> NDArray:
-    """Return the elements (n, columns) of an accessor, as they are stored.
+    """Return the elements (n, columns) of an accessor, as stored.
 
     Parameters
     ----------
     kinds : str
-        Kinds of numbers that are allowed: of ``u``, ``i`` and ``f``.
+        Allowed kinds of numbers: of ``u``, ``i`` and ``f``.
     """
     accessor = file.entry("accessors", index)
     where = f"accessors[{index}]"
@@ -65,7 +65,7 @@ def _strided(
     shape: tuple[int, int],
     dtype: np.dtype,
 ) -> NDArray:
-    """Return elements of a view, without a copy."""
+    """Return elements of a view without a copy."""
     count, columns = shape
     element = columns * dtype.itemsize
     step = element if stride is None else stride

@@ -1,7 +1,7 @@
-"""The header and the buffers of a glTF file, within limits.
+"""Header and buffers of a glTF file, within limits.
 
-A file may name others beside it.  They must lie in its folder or below, also once links
-are followed, and count towards the same limit.
+A file may reference other files. They must be in its folder or below, also after
+symbolic links are resolved, and count toward the same limit.
 """
 
 from __future__ import annotations
@@ -16,16 +16,19 @@ from urllib.parse import unquote
 from estimator.bounded_files import InvalidFile, loads_bounded, read_bytes
 
 MAX_FILE_MB = 256.0
-"""Of a file and those beside it, which are held in memory while it is read."""
+"""Total of a file and the files that it references, all held in memory while
+reading."""
 
 MAX_HEADER_BYTES = 64_000_000
-"""Of JSON, in which a .gltf may hold its buffers as text: it is held four times."""
+"""Size of the JSON, in which a .gltf may hold its buffers as text; held in memory four
+times."""
 
 MAX_HEADER_ITEMS = 1_000_000
-"""Of values in it: 50,000 nodes, meshes and accessors.  A second to parse."""
+"""Number of values in the JSON: 50,000 nodes, meshes and accessors. A second to
+parse."""
 
 MAX_HEADER_DEPTH = 64
-"""Of its objects within each other: extras may hold what a program likes."""
+"""Nesting depth of the JSON: extras may hold anything."""
 
 MAGIC = b"glTF"
 _JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
@@ -40,7 +43,7 @@ class Container:
     ----------
     path : Path
     header : dict
-        Its JSON; only that it is an object is checked.
+        Its JSON; checked only to be an object.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +56,7 @@ class Container:
         self._lists: dict[str, list[dict[str, Any]]] = {}
 
     def list_of(self, name: str) -> list[dict[str, Any]]:
-        """Return a list of objects of the header; empty where there is none."""
+        """Return a list of objects of the header; empty if absent."""
         if name not in self._lists:
             found = self.header.get(name, [])
             if not isinstance(found, list):
@@ -64,7 +67,7 @@ class Container:
         return self._lists[name]
 
     def entry(self, name: str, index: object) -> dict[str, Any]:
-        """Return an object of such a list."""
+        """Return an entry of such a list."""
         entries = self.list_of(name)
         if type(index) is not int or not 0 <= index < len(entries):
             self.refuse(f"'{name}' {index!r:.20}", f"0 to {len(entries) - 1}")
@@ -85,14 +88,14 @@ class Container:
     def whole(
         self, entry: dict[str, Any], field: str, where: str, *, default: int = -1
     ) -> int:
-        """Return a field that is a whole number from 0 on."""
+        """Return a field that must be an integer of at least 0."""
         value = entry.get(field, default)
         if type(value) is not int or not 0 <= value < 1 << 40:
             self.refuse(f"damaged: {where}.{field} is {value!r:.30}", "0 or more")
         return value
 
     def uri_bytes(self, uri: object) -> bytes:
-        """Return what a URI holds, or the file beside this one that it names."""
+        """Return the content of a data URI, or of the referenced file."""
         if not isinstance(uri, str):
             self.refuse(f"damaged: a URI is {uri!r:.30}", "text")
         if uri.startswith("data:"):
@@ -106,7 +109,7 @@ class Container:
         return self._read(self._beside(uri))
 
     def refuse(self, found: str, allowed: str = "") -> NoReturn:
-        """Raise for what is wrong with the file."""
+        """Raise `InvalidFile` for this file."""
         raise InvalidFile(self.path, found, allowed) from None
 
     def _buffer(self, index: object) -> memoryview:
@@ -126,7 +129,7 @@ class Container:
         try:
             found = (folder / name).resolve()
             is_below = found.is_relative_to(folder.resolve())
-        except (OSError, ValueError, RuntimeError):  # a null byte, a circle of links
+        except (OSError, ValueError, RuntimeError):  # a null byte, a symlink loop
             is_below = False
         if not is_below:
             self.refuse(f"the URI '{uri:.60}' leads out of its folder", allowed)
@@ -146,7 +149,7 @@ class Container:
 
 
 def _split(path: Path, content: bytes) -> tuple[bytes, memoryview]:
-    """Return the JSON of a file, and its binary chunk."""
+    """Return the JSON and the binary chunk of a file."""
     whole = memoryview(content)
     if not content.startswith(MAGIC):
         return content, whole[:0]

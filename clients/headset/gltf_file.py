@@ -1,7 +1,7 @@
-"""Read a glTF file into triangles with the look that each part of it has.
+"""Read a glTF file as triangles with the appearance of each part.
 
-What a file places is counted before anything is copied: it may place one mesh a
-thousand times, and name one image of a gigabyte.
+Everything that a file places is counted before anything is copied: a file may place one
+mesh a thousand times, or contain a gigabyte image.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from filter_service.bounded_images import check_picture, read_picture_rgb
 
 MAX_TRIANGLES = 2_000_000
 MAX_VERTICES = 6_000_000
-"""Placed ones, three for each triangle without normals: 32 bytes of each stay, and two
-million triangles take 3 to 5 s."""
+"""Placed vertices, three for each triangle without normals: 32 bytes of each are kept,
+and two million triangles take 3 to 5 s."""
 
 MAX_DRAWS = 15_000
-"""Parts placed by nodes: 0.25 ms each."""
+"""Parts placed by nodes; each takes 0.25 ms."""
 
 MAX_TEXTURE_PIXELS = 1 << 26
-"""In all textures: three bytes of each stay."""
+"""Pixels of all textures; each takes three bytes."""
 
 LEAST_VOLUME_RATIO = 1e-30
-"""A node that shrinks volumes to less has no inverse."""
+"""A node that scales volumes by less is not invertible."""
 
 LEAST_WEIGHT_RATIO = 0.5
-"""What is blended with less is left out."""
+"""Parts blended with less opacity are left out."""
 
 _TRIANGLES, _STRIP = 4, 5
 _KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""How the names of those begin without which a file is shown all the same."""
+"""Prefixes of extensions that a file may require and is shown without."""
 
 _PICTURES = ("", "image/png", "image/jpeg", "image/webp")
 
@@ -51,13 +51,13 @@ class Part:
     Attributes
     ----------
     world_from_part : (4, 4)
-    vertices_m : (n, 3), as they are stored, and so are normals
+    vertices_m : (n, 3), as stored, and so are normals
     faces : (m, 3)
-    normals : (n, 3), or None where the file has none
+    normals : (n, 3), or None if the file has none
     uv : (n, 2), v up, or None
     reflectance_ratio : (n, 3), linear, without the texture
     texture : (h, w, 3) uint8 sRGB, or None; parts may share one
-    is_unlit : whether it shows its colour whatever the light
+    is_unlit : whether its color is independent of the light
     """
 
     world_from_part: Array
@@ -76,13 +76,14 @@ def read_parts(path: Path) -> Iterator[Part]:
     Raises
     ------
     InvalidFile
-        No such file, no glTF 2, one that needs extensions not known here, damaged,
-        without triangles, or too large.
+        The file does not exist, is not glTF 2, requires unknown extensions, is damaged,
+        has no triangles, or is too large.
 
     Notes
     -----
-    Nothing is transparent: what the file blends with less than `LEAST_WEIGHT_RATIO`
-    is left out, all else is opaque.  Skins, shape keys and animations rest.
+    There is no transparency: parts that the file blends with less than
+    `LEAST_WEIGHT_RATIO` are left out, all others are opaque. Skins, shape keys and
+    animations are ignored.
     """
     file = Container(path)
     required = file.header.get("extensionsRequired", [])
@@ -110,7 +111,7 @@ def read_parts(path: Path) -> Iterator[Part]:
 
 
 def _primitives(file: Container, mesh: int) -> list[dict[str, Any]]:
-    """Return the primitives of a mesh that are triangles: no lines, no points."""
+    """Return a mesh's primitives that are triangles, without lines and points."""
     primitives = file.entry("meshes", mesh).get("primitives")
     if not isinstance(primitives, list):
         file.refuse(f"damaged: meshes[{mesh}].primitives is not a list")
@@ -133,7 +134,7 @@ def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
 
 
 def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
-    """Refuse too many of anything; a primitive counts each time that it is placed."""
+    """Reject counts above the limits; a primitive counts each time it is placed."""
     counts = {id(p): _triangle_count(file, p) for p in primitives}
     n_triangles = sum(counts[id(p)] for p in primitives)
     if n_triangles > MAX_TRIANGLES:
@@ -214,7 +215,7 @@ def _columns(
     kinds: str,
     count: int | None = None,
 ) -> NDArray:
-    """Return a vertex attribute; integers as shares of their largest value."""
+    """Return a vertex attribute; integers as fractions of their largest value."""
     array = accessor_array(file, attributes.get(name), kinds=kinds)
     if array.shape[1] < columns or count not in (None, len(array)):
         found = f"damaged: {name} has {len(array):,} entries of {array.shape[1]}"
@@ -227,7 +228,7 @@ def _columns(
 def _reflectance(
     file: Container, material: dict[str, Any], attributes: dict[str, Any], n: int
 ) -> Array:
-    """Return the linear factor (n, 3) on each vertex."""
+    """Return the linear color factor (n, 3) of each vertex."""
     factor = _factor(file, material)[:3]
     if "COLOR_0" not in attributes:
         return np.broadcast_to(factor, (n, 3))
@@ -250,7 +251,7 @@ def _faces(
             file.refuse(found, f"0 to {n_vertices - 1:,}")
     if primitive.get("mode", _TRIANGLES) == _STRIP:
         faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-        faces[1::2] = faces[1::2, ::-1]  # so that all face the same way
+        faces[1::2] = faces[1::2, ::-1]  # consistent winding
         return faces
     if len(corners) % 3:
         file.refuse(f"damaged: {len(corners):,} corners of triangles", "three of each")
@@ -258,14 +259,14 @@ def _faces(
 
 
 class _Textures:
-    """The pictures of a file: their headers are checked; a part has its own decoded."""
+    """Images of a file: all headers are checked; images are decoded when used."""
 
     def __init__(self, file: Container) -> None:
         self._file = file
         self._decoded: dict[int, NDArray[np.uint8]] = {}
 
     def check(self, materials: list[dict[str, Any]]) -> None:
-        """Refuse more pixels than are allowed, by the headers of the pictures."""
+        """Reject more pixels than allowed, from the image headers alone."""
         distinct = {id(m): m for m in materials}.values()
         images = sorted({i for m in distinct if (i := self._image_of(m)) is not None})
         n_pixels = 0
@@ -276,7 +277,7 @@ class _Textures:
                 self._file.refuse(found, f"at most {MAX_TEXTURE_PIXELS:,}")
 
     def of(self, material: dict[str, Any]) -> NDArray[np.uint8] | None:
-        """Return the texture of a material, if it has one."""
+        """Return the texture of a material, or None."""
         index = self._image_of(material)
         if index is None:
             return None
@@ -286,7 +287,7 @@ class _Textures:
         return self._decoded[index]
 
     def _image_of(self, material: dict[str, Any]) -> int | None:
-        """Return the number of a material's image; None without one that is read."""
+        """Return the index of a material's image; None without a supported one."""
         surface = _object(self._file, material, "pbrMetallicRoughness")
         if "baseColorTexture" not in surface:
             return None

@@ -1,4 +1,4 @@
-"""Where a glTF file places its meshes: its tree of nodes, walked without recursion."""
+"""Placement of a glTF file's meshes: its node tree, traversed without recursion."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from clients.headset.gltf_container import Container
 from clients.scenes.geometry import Array
 
 MAX_NODE_DEPTH = 1000
-"""Of nodes within each other.  A skeleton has 20, a chain of links some 100."""
+"""Nesting depth of nodes. A skeleton has 20, a chain of links some 100."""
 
 _SIZES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
-    """Yield (world_from_mesh (4, 4), number of the mesh) of the file's scene.
+    """Yield (world_from_mesh (4, 4), mesh index) for the file's scene.
 
     Raises
     ------
     InvalidFile
-        Nodes that are no tree, too deep, or placed by what are not numbers.
+        Nodes that do not form a tree, are nested too deep, or are placed by values that
+        are not finite numbers.
     """
     if not file.list_of("scenes"):
         return
@@ -86,7 +87,7 @@ def _local(file: Container, node: dict[str, Any], k: int) -> Array:
 
 
 def _turned(quaternion: Array) -> Array:
-    """Return the rotation (4, 4) by a quaternion x, y, z, w of any length but zero."""
+    """Return the rotation (4, 4) of a quaternion x, y, z, w of any nonzero length."""
     length = np.linalg.norm(quaternion)
     if not length > np.finfo(float).tiny:
         return np.eye(4)

@@ -1,4 +1,4 @@
-"""Any glTF file as a scene: its light is simple, fixed, and baked into its vertices."""
+"""Any glTF file as a scene; its light is simple, fixed and baked into the vertices."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +12,10 @@ from clients.scenes.scene import Batch, Scene, finished
 from estimator import InvalidFile
 
 MAX_EXTENT_M = 10_000.0
-"""What is larger is in other units than metres, as glTF has them, or a landscape."""
+"""A larger scene is not in meters, the unit of glTF, or is a landscape."""
 
 PIECE_TRIANGLES = 250_000
-"""Of a part at once: each takes 0.4 kB on its way."""
+"""Triangles of a part converted at once; each takes 0.4 kB meanwhile."""
 
 NEAR_M = 0.05
 LEAST_FAR_M = 10.0
@@ -25,21 +25,21 @@ _SKY = np.array([0.42, 0.45, 0.50])
 _GROUND = np.array([0.22, 0.20, 0.18])
 _SUN = np.array([0.55, 0.53, 0.48])
 _TO_SUN = np.array([0.40, 0.80, 0.45]) / np.linalg.norm([0.40, 0.80, 0.45])
-"""Light on white, linear; none of it is above 1 on any surface."""
+"""Light on white, linear; at most 1 in total on any surface."""
 
 
 def load_gltf(path: str | Path) -> Scene:
-    """Return the scene of a .glb or .gltf file, in metres, y up.
+    """Return the scene of a .glb or .gltf file, in meters, y up.
 
     Raises
     ------
     InvalidFile
-        What is wrong with the file, which it names: see `read_parts`; or a place that
-        is no number, or more than `MAX_EXTENT_M` across.
+        The file is invalid, see `read_parts`; or it has a position that is
+        not a number, or an extent of more than `MAX_EXTENT_M`.
     """
     path = Path(path)
     batches, corners_m = [], []
-    with np.errstate(over="ignore", invalid="ignore"):  # places that are no numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # positions that are not finite
         for part in read_parts(path):  # one at a time: a batch takes a sixth of it
             for mesh in _meshes(part):
                 low_m, high_m = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
@@ -50,7 +50,7 @@ def load_gltf(path: str | Path) -> Scene:
     if not extent_m <= MAX_EXTENT_M:
         allowed = f"at most {MAX_EXTENT_M:g} m"
         raise InvalidFile(path, f"{extent_m:.3g} m across", allowed)
-    # Twice that: the viewer may stand outside, see `viewpoint`, and walk.
+    # Twice the extent: the viewer may stand outside, see `viewpoint`, and walk.
     far_m = max(LEAST_FAR_M, 4.0 * extent_m)
     return Scene(
         name=path.name,
@@ -67,9 +67,9 @@ def light_on(normals: Array) -> Array:
 
     Notes
     -----
-    A uniform sky and a uniform ground fill (1 + cos t) / 2 and (1 - cos t) / 2 of what
-    a surface tilted by t sees (Liu and Jordan 1963, Solar Energy 7, 53-74).  The sun
-    adds its cosine.  Nothing casts a shadow.
+    A uniform sky and a uniform ground fill (1 + cos t) / 2 and (1 - cos t) / 2 of the
+    view of a surface tilted by t (Liu and Jordan 1963, Solar Energy 7, 53-74). The sun
+    adds its cosine. There are no shadows.
     """
     cosine = normals[:, 1:2]
     around = _SKY * (1.0 + cosine) / 2.0 + _GROUND * (1.0 - cosine) / 2.0
@@ -79,7 +79,7 @@ def light_on(normals: Array) -> Array:
 def _by_texture(batches: list[Batch]) -> list[Batch]:
     """Merge batches into one per texture, so that a frame takes few draw calls."""
     groups: dict[int, list[Batch]] = {}
-    while batches:  # each is let go as soon as it is in its group's arrays
+    while batches:  # each is freed once its group is merged
         batch = batches.pop(0)
         groups.setdefault(id(batch.texture), []).append(batch)
     return [_merged(group) for group in groups.values()]
@@ -100,12 +100,12 @@ def _merged(batches: list[Batch]) -> Batch:
 
 
 def _meshes(part: Part) -> Iterator[Mesh]:
-    """Yield a part in the world's frame, its normals as glTF wants them, in pieces."""
+    """Yield a part in the world frame, in pieces, with normals as glTF specifies."""
     for start in range(0, len(part.faces), PIECE_TRIANGLES):
         faces = part.faces[start : start + PIECE_TRIANGLES]
         is_whole = len(faces) == len(part.faces)
         used = np.arange(len(part.vertices_m))
-        if part.normals is None:  # each face is flat, and has its corners for itself
+        if part.normals is None:  # faces are flat and share no vertices
             used, faces = faces.ravel(), np.arange(faces.size).reshape(-1, 3)
         elif not is_whole:
             is_used = np.zeros(len(used), bool)
@@ -115,7 +115,7 @@ def _meshes(part: Part) -> Iterator[Mesh]:
 
 
 def _mesh(part: Part, used: NDArray[np.int64], faces: NDArray[np.int64]) -> Mesh:
-    """Return triangles of the vertices of a part that they use."""
+    """Return triangles with only the vertices that they use."""
     vertices_m = part.vertices_m[used].astype(float)
     albedo = part.reflectance_ratio[used]
     uv = np.zeros((len(used), 2)) if part.uv is None else part.uv[used].astype(float)

@@ -1,4 +1,4 @@
-"""Single keys from a terminal, without waiting for them."""
+"""Read single keys from a terminal without blocking."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ except ImportError:
 
 
 class TerminalKeys:
-    """What is pressed while this is open; nothing where stdin is no terminal."""
+    """Keys pressed while this is open; none if stdin is not a terminal."""
 
     def __init__(self) -> None:
         self._before = None
         self._descriptor: int | None = None
 
     def __enter__(self) -> TerminalKeys:
-        """Take keys one by one."""
+        """Switch the terminal to single keys."""
         if termios is not None and sys.stdin is not None and sys.stdin.isatty():
             self._descriptor = sys.stdin.fileno()
             self._before = termios.tcgetattr(self._descriptor)
@@ -29,12 +29,12 @@ class TerminalKeys:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal's settings."""
         if self._before is not None and termios is not None:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:
-        """Return what was pressed since the last call."""
+        """Return the keys pressed since the last call."""
         if self._descriptor is None:
             return ""
         keys = b""

@@ -1,4 +1,4 @@
-"""What both eyes of a person do with what they are shown: gaze, focus and pupils."""
+"""Gaze, focus and pupils of both eyes as a person looks at a scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from filter_service.messages import Camera
 
 STRAIGHT_AHEAD = (0.0, 0.0)
 FAR_M = 1e6
-"""What is farther is seen in the same direction by both eyes."""
+"""Points farther than this are seen in the same direction by both eyes."""
 
 _N_STEPS = 3
 _SAME_RATIO = 1e-3
@@ -32,7 +32,7 @@ _SAME_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class RgbdPicture:
-    """What one eye is shown, unfiltered.
+    """Unfiltered picture of one eye.
 
     Attributes
     ----------
@@ -47,21 +47,21 @@ class RgbdPicture:
 
     @property
     def camera(self) -> Camera:
-        """Return the camera that has taken it."""
+        """Return the camera of the picture."""
         height_px, width_px = self.depth_m.shape
         return Camera(width_px, height_px, self.view.tangents)
 
 
 @dataclass(frozen=True)
 class LookingEye:
-    """One eye in a moment.
+    """State of one eye at a moment.
 
     Attributes
     ----------
     state : EyeState
     gaze_deg, ahead_deg : (h, v)
-        Where it looks, and straight ahead of the head, in its own picture: displays may
-        be canted.
+        Its gaze, and straight ahead of the head, in its own picture: displays may be
+        canted.
     """
 
     state: EyeState
@@ -70,16 +70,16 @@ class LookingEye:
 
 
 class StereoLook:
-    """Follows both eyes: the pupils are alike, and both focus alike as far as they can.
+    """Model of both eyes, with equal pupils and equal focus as far as each eye can.
 
     Parameters
     ----------
     age_years, pupil_diameter_mm
-        As of `NaturalEye`.
+        As in `NaturalEye`.
     white_cd_m2 : float
-        The display's white.
+        Luminance of the display's white.
     gaze_range_deg : (h, v)
-        How far eyes turn in their pictures; what is beyond counts as this.
+        Range of gaze in the pictures; gaze beyond it is clamped.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class StereoLook:
     def follow(
         self, due: DueFrame, pictures: Sequence[RgbdPicture]
     ) -> tuple[LookingEye, ...]:
-        """Return both eyes as they are when the pictures are shown."""
+        """Return the state of both eyes at the time the pictures are shown."""
         at_s = due.now_s
         if due.gaze is not None:
             seen = due.gaze
@@ -115,7 +115,7 @@ class StereoLook:
         head = _head(due, pictures)
         direction = head[:3, :3] @ direction_of(gaze.h_deg, gaze.v_deg)
         distance_m = self._distance(head[:3, 3], direction, pictures)
-        # Both pupils follow the light of both eyes, and both lenses one command.
+        # Both pupils follow the light of both eyes, and both lenses the same command.
         light_cd_m2 = float(
             np.mean([luminance_cd_m2(p.color, self._white_cd_m2) for p in pictures])
         )
@@ -134,19 +134,19 @@ class StereoLook:
         return tuple(found)
 
     def restart(self) -> None:
-        """Begin anew: a runtime's clock may start again with it."""
+        """Reset all state: a new runtime may start its clock again."""
         self._follower = GazeFollower()
         self._eyes = {}
         self._distance_m = None
         self.is_tracked = False
 
     def learn(self, eye: Eye, asked_dpt: float, used_dpt: float) -> None:
-        """Take in what the filter made of an eye's focus."""
+        """Take in the focus that the filter used for an eye."""
         if eye in self._eyes:
             self._eyes[eye].learn(asked_dpt, used_dpt)
 
     def change(self, eye: Eye) -> None:
-        """Let an eye become another one."""
+        """Replace an eye by another one."""
         if eye in self._eyes:
             self._eyes[eye].change()
 
@@ -161,9 +161,9 @@ class StereoLook:
         return self._eyes[eye]
 
     def _distance(self, origin, direction, pictures: Sequence[RgbdPicture]) -> float:
-        """Return how far what is looked at is from between the eyes.
+        """Return the distance of the point of fixation from between the eyes.
 
-        Where nothing has depth, what was looked at last counts, and infinity before.
+        Where nothing has depth it is the last distance, or infinity at first.
         """
         before_m = self._distance_m or math.inf
         for picture in reversed(pictures):
@@ -186,10 +186,10 @@ class StereoLook:
 
 
 def _along(origin, direction, picture: RgbdPicture, distance_m: float) -> float | None:
-    """Return where a ray meets what a picture shows; None where it has no depth.
+    """Return the distance at which a ray meets a picture's surface; None without depth.
 
-    The picture is another eye's: from a first guess the point is looked for where the
-    ray is seen, until it stays.
+    The picture is that of one eye and the ray starts elsewhere: iterate from a first
+    guess, each time with the depth where the ray is seen, until the distance is stable.
     """
     own = matrix_of(picture.view.pose)
     turn = own[:3, :3].T
@@ -208,11 +208,11 @@ def _along(origin, direction, picture: RgbdPicture, distance_m: float) -> float 
 
 
 def _head(due: DueFrame, pictures: Sequence[RgbdPicture]):
-    """Return the head's matrix; between the eyes where the runtime does not say."""
+    """Return the head's matrix; the mean of the eyes' poses if it is not known."""
     if due.head is not None:
         return matrix_of(due.head)
     poses = np.array([picture.view.pose for picture in pictures])
-    # q and -q are the same turn
+    # q and -q are the same rotation
     signs = np.sign(poses[:, 3:] @ poses[0, 3:])
     poses[:, 3:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
     between = poses.mean(axis=0)

@@ -1,4 +1,4 @@
-"""What a controller's trigger and an eye tracker say, as OpenXR actions."""
+"""Controller buttons and eye gaze, as OpenXR actions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clients.headset.runtime import GazeSample
 
 EYE_GAZE = "XR_EXT_eye_gaze_interaction"
 _BUTTONS = {
-    # name: where it is on the plain controller that every runtime knows
+    # name: its path on the simple controller that every runtime supports
     "next_eye": "/user/hand/right/input/select/click",
     "on_off": "/user/hand/left/input/select/click",
 }
@@ -20,20 +20,20 @@ _CONTROLLER = "/interaction_profiles/khr/simple_controller"
 _TRACKER = "/interaction_profiles/ext/eye_gaze_interaction"
 _GAZE = "/user/eyes_ext/input/gaze_ext/pose"
 _SEEN = (
-    # VALID alone is the last pose that was known, as while the eyes are shut
+    # VALID alone means the last known pose, for example while the eyes are shut
     xr.SpaceLocationFlags.ORIENTATION_VALID_BIT
     | xr.SpaceLocationFlags.ORIENTATION_TRACKED_BIT
 )
 
 
 class Actions:
-    """The actions of one session; they are attached when it is made.
+    """Actions of one session, attached on construction.
 
     Parameters
     ----------
-    instance, session : of OpenXR
+    instance, session : OpenXR handles
     with_gaze : bool
-        The system tracks eyes, and the extension is on.
+        The system tracks eyes, and the extension is enabled.
     """
 
     def __init__(self, instance, session, *, with_gaze: bool) -> None:
@@ -67,7 +67,7 @@ class Actions:
         return xr.create_action(self._set, info)
 
     def sync(self) -> tuple[str, ...]:
-        """Take in what has happened; return what was pressed since."""
+        """Synchronize the actions; return the buttons pressed since the last call."""
         active = xr.ActiveActionSet(self._set, xr.NULL_PATH)
         try:
             xr.sync_actions(
@@ -86,10 +86,10 @@ class Actions:
         return tuple(pressed)
 
     def gaze(self, head_space, time_ns: int) -> GazeSample | None:
-        """Return where the eyes look, as seen from the head; None while unknown.
+        """Return the gaze relative to the head; None if unknown.
 
-        Trackers that cannot predict give their nearest sample, whose time then counts;
-        one that does not know that time says 0, and what was asked for counts.
+        Trackers that cannot predict return their nearest sample and its time. If a
+        tracker does not know that time it returns 0, and the requested time is used.
         """
         if self._gaze_space is None:
             return None
@@ -101,7 +101,7 @@ class Actions:
         sampled = xr.EyeGazeSampleTimeEXT()
         chained = ctypes.cast(ctypes.pointer(sampled), ctypes.c_void_p)
         found = xr.SpaceLocation(next=chained)
-        # pyopenxr's own call has no room for the time of the sample.
+        # pyopenxr's own wrapper cannot return the time of the sample.
         raise_failure(
             xr.raw_functions.xrLocateSpace(
                 self._gaze_space, head_space, time_ns, ctypes.byref(found)
@@ -109,7 +109,7 @@ class Actions:
         )
         if found.location_flags & _SEEN != _SEEN:
             return None
-        # A gaze looks along -z of its pose.
+        # The gaze direction is -z of its pose.
         h_deg, v_deg = angles_of(-matrix_of(pose_of(found.pose))[:3, 2])
         at_ns = int(sampled.time) or time_ns
         return GazeSample(h_deg, v_deg, 1e-9 * at_ns)
@@ -130,7 +130,7 @@ def _suggest(instance, profile: str, bound: list) -> None:
 
 
 def raise_failure(result) -> None:
-    """Raise what a raw call of OpenXR has returned, where it is a failure."""
+    """Raise the exception of a raw OpenXR call's result, if it is a failure."""
     found = xr.exception.check_result(xr.Result(result))
     if found.is_exception():
         raise found

@@ -1,7 +1,7 @@
-"""OpenGL for OpenXR: a context that a runtime can take, and how a session takes it.
+"""OpenGL contexts for OpenXR, and their session bindings.
 
-open_context       EGL's without a window, or GLX's of a hidden one
-current_platform   which of both is current: what a session needs, and is told
+open_context       EGL context without a window, or GLX context of a hidden window
+current_platform   platform of the current context: required extensions and binding
 
 pyopenxr makes PyOpenGL use GLX when it is imported, so functions are loaded here.
 """
@@ -31,7 +31,7 @@ _COLOR, _DEPTH = 0x8CE0, 0x8D00  # GL_COLOR_ATTACHMENT0, GL_DEPTH_ATTACHMENT
 
 
 def offered_extensions() -> set[str]:
-    """Return what the runtime offers; raise OpenXR's own exception where none is."""
+    """Return the runtime's extensions; raise OpenXR's exception if there is none."""
     return {
         properties.extension_name.decode()
         for properties in xr.enumerate_instance_extension_properties()
@@ -40,24 +40,24 @@ def offered_extensions() -> set[str]:
 
 @contextmanager
 def open_context() -> Iterator[moderngl.Context]:
-    """Give a context that the runtime can take, until it is left; none is current.
+    """Open a context that the runtime supports; on entry no context is current.
 
-    It is EGL's, without a window and without a display, where the runtime takes that,
-    or where there is no runtime yet; otherwise GLX's, of a hidden window under X.  The
-    environment variable ``OCUFILTER_HEADSET_GRAPHICS`` asks for ``egl`` or ``glx``
+    If the runtime supports it, or if there is no runtime yet, the context is EGL's,
+    without window and display; otherwise it is GLX's, of a hidden window under X. The
+    environment variable ``OCUFILTER_HEADSET_GRAPHICS`` selects ``egl`` or ``glx``
     whatever the runtime offers.
 
     Raises
     ------
     NoRuntime
-        The runtime needs an X display, and there is none that does.
+        The runtime needs an X display with OpenGL 4.3, and there is none.
     ValueError
-        The variable asks for something else.
+        The variable has another value.
     """
     opened = _egl_context() if _wanted() == "egl" else _glx_context()
     with opened as context:
-        # EGL's is current from birth.  In a thread where a context of EGL is current
-        # none of GLX can be, nor the other way round; the filter has one of EGL.
+        # An EGL context is current once created. In a thread with a current EGL context
+        # no GLX context can be current, nor vice versa; the filter uses EGL.
         with context:
             pass
         yield context
@@ -89,7 +89,7 @@ def _egl_context() -> Iterator[moderngl.Context]:
 def _glx_context() -> Iterator[moderngl.Context]:
     if not os.environ.get("DISPLAY"):
         raise _no_display("DISPLAY is not set")
-    # Under Wayland glfw would load a library that knows no GLX.
+    # Under Wayland glfw would load a library without GLX.
     os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
     try:
         import glfw
@@ -102,7 +102,7 @@ def _glx_context() -> Iterator[moderngl.Context]:
         if window is None:
             raise _no_display("; ".join(errors))
         glfw.make_context_current(window)
-        # With libraries named it is a context of its own, not moderngl's default one.
+        # With explicit libraries this is a separate context, not moderngl's default.
         context = moderngl.create_context(
             require=_VERSION, libgl="libGL.so.1", libx11="libX11.so.6"
         )
@@ -114,7 +114,7 @@ def _glx_context() -> Iterator[moderngl.Context]:
 
 
 def _hidden_window(glfw: Any):
-    """Return a window that nobody sees; None where it cannot be made."""
+    """Create a hidden window; return None if that fails."""
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
     if not glfw.init():
         return None
@@ -134,12 +134,12 @@ def _no_display(why: str) -> NoRuntime:
 
 
 class Egl:
-    """EGL, which has contexts without a window.
+    """EGL, which provides contexts without a window.
 
     Attributes
     ----------
     name : str
-    extensions : what a session that draws with it needs of the runtime
+    extensions : OpenXR extensions that a session with such a context requires
     """
 
     name = "EGL"
@@ -156,15 +156,15 @@ class Egl:
         ]
 
     def is_current(self) -> bool:
-        """Return whether the current context is one of it."""
+        """Return whether the current context is an EGL context."""
         return bool(self._egl.eglGetCurrentContext())
 
     def load(self, name: str) -> int:
-        """Return where a function of OpenGL is."""
+        """Return the address of an OpenGL function."""
         return self._egl.eglGetProcAddress(name.encode())
 
     def binding(self) -> xr.GraphicsBindingEGLMNDX:
-        """Return what a session is told of the current context."""
+        """Return the session's graphics binding for the current context."""
         egl = self._egl
         display, context = egl.eglGetCurrentDisplay(), egl.eglGetCurrentContext()
         config_id, config, n_found = c_int(), c_void_p(), c_int()
@@ -181,7 +181,7 @@ class Egl:
 
 
 class Glx:
-    """GLX, which has the contexts of windows under X; else as `Egl`."""
+    """GLX, which provides contexts of windows under X; otherwise as `Egl`."""
 
     name = "GLX"
     extensions = (OPENGL,)
@@ -202,15 +202,15 @@ class Glx:
         self._x11.XFree.argtypes = [c_void_p]
 
     def is_current(self) -> bool:
-        """Return whether the current context is one of it."""
+        """Return whether the current context is a GLX context."""
         return bool(self._glx.glXGetCurrentContext())
 
     def load(self, name: str) -> int:
-        """Return where a function of OpenGL is."""
+        """Return the address of an OpenGL function."""
         return self._glx.glXGetProcAddressARB(name.encode())
 
     def binding(self) -> xr.GraphicsBindingOpenGLXlibKHR:
-        """Return what a session is told of the current context."""
+        """Return the session's graphics binding for the current context."""
         glx = self._glx
         display, context = glx.glXGetCurrentDisplay(), glx.glXGetCurrentContext()
         config = self._config(display, context)
@@ -238,13 +238,13 @@ class Glx:
 
 
 def current_platform() -> Egl | Glx:
-    """Return what the current context is of."""
+    """Return the platform of the current context."""
     egl = Egl()
     return egl if egl.is_current() else Glx()
 
 
 def _filled(structure: Any, **fields: Any):
-    """Return a structure, its pointers those of PyOpenGL that it asks for."""
+    """Return a structure with its pointers cast to the PyOpenGL types of its fields."""
     kinds = dict(structure._fields_)
     return structure(
         **{
@@ -257,7 +257,7 @@ def _filled(structure: Any, **fields: Any):
 
 
 class Framebuffers:
-    """Framebuffers over a runtime's images, each pair once.
+    """Framebuffers of a runtime's images, created once per pair.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ class Framebuffers:
         self._found: dict[tuple[int, int], moderngl.Framebuffer] = {}
 
     def of(self, color: int, depth: int) -> moderngl.Framebuffer:
-        """Return the framebuffer of two textures; depth 0 is none."""
+        """Return the framebuffer of two textures; depth 0 means none."""
         found = self._found.get((color, depth))
         if found is None:
             name = c_uint()
@@ -293,7 +293,7 @@ class Framebuffers:
         return found
 
     def release(self) -> None:
-        """Free all; a later session's textures have the same names."""
+        """Free all framebuffers; a later session's textures reuse the same names."""
         for framebuffer in self._found.values():
             self._delete(1, byref(c_uint(framebuffer.glo)))
         self._found = {}

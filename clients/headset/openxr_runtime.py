@@ -1,6 +1,6 @@
-"""A real headset, or Monado's simulated one, through OpenXR.
+"""OpenXR runtime: a real headset, or Monado's simulated one.
 
-Import this only where nothing else needs PyOpenGL: pyopenxr makes it use GLX.
+Import this module only if nothing else needs PyOpenGL: pyopenxr makes it use GLX.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ log = logging.getLogger("ocufilter.headset")
 
 
 def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Say `SessionLost` where OpenXR says that the runtime is gone."""
+    """Raise `SessionLost` if OpenXR reports that the runtime is gone."""
 
     @wraps(method)
     def wrapped(self, *arguments):
@@ -74,16 +74,16 @@ class OpenXrRuntime:
     Parameters
     ----------
     context : moderngl.Context
-        As of `openxr_gl.open_context`, which what is shown is drawn in.
+        Context that frames are drawn in, from `openxr_gl.open_context`.
     layers : sequence of str
-        OpenXR API layers to load, as ``XR_APILAYER_LUNARG_core_validation``.
+        OpenXR API layers to load, such as ``XR_APILAYER_LUNARG_core_validation``.
     scale : float
-        Of the picture size that the runtime recommends.
+        Factor on the picture size that the runtime recommends.
 
     Raises
     ------
     NoRuntime
-        None is installed, it does not run, or it lacks what is needed.
+        No runtime is installed, it is not running, or it lacks a required extension.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class OpenXrRuntime:
         self._closing.callback(self._release_images)
 
     def _size(self) -> tuple[int, int]:
-        """Return (width, height) of a picture: as recommended, and as allowed."""
+        """Return a picture's (width, height): as recommended, up to the maximum."""
         view = xr.enumerate_view_configuration_views(
             self._instance, self._system, _STEREO
         )[0]
@@ -169,7 +169,7 @@ class OpenXrRuntime:
         )
 
     def _blend_mode(self) -> xr.EnvironmentBlendMode:
-        """Return how the room is hidden, or what comes next to that."""
+        """Return the opaque blend mode, or the runtime's preferred one."""
         opaque = xr.EnvironmentBlendMode.OPAQUE
         offered = [
             xr.EnvironmentBlendMode(mode)
@@ -180,7 +180,7 @@ class OpenXrRuntime:
         return opaque if opaque in offered else offered[0]
 
     def _new_session(self):
-        # The standard asks for this call, whatever its answer.
+        # The standard requires this call, whatever it returns.
         ask = ctypes.cast(
             xr.get_instance_proc_addr(
                 self._instance, "xrGetOpenGLGraphicsRequirementsKHR"
@@ -217,14 +217,14 @@ class OpenXrRuntime:
 
     @property
     def has_depth(self) -> bool:
-        """Return whether depth is handed to the compositor."""
+        """Return whether depth is submitted to the compositor."""
         return self._images.has_depth
 
     # Frames
 
     @_or_lost
     def begin_frame(self) -> DueFrame | None:
-        """Wait for the next frame; None where there is none for the moment."""
+        """Wait for the next frame; return None if there is none at the moment."""
         with self._context:
             self._take_events()
             if self._is_over:
@@ -233,7 +233,7 @@ class OpenXrRuntime:
                 time.sleep(_IDLE_S)
                 return None
             state = xr.wait_frame(self._session, xr.FrameWaitInfo())
-            with suppress(xr.FrameDiscarded):  # it has begun, in place of another
+            with suppress(xr.FrameDiscarded):  # begun, and replaces the previous one
                 xr.begin_frame(self._session, xr.FrameBeginInfo())
             time_ns = int(state.predicted_display_time)
             pressed = self._actions.sync()
@@ -250,7 +250,7 @@ class OpenXrRuntime:
 
     @_or_lost
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
-        """Show a frame; nothing where ``shown`` is empty."""
+        """Show a frame; nothing if ``shown`` is empty."""
         with self._context:
             layers, kept = [], []
             if shown:
@@ -258,7 +258,7 @@ class OpenXrRuntime:
                 layers = [ctypes.byref(layer)]
             info = xr.FrameEndInfo(due.display_time_ns, self._blend, layers=layers)
             xr.end_frame(self._session, info)
-            del kept  # until here the layer pointed to it
+            del kept  # the layer pointed to it until here
 
     def _views(self, time_ns: int) -> tuple[EyeView, ...]:
         state, views = xr.locate_views(
@@ -314,12 +314,12 @@ class OpenXrRuntime:
     # Closing
 
     def close(self) -> None:
-        """End the session as the runtime wants it ended, if it is still there."""
+        """End the session in the order that OpenXR requires, if it still exists."""
         if self._is_running and not self._is_over:
             try:
                 self._leave()
             except (xr.XrException, SessionLost, SessionEnded):
-                pass  # gone is gone
+                pass  # the session is gone already
         self._is_running = False
         self._closing.close()
 
@@ -337,7 +337,7 @@ class OpenXrRuntime:
 
 
 def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
-    """Give something up that may be gone already."""
+    """Release a resource that may be gone already."""
     try:
         release(*arguments)
     except xr.XrException as error:

@@ -1,4 +1,4 @@
-"""A session's images: colour and depth of both eyes, and the layers made of them."""
+"""A session's swapchains: color and depth of both eyes, and their projection layers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Swapchain:
         self.part = xr.SwapchainSubImage(self.handle, rect, 0)
 
     def acquire(self) -> int:
-        """Return the texture that may be drawn into."""
+        """Acquire and return the texture to draw into."""
         index = xr.acquire_swapchain_image(self.handle, xr.SwapchainImageAcquireInfo())
         xr.wait_swapchain_image(
             self.handle, xr.SwapchainImageWaitInfo(timeout=_WAIT_NS)
@@ -51,20 +51,20 @@ class _Swapchain:
         return self._textures[index]
 
     def release(self) -> None:
-        """Hand the texture over."""
+        """Release the texture to the runtime."""
         xr.release_swapchain_image(self.handle, xr.SwapchainImageReleaseInfo())
 
 
 class StereoImages:
-    """What both eyes are shown, and how it is handed over.
+    """Swapchains of both eyes, and the projection layers that show them.
 
     Parameters
     ----------
     session : xr.Session
-    context : moderngl.Context, current for everything here
+    context : moderngl.Context, current for every call
     size_px : (width, height)
     with_depth : bool
-        Hand depth over, too: the runtime takes it.
+        Submit depth as well; the runtime must support it.
     """
 
     def __init__(
@@ -96,18 +96,18 @@ class StereoImages:
 
     @property
     def has_depth(self) -> bool:
-        """Return whether depth is handed over."""
+        """Return whether depth is submitted."""
         return bool(self._depth)
 
     def release(self) -> None:
-        """Free what is ours; the session frees its images."""
+        """Free our objects; the session frees its images."""
         self._framebuffers.release()
         self._presenter.release()
         for swapchain in (*self._color, *self._depth):
             xr.destroy_swapchain(swapchain.handle)
 
     def layer(self, space, shown: Sequence[ShownView]):
-        """Draw a frame; return the projection layer and what it points to."""
+        """Draw a frame; return the projection layer and the structures it points to."""
         kept, views = [], []
         for i, view in enumerate(shown):
             used = [self._color[i], *self._depth[i : i + 1]]
@@ -146,13 +146,13 @@ def _first_of(wanted: Sequence[int], offered: Sequence[int]) -> int | None:
 
 
 def posef(pose: Pose) -> xr.Posef:
-    """Return a pose as OpenXR has it."""
+    """Return a pose as an OpenXR structure."""
     x, y, z, *quaternion = pose
     return xr.Posef(xr.Quaternionf(*quaternion), xr.Vector3f(x, y, z))
 
 
 def pose_of(posef: xr.Posef) -> Pose:
-    """Return OpenXR's pose as seven numbers."""
+    """Return an OpenXR pose as seven numbers."""
     p, q = posef.position, posef.orientation
     return (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
 

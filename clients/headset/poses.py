@@ -1,4 +1,4 @@
-"""Poses as OpenXR has them: x, y, z in metres, then the quaternion x, y, z, w."""
+"""Poses as in OpenXR: x, y, z in meters, then the quaternion x, y, z, w."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +9,12 @@ Array = NDArray[np.float64]
 
 
 def matrix_of(pose: Pose) -> Array:
-    """Return the matrix (4, 4) from the pose's frame to the one that it is given in.
+    """Return the matrix (4, 4) from the pose's frame to its reference frame.
 
     Raises
     ------
     ValueError
-        A quaternion of no length.
+        The quaternion's length is not near 1.
     """
     x, y, z, w = _unit(pose[3:])
     matrix = np.eye(4)
@@ -36,7 +36,7 @@ def _unit(quaternion) -> Array:
 
 
 def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, ...]:
-    """Return the quaternion of a head that turns left by yaw, then up by pitch."""
+    """Return the quaternion of a head turned left by yaw, then up by pitch."""
     yaw, pitch = np.radians(yaw_deg) / 2, np.radians(pitch_deg) / 2
     # q = q_yaw q_pitch
     return (
@@ -48,20 +48,20 @@ def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, ...]:
 
 
 def direction_of(h_deg: float, v_deg: float) -> Array:
-    """Return the unit vector of a direction to the right and up, (3,)."""
+    """Return the unit vector (3,) of a direction to the right and up."""
     h, v = np.radians(h_deg), np.radians(v_deg)
     return np.array([np.sin(h) * np.cos(v), np.sin(v), -np.cos(h) * np.cos(v)])
 
 
 def angles_of(direction: Array) -> tuple[float, float]:
-    """Return (h, v) in degrees of a vector in front of the viewer."""
+    """Return the angles (h, v) in degrees of a vector in front of the viewer."""
     x, y, z = direction
     h = np.degrees(np.arctan2(x, -z))
     return float(h), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
 
 
 def upright(pose: Array) -> Array:
-    """Return a pose (4, 4) at the same place that looks the same way, on the level."""
+    """Return a level pose (4, 4) with the same position and heading."""
     ahead = -pose[:3, 2]
     h = np.arctan2(ahead[0], -ahead[2])
     level = np.eye(4)

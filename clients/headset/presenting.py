@@ -1,4 +1,4 @@
-"""Pictures from memory into a headset's images, with OpenGL."""
+"""Draw pictures from memory into the headset's images with OpenGL."""
 
 from pathlib import Path
 
@@ -8,18 +8,18 @@ import numpy as np
 from clients.headset.runtime import ShownView
 
 NEAR_M = 0.05
-"""What is nearer counts as being there."""
+"""Depths below this are clamped to it."""
 
 _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
 class Presenter:
-    """Draws pictures of one size into framebuffers of the caller's.
+    """Draws pictures of one size into the caller's framebuffers.
 
     Parameters
     ----------
     context : moderngl.Context
-        It must be current for everything here.
+        Must be current for every call.
     size_px : (width, height)
     """
 
@@ -47,7 +47,7 @@ class Presenter:
             made.release()
 
     def draw(self, shown: ShownView, target: moderngl.Framebuffer) -> None:
-        """Fill colour and depth of a framebuffer."""
+        """Fill color and depth of a framebuffer."""
         self._seen.write(np.ascontiguousarray(shown.color), alignment=1)
         self._depth_m.write(np.ascontiguousarray(shown.depth_m))
         ratio = 0.0 if shown.plain is None else shown.plain_ratio
@@ -56,7 +56,7 @@ class Presenter:
         self._program["plain_ratio"].value = ratio
         context = self._context
         with context.scope(target, moderngl.DEPTH_TEST):
-            context.depth_func = "1"  # always: depth is written only where it is tested
+            context.depth_func = "1"  # always: depth is written only if it is tested
             for unit, texture in enumerate((self._seen, self._plain, self._depth_m)):
                 texture.use(unit)
             target.viewport = (0, 0, *self._size_px)

@@ -1,4 +1,4 @@
-"""The matrices of one eye's camera."""
+"""Camera matrices of one eye."""
 
 import numpy as np
 
@@ -11,18 +11,18 @@ Tangents = tuple[float, float, float, float]
 def camera_uniforms(
     pose: Array, tangents: Tangents, scene: Scene
 ) -> dict[str, tuple[float, ...]]:
-    """Return what the scene's shader is told of a camera, by name.
+    """Return the camera's uniforms of the scene shader, by name.
 
     Parameters
     ----------
     pose : (4, 4), camera to world
     tangents : (left, right, up, down)
-    scene : whose near and far plane are taken
+    scene : scene whose near and far planes are used
 
     Raises
     ------
     ValueError
-        A pose or tangents of no camera.
+        The pose or the tangents do not describe a camera.
     """
     pose = np.asarray(pose, float)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -32,7 +32,7 @@ def camera_uniforms(
         raise ValueError("the pose stretches: its axes must be unit vectors, square")
     clip_from_view = projection(tangents, scene.near_m, scene.far_m)
     view_from_world = np.linalg.inv(pose)
-    # GLSL counts a matrix's columns first.
+    # GLSL matrices are column-major.
     clip_from_world = (clip_from_view @ view_from_world).T
     return {
         "clip_from_world": tuple(clip_from_world.ravel()),
@@ -41,7 +41,7 @@ def camera_uniforms(
 
 
 def projection(tangents: Tangents, near_m: float, far_m: float) -> Array:
-    """Return OpenGL's projection (4, 4) of a camera with any four edges.
+    """Return OpenGL's projection (4, 4) for an asymmetric frustum.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the viewer asks of a headset's runtime, real or simulated."""
+"""Interface between the viewer and a headset runtime, real or simulated."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ EYES: tuple[Eye, Eye] = ("left", "right")
 
 
 class NoRuntime(Exception):
-    """There is no headset to talk to; later there may be one."""
+    """No headset is available; one may become available later."""
 
 
 class SessionLost(Exception):
-    """The headset went away in the middle; it may come back."""
+    """The headset was disconnected during the session; it may come back."""
 
 
 class SessionEnded(Exception):
-    """The user has ended the program from within the headset."""
+    """The user ended the program from within the headset."""
 
 
 @dataclass(frozen=True)
 class EyeView:
-    """Where one eye is at the time a frame is shown, and what its display covers.
+    """Pose of one eye at the time a frame is shown, and the extent of its display.
 
     Attributes
     ----------
     pose : seven floats
-        Of the eye in the room, as of `poses`.
+        Pose of the eye in the room, as in `poses`.
     tangents : (left, right, up, down) of the display's edges
     """
 
@@ -45,7 +45,7 @@ class EyeView:
 
 @dataclass(frozen=True)
 class GazeSample:
-    """Where a tracker saw the eyes look, from between them: right and up of the head.
+    """Gaze that a tracker measured from between the eyes: right and up of the head.
 
     ``at_s`` is on the clock of `DueFrame.now_s`.
     """
@@ -57,22 +57,22 @@ class GazeSample:
 
 @dataclass(frozen=True)
 class DueFrame:
-    """One frame that the runtime asks for.
+    """One frame that the runtime requests.
 
     Attributes
     ----------
     display_time_ns : int
-        When it will be shown, on the runtime's clock.
+        Time at which it will be shown, on the runtime's clock.
     should_render : bool
-        False: nobody will see it.
-    views : the left eye's and the right eye's; none where nothing is tracked
-    head : the pose between the eyes, where it is known
+        False if the frame will not be visible.
+    views : the left eye's and the right eye's; empty without tracking
+    head : the pose between the eyes, if known
     gaze : GazeSample, optional
-    pressed : names of what was pressed on a controller since the last frame
+    pressed : names of the controller buttons pressed since the last frame
     pupil_diameter_mm : float, optional
-        As a tracker measures it.
+        Pupil measured by a tracker.
     period_s : float
-        From one frame to the next, where the runtime says so; else 0.
+        Time between frames if the runtime reports it, otherwise 0.
     """
 
     display_time_ns: int
@@ -86,24 +86,24 @@ class DueFrame:
 
     @property
     def now_s(self) -> float:
-        """Return its time in seconds."""
+        """Return the display time in seconds."""
         return 1e-9 * self.display_time_ns
 
 
 @dataclass(frozen=True)
 class ShownView:
-    """What one eye is shown.
+    """Content of one eye's display.
 
     Attributes
     ----------
     view : EyeView
-        As it was rendered, which may be longer ago than the frame.
+        View that the picture was rendered for, which may be that of an earlier frame.
     color : (h, w, 3) uint8 sRGB, top row first
     depth_m : (h, w) float32, planar
     plain : (h, w, 3) uint8, optional
-        The unfiltered picture, for the left part of the display.
+        Unfiltered picture for the left part of the display.
     plain_ratio : float
-        How much of the width that is.
+        Fraction of the width that the unfiltered picture covers.
     """
 
     view: EyeView
@@ -114,7 +114,7 @@ class ShownView:
 
 
 class Runtime(Protocol):
-    """A headset's runtime: one frame after the other.
+    """Interface of a headset's runtime, which runs one frame after the other.
 
     Attributes
     ----------
@@ -128,18 +128,18 @@ class Runtime(Protocol):
     tracks_eyes: bool
 
     def begin_frame(self) -> DueFrame | None:
-        """Wait for the next frame; None where there is none for the moment.
+        """Wait for the next frame; return None if there is none at the moment.
 
         Raises
         ------
         SessionLost
-            It may come back.
+            The session is lost; it may come back.
         SessionEnded
-            The user wants it so.
+            The user ended the session.
         """
 
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
-        """Show a frame; nothing where ``shown`` is empty.
+        """Show a frame; nothing if ``shown`` is empty.
 
         Raises
         ------
@@ -147,4 +147,4 @@ class Runtime(Protocol):
         """
 
     def close(self) -> None:
-        """Let the headset go."""
+        """Release the headset."""

@@ -1,4 +1,4 @@
-"""What a view of a scene keeps in an OpenGL context: targets, programs, triangles."""
+"""OpenGL objects of a scene view: render targets, programs and triangles."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 _SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
 
 _RESOLVE_CONSTANTS = {
-    # what a float of these bits is; a division by zero need not give it
+    # the float with these bits; a division by zero need not give infinity
     "INFINITY_BITS": "0x7F800000u",
     # IEC 61966-2-1, as in `clients.scenes.geometry`
     "SRGB_GAIN": 1.055,
@@ -23,7 +23,7 @@ _RESOLVE_CONSTANTS = {
 
 
 class SceneBuffers:
-    """The OpenGL objects of one view; their context must be current for all of it.
+    """OpenGL objects of one view; their context must be current for every call.
 
     Parameters
     ----------
@@ -33,14 +33,14 @@ class SceneBuffers:
     Attributes
     ----------
     samples, pixels : moderngl.Framebuffer
-        Where samples are drawn and pixels are made of them: colour, then a float for
-        depth, 1/m of samples and m of pixels.  What a depth buffer holds is too coarse
-        far away.
+        Targets of the samples and of the pixels resolved from them: color, then a float
+        for depth, 1/m for samples and m for pixels. A depth buffer is too coarse far
+        away.
     program : moderngl.Program
         Draws the scene.
     draw_calls : list of (moderngl.VertexArray, moderngl.Texture)
     resolving : moderngl.VertexArray
-        One triangle that makes pixels of samples.
+        One triangle that resolves samples to pixels.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class SceneBuffers:
         self._owned: list = []
         try:
             samples_px = (supersampling * size_px[0], supersampling * size_px[1])
-            # Samples hold sRGB values, and OpenGL makes light of them when they are
-            # read: faster than a power law in the shader.
+            # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
+            # faster than a power law in the shader.
             self.samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
             self.pixels = self._target(size_px, None, with_depth=False)
             self.program = self._program("scene.vert", "scene.frag", {})
@@ -71,12 +71,12 @@ class SceneBuffers:
             self._owned.pop().release()
 
     def _own(self, made):
-        """Return what was made, and free it in the end."""
+        """Register an object for release and return it."""
         self._owned.append(made)
         return made
 
     def _target(self, size_px, color_format: int | None, *, with_depth: bool):
-        """Return a framebuffer for colour and a float."""
+        """Return a framebuffer for color and a float."""
         context, own = self._context, self._own
         color = own(context.texture(size_px, 4, internal_format=color_format))
         values = own(context.texture(size_px, 1, dtype="f4"))
@@ -86,11 +86,11 @@ class SceneBuffers:
         return own(context.framebuffer([color, values], depth))
 
     def _program(self, vertex: str, fragment: str, defines: dict):
-        """Return the program of two files in assets/."""
+        """Build the program of two files in assets/."""
         texts = [(_ASSETS / name).read_text("utf-8") for name in (vertex, fragment)]
         version, _, rest = texts[1].partition("\n")
         lines = [f"#define {key} {value}" for key, value in defines.items()]
-        # Compilers' messages then name the file's lines.
+        # Compiler messages then refer to the lines of the file.
         texts[1] = "\n".join([version, *lines, "#line 2", rest])
         return self._own(
             self._context.program(vertex_shader=texts[0], fragment_shader=texts[1])
@@ -107,8 +107,8 @@ class SceneBuffers:
         return self._own(self._context.vertex_array(program, []))
 
     def _all_draw_calls(self, scene: Scene) -> list:
-        """Return each batch's triangles and texture; batches may share one."""
-        # A surface without a texture is its colour times white.
+        """Return each batch's triangles and texture; batches may share a texture."""
+        # A surface without a texture is its color times white.
         textures = {None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))}
         calls = []
         for batch in scene.batches:
@@ -119,7 +119,7 @@ class SceneBuffers:
         return calls
 
     def _triangles(self, batch: Batch):
-        """Return a batch's vertices and indices as the program takes them."""
+        """Return a batch's vertices and indices in the program's layout."""
         columns = (
             (batch.vertices_m, "3f", "vertex_m"),
             (batch.srgb, "3f", "srgb"),
@@ -136,7 +136,7 @@ class SceneBuffers:
         return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
 
     def _surface(self, texels: NDArray[np.uint8]):
-        """Return a texture with mipmaps, filtered and repeated as pyrender's are."""
+        """Return a texture with mipmaps, filtered and repeated as in pyrender."""
         height, width = texels.shape[:2]
         upright = np.ascontiguousarray(texels[::-1])
         texture = self._own(self._context.texture((width, height), 3, upright))

@@ -1,7 +1,7 @@
-"""Render a scene's colour and depth for one eye, in an OpenGL context of the caller's.
+"""Render a scene's color and depth for one eye, in an OpenGL context of the caller.
 
-The scenes of `clients.scene_renderer`, shown as they are there, without pyrender: that
-one wants a PyOpenGL of its own, and OpenXR has chosen another one by then.
+It renders the scenes of `clients.scene_renderer` with the same look, without pyrender,
+which requires a different PyOpenGL platform than the one that OpenXR selects.
 """
 
 import moderngl
@@ -20,29 +20,31 @@ _WRITE, _KEEP = (True,) * 4, (False,) * 4
 
 
 class SceneView:
-    """A window onto one scene, in a context that others may use too.
+    """View of one scene, in an OpenGL context that may be shared.
 
     Parameters
     ----------
-    context : where it renders; OpenGL 3.3 or later
-    scene : what to show
+    context : moderngl.Context
+        Context to render in; OpenGL 3.3 or later.
+    scene : Scene
     size_px : (width, height) of a picture
     supersampling : samples per pixel and axis
 
     Raises
     ------
     ValueError
-        A size below 1 px, or above what the context can render.
+        A size below 1 px, or larger than the context can render.
 
     Notes
     -----
-    A pixel's colour is the mean of its samples in linear light.  Its depth is that of
-    one sample, the second nearest of each four, so that it is never a depth at which
-    nothing is: a mean across an edge would be.
+    A pixel's color is the mean of its samples in linear light. Its depth is that of one
+    sample, the second nearest of each four. A mean across an edge would be a depth at
+    which there is no surface.
 
-    Every call makes the context current.  Afterwards none is where moderngl came to it
-    through EGL: all else that the thread draws must stand in a `with context:` of its
-    own, which must not be open around a call.  GL_FRAMEBUFFER_SRGB is left off.
+    Every call makes the context current. If moderngl obtained the context through EGL,
+    no context is current afterwards: other drawing in the same thread must be in a
+    `with context:` of its own, which must not be open around a call.
+    GL_FRAMEBUFFER_SRGB is left off.
     """
 
     def __init__(
@@ -69,33 +71,34 @@ class SceneView:
         self.close()
 
     def close(self) -> None:
-        """Free all that lies in the context; closing twice is allowed."""
+        """Free the OpenGL objects; closing twice is allowed."""
         with self._context:
             self._held.release()
 
     def render(
         self, pose: Array, tangents: Tangents, *, out: Picture | None = None
     ) -> Picture:
-        """Return what is seen from a pose.
+        """Render the scene from a pose.
 
         Parameters
         ----------
         pose : (4, 4)
-            Camera to world; x right, y up, it looks along -z.
+            Camera to world; x right, y up, looking along -z.
         tangents : (left, right, up, down) of the image edges
         out : (color, depth_m), optional
-            Memory to render into, of the shapes and types below, without gaps.
+            Output arrays, contiguous, of the shapes and types below.
 
         Returns
         -------
         color : (h, w, 3) uint8 sRGB, top row first
         depth_m : (h, w) float32
-            Planar depth; +inf is background, and all from `scene.infinite_from_m` on.
+            Planar depth; +inf for the background and from `scene.infinite_from_m` on.
 
         Raises
         ------
         ValueError
-            A pose or tangents of no camera, or memory that does not fit.
+            The pose or tangents do not describe a camera, or an output array does not
+            fit.
         """
         uniforms = camera_uniforms(pose, tangents, self.scene)
         color, depth_m = self._memory(out)
@@ -109,7 +112,8 @@ class SceneView:
         """Draw all samples."""
         held, samples = self._held, self._held.samples
         with self._context.scope(samples, moderngl.DEPTH_TEST):
-            # Vertices hold sRGB values already; what shows to a headset may want it on.
+            # Vertices hold sRGB values already. Code that draws to a headset may have
+            # enabled the conversion.
             self._context.disable_direct(_FRAMEBUFFER_SRGB)
             samples.color_mask = (_WRITE, _KEEP)
             samples.clear(*self.scene.background_srgb, 1.0)
@@ -123,21 +127,21 @@ class SceneView:
                 triangles.render(moderngl.TRIANGLES)
 
     def _resolve(self) -> None:
-        """Make pixels of samples."""
+        """Resolve samples to pixels."""
         with self._context.scope(self._held.pixels, moderngl.NOTHING):
             for unit, texture in enumerate(self._held.samples.color_attachments):
                 texture.use(unit)
             self._held.resolving.render(moderngl.TRIANGLES, vertices=3)
 
     def _read_into(self, color, depth_m) -> None:
-        """Copy the pixels to the caller; waits for the GPU."""
+        """Copy the pixels to the output arrays; waits for the GPU."""
         pixels = self._held.pixels
-        # Rows of three bytes a pixel are not always a multiple of four.
+        # The size of a row of three-byte pixels need not be a multiple of four.
         pixels.read_into(color, components=3, attachment=0, alignment=1)
         pixels.read_into(depth_m, components=1, attachment=1, dtype="f4")
 
     def _memory(self, out: Picture | None) -> Picture:
-        """Return memory for a picture: the caller's, or new."""
+        """Return the caller's output arrays after a check, or new ones."""
         width, height = self.size_px
         wanted = (((height, width, 3), np.uint8), ((height, width), np.float32))
         if out is None:

@@ -1,4 +1,4 @@
-"""A scene around a headset: both eyes' pictures, in one OpenGL context."""
+"""Rendering of a scene for both eyes of a headset, in one OpenGL context."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SceneScenery:
     context : moderngl.Context
     scene : Scene
     stand : (4, 4)
-        Where the room's origin, at the height of the eyes, is in the scene.
+        Pose in the scene of the room's origin, at eye height.
     supersampling : int
         Samples per pixel and axis.
     """
@@ -44,7 +44,7 @@ class SceneScenery:
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
     ) -> tuple[RgbdPicture, ...]:
-        """Return what each eye is shown."""
+        """Render the picture of each eye."""
         found = []
         for view in views:
             pose = self._stand @ matrix_of(view.pose)
@@ -64,7 +64,7 @@ class SceneScenery:
         return self._view
 
     def close(self) -> None:
-        """Free what lies in the context."""
+        """Free the OpenGL objects."""
         if self._view is not None:
             self._view.close()
             self._view = None

@@ -1,4 +1,4 @@
-"""What a person's eyes are given, what they see of it, and what filters between."""
+"""Frames before and after the filter, and the interface of the filters between."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class LookedAt:
-    """One frame on its way to a person's eyes."""
+    """One frame to be filtered, with the state of both eyes."""
 
     due: DueFrame
     pictures: tuple[RgbdPicture, ...]
@@ -28,12 +28,12 @@ class LookedAt:
 
     @property
     def views(self) -> list[RgbdView]:
-        """Return what is filtered."""
+        """Return the views to filter."""
         return [RgbdView(p.color, p.depth_m, p.view.tangents) for p in self.pictures]
 
     @property
     def states(self) -> tuple[ViewState, ...]:
-        """Return through whose eyes, in which state, from where."""
+        """Return eye, pupil, focus, gaze and pose of each view."""
         return tuple(
             ViewState(
                 picture.view.eye,
@@ -48,16 +48,16 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame as it is seen, with the views that it was rendered for.
+    """A filtered frame, with the views that it was rendered for.
 
     Attributes
     ----------
     frame : LookedAt
-        What went in.
-    views : EyeView of each picture, with the pose that came back with it
+        Input frame.
+    views : EyeView of each picture, with the pose that was returned with it
     colors : (h, w, 3) uint8 of each eye
-    used_focus_dpt : of each eye; None where that tells nothing of the eye that is
-        wanted, as it is seen through the one before, or through a preview
+    used_focus_dpt : of each eye; None where it says nothing about the requested eye,
+        because the view shows the previous eye or a preview
     stages_ms : times of the filter, and of the way to it and back
     """
 
@@ -71,27 +71,27 @@ class Seen:
 
 
 class Seeing(Protocol):
-    """Filters frames, each eye through its own profile.
+    """Interface of a filter of frames, each eye through its own profile.
 
     Attributes
     ----------
     settings : FilterSettings
-        Of eyes from the next change on; where they look straight ahead is each view's.
+        Settings of eyes from the next change on; straight ahead is that of each view.
     """
 
     settings: FilterSettings
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Ask for another eye; frames go on through the one before."""
+        """Request another eye; frames use the previous one until it is ready."""
 
     def see(self, frame: LookedAt) -> Seen | None:
-        """Hand a frame over; return the newest that is seen, None while none is."""
+        """Submit a frame; return the newest result, or None if there is none yet."""
 
     def restart(self) -> None:
-        """Forget what was seen: its poses are of a room that is gone."""
+        """Discard results: their poses refer to a previous session."""
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
 
 
 def settings_ahead(settings: FilterSettings, eye: LookingEye) -> FilterSettings:

@@ -1,4 +1,4 @@
-"""What a person sees in a headset, filtered in this process."""
+"""Filtering of headset frames in this process."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ EyeEvent = BuildingEye | EyeReady | EyeFailed
 
 
 class SeeingHere:
-    """Filters in this process; each frame is seen at once.
+    """Filter in this process; the result of a frame is returned at once.
 
     Parameters
     ----------
     settings : FilterSettings
     say : callable
-        Told in a line what happens to the eyes.
+        Called with each message about the eyes, one line.
     """
 
     def __init__(self, settings: FilterSettings, say: Say) -> None:
@@ -54,7 +54,7 @@ class SeeingHere:
             self._say(f"{eye} eye: {event.error}")
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Ask for another eye; frames go on through the one before."""
+        """Request another eye; frames use the previous one until it is ready."""
         self._wanted[eye] = profile
 
     def _set_profiles(self, frame: LookedAt) -> None:
@@ -74,12 +74,12 @@ class SeeingHere:
                 self._say(f"{eye} eye: {error}")
 
     def see(self, frame: LookedAt) -> Seen | None:
-        """Filter a frame; None while an eye is being prepared for it.
+        """Filter a frame; return None while an eye is being prepared for it.
 
         Raises
         ------
         FilterError
-            An eye cannot be prepared, and there is none before it.
+            An eye cannot be prepared, and there is no previous one.
         """
         begin_s = time.monotonic()
         self._set_profiles(frame)
@@ -115,9 +115,9 @@ class SeeingHere:
         )
 
     def restart(self) -> None:
-        """Nothing is kept from frame to frame."""
+        """Do nothing: there is no state between frames."""
 
     def close(self) -> None:
-        """End what filters."""
+        """Close the filters."""
         for eye_filter in self.filters.values():
             eye_filter.close()

@@ -1,7 +1,7 @@
-"""A headset that is not there: a head that moves as told, and pictures that are kept.
+"""Simulated headset runtime with a scripted head, for tests and previews.
 
-For tests, and to see what a headset would show.  It keeps what OpenXR's runtimes keep
-of the rules: frames begin and end in turn, and what it shows has a pose.
+It enforces OpenXR's frame rules as far as they matter here: frames begin and end in
+turn, and each view shown has a pose.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from filter_service.messages import Pose
 EYE_DISTANCE_M = 0.063
 EYE_LEVEL_M = 0.0
 LEFT_EDGES_DEG = (-50.0, 42.0, 43.0, -48.0)
-"""Of the left eye's display: left, right, up, down; the right one's is mirrored."""
+"""Edges of the left eye's display: left, right, up, down. The right eye's are
+mirrored."""
 
 NS_PER_S = 1e9
 
 
 def swaying(at_s: float) -> Pose:
-    """Return a standing person's head that looks a little around."""
+    """Return the head pose of a standing person who looks around a little."""
     yaw_deg = 8.0 * math.sin(2.0 * math.pi * at_s / 6.0)
     pitch_deg = 3.0 * math.sin(2.0 * math.pi * at_s / 4.0)
     side_m = 0.03 * math.sin(2.0 * math.pi * at_s / 5.0)
@@ -40,29 +41,29 @@ def swaying(at_s: float) -> Pose:
 
 
 def still(at_s: float) -> Pose:
-    """Return a head that does not move."""
+    """Return a head pose that does not move."""
     return (0.0, EYE_LEVEL_M, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass
 class Happening:
-    """What goes on beside the head's motion; a test changes it as it goes.
+    """Simulated events and sensor values; a test changes them while frames run.
 
     Attributes
     ----------
     should_render : bool
         False: the headset is taken off.
     is_lost : bool
-        The next call says that the session is lost.
+        The next call raises `SessionLost`.
     is_ended : bool
-        The next frame says that the user has ended it.
+        The next frame raises `SessionEnded`.
     is_paused : bool
         No frames for the moment.
     gaze_deg : (h, v), optional
-        What a tracker sees; None is no tracker.
+        Gaze measured by a tracker; None means no tracker.
     pupil_diameter_mm : float, optional
-        What it measures.
-    pressed : names that come with the next frame
+        Pupil measured by a tracker.
+    pressed : names of buttons that the next frame reports
     """
 
     should_render: bool = True
@@ -75,18 +76,18 @@ class Happening:
 
 
 class SimulatedRuntime:
-    """A headset's runtime without a headset.
+    """Headset runtime without a headset.
 
     Parameters
     ----------
     size_px : (width, height) of each eye's picture
     rate_hz : float
-        Frames a second, at most.
+        Maximum number of frames per second.
     head_at : callable
-        ``head_at(seconds)`` gives the head's pose.
+        ``head_at(seconds)`` returns the head's pose.
     happening : Happening
     on_shown : callable, optional
-        ``on_shown(due, shown)`` is given each frame that ends.
+        ``on_shown(due, shown)`` is called for each frame that ends.
     """
 
     name = "simulated headset"
@@ -146,7 +147,7 @@ class SimulatedRuntime:
         return self._begun
 
     def _wait(self) -> None:
-        """Sleep until the next frame of the display that is still to come."""
+        """Sleep until the display's next frame that is still ahead."""
         now_s = time.monotonic() - self._start_s
         missed = math.floor((now_s - self._next_s) / self._period_s)
         self._next_s += self._period_s * (1 + max(0, missed))
@@ -169,11 +170,11 @@ class SimulatedRuntime:
             self._on_shown(due, shown)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""
 
 
 def eye_views(head: Pose) -> tuple[EyeView, EyeView]:
-    """Return both eyes' views of a head's pose."""
+    """Return both eyes' views for a head pose."""
     matrix = matrix_of(head)
     left, right, up, down = (math.tan(math.radians(e)) for e in LEFT_EDGES_DEG)
     found = []

@@ -1,4 +1,4 @@
-"""The viewer's loop: render, look, filter, show, whatever the headset does."""
+"""The viewer's main loop: render, follow the eyes, filter, show."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from clients.headset.seeing import LookedAt, Seeing, Seen
 
 MS_PER_S = 1e3
 STALE_S = 1.0
-"""A picture begun so long ago is not shown any more: the scene is, as it is."""
+"""A result older than this is not shown; the unfiltered scene is shown instead."""
 
 RETRY_S = 1.0
 SPLIT_RATIO = 0.5
 
 
 class Scenery(Protocol):
-    """What renders both eyes' pictures."""
+    """Interface of a renderer of both eyes' pictures."""
 
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
     ) -> tuple[RgbdPicture, ...]:
-        """Return what each eye is shown."""
+        """Render the picture of each eye."""
 
 
 @dataclass
 class ViewerLog:
-    """What became of the frames.
+    """Counts and times of the frames.
 
     Attributes
     ----------
-    shown : frames that were shown filtered, plain, or were not to be rendered
-    first_filtered_s : when the first of them was, of `time.monotonic`
+    n_filtered, n_plain, n_hidden : frames shown filtered, shown plain, and not rendered
+    first_filtered_s : time of the first filtered frame, of `time.monotonic`
     stages_ms : times of each stage of filtered frames
     """
 
     n_filtered: int = 0
     first_filtered_s: float | None = None
-    n_repeated: int = 0  # filtered pictures that were shown once more
+    n_repeated: int = 0  # filtered pictures that were shown again
     n_plain: int = 0
     n_hidden: int = 0
     n_sessions: int = 0
@@ -60,7 +60,7 @@ class ViewerLog:
     notes: dict[str, tuple[int, str]] = field(default_factory=dict)
 
     def add(self, **times_ms: float) -> None:
-        """Note a filtered frame's times."""
+        """Record a filtered frame's times."""
         self.n_filtered += 1
         if self.first_filtered_s is None:
             self.first_filtered_s = time.monotonic()
@@ -68,7 +68,7 @@ class ViewerLog:
             self.stages_ms.setdefault(name, []).append(value_ms)
 
     def add_notes(self, notes: Sequence[str]) -> None:
-        """Count what the filter has to say, by its kind: numbers differ each time."""
+        """Count the filter's notes by kind, ignoring the numbers in them."""
         for note in notes:
             kind = NUMBER.sub("#", note)
             count, example = self.notes.get(kind, (0, note))
@@ -94,22 +94,22 @@ class ViewerLog:
 
 
 class Viewer:
-    """Shows a scene as two eyes see it.
+    """Shows a scene as seen through two eyes.
 
     Parameters
     ----------
     open_runtime : callable
-        Gives the headset's runtime; called again after a session is lost.
+        Opens the headset's runtime; called again after a session is lost.
     scenery : Scenery
     seeing : Seeing
     look : StereoLook
     controls : Controls
     read_keys : callable
-        Gives the keys that were pressed.
+        Returns the keys pressed since the last call.
     say : callable
-        Told in a line what the user should know.
+        Called with each message for the user, one line.
     on_session : callable
-        Told of each runtime that a session begins with.
+        Called with the runtime of each new session.
     """
 
     def __init__(
@@ -144,16 +144,16 @@ class Viewer:
         limit_s: float | None = None,
         warm_up_s: float = 0.0,
     ) -> ViewerLog:
-        """Show frames until the user ends it; a headset that goes away is waited for.
+        """Show frames until the user ends the program; wait for a lost headset.
 
         Parameters
         ----------
         max_frames : int, optional
-            Filtered frames after which it ends.
+            Number of filtered frames after which to stop.
         limit_s : float, optional
-            Time after which it ends.
+            Time after which to stop.
         warm_up_s : float
-            How long the first filtered frame may take; the limit counts from that
+            Longest wait for the first filtered frame; the time limit counts from that
             frame.
         """
         started_s = time.monotonic()
@@ -212,7 +212,7 @@ class Viewer:
                 if due.should_render:
                     seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
             except BaseException:
-                # A frame that was begun is to be ended, whatever happened to it.
+                # A frame that was begun must be ended, whatever happened to it.
                 runtime.end_frame(due, ())
                 raise
             show_s = time.monotonic()
@@ -226,7 +226,7 @@ class Viewer:
     def _frame(
         self, due: DueFrame, begun_s: float, size_px: tuple[int, int]
     ) -> tuple[Seen | None, tuple[ShownView, ...], dict[str, float]]:
-        """Return what is seen, what is to be shown, and what that took."""
+        """Return the filtered frame, the views to show, and the times of the stages."""
         pictures = self._scenery.pictures(due.views, size_px)
         rendered_s = time.monotonic()
         eyes = self._look.follow(due, pictures)
@@ -246,7 +246,7 @@ class Viewer:
         return seen, self._shown(frame, seen), times_ms
 
     def _shown(self, frame: LookedAt, seen: Seen | None) -> tuple[ShownView, ...]:
-        """Return what is shown: a picture always with the view that it is of."""
+        """Return the views to show: each picture with the view it was rendered for."""
         if seen is None or not self._controls.is_on:
             return tuple(
                 ShownView(picture.view, picture.color, picture.depth_m)

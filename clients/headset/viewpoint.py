@@ -1,4 +1,4 @@
-"""Where a viewer stands at first, so that a scene is in front of them."""
+"""The viewer's initial position, with the scene in front of them."""
 
 import numpy as np
 
@@ -8,24 +8,24 @@ from clients.scenes.scene import Scene
 
 EYE_HEIGHT_M = 1.6
 _FLOOR_M = 0.3
-"""A scene that begins no further from 0 than this stands on the floor."""
+"""A scene whose lowest point is no further from 0 than this stands on the floor."""
 
 _HEADROOM_M = 0.1
 _STEP_BACK_RATIO = 0.25
-"""Of a place's depth: how far from its near end a viewer stands."""
+"""Distance of the viewer from the near end of an interior, as a part of its depth."""
 
 _LEAST_DISTANCE_M = 0.4
 _DISTANCE_RADII = 2.2
-"""A sphere around the scene is then 54 degrees wide."""
+"""At this distance a sphere around the scene is 54 degrees wide."""
 
 
 def viewpoint(scene: Scene) -> Array:
     """Return the pose (4, 4), camera to world, of an upright viewer.
 
-    In our own scenes that is where their path begins.  In a place whose floor is at 0
-    and that is higher than a person, a viewer stands in it, `EYE_HEIGHT_M` above the
-    floor.  Anything else is looked at from outside, along -z, at the height of its
-    centre.
+    In a built-in scene, the viewer stands where the scene's path begins. In an
+    interior, that is a scene with its floor at 0 that is higher than a person, the
+    viewer stands inside, `EYE_HEIGHT_M` above the floor. Any other scene is viewed from
+    outside, along -z, at the height of its center.
     """
     if scene.name in PATHS:
         return path_moments(PATHS[scene.name], 1)[0].pose

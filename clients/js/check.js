@@ -1,11 +1,11 @@
-// Streams a few frames through a service and says as JSON what came back.
+// Sends a few frames to a service and prints the results as JSON.
 //
 //     node check.js ENDPOINT PROFILE_JSON [LEFT_JSON RIGHT_JSON]
 //
-// Mono and stereo frames, two eyes with profiles of their own (PROFILE_JSON where none are
-// given), 8 bits and linear light, errors with their fields; then it says
-// "lost" on a line of its own, waits for a line on stdin (whoever runs it may end the
-// connection meanwhile), and filters once more.
+// Covers mono and stereo frames, two eyes with separate profiles (PROFILE_JSON by
+// default), 8-bit and linear light, and errors with their fields. It then prints "lost"
+// on a separate line, waits for a line on stdin (meanwhile the caller may break the
+// connection), and filters once more.
 
 import { createInterface } from "node:readline";
 import { FilterClient } from "./filter_client.js";

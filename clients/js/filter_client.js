@@ -1,4 +1,4 @@
-// A client of the filter service for Node; filter_service/PROTOCOL.md says what travels.
+// Client of the filter service for Node. Protocol: filter_service/PROTOCOL.md.
 //
 //     const client = new FilterClient("tcp://127.0.0.1:5577");
 //     await client.hello();
@@ -6,11 +6,11 @@
 //     const seen = await client.filter([view], { pupilMm: 4, focusDpt: 0 });
 //     client.close();
 //
-// A camera is { widthPx, heightPx, tangents: [left, right, up, down] }; a view is one with
-// color, a Uint8Array of sRGB or a Float32Array of linear light, and depthM, a
-// Float32Array of metres.  A view may name the eye that sees it, "left" or "right", with
-// eye, and what is that eye's own: pupilMm, focusDpt, gazeDeg; pose, seven numbers, comes
-// back with the picture.  One call of `filter` at a time.
+// A camera is { widthPx, heightPx, tangents: [left, right, up, down] }. A view is a
+// camera with color, a Uint8Array of sRGB or a Float32Array of linear light, and
+// depthM, a Float32Array of meters. A view may also have eye, "left" or "right"; the
+// state of that eye: pupilMm, focusDpt, gazeDeg; and pose, seven numbers, which the
+// result repeats. Only one call of `filter` at a time.
 
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
@@ -29,18 +29,18 @@ export class FilterError extends Error {
 }
 
 export class FilterClient {
-  // options: timeoutMs, the longest wait for an answer; name, for the service's log;
-  // key, { server, publicKey, secretKey }, for a service that wants one.
+  // Options: timeoutMs, the longest wait for a reply; name, for the service's log;
+  // key, { server, publicKey, secretKey }, for a service that requires one.
   constructor(endpoint, { timeoutMs = 10000, name = "filter_client.js", key } = {}) {
     this.endpoint = endpoint;
     this.timeoutMs = timeoutMs;
     this.name = name;
     this.welcome = null;
-    this.profiles = new Map(); // of each eye the last request, for a new session
+    this.profiles = new Map(); // last request of each eye, resent to a new session
     this.nextFrameId = 0;
     this.nextProfileId = 0;
     this.waiting = []; // { accepts, resolve, reject, timer }
-    this.notes = new Set(); // told of every reply
+    this.notes = new Set(); // called with every reply
     this.socket = new Dealer({
       linger: 0,
       immediate: true,
@@ -60,7 +60,7 @@ export class FilterClient {
     this.reading = this.read();
   }
 
-  // Resolves when the service has said welcome, with what it said.
+  // Resolves with the service's welcome message.
   async hello() {
     return this.welcome ?? this.await_((reply) => reply.type === "welcome", "hello");
   }
@@ -84,7 +84,7 @@ export class FilterClient {
       "the profile to be accepted",
       ours,
     );
-    // An eye may be ready before we have read how many cameras it is made for.
+    // An eye may be ready before we have read the number of its cameras.
     const isReady = (reply) => ours(reply) && reply.type === "ready";
     const arrived = [];
     const note = (reply) => isReady(reply) && arrived.push(reply);
@@ -106,7 +106,7 @@ export class FilterClient {
     }
   }
 
-  // Resolves with the result's header and its pictures, `colors`, one for each view.
+  // Resolves with the result's header and its pictures, `colors`, one per view.
   async filter(views, look) {
     const { pupilMm, focusDpt, gazeDeg, displayTimeNs, output = "uint8", options = {} } = look;
     const end = Date.now() + this.timeoutMs;
@@ -155,7 +155,7 @@ export class FilterClient {
     await this.reading;
   }
 
-  // What follows is not for callers.
+  // The methods below are private.
 
   async greet() {
     const key = this.key ?? "";
@@ -172,10 +172,10 @@ export class FilterClient {
   }
 
   async send(parts) {
-    // Messages leave in order: a Dealer may have one send at a time.
+    // A Dealer allows one send at a time, so messages are chained in order.
     this.sending = (this.sending ?? Promise.resolve())
       .then(() => this.socket.send(parts))
-      .catch(() => {}); // the connection is lost: what waits is told by `lose`
+      .catch(() => {}); // the connection is lost: `lose` rejects pending requests
     return this.sending;
   }
 
@@ -274,6 +274,6 @@ function images(view) {
 function picture(result, part, index) {
   const { dtype } = result.views[index].color;
   if (dtype === "uint8") return new Uint8Array(part.buffer, part.byteOffset, part.byteLength);
-  const copy = new Uint8Array(part); // aligned, which the message need not be
+  const copy = new Uint8Array(part); // aligned; the message need not be
   return dtype === "float32" ? new Float32Array(copy.buffer) : new Uint16Array(copy.buffer);
 }

@@ -1,37 +1,38 @@
-"""A page in people's hands: `ocufilter web`.
+"""Interactive page in the browser: `ocufilter web`.
 
 program        the command
-server         NiceGUI within a guard and limits, and a websocket for pictures
-guard          who may open the page
+server         NiceGUI behind a guard and limits, and a websocket for pictures
+guard          access control by token
 bounds         limits on requests
-connections    and on connections
-page           the page, and what becomes of every entry
-page_state     what a page holds, without the page
+connections    limits on connections
+page           the page: layout and event handlers
+page_state     state of a page, independent of the layout
 eye_panel      the entries of one eye
-eye_form       what they say, and the profile that it makes
-worn_form      what is worn, as entries
-numbers        numbers that people type, with their limits
+eye_form       their values, and the resulting profile
+worn_form      the entries of a correction, and the resulting correction
+numbers        numeric entries with their limits
 slider_row     a slider with its name and value
-upload_entry   an entry for a file
-file_names     names of files, made safe
-scene_panel    what is looked at, chosen
-picture        a picture with depth, in full and small
+upload_entry   a file upload
+file_names     sanitized file names
+scene_panel    selection of the scene
+picture        a picture with depth, at full and preview size
 chart          a letter chart as a picture
-scene_file     a scene rendered in a process apart
-seen_view      scene and eye with a split between them; seen_view.js is its browser part
-figure_panel   the point under the pointer, figures of the eye
+scene_file     a scene rendered in a child process
+seen_view      scene and filtered picture with a split; seen_view.js is its browser part
+figure_panel   the point under the pointer, and figures of the eye
 eye_figures    those figures
-point_spread   what the eye makes of one point, in colour
-studying       the process beside the page that draws them
-seeing         the thread that filters: of what is wished, the newest wins
-eye_view       one eye: a quick small picture, then the full one
-wishes         what is wanted, and what is shown
-pictures_out   pictures on their way to the browser
-picture_files  as files in memory
+point_spread   point-spread function of one point, in color
+studying       worker process that draws them
+seeing         filter thread; the newest wish wins
+eye_view       one eye: a fast preview, then the full picture
+wishes         the requested state, and the pictures returned
+pictures_out   sends pictures to the browser
+picture_files  pictures encoded in memory
 
-Slider to picture: `page` leaves a wish with `seeing`, which never runs on the page's
-event loop; its thread hands pictures to `pictures_out`.  `EyeFilter` runs in this
-process, as a service would add its two ways (of 1280 x 720 px, wire and queue: 1.1 ms
-through shared memory, 4.5 ms over ipc, tests/benchmarks/results/roundtrip_*_mono.json)
-and no gain: PSFs are built in a process of their own either way.
+From slider to picture: `page` passes a wish to `seeing`, which never runs on the page's
+event loop; its thread passes pictures to `pictures_out`. `EyeFilter` runs in this
+process: a service would add the transfer in both directions (for 1280 x 720 px, wire
+and queue: 1.1 ms through shared memory, 4.5 ms over ipc,
+tests/benchmarks/results/roundtrip_*_mono.json) and gain nothing, as PSFs are built in
+a process of their own either way.
 """

@@ -1,7 +1,7 @@
-"""Limits on HTTP requests: methods, paths, sizes of bodies, and time to send them.
+"""Limits on HTTP requests: methods, paths, body sizes, and time to send a body.
 
-An ASGI layer inside the guard.  It answers a request that exceeds a limit by itself and
-before the body is in memory; the application then sees a client that disconnected.
+An ASGI layer inside the guard. It responds itself to a request that exceeds a limit,
+before the body is in memory; the application then sees a disconnected client.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from typing import Any
 from clients.web.guard import Application, Scope, Send, answer, header, page_of
 
 MAX_MESSAGE_BYTES = 1_000_000
-"""Of a request that is no upload, and of a websocket message, as Engine.IO has it."""
+"""Size of a request that is not an upload, and of a websocket message, as in
+Engine.IO."""
 
 MAX_UPLOAD_BYTES = 201_000_000
-"""Of a request that uploads a file: the largest file, a glTF scene, in its envelope."""
+"""Size of an upload request: the largest file, a glTF scene, with its multipart
+envelope."""
 
 MAX_PAGES = 32
-"""Open pages; each has eyes of its own, with tens of megabytes of PSFs."""
+"""Open pages; each has its own eyes, with tens of megabytes of PSFs."""
 
 PAGE_PATH = "/"
 KNOWN_PREFIXES = ("/_nicegui/", "/_nicegui_ws/", "/favicon.ico")
@@ -31,15 +33,15 @@ READS, ALL_METHODS = ("GET", "HEAD"), ("GET", "HEAD", "POST")
 
 @dataclass(frozen=True)
 class Limits:
-    """What a request may take.
+    """Limits of a request.
 
     Attributes
     ----------
     message_bytes, upload_bytes : int
     body_s : float
-        Until a body has arrived.
+        Time until a body has arrived.
     uploads : int
-        At the same time: each lies in a temporary file while it arrives.
+        Uploads at the same time: each is in a temporary file while it arrives.
     """
 
     message_bytes: int = MAX_MESSAGE_BYTES
@@ -49,13 +51,13 @@ class Limits:
 
 
 class Bounds:
-    """Answer requests beyond the limits, and pass on the others.
+    """Respond to requests beyond the limits, and pass on the others.
 
     Parameters
     ----------
     app : ASGI application
     is_full : callable
-        Whether there is no room for another page.
+        Returns whether the maximum number of pages is open.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Bounds:
         self._n_uploads = 0
 
     async def __call__(self, scope: Any, receive: Any, send: Send) -> None:
-        """Answer one connection."""
+        """Handle one connection."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -85,7 +87,7 @@ class Bounds:
         try:
             await self.app(scope, body.receive, body.send)
         except Exception:
-            if not body.is_over:  # else the application complains of its client
+            if not body.is_over:  # otherwise the application reports its client
                 raise
         finally:
             self._n_uploads -= is_upload
@@ -95,7 +97,7 @@ class Bounds:
         return limits.upload_bytes if is_upload else limits.message_bytes
 
     def _refusal(self, scope: Scope, is_upload: bool) -> tuple[int, str] | None:
-        """Return status and reason where a request is refused by its head."""
+        """Return status and reason if a request is refused by its head, or None."""
         method, path = scope["method"], scope["path"]
         if method not in ALL_METHODS:
             return 405, f"{method:.20}: expected GET, HEAD or POST"
@@ -115,7 +117,7 @@ class Bounds:
 
 
 class _BoundedBody:
-    """The body of one request; answers in place of the application where it is over."""
+    """Body of one request; responds instead of the application beyond a limit."""
 
     def __init__(self, receive: Any, send: Send, most_bytes: int, limits: Limits):
         self._receive, self._send = receive, send
@@ -126,7 +128,7 @@ class _BoundedBody:
         self.is_over = False
 
     async def receive(self) -> Any:
-        if self._is_whole:  # what comes now is the end of the connection
+        if self._is_whole:  # the next event is the end of the connection
             return await self._receive()
         if self.is_over:
             return {"type": "http.disconnect"}
@@ -171,5 +173,5 @@ def _too_large(most_bytes: int) -> str:
 
 
 async def _refuse(send: Send, status: int, reason: str) -> None:
-    # what is left of the body is not read
+    # the rest of the body is not read
     await answer(send, status, page_of(reason), [(b"connection", b"close")])

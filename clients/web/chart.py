@@ -15,7 +15,7 @@ SIZE_PX = (960, 540)
 
 
 def chart_picture(distance_dpt: float) -> Picture:
-    """Return a chart that is as large by angle at every distance."""
+    """Return a chart of the same visual angle at every distance."""
     camera = camera_of(WIDTH_DEG, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
     chart = letter_chart(camera, distance_m=math.inf, log_mar=ROWS)
     return picture_of("Letter chart", chart.view, distance_dpt=0.0).at(distance_dpt)

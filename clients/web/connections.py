@@ -1,7 +1,7 @@
-"""A connection that cannot wait forever for a request, one of a limited number.
+"""HTTP connections with a request timeout and a limited number.
 
-uvicorn's own has no limit on the time that a request's head takes, and with httptools
-none on its size.
+uvicorn itself limits neither the time that a request's head takes nor, with httptools,
+its size.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import asyncio
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MAX_HEAD_BYTES = 32_768
-"""Of a request line with its headers; for `uvicorn.Config`."""
+"""Size of a request line with its headers; for `uvicorn.Config`."""
 
 
 class BoundedConnection(H11Protocol):
-    """HTTP/1.1, as uvicorn speaks it, with limits.
+    """uvicorn's HTTP/1.1 connection, with limits.
 
     Attributes
     ----------
     head_s : float
-        Until the head of the next request is whole.
+        Time until the head of the next request is complete.
     most : int
         Connections at the same time, websockets included; a page takes up to 8.
     """
@@ -30,7 +30,7 @@ class BoundedConnection(H11Protocol):
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """Begin, unless there are too many."""
+        """Accept the connection, unless there are too many."""
         super().connection_made(transport)
         if len(self.connections) > self.most:
             transport.abort()
@@ -38,7 +38,7 @@ class BoundedConnection(H11Protocol):
             self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Take in a part of a request."""
+        """Process a part of a request."""
         super().data_received(data)
         self._watch()
 
@@ -48,12 +48,12 @@ class BoundedConnection(H11Protocol):
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End."""
+        """Stop the timer."""
         self._stop_watching()
         super().connection_lost(exc)
 
     def _watch(self) -> None:
-        """Start the clock where a request is awaited, stop it where one is answered."""
+        """Start the timer while a request is awaited, stop it while one is handled."""
         is_awaited = self.cycle is None or self.cycle.response_complete
         if not is_awaited or self.transport.get_protocol() is not self:
             self._stop_watching()

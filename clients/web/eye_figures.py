@@ -1,4 +1,4 @@
-"""Figures of an eye for the page, as PNG; they run in a process beside it."""
+"""Figures of an eye for the page, as PNG; drawn in a worker process."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def eye_figure(
     ----------
     name : one of `FIGURE_TITLES`
     body : str
-        The profile as JSON: the eye is kept by it.
+        The profile as JSON, which is the cache key of the eye.
     """
     study = _study(body)
     if name == "field":
@@ -78,7 +78,7 @@ def _field_figure(study: EyeStudy) -> Figure:
 
 
 def _acuity_figure(study: EyeStudy, pupil_diameter_mm: float) -> Figure:
-    """Return what is read at each distance through this pupil."""
+    """Return the visual acuity at each distance through this pupil."""
     figure = Figure(figsize=_size(95.0, 90.0), layout="constrained")
     draw_through_focus_acuity(figure.subplots(), study, pupils_mm=[pupil_diameter_mm])
     return figure
@@ -91,7 +91,7 @@ def _size(width_mm: float, height_mm: float) -> tuple[float, float]:
 def _wavefront_figure(
     study: EyeStudy, pupil_diameter_mm: float, focus_dpt: float
 ) -> Figure:
-    """Return the wavefront in this pupil, of the distance that the eye looks at."""
+    """Return the wavefront in this pupil for an object at the focus distance."""
     seen = study.wavefront(pupil_diameter_mm, object_dpt=focus_dpt, focus_dpt=focus_dpt)
     figure = Figure(figsize=_size(95.0, 75.0), layout="constrained")
     draw_wavefront_map(

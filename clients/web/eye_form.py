@@ -1,6 +1,6 @@
-"""What a person enters about one eye, and the profile that it makes.
+"""Entries of one eye, and the resulting profile.
 
-Nothing of the page is here: texts go in, a profile's body or refusals come out.
+Independent of the page: texts go in, a profile or error messages come out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PRESET_TITLES = {
 
 
 def preset_titles() -> dict[str, str]:
-    """Return each preset's name and how a person reads it."""
+    """Return the title of each preset by name."""
     return {
         name: PRESET_TITLES.get(name, name.replace("_", " ").capitalize())
         for name in preset_names()
@@ -47,18 +47,18 @@ def preset_titles() -> dict[str, str]:
 
 @dataclass
 class EyeForm:
-    """The entries for one eye.
+    """The entries of one eye.
 
     Attributes
     ----------
     side : "OD" or "OS"
-    source : which of the three kinds of entries counts
-    texts : the prescription, by a field's name, as typed
-    has_higher_order : whether it has the aberrations that are typical of its age
+    source : which of the three kinds of entries is used
+    texts : the prescription as typed, by field name
+    has_higher_order : whether it has the typical aberrations of its age
     preset : name
-    file_body : profile of the file that was read, or None
-    file_name : of that
-    wears_correction : whether `worn` counts
+    file_body : profile from a file, or None
+    file_name : name of that file
+    wears_correction : whether `worn` is used
     """
 
     side: EyeSide
@@ -77,12 +77,12 @@ class EyeForm:
         Raises
         ------
         ValueError
-            An entry that is wrong: what it is and what is allowed.
+            An invalid entry: its value and the allowed ones.
         """
         body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
         if self.wears_correction:
             body["correction"] = self.worn.body()
-            if self.worn.kind == "iol":  # its own lens is gone, and what is typical
+            if self.worn.kind == "iol":  # no natural lens, no typical aberrations
                 body.pop("higher_order", None)
         parse_profile(body)
         return body
@@ -101,7 +101,7 @@ class EyeForm:
         }
 
     def correct_fully(self) -> None:
-        """Wear what the prescription says."""
+        """Wear spectacles of the prescription."""
         self.worn.kind = "spectacles"
         self.worn.texts |= self.texts
         self.wears_correction = True
@@ -112,14 +112,14 @@ class EyeForm:
         Raises
         ------
         ValueError
-            Not a profile; the form stays as it was.
+            Not a profile; the form is unchanged.
         """
         body = read_profile_file(name, content)
         self.take_body(body, Path(name).name)
         return body.get("age_years")
 
     def take_body(self, body: Mapping[str, Any], name: str) -> None:
-        """Take a profile over into the entries."""
+        """Set the entries from a profile."""
         body = dict(body)
         correction = body.pop("correction", None)
         if correction is not None:
@@ -135,12 +135,12 @@ class EyeForm:
 
 
 def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
-    """Return the profile in a file that was sent.
+    """Return the profile in an uploaded file.
 
     Raises
     ------
     InvalidFile
-        Another kind of file, too large, or not a profile: says what is allowed.
+        Another kind of file, too large, or not a profile.
     """
     suffix, shown = Path(name).suffix.lower(), Path(name).name[:60]
     if suffix not in PROFILE_SUFFIXES:
@@ -157,7 +157,7 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
             load_profile(path)  # checks its fields
         except InvalidFile as error:
             raise InvalidFile(shown, error.found, error.allowed) from None
-    if body.get("name") == path.name:  # coefficients are called as their file is
+    if body.get("name") == path.name:  # coefficients take the name of their file
         body["name"] = shown
     return body
 

@@ -19,15 +19,15 @@ from clients.web.worn_form import DESIGNS, HINTS, PRESCRIPTION, SPHERE
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
-"""Of the slider beneath the sphere; what is typed may go further."""
+"""Range of the slider below the sphere; typed values may go further."""
 
 
 class EyePanel:
-    """Entries for one eye; all of them keep the form up to date.
+    """Entries of one eye, which keep its form up to date.
 
     Parameters
     ----------
-    on_change : called when what is entered has changed and is right
+    on_change : called when the entries have changed and are valid
     on_age : called with the age that a file states, years
     """
 
@@ -74,7 +74,7 @@ class EyePanel:
         ).props("dense").classes("oc-switch")
 
     def _sphere_slider(self, entry: ui.input) -> None:
-        """Show a slider that moves an entry, and moves with it."""
+        """Show a slider that is linked with an entry in both directions."""
         slider = (
             ui.slider(
                 min=-SLIDER_REACH_DPT,
@@ -94,7 +94,7 @@ class EyePanel:
         entry.on_value_change(lambda event: slider.set_value(_within(event.value)))
 
     def _entry(self, number: NumberField, texts: dict[str, str]) -> ui.input:
-        """Return an entry for one number, which says what is wrong with it."""
+        """Return an entry for one number, with validation."""
 
         def take(event: events.ValueChangeEventArguments) -> None:
             texts[number.name] = event.value or ""
@@ -162,7 +162,7 @@ class EyePanel:
             ui.label(HINTS[worn.kind]).classes("oc-hint")
 
     def copy(self, other: EyeForm) -> None:
-        """Take over the entries of the other eye."""
+        """Copy the entries of the other eye."""
         form = self.form
         form.source, form.preset = other.source, other.preset
         form.texts, form.worn = dict(other.texts), other.worn.copied()
@@ -171,7 +171,7 @@ class EyePanel:
         form.wears_correction = other.wears_correction
         self._changed()
 
-    # What is chosen
+    # Event handlers
 
     def _choose_source(self, event: events.ValueChangeEventArguments) -> None:
         self.form.source = event.value
@@ -212,13 +212,13 @@ class EyePanel:
         self._changed()
 
     def _changed(self) -> None:
-        """Build it anew: other entries count now."""
+        """Rebuild the panel after a change of the visible entries."""
         self._build.refresh()
         self._on_change()
 
 
 def _within(text: str | None) -> float:
-    """Return where the slider stands for a text."""
+    """Return the slider's position for a text."""
     try:
         value = SPHERE.read(text or "")
     except ValueError:

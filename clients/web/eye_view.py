@@ -1,7 +1,7 @@
-"""One eye as the page shows it: a quick small picture, then the full one.
+"""One eye as the page shows it: a fast preview, then the full picture.
 
-The small one goes through the eye's wavefront on its axis, by formula, and is there
-within some hundredths of a second; the full one through the eye traced over its field.
+The preview uses the eye's wavefront on its axis, from a formula, and takes some
+hundredths of a second; the full picture uses the eye traced over its field.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ PSF_SLICE_S = 0.05
 FULL = FilterSettings()
 QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")
 LEAST_WIDTH_PX = 200
-"""Pictures whose blur is too wide for the filter are shown with fewer pixels, until
-that."""
+"""If the blur is too wide for the filter, pictures are reduced, down to this width."""
 
 
 @dataclass
@@ -37,14 +36,14 @@ class _Through:
     given: Any = None
 
     def give(self, body: Mapping[str, Any], settings: FilterSettings, view) -> None:
-        """Change the eye, if it is another."""
+        """Set the profile if it has changed."""
         given = (body, settings, view.camera)
         if given != self.given:
             self.given = given
             self.filter.set_profile(body, settings=settings, cameras=[view.camera])
 
     def see(self, view: RgbdView, wish: Wish, *, gaze_deg) -> Filtered | None:
-        """Return the picture through the newest eye; None while it is prepared."""
+        """Return the picture through the newest eye; None while the eye is prepared."""
         state = {
             "pupil_diameter_mm": wish.pupil_diameter_mm,
             "focus_dpt": wish.focus_dpt,
@@ -56,12 +55,12 @@ class _Through:
             newest_only=True,
             until_s=time.monotonic() + PSF_SLICE_S,
         )
-        self.filter.advance()  # by now it knows what this frame asks for
+        self.filter.advance()  # by now it knows what this frame needs
         return seen
 
 
 class EyeView:
-    """The pictures of one eye of one page; for one thread.
+    """Pictures of one eye of one page; must be used from a single thread.
 
     Parameters
     ----------
@@ -76,7 +75,7 @@ class EyeView:
         self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
 
     def preview(self, wish: Wish) -> Seen | None:
-        """Return the small picture; None while its eye is being prepared."""
+        """Return the preview; None while its eye is being prepared."""
         self._stop_other(wish)
         if self._quick is None:
             self._quick = _Through(EyeFilter())
@@ -98,7 +97,7 @@ class EyeView:
         return self._look(self._full, "full", wish, settings, view)
 
     def _stop_other(self, wish: Wish) -> None:
-        """Give up the full eye where it is another, so that the worker is free."""
+        """Cancel the full eye if it is outdated, to free the worker."""
         full = self._full
         if full is None or full.given is None:
             return
@@ -134,7 +133,7 @@ class EyeView:
         )
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close the filters."""
         for through in (self._quick, self._full):
             if through is not None:
                 through.filter.close()

@@ -1,4 +1,4 @@
-"""The point under the pointer, and figures of the eye, at the side of the page."""
+"""Side panel: the point under the pointer, and figures of the eye."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from clients.web.studying import StudyFailed, Studying
 
 
 def data_url(png: bytes) -> str:
-    """Return a picture as an address."""
+    """Return a picture as a data URL."""
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 class FigurePanel:
-    """What one eye makes of a point, and what it is like.
+    """Point-spread function and figures of one eye.
 
     Parameters
     ----------
     page : str
-        Whose questions it asks.
+        Page that owns the requests.
     """
 
     def __init__(self, page: str, state: PageState, studying: Studying) -> None:
@@ -51,12 +51,12 @@ class FigurePanel:
             self._image = ui.html("", sanitize=False).classes("oc-figure")
 
     async def point(self, side: EyeSide, x: float, y: float) -> None:
-        """Show what becomes of a point of the picture."""
+        """Show the point-spread function at a position in the picture."""
         self._side, self._at = side, (x, y)
         await self._show_point()
 
     async def renew(self) -> None:
-        """Show all anew, as the eye or its state is another."""
+        """Redraw everything after a change of the eye or its state."""
         if self._side not in self._state.sides:
             self._side = self._state.sides[0]
         await self._show_point()
@@ -67,7 +67,7 @@ class FigurePanel:
         await self._show_figure()
 
     async def _ask(self, kind: str, function: Callable, *args, **options) -> Any:
-        """Ask the process beside; None where it was answered otherwise."""
+        """Ask the worker process; return None if it failed or a newer request came."""
         try:
             return await self._studying.ask(
                 self._page, kind, function, *args, **options
@@ -117,7 +117,7 @@ class FigurePanel:
 
 
 def point_words(facts: dict[str, float]) -> str:
-    """Return where a point is and how wide its light, in words."""
+    """Describe a point's position and the width of its light."""
     across = f"{abs(facts['h_deg']):.1f}° {'right' if facts['h_deg'] >= 0 else 'left'}"
     along = f"{abs(facts['v_deg']):.1f}° {'up' if facts['v_deg'] >= 0 else 'down'}"
     return (

@@ -1,4 +1,4 @@
-"""Names of files as browsers send them: any text, made safe to show and to save as."""
+"""Sanitize file names sent by browsers, for display and for saving."""
 
 from pathlib import Path
 

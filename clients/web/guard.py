@@ -1,8 +1,8 @@
-"""Who may open the page: whoever has the token that was printed with its address.
+"""Access control: a client needs the token that was printed with the address.
 
-An ASGI layer around the whole application, files and websockets alike.  The first
-visit with the token in the address gets a cookie and is redirected to the address
-without the token.  Requests from other sites are refused even with the cookie.
+An ASGI layer around the whole application, files and websockets alike. The first visit
+with the token in the address sets a cookie and redirects to the address without the
+token. Requests from other sites are refused even with the cookie.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ HEADERS = [
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"referrer-policy", b"no-referrer"),
 ]
-"""Of every response: other pages can neither frame this one nor embed its files."""
+"""Headers of every response: other pages can neither frame this one nor embed its
+files."""
 
 POLICY_VIOLATION = 1008
-"""Code with which a websocket is closed that may not be opened."""
+"""Close code of a websocket that is refused."""
 
 
 class Guard:
@@ -53,10 +54,10 @@ class Guard:
     app : ASGI application
     token : str
     cookie : str
-        Name of the cookie; it should contain the port, as cookies do not know ports.
+        Name of the cookie; it should contain the port, which cookies ignore.
     opening : str, optional
-        A token that works once.  It is for the command line of a browser, which other
-        users of the machine can read.
+        A token that works once, for a browser's command line, which other users of the
+        machine can read.
     hosts : collection of str, optional
         Host names that requests may be addressed to; any if not given.
     """
@@ -75,9 +76,9 @@ class Guard:
         self._opening, self._hosts = opening, hosts
 
     async def __call__(self, scope: Any, receive: Any, send: Send) -> None:
-        """Answer one connection."""
+        """Handle one connection."""
         kind = scope["type"]
-        if kind not in ("http", "websocket"):  # the server's own start and end
+        if kind not in ("http", "websocket"):  # lifespan events of the server
             await self.app(scope, receive, send)
         elif not self._is_addressed_to_us(scope):
             await _refuse(kind, receive, send, 421, page_of("There is no such host"))
@@ -91,7 +92,7 @@ class Guard:
     def _is_addressed_to_us(self, scope: Scope) -> bool:
         """Return whether the Host header names us.
 
-        Otherwise the browser may have found our address under a name of another site.
+        Otherwise the browser may have reached us under another site's name.
         """
         return self._hosts is None or host_name(header(scope, b"host")) in self._hosts
 
@@ -107,7 +108,7 @@ class Guard:
 
     def _has_cookie(self, scope: Scope) -> bool:
         # Not with http.cookies: it takes 13 s for a header of 64 kB of backslashes, and
-        # nothing from a header in which another program's cookie is JSON.
+        # finds nothing in a header in which another program's cookie is JSON.
         pairs = (part.partition("=") for part in header(scope, b"cookie").split(";"))
         return any(
             name.strip() == self._cookie and _is_same(value.strip(), self._token)
@@ -116,7 +117,7 @@ class Guard:
 
     async def _welcome(self, send: Send) -> None:
         cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
-        # the token stays neither in the address bar nor in the browser's history
+        # keeps the token out of the address bar and the browser's history
         headers = [
             (b"set-cookie", cookie.encode("latin-1")),
             (b"location", b"/"),
@@ -131,9 +132,9 @@ def _is_same(given: str, token: str) -> bool:
 def is_from_here(scope: Scope) -> bool:
     """Return whether a request comes from our own page, or from no page at all.
 
-    A page of another port of this machine brings our cookie along; its origin tells.
-    Where a request has no origin, browsers say in `Sec-Fetch-Site` whose it is; another
-    site may only link to the page.
+    A page on another port of this machine sends our cookie too, but with its own
+    origin. For requests without an origin, browsers report the site in
+    `Sec-Fetch-Site`; another site may only link to the page.
     """
     if header(scope, b"sec-fetch-site") in ("same-site", "cross-site"):
         mode = header(scope, b"sec-fetch-mode"), header(scope, b"sec-fetch-dest")
@@ -142,12 +143,12 @@ def is_from_here(scope: Scope) -> bool:
     origin = header(scope, b"origin")
     try:
         return not origin or urlsplit(origin).netloc == header(scope, b"host")
-    except ValueError:  # no address at all
+    except ValueError:  # not a valid address
         return False
 
 
 def host_name(host: str) -> str | None:
-    """Return the name in a Host header, without the port; None where there is none."""
+    """Return the name in a Host header without the port; None if invalid."""
     try:
         return urlsplit(f"//{host}").hostname
     except ValueError:
@@ -155,7 +156,7 @@ def host_name(host: str) -> str | None:
 
 
 def header(scope: Scope, name: bytes) -> str:
-    """Return the value of a header; an empty text without one."""
+    """Return the value of a header; an empty string if absent."""
     values = [value for key, value in scope["headers"] if key == name]
     return b"; ".join(values).decode("latin-1")
 
@@ -181,10 +182,10 @@ def _with_headers(send: Send) -> Send:
 async def _refuse(
     kind: str, receive: Any, send: Send, status: int, page: bytes
 ) -> None:
-    if kind == "http":  # what is left of its body is not read
+    if kind == "http":  # the rest of the body is not read
         await answer(send, status, page, [(b"connection", b"close")])
     else:
-        await receive()  # its request to connect
+        await receive()  # the connect event
         await send({"type": "websocket.close", "code": POLICY_VIOLATION})
 
 
@@ -194,7 +195,7 @@ async def answer(
     body: bytes,
     headers: list[tuple[bytes, bytes]] | None = None,
 ) -> None:
-    """Answer a request with a page."""
+    """Respond to a request with a page."""
     common = [
         (b"content-type", b"text/html; charset=utf-8"),
         (b"cache-control", b"no-store"),

@@ -1,4 +1,4 @@
-"""Numbers that people type, read with their limits; refusals say what is allowed."""
+"""Numeric entries with limits; error messages say what is allowed."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ class NumberField:
     name : str
         As in a profile, with its unit.
     label, unit : str
-        As a person reads them.
+        As displayed.
     low, high : float
-        What is allowed.
+        Allowed range.
     step : float
-        Of arrow keys and sliders.
+        Step of arrow keys and sliders.
     digits : int
-        Decimals that are shown.
+        Decimals shown.
     is_signed : bool
-        Whether a plus is shown, as on a prescription.
+        Whether a plus sign is shown, as on a prescription.
     """
 
     name: str
@@ -40,7 +40,7 @@ class NumberField:
 
     @property
     def allowed(self) -> str:
-        """Return the range in words."""
+        """Return the range as text."""
         limits = f"{self.low:g} to {self.with_unit(f'{self.high:g}')}"
         return limits.replace("-", "\N{MINUS SIGN}")
 
@@ -50,7 +50,7 @@ class NumberField:
         Raises
         ------
         ValueError
-            No number, or out of range: the text and what is allowed.
+            Not a number, or out of range: the text and what is allowed.
         """
         shown = text.strip()
         if not shown:
@@ -66,13 +66,13 @@ class NumberField:
         return value
 
     def within(self, sent: object) -> float | None:
-        """Return what a browser sent, within the limits; None where it is no number."""
+        """Return a browser's value clamped to the range; None if it is not a number."""
         if not isinstance(sent, int | float) or math.isnan(sent):
             return None
         return float(min(max(sent, self.low), self.high))
 
     def problem(self, text: str) -> str | None:
-        """Return what is wrong with a text, or None."""
+        """Return the error in a text, or None."""
         try:
             self.read(text)
         except ValueError as error:
@@ -80,16 +80,16 @@ class NumberField:
         return None
 
     def show(self, value: float) -> str:
-        """Return a value as it stands in the form."""
+        """Return a value as displayed in the form."""
         sign = "+" if self.is_signed and value > 0 else ""
         return f"{sign}{value:.{self.digits}f}"
 
     def with_unit(self, text: str) -> str:
-        """Return a number's text with its unit behind it."""
+        """Return a number's text followed by its unit."""
         return f"{text}{'' if self.unit == DEGREE else ' '}{self.unit}"
 
     def stepped(self, text: str, steps: int) -> str:
-        """Return the text some steps further, within what is allowed."""
+        """Return the text changed by some steps, clamped to the range."""
         try:
             value = self.read(text)
         except ValueError:
@@ -99,7 +99,7 @@ class NumberField:
 
 
 def distance_text(vergence_dpt: float) -> str:
-    """Return a distance in dpt and as people say it."""
+    """Return a distance in dpt and in meters or centimeters."""
     if vergence_dpt < 0.005:
         return "0 dpt · far away"
     metres = 1.0 / vergence_dpt

@@ -1,4 +1,4 @@
-"""The page: what it shows, and what becomes of every entry."""
+"""The page: layout and event handlers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from clients.web.wishes import Seen
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
 FIGURES_REST_S = 0.35
-"""After the last change: figures are drawn anew."""
+"""Time after the last change until figures are redrawn."""
 
 FIRST_ASPECT = 960 / 540
 PICTURES_PATH = "/pictures/"
@@ -40,7 +40,7 @@ NamedProfile = tuple[Mapping[str, Any], str]
 
 
 class Desk:
-    """What all pages of a process share."""
+    """Resources shared by all pages of a process."""
 
     def __init__(self) -> None:
         self.seeing = Seeing()
@@ -48,7 +48,7 @@ class Desk:
         self.out: dict[str, PicturesOut] = {}
 
     def close(self) -> None:
-        """End the thread and the process; closing twice is allowed."""
+        """Stop the thread and the process; closing twice is allowed."""
         self.seeing.close()
         self.studying.close()
 
@@ -58,7 +58,7 @@ class Page:
 
     Parameters
     ----------
-    profile : what both eyes are at first, and its name
+    profile : initial profile of both eyes, and its name
     """
 
     def __init__(self, desk: Desk, profile: NamedProfile | None) -> None:
@@ -155,10 +155,10 @@ class Page:
             self._show_boxes()
             self._problem = ui.label("").classes("oc-problem")
 
-    # What happens
+    # Event handlers
 
     def wish(self) -> None:
-        """Ask for what the entries say; explain an entry that is wrong."""
+        """Request a picture for the current entries; report invalid entries."""
         wish = self.state.wish()
         self._problem.text = "\n".join(self.state.problems())
         if wish is None:
@@ -170,7 +170,7 @@ class Page:
 
     async def _renew_figures(self) -> None:
         await asyncio.sleep(FIGURES_REST_S)
-        self._renewal = None  # from here on it is not cancelled: newer ones wait
+        self._renewal = None  # from here on it is not canceled: newer ones wait
         await self.figures.renew()
 
     def _slide(self, name: str, value: float) -> None:
@@ -221,7 +221,7 @@ class Page:
         self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
         self.wish()
 
-    # What the thread shows
+    # Pictures from the filter thread
 
     def _from_thread(self, seen: Seen) -> None:
         self._loop.call_soon_threadsafe(self._take_seen, seen)
@@ -285,14 +285,14 @@ class Page:
             ui.download(text.encode(), f"ocufilter_{side}.json")
 
     def close(self) -> None:
-        """Let go of what the page had."""
+        """Release the page's resources."""
         self.desk.seeing.forget(self.name)
         self.desk.studying.forget(self.name)
         self.desk.out.pop(self.name, None)
 
 
 def _share(event: events.GenericEventArguments) -> tuple[float, float]:
-    """Return a place in the picture, from 0, 0 to 1, 1, whatever was sent."""
+    """Return a position in the picture, clamped to 0, 0 to 1, 1."""
     x, y = (min(max(float(event.args[name]), 0.0), 1.0) for name in "xy")
     return x, y
 

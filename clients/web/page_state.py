@@ -1,4 +1,4 @@
-"""What a page holds: both eyes' entries, how they look, and what at."""
+"""State of a page: both eyes' entries, viewing conditions, and the picture."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class PageState:
 
     Attributes
     ----------
-    picture : what is looked at; None while none is ready
-    right : the last profile of each eye in which nothing was wrong
+    picture : the scene; None until one is ready
+    right : the last valid profile of each eye
     shown : which eye, or both
     """
 
@@ -64,12 +64,12 @@ class PageState:
         Raises
         ------
         ValueError
-            An entry that is wrong: what it is and what is allowed.
+            An invalid entry: its value and the allowed ones.
         """
         return self.eyes[side].body(age_years=self.values[AGE.name])
 
     def problems(self) -> list[str]:
-        """Return what is wrong with the entries of the eyes that are shown."""
+        """Return the errors in the entries of the eyes shown."""
         found = []
         for side in self.sides:
             try:
@@ -80,16 +80,16 @@ class PageState:
 
     @property
     def gaze_deg(self) -> tuple[float, float]:
-        """Return where the eye looks in the picture."""
+        """Return the gaze in the picture."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
 
     def looking_body(self, side: EyeSide) -> dict[str, Any] | None:
-        """Return the last right profile of an eye, its lens as the gaze meets it."""
+        """Return an eye's last valid profile, with the correction at the gaze."""
         body = self.right.get(side)
         return None if body is None else looking(body, self.gaze_deg)
 
     def take_picture(self, picture: Picture) -> None:
-        """Look at another picture; the first is seen in the state that it suggests."""
+        """Set the picture; the first one also sets the state that it suggests."""
         if self.picture is None:
             for number, value in (
                 (FOCUS, picture.focus_dpt),
@@ -102,9 +102,9 @@ class PageState:
             self.values[DISTANCE.name] = picture.distance_dpt
 
     def wish(self) -> Wish | None:
-        """Return what is to be seen now; None while there is no picture, or no eye.
+        """Return the wish for the current state; None without a picture or an eye.
 
-        An eye with a wrong entry stays as it was: see `problems`.
+        An eye with an invalid entry keeps its last profile: see `problems`.
         """
         for side in self.sides:
             try:
@@ -126,11 +126,11 @@ class PageState:
         )
 
     def place(self, x: float, y: float) -> Place | None:
-        """Return what is at a place of the picture."""
+        """Return the place at a position in the picture."""
         return None if self.picture is None else self.picture.place(x, y)
 
     def look_at(self, x: float, y: float) -> None:
-        """Focus on what is at a place of the picture."""
+        """Focus on the place at a position in the picture."""
         place = self.place(x, y)
         if place is not None:
             self.values[FOCUS.name] = min(place.distance_dpt, FOCUS.high)

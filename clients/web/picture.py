@@ -1,4 +1,4 @@
-"""What is looked at: a picture with depth, in full and small."""
+"""A picture with depth, at full and preview size."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from filter_service.bounded_images import read_picture_rgb
 from filter_service.image_files import read_depth
 
 MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
-"""Of the picture in full; what comes larger is made smaller."""
+"""Size of the full picture; larger ones are reduced."""
 
 SMALL_WIDTH_PX = 480
-"""A preview is no wider."""
+"""Maximum width of a preview."""
 
 LEAST_SIDE_PX = 16
 MAX_SIDE_RATIO = 100
-"""Of one side to the other: of more, nothing is left in a preview."""
+"""Ratio of the longer side to the shorter; beyond it nothing is left in a preview."""
 
 MAX_PHOTO_BYTES = 60_000_000
 PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-"""By content, whatever the name: others run programs (EPS) or have rare readers."""
+"""By content, not by name: other formats run programs (EPS) or have rarely used
+readers."""
 
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 FAR_DPT = 0.0
@@ -37,15 +38,15 @@ DEPTH_HELP = ".npy or .exr in metres, 16-bit .png in millimetres, float .tif"
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture to look at.
+    """A picture with depth.
 
     Attributes
     ----------
-    title : as a person reads it
-    view : in full
+    title : as shown
+    view : at full size
     small : the same with fewer pixels
-    distance_dpt : where all of it stands; None where it has depths of its own
-    focus_dpt, pupil_diameter_mm : a state to begin with, or None
+    distance_dpt : distance of a flat picture; None if it has its own depth
+    focus_dpt, pupil_diameter_mm : an initial state, or None
     """
 
     title: str
@@ -61,7 +62,7 @@ class Picture:
         return self.view.width_px / self.view.height_px
 
     def at(self, distance_dpt: float) -> Picture:
-        """Return a flat picture at another distance; one with depths as it is."""
+        """Return a flat picture at another distance; one with depth unchanged."""
         if self.distance_dpt is None or distance_dpt == self.distance_dpt:
             return self
         return replace(
@@ -72,7 +73,7 @@ class Picture:
         )
 
     def place(self, x: float, y: float) -> Place:
-        """Return what is at a place, from 0, 0 at the top left to 1, 1."""
+        """Return the place at a position, from 0, 0 at the top left to 1, 1."""
         view = self.view
         column = min(int(x * view.width_px), view.width_px - 1)
         row = min(int(y * view.height_px), view.height_px - 1)
@@ -87,16 +88,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class Place:
-    """A place in a picture: its direction, and how far what is there is."""
+    """A place in a picture: its direction and its distance."""
 
     tangents: tuple[float, float]
     distance_dpt: float
 
     def direction_deg(self, gaze_deg: tuple[float, float]) -> tuple[float, float]:
-        """Return azimuth and elevation for an eye that looks at a gaze, deg.
+        """Return azimuth and elevation relative to an eye with a gaze, deg.
 
-        Gaze turns the eye up by v, then aside by h; turned back, the place is where the
-        eye has it in its own field.
+        Gaze rotates the eye up by v, then sideways by h. The inverse rotation gives the
+        direction in the eye's own field.
         """
         h, v = (math.radians(angle) for angle in gaze_deg)
         x, y, z = self.tangents[0], self.tangents[1], -1.0
@@ -107,15 +108,15 @@ class Place:
 
 
 def picture_of(title: str, view: RgbdView, **more) -> Picture:
-    """Return a picture with its small one."""
+    """Return a picture with its preview."""
     n = math.ceil(view.width_px / SMALL_WIDTH_PX)
     return Picture(title, view, coarser(view, n), **more)
 
 
 def coarser(view: RgbdView, n: int) -> RgbdView:
-    """Return a view with n x n pixels made one: mean light, nearest depth.
+    """Return a view with n x n pixels merged: mean light, nearest depth.
 
-    Columns and rows at the right and lower edge that do not fill a pixel are left out.
+    Incomplete blocks at the right and lower edges are cropped.
     """
     height_px, width_px = view.height_px // n, view.width_px // n
     blocks = (height_px, n, width_px, n)
@@ -165,21 +166,21 @@ def photo_picture(
     distance_dpt: float,
     depth: tuple[str, bytes] | None = None,
 ) -> Picture:
-    """Return a photo as a picture: flat at a distance, or with the depth of a file.
+    """Return a photo as a picture: flat at a distance, or with depth from a file.
 
     Parameters
     ----------
     width_deg : float
-        How wide it is seen, deg.
+        Visual angle of its width, deg.
     distance_dpt : float
-        Where it stands if there is no depth.
+        Distance of the photo if there is no depth.
     depth : (name, content), optional
-        Of the file.
+        Depth file.
 
     Raises
     ------
     InvalidFile
-        A file that is no picture, or a depth of another shape: says what is allowed.
+        A file is not a picture, or the depth has another shape.
     """
     color = _photo_color(name, content)
     height_px, width_px = color.shape[:2]
@@ -202,7 +203,7 @@ def photo_picture(
 def _resized(
     color: NDArray[np.uint8], width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
-    """Return colour with fewer pixels: each the light around it."""
+    """Return color with fewer pixels, resampled in linear light."""
     if color.shape[:2] == (height_px, width_px):
         return color
     planes = [
@@ -261,7 +262,7 @@ def _check_size(name: str, content: bytes) -> None:
 
 
 def camera_of(width_deg: float, *, width_px: int, height_px: int) -> Camera:
-    """Return a symmetric camera that sees so many degrees across."""
+    """Return a symmetric camera with the given horizontal field of view."""
     right = math.tan(math.radians(width_deg) / 2.0)
     up = right * height_px / width_px
     return Camera(width_px, height_px, (-right, right, up, -up))

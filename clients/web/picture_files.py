@@ -1,4 +1,4 @@
-"""Pictures as files in memory."""
+"""Pictures encoded in memory."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from PIL import Image
 
 PREVIEW_QUALITY = 92
 PNG_LEVEL = 1
-"""Of nine: the least work, as the file goes a short way."""
+"""Of nine: the fastest, as the file is not sent far."""
 
 
 def png_of(color: NDArray[np.uint8], *, level: int = PNG_LEVEL) -> bytes:
-    """Return a picture (h, w, 3) as a PNG, exact."""
+    """Return a picture (h, w, 3) as a PNG, lossless."""
     file = io.BytesIO()
     Image.fromarray(color).save(file, "png", compress_level=level)
     return file.getvalue()
 
 
 def jpeg_of(color: NDArray[np.uint8]) -> bytes:
-    """Return a picture (h, w, 3) as a JPEG without colour subsampling."""
+    """Return a picture (h, w, 3) as a JPEG without color subsampling."""
     file = io.BytesIO()
     Image.fromarray(color).save(file, "jpeg", quality=PREVIEW_QUALITY, subsampling=0)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""Pictures on their way to a browser: of each place the newest, over a websocket."""
+"""Send pictures to a browser over a websocket, the newest of each place."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from clients.web.wishes import Seen
 
 
 class PicturesOut:
-    """What one page has yet to be sent; for the event loop's thread.
+    """Pictures of one page waiting to be sent; for the event loop's thread.
 
-    A picture that was not sent yet is dropped for a newer one of the same place: a slow
-    connection is late by one picture and not by many.
+    A newer picture replaces a waiting one of the same place, so that a slow connection
+    is late by one picture and not by many.
     """
 
     def __init__(self) -> None:
@@ -23,16 +23,16 @@ class PicturesOut:
         self._came = asyncio.Event()
 
     def put(self, seen: Seen) -> None:
-        """Leave a picture to be sent."""
+        """Queue a picture."""
         self._waiting[seen.place] = self._last[seen.place] = seen
         self._came.set()
 
     def last(self, place: str) -> Seen | None:
-        """Return what was last shown at a place."""
+        """Return the picture last shown at a place."""
         return self._last.get(place)
 
     async def serve(self, socket: WebSocket) -> None:
-        """Send until the other side is gone; one that comes back gets all again."""
+        """Send pictures until the client disconnects; resend all after a reconnect."""
         await socket.accept()
         self._waiting = dict(self._last)
         self._came.set()
@@ -47,10 +47,10 @@ class PicturesOut:
                     place = next(iter(self._waiting))
                     await socket.send_bytes(self._waiting.pop(place).packed())
         except WebSocketDisconnect:
-            pass  # it went while something was being sent
+            pass  # it disconnected during a send
         except RuntimeError:
             if _is_open(socket) and not gone.done():
-                raise  # another fault is ours
+                raise  # any other error is ours
         finally:
             gone.cancel()
 
@@ -61,6 +61,6 @@ def _is_open(socket: WebSocket) -> bool:
 
 
 async def _gone(socket: WebSocket) -> None:
-    """Wait until the other side is gone; it says nothing else."""
+    """Wait until the client disconnects; it sends nothing else."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass

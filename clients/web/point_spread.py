@@ -1,4 +1,4 @@
-"""What the eye makes of one point of the picture, in colour."""
+"""Point-spread function of the eye at one point of the picture, in color."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ FOCUS_RANGE_DPT = (0.0, 8.0)
 FIELD_DEG = ((-45.0, 45.0), (-35.0, 35.0))
 LEAST_SIDE_ARCMIN = 12.0
 ROOM_RATIO = 3.2
-"""Side of the picture over the blur's radius."""
+"""Ratio of the picture's side to the radius of the blur."""
 
 RINGS_ROOM_RATIO = 2.2
-"""And over the radius of the light of another focus."""
+"""Ratio of the picture's side to the radius of the light of another focus."""
 
 GAMMA = 0.45
-"""Of the light as it is shown, so that faint parts are seen."""
+"""Exponent of the displayed light, which makes faint parts visible."""
 
 WHITE_PERCENT = 99.9
-"""Of the values that are no brighter than what is shown as full light: a single peak
-leaves the rest black otherwise."""
+"""Percentile of the light that is shown as white: scaled to a single peak, the rest
+would be black."""
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300)
@@ -42,7 +42,7 @@ NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300)
 
 @dataclass(frozen=True)
 class PointState:
-    """A point and the eye that looks.
+    """A point, and the state of the eye.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ def _eye(body: str) -> EyeOptics:
 
 
 def point_spread(body: str, state: PointState) -> tuple[bytes, dict]:
-    """Return a picture of the point's light (PNG), and its figures.
+    """Return a picture (PNG) of the point's light, and its figures.
 
     Parameters
     ----------
     body : str
-        The profile as JSON: the eye is kept by it.
+        The profile as JSON, which is the cache key of the eye.
     """
     eye = _eye(body)
     kernels, side_arcmin = _kernels(eye, state)
@@ -131,7 +131,7 @@ def _kernels(
 
 
 def _rings_reach_mrad(rings: Rings | None, radius_mm: float) -> float:
-    """Return how far rings send light aside to their foci, or lenslets all of it."""
+    """Return the deflection by rings toward their foci, or by lenslets in all."""
     if rings is None:
         return 0.0
     if rings.lattice_mm is not None:
@@ -142,15 +142,15 @@ def _rings_reach_mrad(rings: Rings | None, radius_mm: float) -> float:
 def _kernel(
     zernike_um: NDArray[np.float64], rings: Rings | None, **state
 ) -> NDArray[np.float64]:
-    """Return one PSF, by waves where they can be had.
+    """Return one PSF, by the wave method where possible.
 
-    A mix of waves and rays shows its seams where light is faint.
+    A mix of waves and rays has visible seams where light is faint.
     """
     try:
         found = compute_psfs(
             zernike_um, method="fourier", accuracy="fine", pupil_screen=rings, **state
         )
-    except ValueError:  # too steep for that: by far wider than what rings add
+    except ValueError:  # too steep: the blur is far wider than what rings add
         found = compute_psfs(zernike_um, **state)
     return found[0].kernel
 
@@ -158,10 +158,10 @@ def _kernel(
 def _side_arcmin(
     zernike_um: NDArray, diameter_mm: NDArray, *, more_mrad: float
 ) -> float:
-    """Return how large a picture the widest colour needs, on a scale that stays.
+    """Return the picture's side for the widest color, rounded up to a fixed scale.
 
-    The blur's radius at the rim of the pupil is about that of its RMS slope: sqrt(2)
-    times the slope that the terms of the second order make.
+    The blur's radius at the edge of the pupil is about that of its RMS slope: sqrt(2)
+    times the slope that the second-order terms make.
     """
     radius_mm = np.asarray(diameter_mm) / 2.0
     spread = np.sqrt((np.asarray(zernike_um)[:, 3:] ** 2).sum(axis=1))
@@ -173,7 +173,7 @@ def _side_arcmin(
 
 
 def half_light_px(kernel: NDArray[np.float64]) -> float:
-    """Return the radius about the middle of the light that holds half of it, px."""
+    """Return the radius about the centroid that holds half of the light, px."""
     y, x = np.indices(kernel.shape)
     total = kernel.sum()
     middle_x, middle_y = (x * kernel).sum() / total, (y * kernel).sum() / total
@@ -184,7 +184,7 @@ def half_light_px(kernel: NDArray[np.float64]) -> float:
 
 
 def _picture(light: NDArray[np.float64], side_arcmin: float) -> NDArray[np.uint8]:
-    """Return light (n, n, 3), 0 to 1, enlarged, with a scale."""
+    """Return light (n, n, 3), 0 to 1, enlarged, with a scale bar."""
     shown = np.round(255.0 * np.clip(light, 0.0, 1.0) ** GAMMA).astype(np.uint8)
     image = Image.fromarray(shown).resize(
         (SHOWN_PX, SHOWN_PX), Image.Resampling.BICUBIC

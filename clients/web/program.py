@@ -1,10 +1,10 @@
-"""A page in people's hands: `ocufilter web`.
+"""Interactive page in the browser: `ocufilter web`.
 
     ocufilter web
     ocufilter web --profile myopia --port 8080 --no-browser
 
-Serves this machine alone, with a token in the address that it prints; `--host` lets
-other machines in.
+Serves this machine only, with a token in the address that it prints; `--host` admits
+other machines.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ EXPOSED = (
 
 
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the command line."""
+    """Return the parsed command line."""
     parser = argparse.ArgumentParser(
         prog="ocufilter web",
         description=__doc__,
@@ -79,7 +79,7 @@ def read_profile(source: str | None) -> tuple[Mapping[str, Any], str] | None:
     Raises
     ------
     ValueError
-        Names the field, the bad value and what is allowed.
+        Names the field, the invalid value and what is allowed.
     """
     if source is None:
         return None
@@ -96,9 +96,10 @@ def open_socket(host: str, port: int) -> socket.socket:
     Raises
     ------
     ValueError
-        A port that is none.
+        Invalid port or empty host.
     OSError
-        It is taken, or the address is not this machine's: says what helps.
+        The port is taken, or the address is not this machine's; the message says what
+        helps.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port is {port}; allowed: 0 to 65535")
@@ -124,10 +125,10 @@ def address_of(host: str, port: int, token: str) -> str:
 
 
 def hosts_of(listening: socket.socket, names: Sequence[str]) -> set[str] | None:
-    """Return the names that requests may be addressed to; None where any may be.
+    """Return the allowed host names of requests; None if any is allowed.
 
-    A page that only this machine reaches has few names.  One that others reach may have
-    any, and there the cookie alone keeps out the pages of other sites.
+    A page reachable from this machine only has few names. A page reachable from others
+    may have any name, and there only the cookie keeps out other sites' pages.
     """
     address = listening.getsockname()[0]
     if not ipaddress.ip_address(address).is_loopback:
@@ -155,7 +156,7 @@ def serve(options: argparse.Namespace) -> int:
         hosts=hosts,
         on_ready=lambda: _tell(*addresses, options),
     )
-    # the server stops by itself, then hands the signal on: to an orderly end
+    # the server shuts down by itself and raises the signal again: exit cleanly
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.run(sockets=[listening])
     return 0

@@ -1,9 +1,9 @@
-"""A scene rendered in a process apart, as the page's own must have no pyrender in it.
+"""A scene rendered in a child process, as the page's process must not load pyrender.
 
     python -m clients.web.scene_file courtyard out.npz 960x540
 
-pyrender's OpenGL and a GPU's that filters do not share a process well, and building a
-scene takes seconds in which the page should answer.
+pyrender's OpenGL and that of GPU filters do not share a process well, and building a
+scene takes seconds, during which the page must stay responsive.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ MAX_GLTF_BYTES = 200_000_000
 _GLB_HEADER = struct.Struct("<4sIIII")
 TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
 _CHECKOUT = Path(__file__).resolve().parents[2]
-# There `-m` finds our packages whatever the folder; installed ones are found anyway.
+# From the checkout `-m` finds our packages; installed packages are found anyway.
 _FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
 
 
 class SceneNotRendered(Exception):
-    """A scene could not be rendered; the text says why."""
+    """A scene could not be rendered; the message says why."""
 
 
 @cache
 def scene_picture(name: str) -> Picture:
-    """Return one of the project's scenes as a picture; takes seconds the first time.
+    """Return a built-in scene as a picture; takes seconds the first time.
 
     Raises
     ------
@@ -58,9 +58,9 @@ def gltf_picture(name: str, content: bytes) -> Picture:
     Raises
     ------
     InvalidFile
-        Not a file of that kind.
+        Another kind of file.
     SceneNotRendered
-        Damaged, or not to be rendered here.
+        The file is damaged or cannot be rendered here.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in GLTF_SUFFIXES:
@@ -79,9 +79,9 @@ def gltf_picture(name: str, content: bytes) -> Picture:
 
 
 def _check_is_self_contained(name: str, content: bytes) -> None:
-    """Refuse a glTF file that names other files: they would be this machine's.
+    """Reject a glTF file that references others, which would be on this machine.
 
-    Whether the file is a right one is the reader's part.
+    The reader checks whether the file is valid.
     """
     text = content
     if content.startswith(b"glTF") and len(content) >= _GLB_HEADER.size:
@@ -101,7 +101,7 @@ def _check_is_self_contained(name: str, content: bytes) -> None:
 
 
 def _uris(part: object) -> list[str]:
-    """Return all addresses in the header of a glTF file, wherever they stand."""
+    """Return all URIs in the header of a glTF file, at any depth."""
     if isinstance(part, list):
         return [uri for each in part for uri in _uris(each)]
     if not isinstance(part, dict):
@@ -144,7 +144,7 @@ def _rendered(source: str, title: str, folder: Path) -> Picture:
 
 
 def main(source: str, file: str, size: str) -> int:
-    """Render a scene and write it to a file; that is the child's part."""
+    """Render a scene and write it to a file, in the child process."""
     try:
         from clients.scene_renderer import SceneRenderer
         from clients.scenes.catalogue import build_scene

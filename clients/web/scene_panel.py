@@ -1,4 +1,4 @@
-"""What is looked at, chosen on the page."""
+"""Selection of the scene on the page."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ FIRST = "courtyard"
 NamedFile = tuple[str, bytes]
 
 MAX_AT_ONCE = 2
-"""Pictures that are made at the same time; a photo of 64 Mpx takes 0.6 GB."""
+"""Pictures made at the same time; a photo of 64 Mpx takes 0.6 GB."""
 
 MAX_WAITING = 4
-"""Pictures of one page that are being made or wait for it, each with its file."""
+"""Pictures of one page that are being made or queued, each with its file."""
 
 _turns = asyncio.Semaphore(MAX_AT_ONCE)
 
 
 class ScenePanel:
-    """Chooses what is looked at; pictures are made beside the event loop.
+    """Selects the scene; pictures are made outside of the event loop.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class ScenePanel:
 
     @ui.refreshable_method
     def _uploads(self) -> None:
-        """Show what a photo or a 3D file needs."""
+        """Show the uploads of a photo or a 3D file."""
         if self._kind not in ("photo", "gltf"):
             return
         with ui.element("div").classes("oc-uploads"):
@@ -95,7 +95,7 @@ class ScenePanel:
         upload_entry(label, accept, most_bytes, take).mark(label)
 
     def _in_use(self) -> None:
-        """Say which files the picture is of."""
+        """Show the names of the files in use."""
         names = [file[0] for file in (self._photo, self._depth) if file is not None]
         self._used.text = f"In use: {', '.join(names)}" if names else ""
 
@@ -117,10 +117,10 @@ class ScenePanel:
         await self._make(gltf_picture, name, content)
 
     async def _take_photo(self, name: str, content: bytes) -> None:
-        # A depth that came first is of this photo; any other was of the last one.
+        # A depth file uploaded first belongs to this photo, any other to the last one.
         depth = self._depth if self._photo is None else None
         if not await self._show_photo((name, content), depth) and self._photo is None:
-            self._depth = None  # it may be what was refused
+            self._depth = None  # it may be the file that was refused
             self._in_use()
 
     async def _take_depth(self, name: str, content: bytes) -> None:
@@ -140,7 +140,7 @@ class ScenePanel:
             await self._show_photo(self._photo, self._depth)
 
     async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> bool:
-        """Show a photo; where one of its files is refused, those of before stay."""
+        """Show a photo; if one of its files is refused, keep the previous ones."""
         is_shown = await self._make(
             photo_picture,
             *photo,
@@ -154,7 +154,7 @@ class ScenePanel:
         return is_shown
 
     async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
-        """Show the picture that a function makes, or say why there is none."""
+        """Show the picture that a function makes, or report its error."""
         if self._n_waiting >= MAX_WAITING:
             ui.notify("Still busy with the last pictures; try again", type="warning")
             return False

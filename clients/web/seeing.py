@@ -1,8 +1,8 @@
-"""The thread that filters: of what a page wishes, the newest wins.
+"""Filter thread of the pages; the newest wish wins.
 
-The page's event loop never filters; it leaves a wish here and goes on.  A wish that
-nobody has begun is replaced by a newer one.  The small picture comes at once; the full
-one once the hand has rested, and it is given up as soon as the hand moves on.
+The page's event loop never filters; it submits a wish here and continues. A newer wish
+replaces one that has not been started. The preview comes at once; the full picture once
+the input has rested, and it is canceled by the next input.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from clients.web.eye_view import EyeView
 from clients.web.wishes import Seen, Wish
 
 REST_S = 0.12
-"""Without a newer wish: the hand rests."""
+"""Time without a newer wish after which the full picture is made."""
 
 POLL_S = 0.002
-"""Between two looks at an eye that is being prepared."""
+"""Interval of polling an eye that is being prepared."""
 
 STALE_S = 0.5
-"""A small picture that takes longer is not waited for where the wish is another."""
+"""If the wish has changed, a preview is awaited no longer than this."""
 
 
 _log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Page:
-    """One page: its newest wish, the one in hand, and its eyes."""
+    """One page: its newest wish, the current one, and its eyes."""
 
     show: Callable[[Seen], None]
     newest: Wish | None = None
@@ -42,7 +42,7 @@ class _Page:
     eyes: dict[EyeSide, EyeView] = field(default_factory=dict)
 
     def step(self) -> float | None:
-        """Do a piece of work; return after how long to come again, in s, or None."""
+        """Do a piece of work; return the time until the next step, in s, or None."""
         now_s = time.monotonic()
         wish = self._next_wish(now_s)
         if wish is None:
@@ -71,7 +71,7 @@ class _Page:
         return POLL_S if waits else None
 
     def _next_wish(self, now_s: float) -> Wish | None:
-        """Return that in hand until its small pictures are seen, then the newest."""
+        """Return the current wish until its previews are shown, then the newest."""
         is_new = self.in_hand is not self.newest
         if is_new and (self._is_previewed() or now_s > self.begun_s + STALE_S):
             self.in_hand, self.begun_s = self.newest, now_s
@@ -90,7 +90,7 @@ class _Page:
         return seen is not None
 
     def give_up(self, reason: str) -> None:
-        """Drop what is wanted, and say so."""
+        """Drop the current wish and report why."""
         wish, self.newest, self.in_hand = self.in_hand, None, None
         for side in wish.bodies if wish else ():
             self.show(Seen("failed", side, wish.number, b"", {"error": reason}))
@@ -112,25 +112,25 @@ class Seeing:
         self._thread.start()
 
     def open(self, page: str, show: Callable[[Seen], None]) -> None:
-        """Take a page in; what it is shown is handed to ``show``, in this thread."""
+        """Register a page; ``show`` gets its pictures, in the filter thread."""
         self._pages[page] = _Page(show)
 
     def wish(self, page: str, wish: Wish) -> None:
-        """Want to see something; an older wish is dropped."""
+        """Request a picture; an older wish is dropped."""
         known = self._pages.get(page)
         if known is not None:
             known.newest, known.arrived_s = wish, time.monotonic()
             self._wake.set()
 
     def forget(self, page: str) -> None:
-        """Let go of a page."""
+        """Remove a page."""
         known = self._pages.pop(page, None)
         if known is not None:
             self._ended.append(known)
             self._wake.set()
 
     def close(self) -> None:
-        """End the thread and all eyes."""
+        """Stop the thread and close all eyes."""
         self._is_over = True
         self._wake.set()
         self._thread.join()
@@ -149,7 +149,7 @@ class Seeing:
         for page in list(self._pages.values()):
             try:
                 wait_s = page.step()
-            except Exception as error:  # of one page; the others go on
+            except Exception as error:  # of one page; the others continue
                 _log.exception("A picture failed")
                 page.give_up(f"{type(error).__name__}: {error}")
                 continue

@@ -1,18 +1,18 @@
-"""The pictures as an element of the page; the browser's part is seen_view.js."""
+"""Page element that shows the pictures; its browser part is seen_view.js."""
 
 from nicegui.element import Element
 
 
 class SeenView(Element, component="seen_view.js"):
-    """Scene and what eyes see of it, with a split between them.
+    """Scene and filtered pictures, with a split between them.
 
-    Events ``point`` and ``look`` say where the pointer is, and where it clicked: the
-    eye, and x and y from 0 to 1.
+    The events ``point`` and ``look`` report the position of the pointer and of a click:
+    the eye, and x and y from 0 to 1.
 
     Parameters
     ----------
     address : str
-        Of the websocket that the pictures come from.
+        Address of the websocket that sends the pictures.
     """
 
     def __init__(self, address: str, eyes: list[str], aspect: float) -> None:
@@ -26,5 +26,5 @@ class SeenView(Element, component="seen_view.js"):
         self._props["eyes"] = eyes
 
     def show_aspect(self, ratio: float) -> None:
-        """Give pictures another shape, width over height."""
+        """Set the aspect ratio of the pictures, width over height."""
         self._props["aspect"] = ratio

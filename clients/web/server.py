@@ -1,4 +1,4 @@
-"""The page's server: NiceGUI behind a guard and limits, a websocket for pictures."""
+"""HTTP server: NiceGUI behind a guard and limits, and a websocket for pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clients.web.guard import POLICY_VIOLATION, Guard
 from clients.web.page import PICTURES_PATH, Desk, add_page
 
 MESSAGE_HISTORY = 50
-"""Messages that are kept for a browser whose connection broke; figures are large."""
+"""Messages kept for a browser that reconnects; figures are large."""
 
 FAREWELL_S = 2
 
@@ -31,11 +31,11 @@ def make_server(
     hosts: Collection[str] | None = None,
     on_ready: Callable[[], None],
 ) -> uvicorn.Server:
-    """Return the server; its sockets are given to its `run`.
+    """Return the server; pass its sockets to its `run`.
 
     Parameters
     ----------
-    opening, hosts : as the guard has them
+    opening, hosts : as in `Guard`
     """
     desk: list[Desk] = []
 
@@ -63,11 +63,11 @@ def make_server(
         title="ocufilter",
         favicon="👁",
         tailwind=False,
-        binding_refresh_interval=None,  # nothing is bound
+        binding_refresh_interval=None,  # there are no bindings
         message_history_length=MESSAGE_HISTORY,
         show_welcome_message=False,
     )
-    # NiceGUI's own makes a page for each address that there is not
+    # NiceGUI's own handler creates a page for each unknown address
     app.add_exception_handler(404, http_exception_handler)
     bounded = Bounds(application, is_full=lambda: len(desk[0].out) >= MAX_PAGES)
     guarded = Guard(

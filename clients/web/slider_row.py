@@ -1,4 +1,4 @@
-"""A slider with its name, and its value in words."""
+"""A slider with its name and its formatted value."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from nicegui import ui
 from clients.web.numbers import NumberField
 
 THROTTLE_S = 0.03
-"""Between two values that are told while a slider is dragged."""
+"""Least time between two values reported while a slider is dragged."""
 
 
 class SliderRow:
-    """A slider of one number.
+    """A slider for one number.
 
     Parameters
     ----------
     on_move : called with each value
-    words : how a value is told; the number with its unit if not given
+    words : formats a value; by default the number with its unit
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class SliderRow:
             self._on_move(value)
 
     def show(self, value: float) -> None:
-        """Show a value that came from elsewhere."""
+        """Show a value that was set elsewhere."""
         self._slider.value = value
         self._told.text = self._words(value)
 
     def enable(self, is_on: bool, why_not: str = "") -> None:
-        """Let it be moved, or say why it cannot be."""
+        """Enable the slider, or disable it and show why."""
         self._slider.set_enabled(is_on)
         self._told.text = self._words(self._slider.value) if is_on else why_not
         self.row.classes(

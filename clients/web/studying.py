@@ -1,7 +1,7 @@
-"""A process beside the page that draws figures and point-spread functions.
+"""Worker process for figures and point-spread functions.
 
-Estimating and tracing an eye takes tenths of a second in which Python's lock is held:
-in the page's own process that would hold up its event loop and its frames.
+Estimating and tracing an eye holds Python's global lock for tenths of a second: in the
+page's own process that would block its event loop and its frames.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Any
 from filter_service import FilterError
 
 NICENESS = 10
-"""Pictures go before figures."""
+"""Pictures have priority over figures."""
 
 
 class StudyFailed(Exception):
-    """There is no answer; the text says why."""
+    """There is no answer; the message says why."""
 
 
 class Studying:
-    """One process; of the questions of one kind and page that wait, the newest wins."""
+    """One worker process; of waiting requests per kind and page, the newest wins."""
 
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
@@ -35,7 +35,7 @@ class Studying:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
-        # not a daemon: a report has a worker of its own
+        # not a daemon: a report starts a worker of its own
         self._process = context.Process(target=_answer_all, args=(theirs,))
         self._process.start()
         theirs.close()
@@ -43,7 +43,7 @@ class Studying:
     async def ask(
         self, page: str, kind: str, function: Callable[..., Any], *args, **options
     ) -> Any:
-        """Return what the function returns there; None where a newer question came.
+        """Return the function's result; None if a newer request came.
 
         Raises
         ------
@@ -53,7 +53,7 @@ class Studying:
         key = (page, kind)
         number = self._newest.get(key, 0) + 1
         self._newest[key] = number
-        async with self._turn:  # asked one by one: what waits can be dropped
+        async with self._turn:  # one by one, so that waiting requests can be dropped
             if self._newest.get(key) != number:
                 return None
             return await asyncio.to_thread(self._answer, (function, args, options))
@@ -73,19 +73,19 @@ class Studying:
         return answer
 
     def forget(self, page: str) -> None:
-        """Let go of a page's questions."""
+        """Drop a page's requests."""
         for key in [key for key in self._newest if key[0] == page]:
             del self._newest[key]
 
     def close(self) -> None:
-        """End the process, in the midst of whatever it draws."""
-        self._is_over = True  # a question in hand starts no other
+        """Terminate the process, whatever it is drawing."""
+        self._is_over = True  # a pending request must not restart the process
         self._process.terminate()
         self._process.join()
 
 
 def _answer_all(line: Connection) -> None:
-    """Answer until the page's process is gone."""
+    """Handle requests until the page's process is gone."""
     os.nice(NICENESS)
     from clients.web import eye_figures, point_spread  # noqa: F401  (loads slowly)
 
@@ -98,7 +98,7 @@ def _answer_all(line: Connection) -> None:
 
 
 def _answer_to(function, args, options) -> tuple[Any, str | None]:
-    """Return an answer, or why there is none; some errors do not travel."""
+    """Return a result, or an error message, as some exceptions cannot be pickled."""
     try:
         return function(*args, **options), None
     except (ValueError, FilterError) as error:

@@ -1,4 +1,4 @@
-"""An entry for a file, which says so where it is of another kind."""
+"""File upload that reports files of another kind."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ Taking = Callable[[str, bytes], Awaitable[None]]
 
 
 class _Upload(ui.upload):
-    """An entry whose page may be gone by the time a file has arrived."""
+    """Upload whose page may be closed by the time a file has arrived."""
 
     async def handle_uploads(self, files: list[Any]) -> None:
-        """Hand the files on; NiceGUI's own raises what ends up in the log."""
+        """Pass the files on; raise an HTTP error if the page was closed.
+
+        NiceGUI's own method raises an error that ends up in the log.
+        """
         if self.is_deleted:
             raise HTTPException(410, "the page was closed")
         await super().handle_uploads(files)
 
 
 def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.upload:
-    """Return an entry for a file.
+    """Return a file upload.
 
     Parameters
     ----------
-    accept : as HTML has it: the browser itself refuses other files, and says nothing
+    accept : as in HTML; the browser rejects other files itself, without a message
     most_bytes : a larger file is refused before it is in memory
     take : called with the name and the content of each file
     """
@@ -39,8 +42,8 @@ def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.u
         ui.notify(f"{label}: not such a file; allowed: {allowed}", type="negative")
 
     async def check(event: events.UploadEventArguments) -> None:
-        event.sender.reset()  # ready for another
-        if event.file.size() > most_bytes:  # the browser was to refuse it
+        event.sender.reset()  # ready for the next file
+        if event.file.size() > most_bytes:  # the browser should have rejected it
             refuse()
         else:
             await take_in(event)
@@ -49,7 +52,7 @@ def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.u
         try:
             await take(plain_name(event.file.name), await event.file.read())
         except RuntimeError:
-            if not entry.is_deleted:  # else its page was closed meanwhile
+            if not entry.is_deleted:  # otherwise its page was closed meanwhile
                 raise
 
     entry = _Upload(

@@ -1,4 +1,4 @@
-"""What the person in front of the page wants to see, and what they are shown."""
+"""Requests from the page, and the pictures returned."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Kind = Literal["scene", "preview", "full", "failed"]
 
 @dataclass(frozen=True)
 class Wish:
-    """One state of the page.
+    """One requested state of the page.
 
     Attributes
     ----------
-    number : rises with each
-    bodies : profile of each eye that is shown
+    number : increases with each wish
+    bodies : profile of each eye shown
     """
 
     number: int
@@ -34,14 +34,14 @@ class Wish:
 
 @dataclass(frozen=True)
 class Seen:
-    """A picture on its way to the browser.
+    """A picture to be sent to the browser.
 
     Attributes
     ----------
-    kind : "scene" before the eye; "preview" or "full" through it; or "failed"
+    kind : "scene" without the eye; "preview" or "full" through it; or "failed"
     number : of the wish
-    data : the picture's file, empty where it failed
-    facts : what else the page should know of it, plain values
+    data : the encoded picture, empty on failure
+    facts : further values for the page, plain types
     """
 
     kind: Kind
@@ -52,11 +52,11 @@ class Seen:
 
     @property
     def place(self) -> str:
-        """Return where it is shown: what comes later takes its place."""
+        """Return where it is shown; a newer picture replaces an older one there."""
         return self.eye or self.kind
 
     def packed(self) -> bytes:
-        """Return it as it travels: length of a JSON header, the header, the picture."""
+        """Return the message: length of a JSON header, the header, the picture."""
         header = {"kind": self.kind, "eye": self.eye, "number": self.number}
         text = json.dumps({**header, **self.facts}).encode()
         return struct.pack("<I", len(text)) + text + self.data

@@ -1,4 +1,4 @@
-"""What a person enters about the correction that is worn, and what it makes."""
+"""Entries of the correction that is worn, and the resulting correction."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "edof": (EDOF_ADD,),
 }
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
-"""Far, intermediate, near, as a usual trifocal lens has it: 50:20:30 of 86 %."""
+"""Far, intermediate, near of a usual trifocal lens: 50:20:30 of 86 %."""
 
 
 def first_texts() -> dict[str, str]:
-    """Return what stands in the entries at first."""
+    """Return the initial texts of the entries."""
     return {
         "sphere_dpt": "0.00",
         "cylinder_dpt": "0.00",
@@ -88,7 +88,7 @@ def first_texts() -> dict[str, str]:
 
 
 def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
-    """Return whether another gaze looks through another part of what is worn."""
+    """Return whether the part of the correction looked through depends on the gaze."""
     worn = profile.get("correction") or {}
     return worn.get("kind") in ("progressive", "lenslets")
 
@@ -96,7 +96,7 @@ def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
 def looking(
     profile: Mapping[str, Any], gaze_deg: tuple[float, float]
 ) -> dict[str, Any]:
-    """Return a profile whose worn lens is seen through at a gaze."""
+    """Return a profile with its correction at a gaze."""
     if not turns_with_gaze(profile):
         return dict(profile)
     worn = dict(profile["correction"])
@@ -107,13 +107,13 @@ def looking(
 
 @dataclass
 class WornForm:
-    """The entries for what one eye wears.
+    """The entries of one eye's correction.
 
     Attributes
     ----------
     design : of an intraocular lens
-    texts : by a field's name, as typed
-    file_body : a correction that the entries cannot hold, or None
+    texts : as typed, by field name
+    file_body : a correction that the entries cannot represent, or None
     """
 
     kind: WornKind = "spectacles"
@@ -123,12 +123,12 @@ class WornForm:
 
     @property
     def kinds(self) -> dict[WornKind, str]:
-        """Return what may be chosen."""
+        """Return the available kinds."""
         return KINDS if self.file_body is None else {**KINDS, "file": AS_IN_FILE}
 
     @property
     def entries(self) -> tuple[NumberField, ...]:
-        """Return the numbers that count."""
+        """Return the entries in use."""
         more = OF_DESIGN[self.design] if self.kind == "iol" else ()
         return (*more, *OF_KIND[self.kind])
 
@@ -138,7 +138,7 @@ class WornForm:
         Raises
         ------
         ValueError
-            Names the entry, what it is and what is allowed.
+            Names the entry, its value and what is allowed.
         """
         if self.kind == "file":
             return dict(self.file_body or {})
@@ -154,7 +154,7 @@ class WornForm:
         return found | {"design": self.design}
 
     def take(self, body: Mapping[str, Any]) -> None:
-        """Take a correction over into the entries, or as it is where they cannot."""
+        """Set the entries from a correction, or keep it as a file if they cannot."""
         kind, design = body.get("kind", "spectacles"), body.get("design", "monofocal")
         values = dict(body)
         if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
@@ -173,7 +173,7 @@ class WornForm:
             self.texts[entry.name] = text
 
     def copied(self) -> WornForm:
-        """Return the same entries for the other eye."""
+        """Return a copy for the other eye."""
         return WornForm(self.kind, self.design, dict(self.texts), self.file_body)
 
 
@@ -185,7 +185,7 @@ def read_numbers(
     Raises
     ------
     ValueError
-        Names the entry, what it is and what is allowed.
+        Names the entry, its value and what is allowed.
     """
     values = {}
     for entry in entries:

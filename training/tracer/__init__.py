@@ -4,8 +4,8 @@
 - `field.field_aberrations_of_eyes`: any field, through the stop
 - `accommodation.focus_of_eyes`: the accommodated state for a distance
 
-The eye and its chief ray are float64 always; ``ray_dtype`` is that of the bundle.
-Rays are solved for without a graph.  Gradients come from Fermat's principle on axis,
-from one Newton step through the graph elsewhere; second derivatives are not there.
+The eye and its chief ray are always float64; ``ray_dtype`` is that of the bundle.
+Rays are solved without a graph. Gradients come from Fermat's principle on axis, and
+from one Newton step through the graph elsewhere; second derivatives are not available.
 Automatic mixed precision must be off around all of it.
 """

@@ -1,8 +1,8 @@
-"""The lens diameter and chamber depth that focus eyes at distances, in batches.
+"""Lens diameter and chamber depth that focus eyes at given distances, in batches.
 
-What `accommodation.AccommodatingEye` does with unlimited amplitude: the lens
-shrinks at constant volume until the least-squares refraction at 555 nm meets the focus;
-an eye that cannot do so stays relaxed, or goes as far as its lens reaches.
+The counterpart of `accommodation.AccommodatingEye` with unlimited amplitude: the lens
+shrinks at constant volume until the least-squares refraction at 555 nm matches the
+focus; an eye that cannot reach it stays relaxed, or goes as far as its lens allows.
 """
 
 import math
@@ -24,21 +24,21 @@ from training.tracer.circle import refraction_of_eyes
 from training.tracer.eye import lens_shape
 
 _TOLERANCE_DPT = {torch.float64: 1e-6, torch.float32: 2e-4}
-"""float32 knows a refraction to 1e-4 dpt at a pupil of 3 mm."""
+"""float32 resolves a refraction to 1e-4 dpt at a pupil of 3 mm."""
 
 _N_WINDOW = 4
 _DIFFERENCE_DPT = 1e-3
 
 
 class Focused(NamedTuple):
-    """States of a batch, each tensor shaped as the focuses were.
+    """States of a batch, each tensor shaped like the focus values.
 
     Attributes
     ----------
     lens_diameter_change_mm, aqueous_thickness_change_mm : (B,) or (B, F)
-        Of the accommodated eye less the relaxed one; nan where not ok.
+        Of the accommodated eye minus the relaxed one; nan where not ok.
     ok : bool
-        Light passes the relaxed eye, and the refraction was met.
+        Light passes the relaxed eye, and the refraction was reached.
     """
 
     lens_diameter_change_mm: Tensor
@@ -47,7 +47,7 @@ class Focused(NamedTuple):
 
 
 def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
-    """Eyes (..., 45) with other lens diameters (...) at the same volume."""
+    """Return eyes (..., 45) with other lens diameters (...) at the same volume."""
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     growth_mm = (
         lens_shape(lens_diameter_mm, volume_mm3)[2]
@@ -60,7 +60,7 @@ def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
 
 
 def smallest_diameters_mm(vectors: Tensor) -> Tensor:
-    """See `estimator.eye.lens_change.smallest_diameter_mm`."""
+    """Compute `estimator.eye.lens_change.smallest_diameter_mm` for a batch."""
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
     c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
@@ -69,7 +69,7 @@ def smallest_diameters_mm(vectors: Tensor) -> Tensor:
 
 
 class _Table(NamedTuple):
-    """Lens diameters (B, 10), falling, and the accommodation at each.
+    """Decreasing lens diameters (B, 10), and the accommodation at each.
 
     ``last`` (B,) is the last entry that the eye can use.
     """
@@ -100,12 +100,12 @@ def _tabulate(vectors: Tensor, refractions) -> _Table:
 
 
 def _take(table: Tensor, index: Tensor) -> Tensor:
-    """Entries (B, F) of a table (B, 10)."""
+    """Return entries (B, F) of a table (B, 10)."""
     return table.gather(1, index)
 
 
 def _cubic(table: _Table, right: Tensor, wanted_dpt: Tensor) -> Tensor:
-    """Diameters (B, F) on the cubic through four entries about ``right``."""
+    """Return diameters (B, F) on the cubic through four entries about ``right``."""
     first = (right - 2).clamp(0, N_TABLE - _N_WINDOW)
     window = [first + i for i in range(_N_WINDOW)]
     at_dpt = [_take(table.accommodations_dpt, i) for i in window]
@@ -121,9 +121,9 @@ def _cubic(table: _Table, right: Tensor, wanted_dpt: Tensor) -> Tensor:
 
 
 def _guess(table: _Table, wanted_dpt: Tensor) -> tuple[Tensor, Tensor]:
-    """Diameters (B, F) by inverse interpolation, and their slopes in mm/dpt.
+    """Return diameters (B, F) by inverse interpolation, and their slopes in mm/dpt.
 
-    Cubic; linear where the table does not rise through the whole window.
+    Cubic; linear where the table does not increase over the whole window.
     """
     known_dpt, known_mm = table.accommodations_dpt, table.diameters_mm
     position = torch.arange(N_TABLE, device=known_dpt.device)
@@ -152,7 +152,7 @@ def focus_of_eyes(
     ray_dtype: torch.dtype | None = None,
     chunk: int | None = None,
 ) -> Focused:
-    """Focus relaxed eyes at distances; without gradients.
+    """Focus relaxed eyes at given distances; without gradients.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def focus_of_eyes(
         Relaxed eyes.
     pupil_diameter_mm : (B,)
     focus_dpt : (B,) or (B, F)
-        Distances looked at; infinity is 0.
+        Focus distances; infinity is 0.
     ray_dtype, chunk
         As in `training.tracer.circle.zernike_of_eyes`.
     """
@@ -196,7 +196,7 @@ def focus_of_eyes(
 
 
 def _refine(vectors, table, refractions, state, inside, tolerance_dpt) -> Tensor:
-    """Secant steps on the diameters that lie inside, in place; where all is met."""
+    """Refine inside diameters in place by secant steps; return where all converged."""
     diameter_mm, slope, wanted_dpt, relaxed_mm, nearest_mm = state
     met = ~inside
     row, column = inside.nonzero().unbind(1)
@@ -214,7 +214,7 @@ def _refine(vectors, table, refractions, state, inside, tolerance_dpt) -> Tensor
         diameter_mm[row, column] = mm
         if last_mm is not None:
             moved_mm, moved_dpt = mm - last_mm, reached_dpt - last_dpt
-            # Where nothing moved but rounding, the old slope is the better one.
+            # Where only rounding moved it, the old slope is better.
             far = moved_dpt.abs() > 10.0 * tolerance_dpt
             slope = torch.where(far, moved_mm / moved_dpt, slope)
         following_mm = mm + slope * error_dpt

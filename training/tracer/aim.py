@@ -19,24 +19,24 @@ def broyden(
     tolerance: Tensor | float,
     n_steps: int,
 ) -> tuple[Tensor, Tensor]:
-    """Bring ``miss_of(unknowns)`` to zero.
+    """Solve ``miss_of(unknowns) = 0``.
 
     Parameters
     ----------
     miss_of : callable
-        From unknowns (B, 2, R) to misses (B, 2, R); nan where a ray fails.
+        Maps unknowns (B, 2, R) to misses (B, 2, R); nan where a ray fails.
     start : (B, 2, R)
     inverse : (B, 2, 2)
-        Of the change of the miss with the unknowns, to begin with.
+        Initial inverse of the change of the miss with the unknowns.
     tolerance : scalar or (B, 1) or (R,)
-        Length of the miss at which a ray is done.
+        Length of the miss at which a ray has converged.
     n_steps : int
 
     Returns
     -------
     unknowns : (B, 2, R)
     miss : (B, R)
-        Length left over; inf where no ray came through.
+        Remaining length; inf where no ray passed.
     """
     unknowns = start
     rows = [inverse[:, i, j, None].expand_as(start[:, 0]) for i, j in _CELLS]
@@ -48,7 +48,7 @@ def broyden(
         todo = (left >= tolerance) & (share > _SMALLEST_SHARE)
         if not bool(todo.any()):
             break
-        # A ray that is done stays, so that the last call saw every ray's solution.
+        # A converged ray stays, so that the last call evaluates every ray's solution.
         moved = torch.where(todo[:, None], share[:, None] * step, 0.0)
         tried = miss_of(unknowns + moved)
         length = _length(tried)
@@ -81,7 +81,7 @@ def _apply(rows: list[Tensor], miss: Tensor) -> Tensor:
 
 
 def _update(rows: list[Tensor], moved: Tensor, change: Tensor) -> tuple[Tensor, ...]:
-    """Sherman-Morrison: the inverse times the change becomes the step."""
+    """Sherman-Morrison update: the inverse maps the change to the step."""
     a, b, c, d = rows
     (da, db), (cx, cy) = moved.unbind(1), change.unbind(1)
     va, vb = da * a + db * c, da * b + db * d

@@ -1,4 +1,4 @@
-"""Large batches in parts that fit the caches of a processor or a GPU's memory."""
+"""Large batches in parts that fit a processor's caches or a GPU's memory."""
 
 from collections.abc import Callable
 from functools import cache
@@ -10,9 +10,9 @@ CPU_CHUNK, GPU_CHUNK = 512, 8192
 
 
 def constant(function: Callable) -> Callable:
-    """Keep what a function returns, as tensors that any later graph may hold.
+    """Cache a function's result, as tensors that any later graph may hold.
 
-    Made within ``torch.inference_mode`` they could not be.
+    Tensors created within ``torch.inference_mode`` could not be.
     """
     return cache(torch.inference_mode(False)(function))
 
@@ -22,7 +22,7 @@ def in_chunks(
     arguments: tuple[Tensor, ...],
     chunk: int | None,
 ) -> tuple[Tensor, ...]:
-    """Run ``work`` over parts of the first axis and join what it returns.
+    """Run ``work`` over parts of the first axis and concatenate the results.
 
     Raises
     ------

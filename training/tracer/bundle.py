@@ -1,4 +1,4 @@
-"""Rays through the cornea and through the lens of every eye, either way."""
+"""Rays through the cornea and through the lens of every eye, in either direction."""
 
 import torch
 from torch import Tensor
@@ -8,11 +8,11 @@ from training.tracer.eye import Eye
 from training.tracer.surfaces import NEWTON_STEPS, cross_conic, cross_iterated
 
 ORDER_TOLERANCE_MM = 1e-6
-"""A leg that is shorter than minus this runs against the light: surfaces cross."""
+"""A leg shorter than minus this runs against the light: surfaces cross."""
 
 
 def ratios(eye: Eye) -> list[Tensor]:
-    """Return indices before over behind each of the four surfaces, (B, 1)."""
+    """Return the indices before over behind each of the four surfaces, (B, 1)."""
     n = eye.indices
     return [n[:, i : i + 1] / n[:, i + 1 : i + 2] for i in range(4)]
 
@@ -24,10 +24,10 @@ def into_cornea(
     starts: tuple[Tensor | None, Tensor | None] = (None, None),
     steps: int = NEWTON_STEPS,
 ):
-    """From the anterior cornea's axes to behind the posterior one, in its axes.
+    """Trace from the anterior cornea's axes to behind the posterior one, in its axes.
 
-    ``starts`` are distances (B, R) to both surfaces to begin Newton's steps with.
-    Returns points (B, 3, R) on both surfaces, direction behind and both distances.
+    ``starts`` are initial distances (B, R) of Newton's steps to both surfaces. Returns
+    points (B, 3, R) on both surfaces, direction behind and both distances.
     """
     n = ratios(eye)
     first, direction, reach = cross_iterated(
@@ -41,7 +41,7 @@ def into_cornea(
 
 
 def into_lens(eye: Eye, point: Tensor, direction: Tensor):
-    """From the stop's axes to behind the lens, in the axes of its posterior surface.
+    """Trace from the stop's axes to behind the lens, in its posterior surface's axes.
 
     Returns points on both surfaces, direction behind and both distances.
     """
@@ -54,7 +54,7 @@ def into_lens(eye: Eye, point: Tensor, direction: Tensor):
 
 
 def out_of_lens(eye: Eye, point: Tensor, direction: Tensor):
-    """From the posterior lens' axes out to the stop plane.
+    """Trace from the posterior lens axes out to the stop plane.
 
     Returns points on the anterior and posterior surface, at the stop, direction there,
     and the distances to all three; the last may be negative.
@@ -73,7 +73,7 @@ def out_of_lens(eye: Eye, point: Tensor, direction: Tensor):
 
 
 def out_of_cornea(eye: Eye, point: Tensor, direction: Tensor):
-    """From the stop out into the air, in the axes of the anterior cornea.
+    """Trace from the stop out into the air, in the axes of the anterior cornea.
 
     Returns points on the anterior and posterior surface, direction, and both distances.
     """
@@ -90,13 +90,13 @@ def out_of_cornea(eye: Eye, point: Tensor, direction: Tensor):
 
 
 def to_stop(point: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Carry rays in the stop's axes to its plane, backwards too; point and distance."""
+    """Trace rays in the stop's axes to its plane, also backward; point and distance."""
     t = -point[:, 2] / direction[:, 2]
     return torch.addcmul(point, t[:, None], direction), t
 
 
 def inverse_2x2(matrix: Tensor) -> Tensor:
-    """Inverse of (..., 2, 2); not finite where it is singular."""
+    """Return the inverse of (..., 2, 2); not finite where it is singular."""
     a, b = matrix[..., 0, 0], matrix[..., 0, 1]
     c, d = matrix[..., 1, 0], matrix[..., 1, 1]
     rows = torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2))
@@ -104,7 +104,7 @@ def inverse_2x2(matrix: Tensor) -> Tensor:
 
 
 def across(direction: Tensor) -> Tensor:
-    """Return two unit vectors (B, 2, 3) across a direction (B, 3, 1)."""
+    """Return two unit vectors (B, 2, 3) perpendicular to a direction (B, 3, 1)."""
     dx, _, dz = direction[..., 0].unbind(-1)
     length, zero = torch.hypot(dx, dz), torch.zeros_like(dx)
     first = torch.stack([dz / length, zero, -dx / length], -1)

@@ -1,7 +1,7 @@
-"""The chief ray: through the centre of the stop, one per eye and field; float64.
+"""The chief ray: through the center of the stop, one per eye and field; float64.
 
-It is few rays but everything hangs on it, so it is traced in float64 whatever the
-precision of the bundle.
+There are few chief rays but every result depends on them, so they are traced in float64
+whatever the precision of the bundle.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Axes(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Where the chief ray crosses the plane through the entrance pupil.
+    """Intersection of the chief ray with the plane through the entrance pupil.
 
     ``start`` (B, 2, 1) mm, ``inverse`` (B, 2, 2) of the change at the stop with it,
     ``base_z`` (B, 1) mm of the plane's point on the axis, ``ok`` (B,).
@@ -50,10 +50,10 @@ class Solved(NamedTuple):
 
 
 class Chief(NamedTuple):
-    """The chief ray of every eye; (B, 3, 1) in the axes of the surface at hand.
+    """The chief ray of every eye; (B, 3, 1) in the axes of the respective surface.
 
     ``points`` are on the four surfaces, ``origin`` on the retina and ``direction``,
-    inwards, in the axes of the posterior lens.  ``ok`` (B,) says where it came through.
+    inward, in the axes of the posterior lens. ``ok`` (B,) says where it passed.
     """
 
     points: tuple[Tensor, ...]
@@ -63,7 +63,7 @@ class Chief(NamedTuple):
 
 
 def field_axes(h_deg: Tensor, v_deg: Tensor) -> Axes:
-    """Pupil axes at fields (B,) in degrees."""
+    """Return pupil axes at fields (B,) in degrees."""
     h, v = torch.deg2rad(h_deg), torch.deg2rad(v_deg)
     u = torch.stack([h.sin() * v.cos(), v.sin(), -h.cos() * v.cos()], dim=-1)
     length, zero = torch.hypot(u[:, 0], u[:, 2]), torch.zeros_like(h)
@@ -73,7 +73,7 @@ def field_axes(h_deg: Tensor, v_deg: Tensor) -> Axes:
 
 
 def _entrance_pupil_z(eye: Eye) -> Tensor:
-    """Paraxial image of the stop in the air, (B, 1) mm; where aiming starts."""
+    """Return the paraxial image of the stop in air, (B, 1) mm; where aiming starts."""
     n = eye.indices
     gaps = (-eye.to_posterior.shift[:, 2], -eye.to_stop.shift[:, 2])
     z, height, slope = gaps[0] + gaps[1], torch.zeros_like(gaps[0]), 1.0 / n[:, 2:3]
@@ -87,10 +87,10 @@ def _entrance_pupil_z(eye: Eye) -> Tensor:
 
 
 def _shoot(eye: Eye, axes: Axes, base_z: Tensor, start: Tensor):
-    """Parallel rays at ``start`` (B, 2, R) of the pupil plane, to the stop.
+    """Trace parallel rays at ``start`` (B, 2, R) of the pupil plane to the stop.
 
     Returns points on both corneal surfaces, at the stop, the direction there, and the
-    distances from the posterior cornea's neighbours to it, (B, R).
+    distances from the posterior cornea's neighbors to it, (B, R).
     """
     point = start[:, :1] * axes.x + start[:, 1:] * axes.y + _START_MM * axes.source
     point = torch.cat([point[:, :2], point[:, 2:] + base_z[:, None]], 1)
@@ -111,7 +111,7 @@ def _shoot(eye: Eye, axes: Axes, base_z: Tensor, start: Tensor):
 
 @torch.no_grad()
 def solve_chief(eye: Eye, axes: Axes) -> Solved:
-    """Aim at the centre of the stop by Newton's method, with halved steps."""
+    """Aim at the center of the stop by Newton's method, with halved steps."""
     base_z, h = _entrance_pupil_z(eye), _DIFFERENCE_MM
     around = base_z.new_tensor([[0.0, h, 0.0], [0.0, 0.0, h]])
     best = base_z.new_zeros(len(base_z), 2, 1)
@@ -121,7 +121,7 @@ def solve_chief(eye: Eye, axes: Axes) -> Solved:
         tried = best + step
         stop = _shoot(eye, axes, base_z, tried + around)[2][:, :2]
         found = torch.hypot(stop[:, 0, 0], stop[:, 1, 0])
-        better = found < miss  # never where a ray failed
+        better = found < miss  # False where a ray failed
         mine = better[:, None, None]
         best, miss = torch.where(mine, tried, best), torch.where(better, found, miss)
         response = inverse_2x2((stop[..., 1:] - stop[..., :1]) / h)
@@ -133,7 +133,7 @@ def solve_chief(eye: Eye, axes: Axes) -> Solved:
 
 
 def _attached(eye: Eye, axes: Axes, solved: Solved) -> Tensor:
-    """Return the solution with its gradient: one Newton step from where it is."""
+    """Return the solution with its gradient: one Newton step from the solution."""
     if not torch.is_grad_enabled():
         return solved.start
     stop = _shoot(eye, axes, solved.base_z, solved.start)[2]
@@ -141,7 +141,7 @@ def _attached(eye: Eye, axes: Axes, solved: Solved) -> Tensor:
 
 
 def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
-    """Carry the solved ray to the retina; differentiable in the eye."""
+    """Trace the solved ray to the retina; differentiable in the eye."""
     start = _attached(eye, axes, solved)
     first, second, stop, direction, (gap, deep) = _shoot(
         eye, axes, solved.base_z, start
@@ -156,9 +156,9 @@ def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
 
 
 def magnification(eye: Eye) -> Tensor:
-    """Entrance pupil over stop (B,), about the axial chief ray; nan where none.
+    """Return entrance pupil over stop (B,), about the axial chief ray; nan where none.
 
-    As `estimator.wavefront.kernels.magnification`, whose differences it shares.
+    As `estimator.wavefront.kernels.magnification`, with the same differences.
     """
     zero = torch.zeros_like(eye.indices[:, 0])
     axes = field_axes(zero, zero)

@@ -1,9 +1,9 @@
 """Aberrations on axis, on the circle of a measurement, for a batch of eyes.
 
-What `estimator.eye.tracing.zernike_of_vectors` gives on axis: the wavefront of the
-chief ray's retinal point on the filled circle of half the pupil diameter, whatever the
-stop.  Here rays start at the nodes of that circle and are aimed at the retinal point;
-what they miss it by hardly matters (see `paths`).
+The counterpart of `estimator.eye.tracing.zernike_of_vectors` on axis: the wavefront of
+the chief ray's retinal point on the filled circle of half the pupil diameter, whatever
+the stop. Here rays start at the nodes of that circle and are aimed at the retinal
+point; their miss has little effect (see `paths`).
 """
 
 import torch
@@ -27,10 +27,11 @@ from training.tracer.eye import Eye
 from training.tracer.paths import extra_path
 
 _ACCEPTED_MM = 1e-4
-"""Miss at the retina: its square leaves 4e-7 um.  But gradients feel it as it is."""
+"""Miss at the retina: its square leaves 4e-7 um, but gradients depend on it
+linearly."""
 
 _TOLERANCE_MM = {torch.float64: 1e-7, torch.float32: 1e-5}
-"""What is aimed at where gradients are wanted; float32 reaches 4e-6 of 17 mm."""
+"""Aim where gradients are required; float32 reaches 4e-6 of 17 mm."""
 
 _TOLERANCE_WITHOUT_GRADIENT_MM = 2e-5
 _STEPS = 10
@@ -41,7 +42,7 @@ _C20 = index_from_nm(2, 0)
 
 @constant
 def _nodes(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Points (2, R) of the unit circle, and the projection (R, 28) without piston."""
+    """Return points (2, R) of the unit circle, and projection (R, 28), no piston."""
     rings, _, azimuths, projection = (torch.tensor(a) for a in circle_nodes())
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     projection[0] = 0.0
@@ -56,7 +57,7 @@ def zernike_of_eyes(
     ray_dtype: torch.dtype | None = None,
     chunk: int | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Coefficients of relaxed or accommodated eyes on axis, object at infinity.
+    """Compute coefficients of relaxed or accommodated eyes on axis, object at infinity.
 
     Parameters
     ----------
@@ -72,8 +73,8 @@ def zernike_of_eyes(
     Returns
     -------
     zernike_um : (B, 28)
-        Piston zero; nan where light does not pass as a whole (there the compiled
-        tracer fits what is left, unless it is too little).
+        Piston zero; nan where light does not pass completely (there the compiled
+        tracer fits the rest, unless it is too little).
     ok : (B,) bool
 
     Notes
@@ -82,7 +83,7 @@ def zernike_of_eyes(
 
     Against the compiled tracer (512 eyes of Table 2, pupils of 3 to 6 mm, 450 to
     900 nm) float64 differs by 1e-9 um at most and float32 by 5e-5 um, 5e-6 um in the
-    root mean square.  Gradients differ from its central differences by 3e-6 of a
+    root mean square. Gradients differ from its central differences by 3e-6 of a
     parameter's largest; in float32 by 2e-4 um over the whole range of a parameter.
     """
     dtype = ray_dtype or vectors.dtype
@@ -104,7 +105,7 @@ def _zernike(vectors, pupil_mm, wavelength_nm, dtype):
         points, outwards, ok = _aim(
             eye, axes, chief, pupil_mm / 2.0, dtype, with_gradient
         )
-    # Only rows that came through go on: a nan would spoil the gradients of the others.
+    # Only rows that passed go on: a nan would spoil the gradients of the others.
     rows = ok.nonzero()[:, 0]
     axes, solved, points, outwards = eyes.mapped(
         lambda t: t[rows], (axes, solved, points, outwards)
@@ -118,15 +119,15 @@ def _zernike(vectors, pupil_mm, wavelength_nm, dtype):
 
 
 def _plane(eye: Eye, axes: chiefs.Axes, dtype) -> tuple[Tensor, ...]:
-    """Axes of the pupil plane as the anterior cornea has them, (B, 3, 1) each."""
+    """Return the pupil plane's axes in those of the anterior cornea, (B, 3, 1) each."""
     return tuple(torch.bmm(eye.to_cornea.turn, axis).to(dtype) for axis in axes)
 
 
 def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
-    """Rays from the nodes to the retinal point.
+    """Aim rays from the nodes at the retinal point.
 
-    Returns points on the four surfaces, the direction outwards in the anterior
-    cornea's axes, both (B, 3, R), and ok (B,).
+    Returns points on the four surfaces, the outward direction in the anterior cornea's
+    axes, both (B, 3, R), and ok (B,).
     """
     x_axis, y_axis, source = _plane(eye, axes, dtype)
     frame = across(chief.direction).to(dtype)
@@ -147,7 +148,7 @@ def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
         return miss
 
     def warm(cosines):
-        # A bundle's second guess meets the cornea where the first did, nearly.
+        # A bundle's second guess meets the cornea nearly where the first did.
         starts = last["legs"][:2] if "legs" in last else (None, None)
         return miss_of(cosines, nodes, starts)
 
@@ -168,7 +169,7 @@ def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
 
 
 def _to_origin(eye: Eye, light, frame, point, direction, starts):
-    """Rays (B, 3, R) from the pupil plane to that of the retinal point.
+    """Trace rays (B, 3, R) from the pupil plane to that of the retinal point.
 
     Returns the miss there (B, 2, R), points on the four surfaces, and the legs.
     """
@@ -186,7 +187,7 @@ def _to_origin(eye: Eye, light, frame, point, direction, starts):
 
 
 def _wavefront(eye: Eye, axes, chief, points, outwards, radius_mm: Tensor) -> Tensor:
-    """W (B, R), um, at the nodes of the circle; differentiable."""
+    """Return W (B, R), um, at the nodes of the circle; differentiable."""
     dtype = outwards.dtype
     x_axis, y_axis, _ = _plane(eye, axes, dtype)
     nodes = _nodes(radius_mm.device, dtype)[0] * radius_mm.to(dtype)[:, None, None]
@@ -205,7 +206,7 @@ def refraction_of_eyes(
     wavelength_nm: Tensor | None = None,
     **options,
 ) -> tuple[Tensor, Tensor]:
-    """Least-squares M (B,), dpt, from C(2,0) on the pupil's circle, and ok (B,).
+    """Return least-squares M (B,), dpt, from C(2,0) on the pupil's circle, and ok (B,).
 
     ``wavelength_nm`` defaults to 555 nm; ``options`` are those of `zernike_of_eyes`.
     """

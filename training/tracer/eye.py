@@ -1,9 +1,9 @@
 """From the 45 parameters to surfaces, as tensors over a batch of eyes.
 
-Rays live in the axes of the surface they are at, so that coordinates stay small and
-float32 keeps its digits.  The frames, from the air inwards: the two surfaces of the
-cornea, the stop (axes of the eye, origin at its centre), the two surfaces of the lens,
-the retina (axes of the eye, origin at its pole).
+Rays are in the axes of the current surface, so that coordinates stay small and float32
+keeps its digits. The frames, from the air inward: the two surfaces of the cornea, the
+stop (axes of the eye, origin at its center), the two surfaces of the lens, the retina
+(axes of the eye, origin at its pole).
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Shape(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Into the next frame: p' = turn p + shift; (B, 3, 3), or None, and (B, 3, 1)."""
+    """Step to the next frame: p' = turn p + shift; (B, 3, 3) or None, and (B, 3, 1)."""
 
     turn: Tensor | None
     shift: Tensor | None
@@ -45,9 +45,9 @@ class Step(NamedTuple):
 class Eye(NamedTuple):
     """A batch of eyes, each at one wavelength.
 
-    ``shapes`` are the four surfaces and the retina.  ``to_cornea`` leads from the eye's
-    frame into the anterior cornea's, the others one frame inwards each.  ``indices``
-    are (B, 5), air first.
+    ``shapes`` are the four surfaces and the retina. ``to_cornea`` leads from the eye's
+    frame to the anterior cornea's, the others one frame inward each. ``indices`` are
+    (B, 5), air first.
     """
 
     shapes: tuple[Shape, ...]
@@ -61,7 +61,7 @@ class Eye(NamedTuple):
 
 
 def mapped(function, tree):
-    """Apply ``function`` to every tensor of a nest of tuples."""
+    """Apply ``function`` to every tensor of nested tuples."""
     if tree is None or isinstance(tree, Tensor):
         return None if tree is None else function(tree)
     parts = [mapped(function, part) for part in tree]
@@ -70,7 +70,7 @@ def mapped(function, tree):
 
 @constant
 def _offset_map(device: torch.device) -> Tensor:
-    """(27, 98): offsets in mm to the flattened ``Shape.offset``."""
+    """Return (27, 98): offsets in mm to the flattened ``Shape.offset``."""
     terms = np.eye(N_TERMS)[1:]
     by_monomial = np.zeros((N_TERMS - 1, _N_POWERS, _N_POWERS + 1))
     horner = offset_monomials(terms, offset_radius_mm=parameters.OFFSET_RADIUS_MM)
@@ -82,7 +82,7 @@ def _offset_map(device: torch.device) -> Tensor:
 
 
 def lens_shape(diameter_mm: Tensor, volume_mm3: Tensor) -> tuple[Tensor, ...]:
-    """Rule C of `lens_shape`: radii anterior, posterior and thickness, mm."""
+    """Return anterior and posterior radii and thickness, mm, by `lens_shape` rule C."""
     cap_mm3 = rule.CAP_VOLUME_RATIO * volume_mm3
     heights_mm = 8.0 * cap_mm3 / (torch.pi * diameter_mm**2)
     posterior_mm = (
@@ -112,9 +112,9 @@ def _shift(*parts: Tensor) -> Tensor:
 
 
 def pack_eyes(vectors: Tensor, wavelength_nm: Tensor) -> Eye:
-    """Surfaces of eyes (B, 45) at wavelengths (B,) nm; float64, differentiable.
+    """Return surfaces of eyes (B, 45) at wavelengths (B,) nm; float64, differentiable.
 
-    The retina is the sphere of radius eye length / 2, the lens follows rule C.
+    The retina is the sphere of radius eye length / 2; the lens follows rule C.
     """
     vectors = vectors.to(torch.float64)
     given = dict(zip(parameters.PARAMETER_NAMES, vectors.unbind(-1), strict=True))
@@ -130,7 +130,7 @@ def pack_eyes(vectors: Tensor, wavelength_nm: Tensor) -> Eye:
     pole_mm = _shift(
         given["lens_decentration_x_mm"], given["lens_decentration_y_mm"], zero
     )
-    # The retina's pole as the lens sees it, on the undisplaced axis of the eye.
+    # The retina's pole relative to the lens, on the undisplaced axis of the eye.
     behind_stop_mm = (
         given["eye_length_mm"]
         - given["cornea_thickness_mm"]
@@ -185,14 +185,14 @@ def _shapes(given, vectors, lens_anterior_mm, lens_posterior_mm) -> tuple[Shape,
 
 
 def turned(turn: Tensor, vector: Tensor) -> Tensor:
-    """Product of (B, 3, 3) and (B, 3, R); faster than small matrix products."""
+    """Multiply (B, 3, 3) by (B, 3, R); faster than small matrix products."""
     x, y, z = vector.split(1, dim=1)
     first = turn[:, :, :1] * x
     return torch.addcmul(torch.addcmul(first, turn[:, :, 1:2], y), turn[:, :, 2:], z)
 
 
 def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
-    """Take a point, and then directions, (B, 3, R) into the next frame."""
+    """Transform a point, and then directions, (B, 3, R) into the next frame."""
     point, *directions = vectors
     if step.turn is not None:
         point = turned(step.turn, point)
@@ -203,7 +203,7 @@ def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
 
 
 def outwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
-    """Take a point, and then directions, (B, 3, R) back from the next frame."""
+    """Transform a point, and then directions, (B, 3, R) back from the next frame."""
     point, *directions = vectors
     if step.shift is not None:
         point = point - step.shift

@@ -1,8 +1,8 @@
 """Aberrations of any field through the stop of an eye, for a batch of eyes.
 
-What `aberrations.eyes_aberrations` gives: rays from the chief ray's retinal
-point are aimed at the nodes of the stop and followed out of the eye; the wavefront is
-fitted on the circle about their rim.  Eye, field, wavelength and pupil are per row.
+The counterpart of `aberrations.eyes_aberrations`: rays from the chief ray's retinal
+point are aimed at the nodes of the stop and traced out of the eye; the wavefront is
+fitted on the circle about their rim. Eye, field, wavelength and pupil are per row.
 """
 
 from typing import NamedTuple
@@ -46,10 +46,10 @@ class FieldAberrations(NamedTuple):
     zernike_radius_mm : (B,)
         Largest distance of the pupil's rim from the chief ray.
     ellipse_mm : (B, 5)
-        The rim's ellipse: centre x, y and the symmetric matrix xx, xy, yy of its
-        semi-axes, R diag(major, minor) R^T, where R turns x to the major axis.
+        The rim's ellipse: center x, y and the symmetric matrix xx, xy, yy of its
+        semi-axes, R diag(major, minor) R^T, where R rotates x to the major axis.
     ok : (B,) bool
-        All of the stop passes light.
+        The whole stop passes light.
     """
 
     zernike_um: Tensor
@@ -60,7 +60,7 @@ class FieldAberrations(NamedTuple):
 
 @constant
 def _nodes(device: torch.device) -> tuple[Tensor, Tensor, int]:
-    """Points (2, R) of the unit stop, their weights (R,), and the number of rings."""
+    """Return points (2, R) of the unit stop, weights (R,), and the number of rings."""
     rings, weights, azimuths = (torch.tensor(a) for a in stop_nodes())
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     shares = weights.repeat(len(azimuths)) / len(azimuths)
@@ -77,15 +77,15 @@ def field_aberrations_of_eyes(
     ray_dtype: torch.dtype | None = None,
     chunk: int | None = None,
 ) -> FieldAberrations:
-    """Aberrations of eyes, each at its field, wavelength and pupil.
+    """Compute aberrations of eyes, each at its field, wavelength and pupil.
 
     Parameters
     ----------
     vectors : (B, 45)
         Relaxed or accommodated eyes, parameters in table order.
     pupil_diameter_mm, wavelength_nm, h_deg, v_deg : (B,)
-        The pupil is the entrance pupil; the stop is it over the magnification at
-        555 nm.  The object is at infinity.
+        The pupil is the entrance pupil; the stop is that divided by the magnification
+        at 555 nm. The object is at infinity.
     ray_dtype : torch.dtype, optional
         Precision of the bundle and of the result; default that of ``vectors``.
     chunk : int, optional
@@ -131,7 +131,7 @@ def _aberrations(vectors, pupil_mm, wavelength_nm, h_deg, v_deg, dtype):
         ok = chief.ok & aimed[2] & torch.isfinite(samples).all(1).all(1)
     rows = ok.nonzero()[:, 0]
     if torch.is_grad_enabled():
-        # Only rows that came through: a nan would spoil the gradients of the others.
+        # Only rows that passed: a nan would spoil the gradients of the others.
         axes, solved, bundle = eyes.mapped(lambda t: t[rows], (axes, solved, bundle))
         eye = eyes.pack_eyes(vectors[rows], wavelength_nm[rows])
         chief = chiefs.trace_chief(eye, axes, solved)
@@ -144,23 +144,23 @@ def _aberrations(vectors, pupil_mm, wavelength_nm, h_deg, v_deg, dtype):
 
 
 class _Launch(NamedTuple):
-    """Where rays leave the retinal point, in the axes of the posterior lens."""
+    """Launch of rays from the retinal point, in the axes of the posterior lens."""
 
     frame: Tensor  # (B, 2, 3) across the chief ray
-    direction: Tensor  # (B, 3, 1) of the chief ray, inwards
+    direction: Tensor  # (B, 3, 1) of the chief ray, inward
     cosines: Tensor  # (B, 2, R)
     inverse: Tensor  # (B, R, 2, 2) of the change at the stop with them
 
 
 def _launched(bundle: _Launch, cosines: Tensor) -> Tensor:
-    """Directions (B, 3, R) outwards."""
+    """Return directions (B, 3, R), outward."""
     along = (1.0 - cosines.square().sum(1, keepdim=True)).sqrt()
     frame, chief = bundle.frame.to(along.dtype), bundle.direction.to(along.dtype)
     return torch.bmm(frame.mT, cosines) - along * chief
 
 
 def _at_stop(eye: Eye, origin: Tensor, bundle: _Launch, cosines: Tensor):
-    """Points (B, 2, R) of the stop that rays from the retinal point cross."""
+    """Return the points (B, 2, R) where rays from the retinal point cross the stop."""
     direction = _launched(bundle, cosines)
     out = out_of_lens(eye, origin.expand_as(direction), direction)
     failed = torch.isnan(sum(out[4]))[:, None]
@@ -168,7 +168,7 @@ def _at_stop(eye: Eye, origin: Tensor, bundle: _Launch, cosines: Tensor):
 
 
 def _aim(eye: Eye, chief, frame, radius_mm: Tensor, dtype):
-    """Direction cosines (B, 2, R) to the nodes, their response, and ok (B,)."""
+    """Return direction cosines (B, 2, R) to the nodes, their response, and ok (B,)."""
     nodes = (_nodes(radius_mm.device)[0] * radius_mm[:, None, None]).to(dtype)
     narrow, origin = eyes.mapped(lambda t: t.to(dtype), (eye, chief.origin))
     bundle = _Launch(frame, chief.direction, None, None)
@@ -195,7 +195,7 @@ def _aim(eye: Eye, chief, frame, radius_mm: Tensor, dtype):
 
 
 def _attached(eye: Eye, chief, bundle: _Launch, radius_mm: Tensor, dtype) -> _Launch:
-    """Return the bundle with its gradient: one Newton step from where it is."""
+    """Return the bundle with its gradient: one Newton step from the solution."""
     nodes = (_nodes(radius_mm.device)[0] * radius_mm[:, None, None]).to(dtype)
     narrow, origin = eyes.mapped(lambda t: t.to(dtype), (eye, chief.origin))
     miss = _at_stop(narrow, origin, bundle, bundle.cosines) - nodes
@@ -204,7 +204,7 @@ def _attached(eye: Eye, chief, bundle: _Launch, radius_mm: Tensor, dtype) -> _La
 
 
 def _samples(eye: Eye, axes, chief, bundle: _Launch, dtype) -> Tensor:
-    """X, Y (mm) and W (um) of every ray on the pupil plane, (B, 3, R)."""
+    """Return X, Y (mm) and W (um) of every ray on the pupil plane, (B, 3, R)."""
     plane = [torch.bmm(eye.to_cornea.turn, axis).to(dtype) for axis in axes]
     eye, (points, origin) = eyes.mapped(
         lambda t: t.to(dtype), (eye, (chief.points, chief.origin))
@@ -228,7 +228,7 @@ def _samples(eye: Eye, axes, chief, bundle: _Launch, dtype) -> Tensor:
 
 
 def _read(samples: Tensor, dtype) -> tuple[Tensor, ...]:
-    """Coefficients, radius and ellipse of whole pupils."""
+    """Return coefficients, radius and ellipse of whole pupils."""
     x_mm, y_mm, wave_um = samples.to(torch.float64).unbind(1)
     _, weights, n_rings = _nodes(samples.device)
     rim = [part[:, n_rings - 1 :: n_rings] for part in (x_mm, y_mm)]
@@ -239,7 +239,7 @@ def _read(samples: Tensor, dtype) -> tuple[Tensor, ...]:
 
 
 def _spread(parts: tuple[Tensor, ...], rows: Tensor, count: int) -> list[Tensor]:
-    """Put results of some rows into a batch whose other rows are nan."""
+    """Scatter results of some rows into a batch whose other rows are nan."""
     return [
         part.new_full((count, *part.shape[1:]), torch.nan).index_copy(0, rows, part)
         for part in parts

@@ -1,4 +1,4 @@
-"""Zernike fit, rim radius and ellipse of pupils that are filled as a whole; float64."""
+"""Zernike fit, rim radius and ellipse of completely filled pupils; float64."""
 
 import math
 
@@ -24,7 +24,7 @@ def _from_monomials(device: torch.device) -> Tensor:
 
 
 def zernike_basis(x: Tensor, y: Tensor) -> Tensor:
-    """Values (B, 28, R) of the polynomials at points (B, R) of the unit circle."""
+    """Return polynomial values (B, 28, R) at points (B, R) of the unit circle."""
     powers = []
     for coordinate in (x, y):
         row = [torch.ones_like(coordinate)]
@@ -38,9 +38,9 @@ def zernike_basis(x: Tensor, y: Tensor) -> Tensor:
 def fit_zernike(
     x_mm: Tensor, y_mm: Tensor, wave_um: Tensor, weights: Tensor, radius_mm: Tensor
 ) -> Tensor:
-    """Weighted least squares of W (B, R) on circles of ``radius_mm`` (B,).
+    """Fit W (B, R) by weighted least squares on circles of ``radius_mm`` (B,).
 
-    ``weights`` (R,).  Returns coefficients (B, 28), um, with piston zero.
+    ``weights`` (R,). Returns coefficients (B, 28), um, with piston zero.
     """
     basis = zernike_basis(x_mm / radius_mm[:, None], y_mm / radius_mm[:, None])
     weighted = basis * weights
@@ -54,7 +54,7 @@ def fit_zernike(
 
 @constant
 def _fourier(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Matrix (2 K + 1, n) to the Fourier series of n equal steps, and its orders."""
+    """Return matrix (2 K + 1, n) to the Fourier series of n equal steps, and orders."""
     angle = 2.0 * math.pi * torch.arange(n, dtype=torch.float64) / n
     order = torch.arange(1, (n - 1) // 2 + 1, dtype=torch.float64)
     turned = order[:, None] * angle
@@ -64,7 +64,7 @@ def _fourier(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def _series(coefficients: Tensor, order: Tensor, angle: Tensor):
-    """Value, slope and bend (B, A) of series (B, 2 K + 1) at angles (B, A)."""
+    """Return value, slope and bend (B, A) of series (B, 2 K + 1) at angles (B, A)."""
     mean, even, odd = coefficients.split([1, len(order), len(order)], dim=-1)
     turned = angle[..., None] * order
     c, s = turned.cos(), turned.sin()
@@ -76,10 +76,10 @@ def _series(coefficients: Tensor, order: Tensor, angle: Tensor):
 
 
 def rim_radius(x_mm: Tensor, y_mm: Tensor) -> Tensor:
-    """Largest distance (B,) of a whole rim (B, n) from the chief ray.
+    """Return the largest distance (B,) of a whole rim (B, n) from the chief ray.
 
     The squared distance is a smooth function of the stop's azimuth: its Fourier series
-    is searched on a finer grid, and the peak refined by Newton.
+    is searched on a finer grid, and the peak refined by Newton's method.
     """
     squared = x_mm**2 + y_mm**2
     n = squared.shape[-1]
@@ -90,7 +90,7 @@ def rim_radius(x_mm: Tensor, y_mm: Tensor) -> Tensor:
         fine = reach * torch.arange(_FINER * n, device=x_mm.device, dtype=x_mm.dtype)
         found = _series(coefficients, order, fine.expand(len(squared), -1))[0]
         highest = (found >= found.roll(1, -1)) & (found >= found.roll(-1, -1))
-        # Peaks may be as high as each other: the grid must not choose between them.
+        # Peaks may have equal height: the grid must not choose between them.
         peaks = torch.where(highest, found, -torch.inf).topk(_N_PEAKS, -1).indices
         start = fine[peaks]
         angle = start
@@ -104,10 +104,10 @@ def rim_radius(x_mm: Tensor, y_mm: Tensor) -> Tensor:
 
 
 def rim_ellipse(x_mm: Tensor, y_mm: Tensor, radius_mm: Tensor) -> Tensor:
-    """Least-squares conic through rims (B, n), as (B, 5) mm.
+    """Fit a least-squares conic to rims (B, n), as (B, 5) mm.
 
-    Centre x, y and the symmetric matrix xx, xy, yy = R diag(a, b) R^T of the semi-axes
-    a, b, where R turns x to the major axis; nan where the conic is no ellipse.
+    Center x, y and the symmetric matrix xx, xy, yy = R diag(a, b) R^T of the semi-axes
+    a, b, where R rotates x to the major axis; nan where the conic is not an ellipse.
     """
     u, v = x_mm / radius_mm[:, None], y_mm / radius_mm[:, None]
     rows = torch.stack([u * u, u * v, v * v, u, v], -1)
@@ -118,7 +118,7 @@ def rim_ellipse(x_mm: Tensor, y_mm: Tensor, radius_mm: Tensor) -> Tensor:
     cx = (b * e - 2.0 * c * d) / determinant
     cy = (b * d - 2.0 * a * e) / determinant
     level = 1.0 + a * cx * cx + b * cx * cy + c * cy * cy
-    # Squares of the semi-axes: M = Q^-1 of u^T Q u = 1, and of M the root
+    # Squares of the semi-axes: M = Q^-1 of u^T Q u = 1, and the root of M is
     # (M + sqrt(det M)) / sqrt(tr M + 2 sqrt(det M)), smooth where the axes are equal.
     xx, xy, yy = (4.0 * level * s / determinant for s in (c, -0.5 * b, a))
     product = (xx * yy - xy * xy).sqrt()

@@ -13,9 +13,9 @@ _POLE_UM2 = 0.028
 
 @constant
 def _dispersion(device: torch.device) -> Tensor:
-    """(4, 5): from 1, L², 1/(L² - 0.028) and its square to the media, air first."""
-    # The formula is linear in these four terms: solve for them from four wavelengths,
-    # so that the table of indices stays in one place.
+    """Return (4, 5): 1, L², 1/(L² - 0.028) and its square to the media, air first."""
+    # The formula is linear in these four terms: solve for them at four wavelengths, so
+    # that the table of indices stays in one place.
     wavelength_nm = torch.tensor([400.0, 500.0, 650.0, 900.0], dtype=torch.float64)
     values = [media.refractive_index(m, wavelength_nm.numpy()) for m in MEDIA_INWARDS]
     indices = torch.stack([torch.from_numpy(v) for v in values], dim=-1)
@@ -29,7 +29,7 @@ def _terms(wavelength_nm: Tensor) -> Tensor:
 
 
 def refractive_indices(wavelength_nm: Tensor) -> Tensor:
-    """Return indices (B, 5), float64, from the air inwards, of wavelengths (B,) nm.
+    """Return indices (B, 5), float64, from the air inward, at wavelengths (B,) nm.
 
     Raises
     ------

@@ -1,12 +1,12 @@
-"""Optical paths of a bundle against its chief ray, to the last digit.
+"""Optical paths of a bundle relative to its chief ray, without cancellation.
 
-An eye is 32 mm of optical path, of which float32 keeps 0.002 um.  So every leg is
-taken as a difference from the chief ray's leg: with e the difference of the two legs
+An eye is 32 mm of optical path, of which float32 keeps 0.002 um. So every leg is
+computed as a difference from the chief ray's leg: with e the difference of the two legs
 as vectors, |v| - |c| = e.(v + c) / (|v| + |c|), where nothing large cancels.
 
-Points come in as x, y in the axes of each surface.  By Fermat's principle the path
-does not change, to first order, when a point slides along its surface: an error of the
-points comes in squared, and points without gradient still give the exact gradient.
+Points are x, y in the axes of each surface. By Fermat's principle the path does not
+change, to first order, when a point slides along its surface: an error of the points
+enters squared, and points without gradient still give the exact gradient.
 """
 
 import torch
@@ -18,7 +18,7 @@ from training.tracer.surfaces import sag
 
 
 def _from_chief(shape, points: Tensor, chief: Tensor) -> tuple[Tensor, Tensor]:
-    """Ray points less the chief's (B, 3, R), and the chief's point (B, 3, 1)."""
+    """Return ray points minus the chief's (B, 3, R), and the latter (B, 3, 1)."""
     z = sag(shape, points[:, 0], points[:, 1])[0]
     chief_z = sag(shape, chief[:, 0], chief[:, 1])[0]
     there = torch.cat([chief[:, :2], chief_z[:, None]], 1)
@@ -29,7 +29,7 @@ def _from_chief(shape, points: Tensor, chief: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _longer(away: Tensor, chief_leg: Tensor) -> Tensor:
-    """Length of ``chief_leg + away`` less that of ``chief_leg``, (B, R)."""
+    """Return the length of ``chief_leg + away`` minus that of ``chief_leg``, (B, R)."""
     leg = chief_leg + away
     lengths = leg.square().sum(1).sqrt() + chief_leg.square().sum(1).sqrt()
     return (away * (leg + chief_leg)).sum(1) / lengths
@@ -38,7 +38,7 @@ def _longer(away: Tensor, chief_leg: Tensor) -> Tensor:
 def extra_path(
     eye: Eye, points: list[Tensor], chief_points: list[Tensor], origin: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Optical path from ``origin`` to the anterior cornea less the chief ray's.
+    """Return the path from ``origin`` to the anterior cornea minus the chief ray's.
 
     Parameters
     ----------
@@ -51,8 +51,9 @@ def extra_path(
     Returns
     -------
     path_mm : (B, R)
+        Optical path difference.
     away_mm : (B, 3, R)
-        Points on the anterior cornea less the chief ray's.
+        Points on the anterior cornea minus the chief ray's.
     """
     placed = [
         _from_chief(shape, ray, chief)

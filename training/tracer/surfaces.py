@@ -1,7 +1,7 @@
 """Rays through one surface of every eye: distance, normal, refraction.
 
-Rays are (B, 3, R): position (mm) and direction cosines, in the surface's own axes.  A
-ray that fails turns into nan and stays so; nothing is raised.
+Rays are (B, 3, R): position (mm) and direction cosines, in the surface's own axes. A
+ray that fails becomes nan and stays so; no exception is raised.
 """
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from training.tracer.eye import Shape
 
 NEWTON_STEPS = 5
-"""From the intersection with the conic; float64 is exhausted after them."""
+"""Steps from the intersection with the conic; they exhaust float64."""
 
 _SMALLEST_RADICAND = 1e-12
 
@@ -22,9 +22,9 @@ def _powers(x: Tensor) -> Tensor:
 
 
 def sag(shape: Shape, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Height z (B, R) mm at x, y (B, R), its slopes, and the conic's radicand.
+    """Return height z (B, R) mm at x, y (B, R), its slopes, and the conic's radicand.
 
-    Where the radicand is not positive there is no surface, and z means nothing.
+    Where the radicand is not positive there is no surface, and z has no meaning.
     """
     cx, cy, k1 = shape.curvature_x, shape.curvature_y, 1.0 + shape.conic
     px, py = cx * x, cy * y
@@ -55,11 +55,11 @@ def _to_vertex_plane(point: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
 def _conic_distance(
     c: Tensor, k: Tensor, point: Tensor, direction: Tensor, sense: float
 ) -> Tensor:
-    """Distance (B, R) from the vertex plane to a conic of revolution.
+    """Return the distance (B, R) from the vertex plane to a conic of revolution.
 
-    To its vertex sheet; nan where there is none.  ``c``, ``k`` (B, 1); ``sense`` is 1
-    for rays that run inwards and -1 outwards.  From farther away the same formula
-    would cancel to 1e-4 mm in float32.
+    To its vertex sheet; nan where there is none. ``c``, ``k`` (B, 1); ``sense`` is 1
+    for inward rays and -1 for outward ones. From farther away the same formula would
+    cancel to 1e-4 mm in float32.
     """
     x, y, _ = point.unbind(1)
     dx, dy, dz = direction.unbind(1)
@@ -84,7 +84,7 @@ def _start(shape: Shape, point: Tensor, direction: Tensor, sense: float) -> Tens
 
 
 def _bend(direction: Tensor, normal: Tensor, ratio: Tensor, sense: float) -> Tensor:
-    """Snell's law; ``ratio`` (B, 1) of the indices before and behind."""
+    """Apply Snell's law; ``ratio`` (B, 1) is the index before over that behind."""
     inverse = (normal * normal).sum(1).rsqrt()
     cosine = (direction * normal).sum(1) * inverse
     root = (1.0 - ratio * ratio * (1.0 - cosine * cosine)).sqrt()
@@ -95,9 +95,10 @@ def _bend(direction: Tensor, normal: Tensor, ratio: Tensor, sense: float) -> Ten
 def cross_conic(
     shape: Shape, point: Tensor, direction: Tensor, ratio: Tensor | None, sense: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Carry rays to a conic of revolution and refract them there.
+    """Trace rays to a conic of revolution and refract them there.
 
-    ``ratio`` None does not bend.  Returns point, direction and distance (B, R).
+    If ``ratio`` is None, rays are not refracted. Returns point, direction and distance
+    (B, R).
     """
     c, k = shape.curvature_x, shape.conic
     point, there = _to_vertex_plane(point, direction)
@@ -122,10 +123,10 @@ def cross_iterated(
     start: Tensor | None = None,
     steps: int = NEWTON_STEPS,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `cross_conic`, to a biconic or offset surface by Newton steps.
+    """Like `cross_conic`, for a biconic or offset surface, by Newton steps.
 
-    ``start`` (B, R) are distances to begin with.  Only the last step keeps a graph:
-    from a converged distance it carries the whole derivative.
+    ``start`` (B, R) are initial distances. Only the last step keeps a graph: from a
+    converged distance it has the complete derivative.
     """
     with torch.no_grad():
         t = _start(shape, point, direction, sense) if start is None else start
