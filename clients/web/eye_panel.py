@@ -21,6 +21,9 @@ SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
 """Range of the slider below the sphere; typed values may go further."""
 
+TYPING_MS = 400
+"""Pause after which a typed number counts: half of one is another eye."""
+
 
 class EyePanel:
     """Entries of one eye, which keep its form up to date.
@@ -98,8 +101,7 @@ class EyePanel:
 
         def take(event: events.ValueChangeEventArguments) -> None:
             texts[number.name] = event.value or ""
-            if number.problem(texts[number.name]) is None:
-                self._on_change()
+            self._on_change()  # an invalid entry is reported
 
         entry = ui.input(
             number.label,
@@ -108,7 +110,8 @@ class EyePanel:
             on_change=take,
         )
         entry.props(
-            f'outlined dense suffix="{number.unit}" inputmode="text" autocomplete="off"'
+            f'outlined dense suffix="{number.unit}" inputmode="text" '
+            f'autocomplete="off" debounce={TYPING_MS}'
         ).classes("oc-entry")
         entry.props["data-name"] = number.name
         for key, steps in (("up", 1), ("down", -1)):

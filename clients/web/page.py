@@ -160,7 +160,10 @@ class Page:
     def wish(self) -> None:
         """Request a picture for the current entries; report invalid entries."""
         wish = self.state.wish()
-        self._problem.text = "\n".join(self.state.problems())
+        problems = self.state.problems()
+        if problems and self.state.right:
+            problems.append("The pictures show the last valid entries.")
+        self._problem.text = "\n".join(problems)
         if wish is None:
             return
         self.desk.seeing.wish(self.name, wish)

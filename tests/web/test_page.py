@@ -59,12 +59,22 @@ def test_a_wrong_entry_is_explained_and_the_eye_stays(page, text, said):
     before = page.seen()
     page.entry("sphere_dpt").fill(text)
     page.page.get_by_text(said, exact=True).wait_for()
+    page.page.get_by_text("The pictures show the last valid entries.").wait_for()
     page.page.wait_for_timeout(500)
     np.testing.assert_array_equal(page.seen(), before)
     number = page.number()
     page.entry("sphere_dpt").fill("-1")
     page.settle(after=number)
     assert page.page.get_by_text(said).count() == 0
+
+
+def test_half_a_number_is_no_eye(page):
+    before = page.seen()
+    page.entry("sphere_dpt").fill("")
+    page.entry("sphere_dpt").press_sequentially("-99", delay=60)
+    page.page.get_by_text("is out of range").first.wait_for()
+    page.page.wait_for_timeout(800)
+    np.testing.assert_array_equal(page.seen(), before)
 
 
 def test_the_split_is_dragged(page):
