@@ -1,21 +1,21 @@
-"""The command line: one file a command.
+"""The command line, one module per command.
 
 console          output, errors, progress
-setting_options  options made from `FilterSettings`
-display_file     a display's measured spectra
-programs         demo and bench: programs of the clients and the checkout
+setting_options  command-line options generated from `FilterSettings`
+display_file     measured spectra of a display
+programs         demo, bench and others: programs of the clients and the checkout
 serve            the service
-status           what a running one says of itself
-keys             who may connect to it
-eyes             whose PSFs are kept on disk
-prepare          loops compiled ahead
-filter_image     one picture
-plan_text        a plan in words
+status           state of a running service
+keys             client keys of the service
+eyes             on-disk cache of eyes
+prepare          ahead-of-time compilation of the loops
+filter_image     one image
+plan_text        a PSF plan as text
 estimate         an eye from a profile
-wavefront        its aberrations
-field            those of its whole visual field
-psf              its PSFs
-doctor           what works here
-doctor_checks    each thing tried
-doctor_probes    trials in a process of their own
+wavefront        aberrations of an eye in one direction
+field            aberrations over the visual field
+psf              PSFs of an eye
+doctor           diagnosis of this machine
+doctor_checks    the individual checks
+doctor_probes    probes that run in their own process
 """

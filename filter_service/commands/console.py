@@ -1,4 +1,4 @@
-"""What all commands share: where output goes, errors, progress."""
+"""Output, errors and progress, shared by all commands."""
 
 import json
 import sys
@@ -16,7 +16,7 @@ Json = Annotated[
 
 
 class CommandFailed(Exception):
-    """A failure the user can read: one line on stderr, exit code 1."""
+    """A failure reported to the user: one line on stderr, exit code 1."""
 
 
 def say(line: str = "") -> None:
@@ -30,12 +30,12 @@ def print_json(data: dict) -> None:
 
 
 def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
-    """Refuse a number outside ``limits``, or that is none.
+    """Check that a number is within ``limits`` and not NaN.
 
     Raises
     ------
     ValueError
-        Names the option, the value and the range.
+        If it is not; the message names the option, the value and the range.
     """
     low, high = limits
     if not low <= value <= high:
@@ -44,9 +44,10 @@ def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
 
 @contextmanager
 def progress_bar(title: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
-    """Give a function (fraction, stage) that says on stderr how far work is.
+    """Yield a function (fraction, stage) that reports progress on stderr.
 
-    A bar on a terminal, now and then a line elsewhere; nothing when ``quiet``.
+    It draws a bar on a terminal and prints occasional lines elsewhere; with ``quiet``
+    it prints nothing.
     """
     with Progress(quiet=quiet) as progress:
         task = progress.task(title, total=1.0, unit="%")

@@ -1,4 +1,4 @@
-"""Measured spectra of a display in a file, to what stands for them."""
+"""Reader for files of measured display spectra."""
 
 from pathlib import Path
 from typing import NoReturn
@@ -9,21 +9,21 @@ from estimator.bounded_files import InvalidFile, read_text
 from filter_service.displays import primaries_of_spectra
 
 MAX_DISPLAY_BYTES = 1_000_000
-"""Of a file of spectra: 0.1 nm from 300 to 1100 nm take 0.4 MB."""
+"""Size limit of a file of spectra; steps of 0.1 nm from 300 to 1100 nm take 0.4 MB."""
 
 MAX_VALUE = 1e30
-"""Of a number in it, so that sums and products stay within float64."""
+"""Largest number in it, so that sums and products stay within float64."""
 
 
 def display_of_file(name: str) -> str:
     """Return the setting `display` for a .csv of nm, red, green and blue.
 
-    A first line of words is left out; wavelengths must be evenly spaced.
+    A header line is skipped; wavelengths must be evenly spaced.
 
     Raises
     ------
     InvalidFile
-        Names the file and what is wrong with it.
+        If the file is invalid; the message names the file and the problem.
     """
     text = read_text(Path(name), max_bytes=MAX_DISPLAY_BYTES, option="display")
     lines = text.split("\n")
@@ -44,7 +44,7 @@ def display_of_file(name: str) -> str:
     if not (steps_nm.size and np.allclose(steps_nm, steps_nm[0]) and steps_nm[0] > 0):
         _refuse(name, "nm do not rise in even steps", "even steps")
     try:
-        with np.errstate(all="ignore"):  # spectra of zeros: refused there by name
+        with np.errstate(all="ignore"):  # primaries_of_spectra rejects zeros
             primaries = primaries_of_spectra(*columns)
     except ValueError as error:
         _refuse(name, str(error), "measured spectra of three primaries")

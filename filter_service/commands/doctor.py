@@ -1,12 +1,12 @@
-"""`ocufilter doctor`: what works on this machine, and what to install."""
+"""`ocufilter doctor`: check what works on this machine and what to install."""
 
 from filter_service.commands.console import CommandFailed, Json, print_json, say
 
 
 def doctor(json_output: Json = False) -> None:
-    """Try what the program needs and say what is missing.
+    """Check this machine for what the program needs and list what is missing.
 
-    Exit code 0 when the service can run here, 1 when it cannot.
+    The exit code is 0 if the service can run here and 1 if it cannot.
 
     ocufilter doctor --json
     """

@@ -1,4 +1,4 @@
-"""What this machine can do, what it lacks, and the command that would install it."""
+"""Checks of this machine: what works, what is missing and how to install it."""
 
 import ctypes.util
 import json
@@ -36,23 +36,23 @@ CLIENT_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg
 WINDOW_PACKAGES = ("glfw",)
 
 SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
-"""Library that must be found by name, and the Debian package that holds it."""
+"""Libraries that are loaded by name, and the Debian packages that provide them."""
 
 PROBE_TIMEOUT_S = 60.0
 SHADERS_TIMEOUT_S = 180.0
-"""At its first use, loops are compiled for half a minute of two idle cores."""
+"""The first use compiles loops, which takes half a minute on two idle cores."""
 
 FRAME_ERROR_MAX = 2e-3
-"""Change of a pixel of a perfect eye's picture; a half float's step is 1e-3."""
+"""Largest pixel change in a perfect eye's image; a half float's step is 1e-3."""
 PSF_ERROR_MAX = 0.1
-"""Light that wave and ray optics may place differently, of all; 0.04 is usual."""
+"""Fraction of light that wave and ray optics may place differently; 0.04 is usual."""
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 IN_CHECKOUT = (CHECKOUT / "setup.sh").is_file()
 
 FIX_SETUP = "make demo, or: sh setup.sh"
 FIX_PYRENDER = "pip install --no-deps pyrender==0.1.45"
-"""Apart and without its dependencies: it pins a PyOpenGL that is too old."""
+"""Installed separately and without dependencies: it pins a PyOpenGL that is too old."""
 FIX_WHEEL = "pip install --force-reinstall --no-deps ocufilter-*.whl"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
 FIX_DRIVER = "update the graphics driver"
@@ -66,7 +66,7 @@ FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was tried: whether it works, what was seen, how to mend it."""
+    """The result of one check: whether it passed, what was found, how to fix it."""
 
     name: str
     ok: bool
@@ -75,14 +75,14 @@ class Check:
 
 
 def examine() -> dict:
-    """Try everything once.
+    """Run every check once.
 
     Returns
     -------
     report : dict
-        Plain JSON: ``ok`` (the service can run), ``works`` by purpose, ``checks``,
-        ``install`` (commands), ``machine``, ``gl`` (with the
-        ``devices`` of EGL), ``native`` (the compiled loops), ``threading_layer``,
+        JSON-compatible: ``ok`` (the service can run), ``works`` by purpose,
+        ``checks``, ``install`` (commands), ``machine``, ``gl`` (with the EGL
+        ``devices``), ``native`` (the compiled loops), ``threading_layer``,
         ``networks`` (each with its weights' size and expected error), ``packages``.
     """
     gl = run_probe("gl")
@@ -123,9 +123,9 @@ def examine() -> dict:
 
 
 def gl_devices() -> list[dict]:
-    """Return the devices of EGL, each with its ``renderer`` or the ``error`` it gave.
+    """Return the EGL devices, each with its ``renderer`` or its ``error``.
 
-    Each is tried in a process of its own: a broken driver may take it along.
+    Each device is probed in its own process, because a broken driver may crash it.
     """
     devices = run_probe("devices").get("devices", [])
     for device in devices:
@@ -138,7 +138,7 @@ def gl_devices() -> list[dict]:
 def run_probe(
     name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
 ) -> dict:
-    """Run one probe in its own process; ``error`` says why it gave no answer."""
+    """Run one probe in its own process; on failure, ``error`` gives the reason."""
     command = [sys.executable, "-m", "filter_service.commands.doctor_probes", name]
     try:
         finished = subprocess.run(
@@ -160,7 +160,7 @@ def run_probe(
 
 
 def machine() -> dict:
-    """Return processor, system and Python, as benchmark files name them too."""
+    """Return processor, system and Python version, as benchmark files record them."""
     try:
         system = platform.freedesktop_os_release().get("PRETTY_NAME", "unknown")
     except OSError:
@@ -174,7 +174,7 @@ def machine() -> dict:
 
 
 def processor_name() -> str:
-    """Model name as the kernel tells it, or the architecture."""
+    """Return the model name reported by the kernel, or else the architecture."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             for line in file:
@@ -186,7 +186,7 @@ def processor_name() -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Version of each package the project may use; None where it is missing."""
+    """Return the version of each package the project may use; None if missing."""
     versions: dict[str, str | None] = {}
     for name in SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES:
         try:
@@ -215,7 +215,7 @@ def check_packages(
 
 
 def install_command(missing: list[str]) -> str:
-    """Return what installs packages: in a checkout, what installs all at once."""
+    """Return the command that installs packages; a checkout installs all at once."""
     if IN_CHECKOUT:
         return FIX_SETUP
     others = " ".join(package for package in missing if package != "pyrender")
@@ -236,7 +236,7 @@ def check_libraries() -> list[Check]:
 
 
 def check_gl(gl: dict) -> Check:
-    """Report the OpenGL context that opens without a screen."""
+    """Report the headless OpenGL context."""
     if "error" in gl:
         return Check("gl", False, gl["error"], FIX_MESA)
     info = gl["info"]
@@ -244,7 +244,7 @@ def check_gl(gl: dict) -> Check:
 
 
 def check_compute(gl: dict) -> Check:
-    """Report whether a compute shader really ran and its result came back."""
+    """Report whether a compute shader ran and its result was read back."""
     if "error" in gl:
         return Check("compute", False, "not tried: no OpenGL context")
     ok = gl["compute_correct"] and gl["gl_error"] == "GL_NO_ERROR"
@@ -253,7 +253,7 @@ def check_compute(gl: dict) -> Check:
 
 
 def check_shaders(gl: dict, shaders: dict) -> Check:
-    """Report whether the real passes compile, run and give what they should."""
+    """Report whether the rendering passes compile, run and are correct."""
     if "error" in gl:
         return Check("shaders", False, "not tried: no OpenGL context")
     if "error" in shaders:
@@ -270,7 +270,7 @@ def check_shaders(gl: dict, shaders: dict) -> Check:
 
 
 def check_native(native: dict) -> Check:
-    """Report whether the compiled loops are there and give what they should."""
+    """Report whether the compiled loops are available and correct."""
     if "error" in native:
         return Check("native", False, native["error"], FIX_COMPILER)
     detail = f"{native['name']}; a perfect eye changes a picture by "
@@ -280,7 +280,7 @@ def check_native(native: dict) -> Check:
 
 
 def check_engine(gl: dict, native: dict) -> Check:
-    """Say which engine filters frames unless told otherwise, and why."""
+    """Report which engine filters frames by default, and why."""
     renderer = gl.get("info", {}).get("renderer", "")
     if is_device_named():
         said = f"{GL_DEVICE_VARIABLE} names its device"
@@ -308,7 +308,7 @@ def check_threads(threads: dict) -> Check:
 
 
 def check_networks(networks: dict) -> Check:
-    """Report the trained networks; without them everything is ray-traced."""
+    """Report the trained networks; without them, all wavefronts are ray-traced."""
     if "error" in networks:
         fix = install_command(["onnxruntime"])
         return Check("networks", False, networks["error"], fix)
@@ -331,7 +331,7 @@ def check_display() -> Check:
 
 
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
-    """Purposes of the program, from the checks each one needs."""
+    """Return which purposes work, from the checks that each one needs."""
     psf = ok["python"] and ok["service packages"]
     shaders = ok["gl"] and ok["compute"] and ok["shaders"]
     filters = psf and (ok["native"] or shaders)

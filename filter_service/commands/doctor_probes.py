@@ -1,4 +1,4 @@
-"""Trials that `ocufilter doctor` runs in a process of their own, one JSON line each.
+"""Probes that `ocufilter doctor` runs in their own processes, one JSON line each.
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
@@ -16,8 +16,7 @@ from numba import njit, prange, threading_layer
 from filter_service.errors import FilterError
 
 PROBE_COUNT = 1000
-
-"""A blur wide enough for wave and ray optics to agree within 5 % of the light."""
+"""Number of values that the compute shader and the parallel loop process."""
 
 LIMITS = (
     "GL_MAX_SHADER_STORAGE_BLOCK_SIZE",
@@ -41,7 +40,7 @@ void main() {
 
 
 def probe_gl() -> dict:
-    """Open a context, run a compute shader and read its result back."""
+    """Open a context, run a compute shader and read back its result."""
     from filter_service.gl.gpu import Gpu
 
     gpu = Gpu()
@@ -63,7 +62,7 @@ def probe_gl() -> dict:
 
 
 def probe_devices() -> dict:
-    """List the devices of EGL; whether they give contexts, `probe_gl` finds out."""
+    """List the EGL devices; `probe_gl` checks whether they provide contexts."""
     from filter_service.gl.egl_devices import egl_devices
 
     return {
@@ -80,7 +79,7 @@ def probe_devices() -> dict:
 
 
 def probe_shaders() -> dict:
-    """Compile and run the passes: a perfect eye must leave a frame as it is."""
+    """Compile and run the passes; a perfect eye must leave a frame unchanged."""
     from filter_service.gl.gpu import Gpu
     from filter_service.rendering.gl.compile_passes import compile_passes
     from filter_service.rendering.gl.renderer import FilterRenderer
@@ -88,7 +87,7 @@ def probe_shaders() -> dict:
     gpu = Gpu()
     try:
         change = compile_passes(FilterRenderer(gpu))
-    except FilterError as error:  # a compiler's text has many lines
+    except FilterError as error:  # compiler messages have many lines
         return {"error": " ".join(str(error).split())}
     else:
         return {"program_count": len(gpu.passes.programs), "frame_error": change}
@@ -117,7 +116,7 @@ def _sum_of_squares(count: int) -> float:
 
 
 def probe_threads() -> dict:
-    """Run one parallel kernel and ask which layer carried it."""
+    """Run one parallel loop and return the threading layer that ran it."""
     total = _sum_of_squares(PROBE_COUNT)
     expected = (PROBE_COUNT - 1) * PROBE_COUNT * (2 * PROBE_COUNT - 1) / 6
     return {"layer": threading_layer(), "sum_correct": bool(total == expected)}

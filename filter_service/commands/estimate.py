@@ -1,4 +1,4 @@
-"""`ocufilter estimate`: the eye behind a profile, its fit and its picture."""
+"""`ocufilter estimate`: estimate the eye model of a profile, with fit and plot."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -21,7 +21,7 @@ TIME_LIMITS_S = (0.1, 86400.0)
 
 
 class Method(StrEnum):
-    """How the eye is found."""
+    """Estimation method."""
 
     NETWORK = "network"
     REFINED = "refined"
@@ -50,10 +50,10 @@ def estimate(
     ] = None,
     json_output: Json = False,
 ) -> None:
-    """Find the 45-parameter eye that has a measured wavefront.
+    """Estimate the 45-parameter eye that reproduces a measured wavefront.
 
-    Coefficients are compared on the measured circle without tilt, which the chief
-    ray ties to coma.
+    Coefficients are compared on the measured circle without tilt, because the chief
+    ray ties tilt to coma.
 
     ocufilter estimate keratoconus --plot eye.png
     """
@@ -69,7 +69,7 @@ def estimate(
     eye = load_profile(profile)
     try:
         found = estimate_eye(eye, method=method.value, max_time_s=max_time_s)
-    except (WeightsMissing, DamagedWeights) as error:  # no fault of the input
+    except (WeightsMissing, DamagedWeights) as error:  # not an input error
         raise CommandFailed(str(error)) from error
     if plot is not None:
         from estimator.estimate.plot import plot_eye

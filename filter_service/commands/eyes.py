@@ -1,4 +1,4 @@
-"""`ocufilter eyes`: whose PSFs a service has kept on disk."""
+"""`ocufilter eyes`: list and erase the eyes in a service's on-disk cache."""
 
 import os
 import time
@@ -41,7 +41,7 @@ def _folder(given: Path | None) -> Path:
 
 @eyes.command(name="list")
 def list_kept(folder: Folder = None, json_output: Json = False) -> None:
-    """List the kept eyes by a hash of their profiles, the one used last first.
+    """List the cached eyes by profile hash, most recently used first.
 
     ocufilter eyes list --dir ~/.cache/ocufilter
     """
@@ -76,7 +76,7 @@ def erase(
     folder: Folder = None,
     json_output: Json = False,
 ) -> None:
-    """Erase what is kept of a person's eye: of a profile, by its hash, or of all.
+    """Erase the cached data of one eye, by profile or by hash, or of all eyes.
 
     ocufilter eyes erase anna.json --dir ~/.cache/ocufilter
     """

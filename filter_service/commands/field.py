@@ -1,4 +1,4 @@
-"""`ocufilter field`: the wavefronts of an eye over its visual field, in one call."""
+"""`ocufilter field`: wavefronts of an eye over its visual field."""
 
 import math
 from pathlib import Path
@@ -44,13 +44,13 @@ def field(
     ] = None,
     json_output: Json = False,
 ) -> None:
-    """Tell refraction and aberrations in every direction of two lists.
+    """Print refraction and aberrations over a grid of visual field directions.
 
-    Each azimuth with each elevation.  Coefficients are OSA, um, at the cornea, on the
-    circle about the chief ray that encloses the pupil; M, J0 and J45 are their least
-    squares.  Off the axis they are those of people with such an axis, or what the
-    profile has measured there; "periphery": "model" in the profile asks for the eye
-    model's own.
+    The grid combines each azimuth with each elevation.  Coefficients are OSA, um, at
+    the cornea, on the circle about the chief ray that encloses the pupil; M, J0 and
+    J45 are the least-squares refraction.  Off the axis they are those measured in the
+    profile, or typical of people with such an axis; "periphery": "model" in the
+    profile selects those of the eye model.
 
     ocufilter field keratoconus --pupil-mm 4 --wavelength-nm 555 --v-deg=-20,0,20
     """
@@ -100,12 +100,12 @@ def field(
 
 
 def _angles(option: str, text: str) -> list[float]:
-    """Read a list of angles.
+    """Parse a list of angles.
 
     Raises
     ------
     ValueError
-        Names the option, the value and what is allowed.
+        If an angle is invalid; the message names option, value and allowed range.
     """
     allowed = f"allowed are numbers from -{FIELD_LIMIT_DEG:g} to {FIELD_LIMIT_DEG:g}"
     angles = []

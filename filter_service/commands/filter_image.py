@@ -1,4 +1,4 @@
-"""`ocufilter filter`: one RGB-D image through one eye, without a server."""
+"""`ocufilter filter`: filter one RGB-D image through one eye, without a server."""
 
 import time
 from collections.abc import Callable
@@ -152,7 +152,7 @@ def filter_image(
     ocufilter filter --color room.png --depth room.npy --fov-deg 50
     --profile myopia --pupil-mm 5 -o blurred.png
 
-    A photograph without depth stands at one distance:
+    Place a photograph without depth at one distance:
 
     ocufilter filter --color photo.jpg --distance-m 2 --fov-deg 50
     --profile myopia -o blurred.png
@@ -224,7 +224,7 @@ def filter_image(
 
 
 def _check_one_of(options: dict[str, object]) -> None:
-    """Refuse none, and more than one, of options that say the same."""
+    """Raise unless exactly one of several equivalent options is given."""
     given = [name for name, value in options.items() if value is not None]
     if len(given) != 1:
         found = " and ".join(given) if given else ", ".join(options)
@@ -239,7 +239,7 @@ def _camera(
     width_px: int,
     height_px: int,
 ) -> Camera:
-    """Return the camera of an image, from the one option that is given."""
+    """Return the camera of an image, from the one option that was given."""
     if fov_deg is not None:
         check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
         return Camera.from_fov(fov_deg, width_px=width_px, height_px=height_px)
@@ -264,7 +264,7 @@ def _planned(
 
 @dataclass(frozen=True)
 class _Filtered:
-    """A filtered image and how it came about."""
+    """A filtered image and how it was computed."""
 
     seen: "Filtered"
     eye_notes: tuple[str, ...]
@@ -283,7 +283,7 @@ def _filtered(
     progress: Callable[[float, str], None],
     **options: Any,
 ) -> _Filtered:
-    """Filter one view as any stream does, with the eye estimated in this process."""
+    """Filter one view like a stream, with the eye estimated in this process."""
     from filter_service.filtering.eye_filter import EyeFilter
     from filter_service.filtering.filtered import BuildingEye, EyeReady
     from filter_service.filtering.shared_workshop import open_inline_workshop
@@ -313,7 +313,7 @@ def _filtered(
 
 
 def _output(out: Path, *, half: bool) -> Output:
-    """Light as a file of this name holds it."""
+    """Return the output format of a file of this name."""
     from filter_service.image_files import LINEAR_SUFFIXES
 
     linear = out.suffix.lower() in LINEAR_SUFFIXES
@@ -364,7 +364,7 @@ def _read_hidden(
     color: "NDArray",
     depth_scale: float | None,
 ) -> tuple["NDArray | None", "NDArray | None"]:
-    """Colour and depth of the hidden layer; None for both where there is none."""
+    """Return color and depth of the hidden layer, or None for both."""
     from filter_service.image_files import read_color, read_depth
 
     if color_path is None and depth_path is None:
@@ -435,7 +435,7 @@ def _summary(
 
 
 def _depth_words(depth_m: "NDArray", missing_count: int) -> str:
-    """Return the range of depth, and how much of it was filled in."""
+    """Return the depth range and the share of filled-in pixels, as text."""
     from filter_service.rgbd_view import LEAST_DEPTH_M
 
     known_m = depth_m[depth_m >= LEAST_DEPTH_M]

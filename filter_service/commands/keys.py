@@ -1,4 +1,4 @@
-"""`ocufilter keys`: who may connect to a service that other machines reach."""
+"""`ocufilter keys`: manage the client keys of a service that other machines reach."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ keys = typer.Typer(
 
 
 def default_folder() -> Path:
-    """Return where keys are kept, unless said otherwise."""
+    """Return the default folder of keys."""
     home = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(home) / "ocufilter" / "keys"
 
@@ -47,10 +47,10 @@ def add(
     folder: Folder = None,
     json_output: Json = False,
 ) -> None:
-    """Let a client in: writes the file that it connects with.
+    """Authorize a client and write the key file that it connects with.
 
-    Give the file to the client by a safe way, and to nobody else.  A service that runs
-    with this folder (keys_dir in its configuration) notices at once.
+    Send the file to the client over a secure channel, and to nobody else.  A service
+    that runs with this folder (keys_dir in its configuration) applies it at once.
 
     ocufilter keys add lab
     """
@@ -64,7 +64,7 @@ def add(
 
 @keys.command()
 def remove(name: Name, folder: Folder = None, json_output: Json = False) -> None:
-    """Let a client in no more; one that is connected is turned out.
+    """Remove a client's key; a connected client is disconnected.
 
     ocufilter keys remove lab
     """

@@ -1,4 +1,4 @@
-"""A plan of PSFs in words and as JSON."""
+"""A PSF plan as text and as JSON."""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 
 
 def plan_summary(plan: "CachePlan") -> dict:
-    """Nodes and prediction, ready for JSON."""
+    """Return the plan's nodes and prediction, ready for JSON."""
     predicted, defocus = plan.prediction, plan.nodes.defocus
     return {
         "h_deg": plan.h_deg.tolist(),
@@ -31,7 +31,7 @@ def plan_summary(plan: "CachePlan") -> dict:
 
 
 def say_plan(plan: "CachePlan", *, json_output: bool) -> None:
-    """Print a plan."""
+    """Print a plan as text or as JSON."""
     summary = plan_summary(plan)
     if json_output:
         print_json(summary)

@@ -1,14 +1,14 @@
-"""`ocufilter prepare`: what a machine compiles once, compiled now."""
+"""`ocufilter prepare`: compile ahead what a machine compiles once."""
 
 from filter_service.commands.console import Json, print_json, say
 from filter_service.progress import Progress
 
 
 def prepare(json_output: Json = False) -> None:
-    """Compile the loops that trace eyes and plan frames, once on a machine.
+    """Compile the loops that trace eyes and plan frames, once per machine.
 
-    A minute on two cores; later it only looks.  Without it the first start of the
-    service compiles while it is idle, and the first eye waits for that.
+    This takes a minute on two cores; later runs only check.  Without it, the service
+    compiles while idle at its first start, and the first eye waits for that.
 
     ocufilter prepare
     """

@@ -1,6 +1,6 @@
-"""`ocufilter demo`, `bench` and others: programs of clients and tests, started.
+"""`ocufilter demo`, `bench` and others: start programs of the clients and tests.
 
-They are started: the service never imports its clients or tests.
+They run as separate processes: the service never imports its clients or tests.
 """
 
 import importlib.util
@@ -20,7 +20,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 class Bench(StrEnum):
-    """Benchmarks by what they time."""
+    """Benchmarks, named after what they time."""
 
     ESTIMATE = "estimate"
     FOCUS = "focus"
@@ -110,7 +110,7 @@ def demo(
 ) -> None:
     """Stream two scenes through six eyes and write a video and a contact sheet.
 
-    Starts a service of its own and a pyrender client against it.  Writes a video,
+    Starts its own service and a pyrender client that connects to it.  Writes a video,
     contact_sheet.png and latency.json.
 
     ocufilter demo --out out/demo --frames 24 --size 480x270
@@ -134,7 +134,7 @@ def headset(context: typer.Context) -> None:
 
 
 def report(context: typer.Context) -> None:
-    """Write a report of one eye, or of one before and after, as HTML or PDF.
+    """Write a report of one eye, or a before-and-after comparison, as HTML or PDF.
 
     Its options: `ocufilter report --help`.
 
@@ -144,7 +144,7 @@ def report(context: typer.Context) -> None:
 
 
 def batch(context: typer.Context) -> None:
-    """Filter data sets: folders and videos of colour and depth, on all cores.
+    """Filter data sets, folders and videos of color and depth, on all cores.
 
     Its options and the layouts it reads: `ocufilter batch --help`.
 
@@ -154,7 +154,7 @@ def batch(context: typer.Context) -> None:
 
 
 def web(context: typer.Context) -> None:
-    """Show a page in a browser: an eye's entries, sliders, before and after.
+    """Serve a web page with an eye's data, sliders, and before and after views.
 
     Its options: `ocufilter web --help`.
 
@@ -164,7 +164,7 @@ def web(context: typer.Context) -> None:
 
 
 def _become(program: str, arguments: list[str]) -> None:
-    """Take a program's options for its own; it says what they are."""
+    """Replace this process by a program, or print its help."""
     folder = _folder_to_start_in(program)
     if {"-h", "--help"} & set(arguments):
         command = [sys.executable, "-m", program, "--help"]
@@ -173,7 +173,7 @@ def _become(program: str, arguments: list[str]) -> None:
     if folder is not None:
         os.chdir(folder)
     sys.stdout.flush()
-    # It takes this process's place: signals are its own.
+    # The program replaces this process, so it receives signals itself.
     os.execv(sys.executable, [sys.executable, "-m", program, *arguments])
 
 
@@ -185,11 +185,11 @@ def bench(
     ] = False,
     json_output: Json = False,
 ) -> None:
-    """Time one part of the program, always beside its error.
+    """Time one part of the program and report its error alongside.
 
     ocufilter bench psf --quick
 
-    Other options are the benchmark's own:
+    Other options are passed to the benchmark:
 
     ocufilter bench roundtrip --transport shm --stereo
     """
@@ -210,10 +210,10 @@ def paper(
     ] = False,
     json_output: Json = False,
 ) -> None:
-    """Set the paper's tables and figures beside ours, as one HTML page.
+    """Compare the paper's tables and figures with ours in one HTML page.
 
-    From the committed results, in seconds: published figures, ours, what differs, and
-    where the paper is better.  Runs in a checkout.
+    Uses the committed results and takes seconds.  Shows published figures, ours, the
+    differences, and where the paper is better.  Requires a checkout.
 
     ocufilter paper -o paper.html
     """
@@ -241,7 +241,7 @@ def _run_program(module: str, arguments: list[str], *, json_output: bool) -> Non
         finished = subprocess.run(
             [*command, "--json"], cwd=folder, stdout=subprocess.PIPE, check=False
         )
-    if finished.returncode in (1, 2):  # it has said why, on the stderr we share
+    if finished.returncode in (1, 2):  # it reported why on our stderr
         raise typer.Exit(finished.returncode)
     if finished.returncode != 0:
         raise CommandFailed(f"{module} ended with code {finished.returncode}")
@@ -257,15 +257,15 @@ def _one_json_object(output: bytes, module: str) -> dict:
 
 
 def _folder_to_start_in(module: str) -> Path | None:
-    """Return where ``python -m`` finds a program; None where it is found anyway.
+    """Return the folder where ``python -m`` finds a program; None if any will do.
 
-    The `ocufilter` of an editable install sees the installed packages, which the
-    tests' are not: they are found from the checkout's own folder.
+    The `ocufilter` of an editable install sees the installed packages only, which do
+    not include the tests: those are found from the checkout's folder.
 
     Raises
     ------
     CommandFailed
-        The program did not come along: says that it needs a checkout.
+        If the program is not installed and needs a checkout.
     """
     try:
         if importlib.util.find_spec(module) is not None:

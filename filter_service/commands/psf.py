@@ -1,4 +1,4 @@
-"""`ocufilter psf`: one point-spread function of one eye, as an array or a picture."""
+"""`ocufilter psf`: compute one point-spread function as an array or an image."""
 
 import math
 from dataclasses import dataclass
@@ -36,11 +36,11 @@ PIXEL_LIMITS_ARCMIN = (0.05, 60.0)
 ARCMIN_PER_DEG = 60.0
 
 MAX_RADIUS_PX = 1023
-"""Of one kernel for a file; the service's own cap is lower."""
+"""Largest radius of a kernel written to a file; the service's own cap is lower."""
 
 
 class Method(StrEnum):
-    """How the PSF is computed."""
+    """PSF computation method."""
 
     AUTO = "auto"
     FOURIER = "fourier"
@@ -50,7 +50,7 @@ class Method(StrEnum):
 
 @dataclass(frozen=True)
 class _State:
-    """Wavefront of the eye in the state and direction asked for."""
+    """Wavefront of the eye in the requested state and direction."""
 
     name: str
     zernike_um: "np.ndarray"
@@ -100,9 +100,9 @@ def psf(
 ) -> None:
     """Compute one PSF, integrated over pixels that are square in visual angle.
 
-    The kernel is an array [y, x] in image orientation (rows grow downwards), with
-    the chief ray in its centre and unit sum.  On axis a measured wavefront is taken
-    as it is; off axis the eye is estimated and ray-traced, with its elliptical pupil.
+    The kernel is an array [y, x] in image orientation (rows grow downward), with the
+    chief ray at its center and unit sum.  On axis a measured wavefront is used as it
+    is; off axis the eye is estimated and ray-traced, with its elliptical pupil.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png
@@ -209,7 +209,7 @@ def _apodisation(state: _State) -> "StilesCrawford":
 
 
 def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", float]:
-    """Return the PSF, and the PSNR that images filtered with it should exceed."""
+    """Return the PSF and the PSNR that images filtered with it should exceed."""
     from estimator.optics.units import MRAD_PER_RAD
     from estimator.psf.compute import compute_psfs, plan_psfs
     from estimator.psf.switch import predicted_least_psnr_db

@@ -1,4 +1,4 @@
-"""`ocufilter serve`: the long-running service."""
+"""`ocufilter serve`: run the service."""
 
 from functools import partial
 from pathlib import Path
@@ -56,8 +56,9 @@ def serve(
 ) -> None:
     """Filter frames for clients until interrupted.
 
-    Messages are described in filter_service/PROTOCOL.md; --bind wins over the file.
-    SIGHUP has the file read again, for limits and times; a service listens on.
+    Messages are described in filter_service/PROTOCOL.md.  --bind overrides the
+    settings file.  SIGHUP reloads the file's limits and timeouts; the service keeps
+    listening.
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """

@@ -1,8 +1,9 @@
-"""Command-line options made from `FilterSettings`: a new setting is an option at once.
+"""Command-line options generated from `FilterSettings`, one for every new setting.
 
-Choices become ``--mode``, angles ``--gaze-h-deg`` and ``--gaze-v-deg``, switches that
-are on ``--no-chromatic`` and those that are off ``--lateral-color``.  Ranges and
-planes have no option: a command takes them from its image.
+Choices become ``--mode``, angles ``--gaze-h-deg`` and ``--gaze-v-deg``.  Switches that
+are on by default become ``--no-chromatic``, and switches that are off
+``--lateral-color``.  Ranges and planes have no option: a command derives them from its
+image.
 """
 
 import functools
@@ -21,12 +22,12 @@ HELP_OF_SIDE = {"h": "to the right", "v": "upwards"}
 
 
 def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
-    """Give a command an option for each setting; it gets them as ``settings``.
+    """Add an option for each setting to a command, which receives ``settings``.
 
     Parameters
     ----------
     **defaults
-        Settings whose default is another here than in a service.
+        Settings whose default differs from the service's.
     """
 
     def decorated(command: Callable) -> Callable:
@@ -55,7 +56,7 @@ def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
 
 
 def _options(name: str, default: Any) -> list[inspect.Parameter]:
-    """Parameters, as typer reads them, for one setting."""
+    """Return the typer parameters of one setting."""
     kind = get_args(setting_types()[name])[0]
     words = setting_help(name)
     if isinstance(default, bool):
@@ -87,7 +88,7 @@ def _option(
 
 
 def _plain_type(kind: Any) -> Any:
-    """Return the type without its limits, which `FilterSettings` checks."""
+    """Return a type without its limits; `FilterSettings` checks those."""
     if hasattr(kind, "__metadata__"):
         return kind.__origin__
     parts = get_args(kind)
@@ -102,7 +103,7 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Names the option, the value and what is allowed.
+        If a value is invalid; the message names option, value and allowed range.
     """
     found = {}
     for name, kind in setting_types().items():

@@ -1,4 +1,4 @@
-"""`ocufilter status`: what a running service says of itself."""
+"""`ocufilter status`: print the state of a running service."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,10 +22,10 @@ def status(
     timeout_s: Seconds = 3.0,
     json_output: Json = False,
 ) -> None:
-    """Ask a service how it is; the exit code is 0 where it is there and answers.
+    """Print the state of a service; the exit code is 0 if it answers.
 
-    Ready is a service that filters; one that is alive and not ready is starting, or is
-    starting the process that filters again.
+    A ready service filters frames.  A service that is alive but not ready is starting,
+    or is restarting its render process.
 
     ocufilter status tcp://127.0.0.1:5577
     """
@@ -49,7 +49,7 @@ def status(
 
 
 def _of_device(device: dict[str, Any]) -> str:
-    """Return what a device is, has and does, in one line."""
+    """Return the identity, state and load of a device, in one line."""
     is_ready = "ready" if device["is_ready"] else "not ready"
     if device["is_lost"]:
         is_ready = "given up"

@@ -1,4 +1,4 @@
-"""`ocufilter wavefront`: the aberrations of one eye at one field, ray-traced."""
+"""`ocufilter wavefront`: ray-trace the aberrations of an eye in one direction."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ FOCUS_LIMITS_DPT = (0.0, 20.0)
 
 
 class Fit(StrEnum):
-    """What the least squares are of."""
+    """Quantity whose squared residual is minimized."""
 
     OPD = "opd"
     SLOPE = "slope"
@@ -124,7 +124,7 @@ def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt
 
 
 def explicit_body(source: str) -> dict | None:
-    """Content of a JSON file that gives surfaces; None for any other source."""
+    """Return the content of a JSON file of surfaces; None for any other source."""
     from estimator.bounded_files import InvalidFile, read_json
     from estimator.eye.explicit import is_explicit_eye
     from estimator.profiles.files import MAX_PROFILE_BYTES
@@ -135,7 +135,7 @@ def explicit_body(source: str) -> dict | None:
     try:
         body = read_json(path, max_bytes=MAX_PROFILE_BYTES)
     except InvalidFile:
-        return None  # the reader of profiles says what is wrong with it
+        return None  # the profile reader reports the problem
     return body if is_explicit_eye(body) else None
 
 
@@ -146,12 +146,12 @@ def load_surfaces(
     pupil_mm: float | None = None,
     stop_mm: float | None = None,
 ) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
-    """Name, surfaces and notes of what the user named.
+    """Return the name, surfaces and notes of a source.
 
     Parameters
     ----------
     focus_dpt : float or None
-        Distance that is sharpest through the pupil or stop given; relaxed where None.
+        Distance that is sharpest through the given pupil or stop; relaxed if None.
     """
     body = explicit_body(source)
     if body is not None:
@@ -184,7 +184,7 @@ def load_surfaces(
 
 
 def ellipse_facts(ellipse: "PupilEllipse") -> dict:
-    """Pupil of a traced wavefront, as the JSON output has it."""
+    """Return the pupil of a traced wavefront in the form of the JSON output."""
     return {
         "centre_x_mm": ellipse.centre_x_mm,
         "centre_y_mm": ellipse.centre_y_mm,
