@@ -1,27 +1,27 @@
-"""Programs to copy: the client library, scenes, a demo, benchmarks.
+"""The client library and programs built on it: scenes, a demo, benchmarks.
 
-Importing this loads nothing but names.
+Importing this package loads nothing but names.
 
-    filter_client    `FilterClient`: the library
-    frame_packer     a frame on its way out
-    link             its side of the protocol
-    connection       its socket
-    shared_memory    memory that it shares with a service on the same machine
-    service_process  a service of one's own
-    hello            the smallest client
-    batch/           data sets through people's eyes
+    filter_client    `FilterClient`: the client library
+    frame_packer     packing of frames for the wire
+    link             the client's side of the protocol
+    connection       the client's socket
+    shared_memory    memory shared with a service on the same machine
+    service_process  a service in a child process
+    hello            a minimal client
+    batch/           `ocufilter batch`: data sets filtered offline
     headset/         a scene in an OpenXR headset, each eye with its own profile
-    natural          an eye that follows light and distance
-    frame_log        what became of a stream's frames
-    arguments          profiles, settings, sizes on command lines
-    pyrender_stream  a scene through a running service
+    natural          pupil and focus that follow light and distance
+    frame_log        statistics of a stream's frames
+    arguments        profiles, settings and sizes on command lines
+    pyrender_stream  a scene streamed through a running service
     demo             two scenes through six eyes
-    latency          how long a frame takes
-    socket_floor     and its bytes alone
-    scenes/          two scenes, a letter chart
+    latency          latency benchmark
+    socket_floor     round trip over a bare socket
+    scenes/          two scenes and a letter chart
     report/          `ocufilter report`
-    web/             a page in a browser
-    figures/         figures of an eye, for reports and pages
+    web/             `ocufilter web`: a page in a browser
+    figures/         figures of an eye, for reports and web pages
 """
 
 import lazy_loader

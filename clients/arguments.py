@@ -1,4 +1,4 @@
-"""What several programs read from their command lines: profiles, settings, sizes."""
+"""Parsers of command-line values shared by several programs."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ MAX_ARGUMENT_BYTES = 1_000_000
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     """Return a profile from JSON text, a file, or the name of a preset.
 
-    A file is one of ``.json``, ``.abp`` and ``.csv``.  A name is the service's to know.
+    A file is one of ``.json``, ``.abp`` and ``.csv``.  The service resolves names.
 
     Raises
     ------
     ValueError
-        Names the option, and the file.
+        If the profile cannot be read; the message names the option and the file.
     """
     if text.lstrip().startswith("{"):
         return read_object(option, text)
@@ -40,7 +40,7 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
 
 
 def read_object(option: str, text: str) -> dict[str, Any]:
-    """Return a JSON object from the command line."""
+    """Parse a JSON object from the command line."""
     try:
         data = text.encode("utf-8", "surrogateescape")
         value = loads_bounded(data, max_bytes=MAX_ARGUMENT_BYTES)
@@ -57,7 +57,7 @@ def read_size_px(text: str, option: str = "--size") -> tuple[int, int]:
     Raises
     ------
     ValueError
-        Not two whole numbers of at least 16; names the option.
+        If these are not two whole numbers of at least 16; the message names the option.
     """
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
@@ -68,7 +68,7 @@ def read_size_px(text: str, option: str = "--size") -> tuple[int, int]:
 
 
 def size_px_argument(text: str) -> tuple[int, int]:
-    """Return what `read_size_px` does, for argparse, which then shows its error."""
+    """Call `read_size_px` as an argparse type, so that argparse shows its error."""
     try:
         return read_size_px(text)
     except ValueError as error:

@@ -1,6 +1,6 @@
-"""One DEALER socket to the service: connection state, sends without copying.
+"""A DEALER socket to the service, with connection state and zero-copy sends.
 
-`filter_client` speaks the protocol over it; this file knows only parts.
+`filter_client` speaks the protocol over it; this module handles message parts only.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ RECONNECT_MAX_MS = 1000
 CLOSE_LINGER_MS = 200
 MAX_BROKEN_HANDSHAKES = 5
 SEND_HIGH_WATER_MARK = 64
-# Results are bounded by the credit.  What adds up are signs of life, one every 5 s,
-# while a program does not read: beyond the mark the connection is taken for dead.
+# The credit bounds results.  Only heartbeats, one every 5 s, add up while a program
+# does not read; beyond the mark the connection counts as dead.
 RECEIVE_HIGH_WATER_MARK = 100_000
 
 _UP = zmq.EVENT_HANDSHAKE_SUCCEEDED
@@ -40,10 +40,10 @@ _HANDSHAKE_FAILED = (
 
 
 class SendBuffer:
-    """Memory that one image is copied into and sent from.
+    """A buffer that one image is copied into and sent from.
 
-    Reusing an array right after a send without copying tears frames at the receiver
-    (2 of 100 measured): a buffer is free again only when its tracker says so.
+    Reusing an array right after a zero-copy send tears frames at the receiver
+    (2 of 100 measured), so a buffer is free again only when its tracker is done.
     """
 
     def __init__(self, size_bytes: int) -> None:
@@ -53,14 +53,14 @@ class SendBuffer:
 
     @property
     def is_free(self) -> bool:
-        """Return whether nobody reads this memory any more."""
+        """Return whether the buffer is no longer read and can be reused."""
         if self.is_held:
             return False
         return self.tracker is None or self.tracker.done
 
 
 class SendBufferPool:
-    """Send buffers by size; a size that is no longer used is let go."""
+    """A pool of send buffers by size; sizes that are no longer used are released."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
@@ -87,7 +87,7 @@ class SendBufferPool:
         return buffer
 
     def _wait_for_one(self, buffers: list[SendBuffer]) -> SendBuffer | None:
-        """Wait until the oldest sent buffer is free; None where all are only held."""
+        """Wait until the oldest sent buffer is free; return None if all are held."""
         for buffer in buffers:
             if not buffer.is_held and buffer.tracker is not None:
                 try:
@@ -101,21 +101,21 @@ class SendBufferPool:
         return None
 
     def _forget_other_sizes(self, size_bytes: int) -> None:
-        """Let go of sizes of which every buffer is free: the camera has changed."""
+        """Release unused sizes once there are many: the camera has changed."""
         for other in [size for size in self._buffers if size != size_bytes]:
             if len(self._buffers) > 8 and all(b.is_free for b in self._buffers[other]):
                 del self._buffers[other]
 
 
 class Connection:
-    """A DEALER socket that knows whether the service is there.
+    """A DEALER socket that tracks whether the service is connected.
 
     Parameters
     ----------
     endpoint : str
-        As in ``tcp://127.0.0.1:5577`` or ``ipc:///run/user/1000/ocufilter``.
+        Address such as ``tcp://127.0.0.1:5577`` or ``ipc:///run/user/1000/ocufilter``.
     key : ClientKey, optional
-        For a service that wants one.
+        Client key, for a service that requires one.
     """
 
     def __init__(self, endpoint: str, key: ClientKey | None = None) -> None:
@@ -149,22 +149,22 @@ class Connection:
     def _set_options(self) -> None:
         socket = self._socket
         socket.linger = 0
-        # Queue nothing for a service that is not there: frames would be stale.
+        # Queue nothing for an absent service: frames would be stale.
         socket.immediate = True
         socket.sndhwm = SEND_HIGH_WATER_MARK
         socket.rcvhwm = RECEIVE_HIGH_WATER_MARK
         socket.reconnect_ivl = RECONNECT_INTERVAL_MS
         socket.reconnect_ivl_max = RECONNECT_MAX_MS
-        # A stopped service is noticed; a hung render loop is not (see ping).
+        # Heartbeats detect a stopped service, but not a hung render loop (see ping).
         socket.heartbeat_ivl = HEARTBEAT_INTERVAL_MS
         socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
 
     def wait(self, timeout_s: float) -> None:
-        """Return when a message or a change of the connection is there, or in time."""
+        """Wait for a message or a connection change, or until the timeout."""
         self._poller.poll(max(0, round(timeout_s * 1000)))
 
     def changes(self) -> list[bool]:
-        """Return what the connection did since the last call: True up, False down."""
+        """Return connection changes since the last call: True is up, False down."""
         changes = []
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)
@@ -179,8 +179,8 @@ class Connection:
                 self.is_up, self.state = False, "connection lost, trying again"
                 changes.append(False)
             else:
-                # Without a reason it may be a wrong key, or a service under attack
-                # that had to close connections.
+                # A failure without a reason means a wrong key, or a service under
+                # attack that had to close connections.
                 self._n_broken_handshakes += (
                     kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
                 )
@@ -192,7 +192,7 @@ class Connection:
         return changes
 
     def receive(self) -> list[zmq.Frame] | None:
-        """Return the parts of one waiting message, or None."""
+        """Return the parts of one received message, or None."""
         try:
             parts = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
         except zmq.Again:
@@ -202,9 +202,10 @@ class Connection:
         return parts
 
     def send(self, parts: Sequence[Any], buffers: Sequence[SendBuffer] = ()) -> bool:
-        """Send parts; return False where the connection cannot take them now.
+        """Send parts; return False if the connection cannot accept them now.
 
-        ``buffers`` hold the memory of ``parts[1:]``, in order, and get the trackers.
+        ``buffers`` hold the memory of ``parts[1:]``, in order, and receive the
+        trackers.
         """
         last = len(parts) - 1
         for i, part in enumerate(parts):
@@ -218,9 +219,9 @@ class Connection:
             except zmq.Again:
                 if i == 0:
                     return False
-                # The connection broke inside the message.  libzmq throws away what
-                # follows up to the last part, so the rest must still be handed over;
-                # the message counts as sent and is lost with the connection.
+                # The connection broke inside the message.  libzmq discards everything
+                # up to the last part, so the remaining parts must still be sent; the
+                # message counts as sent and is lost with the connection.
                 continue
             self.n_bytes_sent += n_bytes
             if is_large and i > 0 and i - 1 < len(buffers):
@@ -228,14 +229,14 @@ class Connection:
         return True
 
     def describe(self) -> str:
-        """Return one phrase about the connection, for the texts of errors."""
+        """Return a phrase about the connection, for error messages."""
         if self.last_message_s is None:
             return f"{self.state}; nothing was ever received"
         silent_s = time.monotonic() - self.last_message_s
         return f"{self.state}; the last message came {silent_s:.1f} s ago"
 
     def close(self) -> None:
-        """Close both sockets; a last bye has 0.2 s to get out."""
+        """Close both sockets, with a linger of 0.2 s for a final bye."""
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=CLOSE_LINGER_MS if self.is_up else 0)

@@ -1,4 +1,4 @@
-"""The demo: two scenes streamed through six eyes by a service of its own.
+"""The demo: two scenes streamed through six eyes by its own service.
 
 `ocufilter demo` runs it.  It writes a video, a contact sheet and latency.json.
 """
@@ -50,19 +50,19 @@ except ModuleNotFoundError as error:
     sys.exit(f"demo: {what_to_install(error)}")
 
 FRAMES_PER_SECOND = 12
-# Upper left corner, as parts of width and height, of what the sheet magnifies.
+# Upper left corner of the detail that the sheet magnifies, in parts of width, height.
 DETAIL_CORNERS = {"courtyard": (0.32, 0.19), "primitives": (0.42, 0.30)}
 LOG_TAIL_LINES = 12
 START_TIMEOUT_S = 180.0  # a slow machine's first start compiles
 
 
 class DemoFailed(Exception):
-    """The service failed; the text says how, and what it printed last."""
+    """The service failed; the message gives the reason and the last output."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """The rendered frames of one scene, and which of them the sheet shows."""
+    """The rendered frames of one scene, and the index of the one on the sheet."""
 
     scene: str
     frames: list[SceneFrame]
@@ -71,7 +71,7 @@ class Shot:
 
 @dataclass
 class EyeFilm:
-    """What came back through one eye: small pictures, and the sheet's in full."""
+    """Frames filtered through one eye: small images, and the sheet's in full size."""
 
     small: list[NDArray[np.uint8]]
     full: dict[int, FilteredFrame]
@@ -109,16 +109,16 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Render, stream through every eye, write the files; return the report.
+    """Render, stream through every eye and write the files; return the report.
 
     Raises
     ------
     DemoFailed
-        The service does not start, fails on the way or does not answer.
+        If the service does not start, fails during the run or does not answer.
     """
     start_s = time.monotonic()
     with Progress("demo", quiet=options.json) as progress:
-        with _service() as service:  # it gets ready while the scenes are rendered
+        with _service() as service:  # starts while the scenes are rendered
             shots = _rendered(options, progress)
             progress.task("Waiting for the service")
             _await_ready(service)
@@ -151,12 +151,12 @@ def _service() -> ServiceProcess:
 def _await_ready(service: ServiceProcess) -> None:
     try:
         service.await_ready(START_TIMEOUT_S)
-    except RuntimeError as error:  # the text ends with what it printed
+    except RuntimeError as error:  # the message ends with the service's output
         raise DemoFailed(str(error)) from None
 
 
 def _through(service: ServiceProcess, shots: list[Shot], size_px, progress: Progress):
-    """Film every eye through a service; return its name and the films."""
+    """Stream through every eye; return the service's description and the films."""
     try:
         with FilterClient(service.endpoint, client_name="demo", timeout_s=30) as client:
             server = dict(client.welcome.server)
@@ -172,7 +172,7 @@ def _rendered(options: argparse.Namespace, progress: Progress) -> list[Shot]:
     n_courtyard = max(1, round(options.frames * 2 / 3))
     task = progress.task("Rendering the scenes", total=options.frames)
     shots = []
-    # The sheet shows the courtyard with a wide pupil focused far (the path's middle)
+    # The sheet shows the courtyard with a wide pupil and far focus (middle of the path)
     # and the primitives focused on the letter.
     for name, count, share in (
         ("courtyard", n_courtyard, 0.5),
@@ -189,7 +189,7 @@ def _rendered(options: argparse.Namespace, progress: Progress) -> list[Shot]:
 
 
 def _filmed(client, shots: list[Shot], size_px, progress: Progress) -> list[EyeFilm]:
-    """Stream every frame through every eye; the stream goes on between the eyes."""
+    """Stream every frame through every eye, continuing while the eye changes."""
     frames = [frame for shot in shots for frame in shot.frames]
     settings = path_settings(*(shot.scene for shot in shots))
     films: list[EyeFilm] = []
@@ -223,7 +223,7 @@ def _filmed(client, shots: list[Shot], size_px, progress: Progress) -> list[EyeF
 
 
 def _sheet_positions(shots: list[Shot]) -> list[int]:
-    """Return the sheet's frames by their place among all frames."""
+    """Return the positions of the sheet's frames among all frames."""
     starts = np.cumsum([0, *(len(shot.frames) for shot in shots)])
     return [
         int(start) + shot.sheet_index
@@ -310,7 +310,7 @@ def _contact_sheet(shots: list[Shot], films: list[EyeFilm], size_px):
 
 
 def _used(asked: EyeState, used: EyeState) -> str:
-    """Say what the eye did: its far point and its measured pupil may be the limit."""
+    """Describe the state used, which far point and measured pupil may limit."""
     text = used.text()
     if used.focus_dpt > asked.focus_dpt + 0.05:
         text += " at the farthest"

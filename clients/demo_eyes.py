@@ -1,4 +1,4 @@
-"""The eyes of the demo, and what a person should look for in each."""
+"""The eyes of the demo, with captions on what to look for in each."""
 
 from dataclasses import dataclass
 

@@ -1,13 +1,13 @@
-"""What the programs that render scenes need beside the service."""
+"""Install instructions for optional dependencies of the client programs."""
 
 import sys
 
 INSTALL = "pip install 'ocufilter[clients]' && pip install --no-deps pyrender==0.1.45"
-"""pyrender apart and without its dependencies: it pins a PyOpenGL that is too old."""
+"""pyrender is installed without dependencies: it pins a PyOpenGL that is too old."""
 
 
 def what_to_install(error: ModuleNotFoundError) -> str:
-    """Say in one line which package is missing and how to get all of them."""
+    """Return one line on which package is missing and how to install them all."""
     return f"the package {error.name} is not installed; to render scenes: {INSTALL}"
 
 

@@ -1,16 +1,16 @@
-"""The client library: connect, send a profile, stream RGB-D frames, get them filtered.
+"""The client library: connect, send a profile and stream RGB-D frames.
 
     with FilterClient("tcp://127.0.0.1:5577") as client:
         client.set_profile("keratoconus", views=[camera])
         reply = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
 
-`filter` sends one frame and waits for it.  `submit` and `poll` are for live streams:
-at most ``max_in_flight`` frames are on their way, and of those that wait at the client
-only the newest is kept.  Every frame submitted comes back from `poll` once, as a
-`FilteredFrame`, a `Dropped` or an `ErrorReply`.
+`filter` sends one frame and waits for the result.  `submit` and `poll` are for live
+streams: at most ``max_in_flight`` frames are in flight, and the client queues only the
+newest of the others.  `poll` returns every submitted frame once, as a `FilteredFrame`,
+a `Dropped` or an `ErrorReply`.
 
-After a restart of the service the client says hello and sends its profile again by
-itself.  Every wait ends in time with an error that says what was awaited.
+After a restart of the service, the client reconnects and sends its profile again
+automatically.  Every wait has a timeout, whose error says what was awaited.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ DEFAULT_SETTINGS = FilterSettings()
 
 
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
-    """Return numpy's numbers as Python's; the service refuses what is no pair."""
+    """Convert numpy numbers to Python's; the service rejects anything but a pair."""
     try:
         return cast("tuple[float, float]", tuple(map(float, pair)))
     except (TypeError, ValueError):
@@ -82,7 +82,7 @@ def _floats(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 EXTENDING_S = 0.03
-"""Between two tries of a frame whose state is being prepared."""
+"""Delay between two tries of a frame whose state is being prepared."""
 
 
 class FilterClient:
@@ -91,27 +91,27 @@ class FilterClient:
     Parameters
     ----------
     endpoint : str
-        Where the service listens.
+        Address that the service listens on.
     timeout_s : float
-        The longest wait for an answer, unless a call says otherwise.
+        Default timeout of a reply.
     max_in_flight : int
-        Frames on their way at once.  1 keeps a live stream freshest (the age of a
-        frame is 1.2 filter periods instead of 2.2); the service's credit, 2 by
+        Maximum number of frames in flight.  1 keeps a live stream freshest (the age of
+        a frame is 1.2 filter periods instead of 2.2); the service's credit, 2 by
         default, gives the highest rate.
     client_name : str
-        Appears in the service's log.
+        Name that appears in the service's log.
     shared_memory : bool
-        Let images lie in memory that both sides share, where both can.
+        Whether to pass images through shared memory if both sides support it.
     key_file : Path or str, optional
-        What ``ocufilter keys add`` has written, for a service that wants keys.
+        Key file written by ``ocufilter keys add``, for a service that requires keys.
     compression : "none" or "lz4"
-        Of images and results where no memory is shared, without loss: for networks
+        Lossless compression of images and results without shared memory, for networks
         slower than about a gigabit a second.
 
     Raises
     ------
     ValueError
-        An endpoint or a key file that is none.
+        If the endpoint or the key file is invalid.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class FilterClient:
         self._next_profile_id = 0
 
     def __enter__(self) -> FilterClient:
-        """Connect; return when the service has answered hello."""
+        """Connect and wait until the service has answered hello."""
         try:
             self.hello()
         except BaseException:
@@ -161,7 +161,7 @@ class FilterClient:
         self.close()
 
     def hello(self, timeout_s: float | None = None) -> Welcome:
-        """Wait until the service has answered hello; return its welcome.
+        """Wait until the service answers hello; return its welcome.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class FilterClient:
 
     @property
     def welcome(self) -> Welcome | None:
-        """Return what the service said of itself, None while it is not there."""
+        """Return the service's welcome message; None while not connected."""
         return self._link.welcome
 
     def close(self) -> None:
@@ -202,45 +202,46 @@ class FilterClient:
         on_progress: Callable[[Progress], None] | None = None,
         timeout_s: float = 120.0,
     ) -> Ready | Accepted:
-        """Change the eye; frames go on through the old one until it is ready.
+        """Change the eye; the previous one filters frames until the new one is ready.
 
         Parameters
         ----------
         body : mapping or str
-            The profile, as in ``{"kind": "prescription", "sphere_dpt": -6}``, or a
-            preset's name.
+            The profile, such as ``{"kind": "prescription", "sphere_dpt": -6}``, or the
+            name of a preset.
         eye : "both", "left" or "right"
-            Which of the session's eyes changes: the one that sees all views unless
-            their `ViewState` says otherwise, or the left or the right one.
+            Eye of the session to change: "both" is used for all views unless their
+            `ViewState` selects another; or the left or the right eye.
         settings : FilterSettings or mapping, optional
-            Or its fields that differ from the defaults.
+            Settings, or the fields that differ from the defaults.
         views : camera or view, or several, optional
-            The cameras to prepare for.  Without them the service prepares for those
-            of the last frame; before any frame there is nothing to prepare, and
-            Accepted is returned with ``is_building`` false.
+            Cameras to prepare for.  Without them the service prepares for those of the
+            last frame; before the first frame there is nothing to prepare, and Accepted
+            is returned with ``is_building`` false.
         wait : bool or "first"
-            Return when everything is in place; or with "first" as soon as frames can be
-            seen through the new eye, maybe by a preview; or with False as soon as the
-            profile is accepted.  `poll` hands out each Progress and Ready that follows.
+            With True, return when the eye is complete; with "first", as soon as frames
+            can be filtered with the new eye, possibly by a preview; with False, as soon
+            as the profile is accepted.  `poll` returns each Progress and Ready that
+            follows.
         on_progress : callable, optional
             Called with each Progress while waiting.
 
         Raises
         ------
         UnknownProfile, GridTooLarge, BuildFailed, WorkerCrashed, ServiceTimeout
-            After any of them the eye that was in use before stays in use.
+            After any of them the previous eye stays in use.
         """
         if wait not in (True, False, "first"):
             raise ValueError(f"wait is {wait!r}; allowed: True, False or 'first'")
         previous = self._link.profiles.get(eye)
         request = self._request(body, eye, settings, views)
-        parts = encode(request)  # before any state changes: it may refuse the body
+        parts = encode(request)  # before any state changes: it may raise
         self.hello()
         self._ask(request, parts)
         try:
             return self._await_profile(request, wait, on_progress, timeout_s)
         except FilterError:
-            # After a restart of the service the last good profile is sent again.
+            # A restart of the service sends the last good profile again.
             if previous is None:
                 self._link.profiles.pop(eye, None)
             else:
@@ -255,13 +256,13 @@ class FilterClient:
         settings: FilterSettings | Mapping[str, Any] = DEFAULT_SETTINGS,
         views: Camera | RgbdView | Sequence[Camera | RgbdView] = (),
     ) -> int:
-        """Ask for another eye like `set_profile`, and wait for nothing.
+        """Request another eye like `set_profile`, without waiting.
 
         Returns
         -------
         int
-            The profile's number: `poll` hands out the Accepted, Progress, Ready or
-            ErrorReply with it.
+            Profile id of the Accepted, Progress, Ready or ErrorReply that `poll`
+            returns.
         """
         request = self._request(body, eye, settings, views)
         self._ask(request, encode(request))
@@ -295,7 +296,7 @@ class FilterClient:
         self._camera = next(iter(request.views), self._camera)
         self._next_profile_id += 1
         self._link.profiles[request.eye] = request
-        if self.welcome is not None:  # else hello is followed by it
+        if self.welcome is not None:  # otherwise it is sent after hello
             self._link.say(parts)
 
     def _await_profile(
@@ -309,7 +310,7 @@ class FilterClient:
         deadline_s = time.monotonic() + timeout_s
         n_awaited = n_ready = 0
         while True:
-            # One at a time: what came with the last one awaited is for the caller.
+            # One at a time: events after the awaited one are left for the caller.
             event = self._link.take_event(
                 lambda e: getattr(e, "profile_id", None) == profile_id
             )
@@ -349,10 +350,10 @@ class FilterClient:
         display_time_ns: int | None = None,
         timeout_s: float | None = None,
     ) -> FilteredFrame:
-        """Send one frame and return it filtered; `submit` explains the arguments.
+        """Send one frame and return it filtered; `submit` describes the arguments.
 
-        Where the service is still preparing the eye for this camera or this state of
-        it, or has just been restarted, the frame is sent again until the time is over.
+        While the service prepares the eye for this camera or this state, or has just
+        restarted, the frame is sent again until the timeout.
 
         Raises
         ------
@@ -400,7 +401,7 @@ class FilterClient:
             self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
 
     def _await_ready(self, deadline_s: float) -> None:
-        """Wait for an eye that is being prepared; a failed build raises."""
+        """Wait for an eye that is being prepared; raise if its build fails."""
         profile_ids = {p.profile_id for p in self._link.profiles.values()}
         while True:
             event = self._link.take_event(
@@ -431,39 +432,39 @@ class FilterClient:
         states: Sequence[ViewState] = (),
         display_time_ns: int | None = None,
     ) -> int:
-        """Hand over a frame without waiting; return its frame_id.
+        """Submit a frame without waiting; return its frame_id.
 
-        The images are copied, so the caller may reuse its arrays at once, but for those
-        of `lend_view`.  If the
-        service is busy the frame waits here, and a frame that already waits is
-        dropped for it with the reason ``superseded``.
+        The images are copied, so the caller may reuse its arrays at once, except those
+        of `lend_view`.  If the service is busy, the frame waits at the client and
+        replaces a frame that already waits, which is dropped with the reason
+        ``superseded``.
 
         Parameters
         ----------
         color : (height, width, 3) array, RgbdView, or several views
             uint8 sRGB, or float32 or float16 linear light.
         depth_m : (height, width) float32, optional
-            View-space z in metres, beside an array of colour, which is then seen by the
-            first camera of the profile; else part of the view.
+            View-space z in meters, required with an array of color, which is then
+            seen by the first camera of the profile; views include their depth.
         gaze_deg : (h, v), optional
-            Where the eye looks in the image, to the right and up from the camera's
-            axis; as in the profile's settings where it is None.
+            Gaze direction in the image, to the right and up from the camera's axis;
+            None uses the profile's settings.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
         render_tolerance : float, 0 to 8
-            Errors of rendering against the usual, which leaves no visible difference;
-            0 is exact, more is faster.
+            Rendering errors relative to the default, which leaves no visible
+            difference; 0 is exact, more is faster.
         prepared_only : bool
-            Dropped with the reason ``extending`` where PSFs for this pupil, focus and
-            scene are not there yet, instead of seen through the nearest that are.
+            Whether to drop the frame with the reason ``extending`` if PSFs for this
+            pupil, focus and scene are not ready, instead of using the nearest ones.
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
-            How depth travels: metres, or half the bytes, for a thin network: metres or
-            dioptres in half precision, or whole millimetres.
+            Encoding of depth on the wire: meters; or, in half the bytes for a slow
+            network, meters or diopters in half precision, or whole millimeters.
         states : sequence of ViewState, optional
-            One for each view: through whose eye it is seen, and what differs from the
-            frame's pupil, focus and gaze; its pose comes back with the picture.
+            One for each view: the eye that sees it, and what differs from the frame's
+            pupil, focus and gaze; its pose is returned with the image.
         display_time_ns : int, optional
-            Comes back with the frame.
+            Returned with the frame.
         """
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
@@ -505,26 +506,26 @@ class FilterClient:
         dtype: str = "uint8",
         depth_kind: DepthKind = "planar",
     ) -> RgbdView:
-        """Return an empty view to render into, which `submit` does not have to copy.
+        """Return an empty view to render into, which `submit` need not copy.
 
-        Its arrays lie in memory that the service reads, where that can be had; else
-        they are plain ones.  Leave it alone from `submit` until the frame is answered:
-        a live stream takes two in turn.
+        Its arrays lie in shared memory if available; otherwise they are ordinary
+        arrays.  Do not modify the view between `submit` and the frame's reply: a live
+        stream alternates between two.
 
         Parameters
         ----------
         camera : Camera
         dtype : "uint8", "float32" or "float16"
-            Of the colour.
+            Data type of the color.
         depth_kind : "planar" or "radial"
         """
-        _ = self._link  # raises where this is closed
+        _ = self._link  # raises if closed
         return self._packer.lend_view(camera, dtype=dtype, depth_kind=depth_kind)
 
     def poll(self, timeout_s: float = 0.0) -> list[Event]:
-        """Return what has happened; wait up to ``timeout_s`` if nothing has.
+        """Return new events; wait up to ``timeout_s`` if there are none.
 
-        Messages about profiles are in the list too.
+        The list includes messages about profiles.
         """
         deadline_s = time.monotonic() + timeout_s
         self._link.pump(0.0)
@@ -537,21 +538,21 @@ class FilterClient:
 
     @property
     def n_unanswered(self) -> int:
-        """Return how many submitted frames are still waiting or on their way."""
+        """Return the number of submitted frames that wait or are in flight."""
         return len(self._link.in_flight) + (self._link.pending is not None)
 
     @property
     def n_bytes(self) -> tuple[int, int]:
-        """Return the bytes of all messages that were sent, and received."""
+        """Return the total bytes of messages sent and received."""
         return self._link.n_bytes
 
     @property
     def n_superseded(self) -> int:
-        """Return how many frames were dropped at the client for a newer one."""
+        """Return the number of frames dropped at the client for a newer one."""
         return self._link.n_superseded
 
     def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
-        """Return (round trip in ms, the state of the service's render loop)."""
+        """Return (round trip in ms, state of the service's render worker)."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
         self.hello(limit_s)
         self._link.pongs.clear()

@@ -1,4 +1,4 @@
-"""What became of a stream's frames: times, drops, notes."""
+"""Statistics of a stream's frames: times, drops, notes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
 
 @dataclass
 class FrameLog:
-    """What became of the frames sent through one eye."""
+    """Times, drops and notes of the frames sent through one eye."""
 
     ages_ms: list[float] = field(default_factory=list)
     round_trips_ms: list[float] = field(default_factory=list)
@@ -25,23 +25,23 @@ class FrameLog:
     notes: dict[str, tuple[int, str]] = field(default_factory=dict)
 
     def add(self, answer: FilteredFrame) -> None:
-        """Note a frame that came back filtered."""
+        """Record a filtered frame."""
         self.ages_ms.append(answer.age_ms)
         self.round_trips_ms.append(answer.round_trip_ms)
         for stage, time_ms in answer.header.stage_times_ms.items():
             self.stages_ms.setdefault(stage, []).append(time_ms)
         for note in answer.header.notes:
-            # A note's numbers change with every frame; its kind is worth counting.
+            # The numbers in a note change with every frame: count notes by kind.
             kind = NUMBER.sub("#", note)
             count, example = self.notes.get(kind, (0, note))
             self.notes[kind] = (count + 1, example)
 
     def add_drop(self, reason: str) -> None:
-        """Note a frame that was dropped."""
+        """Record a dropped frame."""
         self.drops[reason] = self.drops.get(reason, 0) + 1
 
     def summary(self) -> dict[str, Any]:
-        """Return counts and p50, p95, p99 of every stage, age and round trip."""
+        """Return counts, and p50, p95 and p99 of each stage, age and round trip."""
         return {
             "frames": len(self.ages_ms),
             "drops": dict(self.drops),
@@ -58,7 +58,7 @@ class FrameLog:
 
 
 def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p95 and p99, rounded to a microsecond; None without values."""
+    """Return p50, p95 and p99, rounded to microseconds; None without values."""
     names = {"p50": 50, "p95": 95, "p99": 99}
     if not values_ms:
         return dict.fromkeys(names)

@@ -1,6 +1,6 @@
-"""A frame on its way out: checked, and its images where they travel from.
+"""Packing of frames for the wire.
 
-That is memory that both sides share, or buffers, or compressed blocks.
+Images go into shared memory, send buffers or compressed blocks.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ LEND_WAIT_S = 0.1
 
 
 class FramePacker:
-    """Makes what is sent of frames.
+    """Packs frames into messages.
 
     Parameters
     ----------
     link : ServiceLink
-        Whose shared memory is used where there is some.
+        Link whose shared memory is used if available.
     compression : "none" or "lz4"
-        Where there is none.
+        Compression used without shared memory.
     timeout_s : float
-        The longest wait for a buffer.
+        Timeout of a wait for a buffer.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class FramePacker:
         self._pool = SendBufferPool(timeout_s)
 
     def packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
-        """Copy images to where they travel from: shared memory, or buffers."""
+        """Copy the images to shared memory or send buffers; return the message."""
         now_s = time.monotonic()
         per_view = [
             _as_sent(item, header.depth.encoding)
@@ -81,7 +81,7 @@ class FramePacker:
     def _in_shared_memory(
         self, frame: Frame, images: Sequence[NDArray[Any]]
     ) -> tuple[Frame, list[ClientSlot]] | None:
-        """Return a frame whose images lie in shared memory, and its slots."""
+        """Return a frame with its images in shared memory, and its slots."""
         memory = self._link.memory
         if not memory.is_offered:
             return None
@@ -140,7 +140,7 @@ class FramePacker:
 
 
 def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
-    """Return the images of a view, depth as it travels."""
+    """Return the images of a view, with encoded depth."""
     if depth_encoding == "float32":
         return list(view.images)
     return [
@@ -150,11 +150,12 @@ def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
 
 
 def check_limits(views: Sequence[RgbdView], welcome: Welcome) -> None:
-    """Refuse what the service would cut the connection for.
+    """Reject views for which the service would close the connection.
 
     Raises
     ------
     ValueError
+        If there are too many views or one is too large.
     """
     limits = welcome.limits
     if not 1 <= len(views) <= limits.max_views:

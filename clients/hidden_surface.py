@@ -1,8 +1,8 @@
-"""The surface behind the one that is seen, by depth peeling with pyrender.
+"""The surface behind the visible one, by depth peeling with pyrender.
 
-A scene is rendered a second time with a shader that leaves out what lies less than
-`LEAST_GAP_DPT` behind the first picture.  pyrender has no place for that, so its cache
-of programs is exchanged while the second picture is made.
+A scene is rendered a second time with a shader that discards fragments less than
+`LEAST_GAP_DPT` behind the first image.  pyrender has no hook for that, so its program
+cache is replaced during the second rendering.
 """
 
 from pathlib import Path
@@ -14,15 +14,15 @@ from OpenGL import GL
 from clients.pyrender_setup import pyrender
 
 LEAST_GAP_DPT = 0.05
-"""What lies closer behind the surface that is seen would look as sharp as it."""
+"""A surface less far behind the visible one would look as sharp as that."""
 
 _SHADER = Path(__file__).parent / "assets" / "hidden_surface.frag"
 _UNIT = 15
-"""Texture unit that pyrender, which counts from 0, does not come to."""
+"""Texture unit that pyrender does not use: it assigns units from 0."""
 
 
 class HiddenSurface:
-    """Renders what is behind a first picture, in that picture's context.
+    """Renders what is behind a first image, in that image's context.
 
     Parameters
     ----------
@@ -41,17 +41,17 @@ class HiddenSurface:
     def render(
         self, world: "pyrender.Scene", flags: int, seen_m: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Return colour (h, w, 3) and planar depth (h, w) of what is behind.
+        """Return color (h, w, 3) and planar depth (h, w) of the hidden surface.
 
         Parameters
         ----------
         seen_m : (h, w)
-            Depth of the first picture, of the same pose, just rendered; 0 where there
-            is nothing.
+            Depth of the first image, just rendered from the same pose; 0 for the empty
+            background.
 
         Returns
         -------
-        depth_m : 0 where nothing is behind
+        depth_m : 0 where nothing is hidden
         """
         seen_per_m = np.zeros_like(seen_m)
         np.divide(1.0, seen_m, out=seen_per_m, where=seen_m > 0)
@@ -65,13 +65,13 @@ class HiddenSurface:
             GL.glDeleteTextures([texture])
 
     def close(self) -> None:
-        """Free the programs; the renderer's context must still live."""
+        """Release the programs; the renderer's context must still exist."""
         self._renderer._platform.make_current()
         self._programs.clear()
 
 
 def _upload(values: NDArray[np.float32]) -> int:
-    """Bind values (h, w), bottom row first, as a texture of their own."""
+    """Bind values (h, w), bottom row first, as a new texture; return its id."""
     texture = GL.glGenTextures(1)
     GL.glActiveTexture(GL.GL_TEXTURE0 + _UNIT)
     GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
@@ -87,14 +87,14 @@ def _upload(values: NDArray[np.float32]) -> int:
 
 
 class _Programs(pyrender.shader_program.ShaderProgramCache):
-    """pyrender's programs with another fragment shader."""
+    """pyrender's program cache with another fragment shader."""
 
     def __init__(self, depth_range_m: tuple[float, float]):
         super().__init__()
         self._depth_range_m = np.array(depth_range_m)
 
     def get_program(self, vertex_shader, fragment_shader, *others, **options):
-        """Return the program for one kind of mesh; it sets its own uniforms."""
+        """Return the program of one kind of mesh, which sets its own uniforms."""
         program = super().get_program(vertex_shader, str(_SHADER), *others, **options)
         if "_bind" not in vars(program):
             bind = program._bind

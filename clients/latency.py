@@ -3,8 +3,8 @@
     python -m clients.latency --spawn --size 1280x720 --rate-hz 30 --seconds 10
     python -m clients.latency --endpoint tcp://127.0.0.1:5577 --json out.json
 
-The schedule is open-loop: a frame is due when it is due, whether or not earlier ones
-have come back, and ages count from there.  `ocufilter bench roundtrip` is this program.
+The schedule is open-loop: a frame's due time does not depend on earlier replies, and
+ages count from it.  `ocufilter bench roundtrip` runs this program.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from filter_service.messages import (
     ViewState,
 )
 
-N_FRAMES = 8  # in the loop that is sent
+N_FRAMES = 8  # in the loop of frames
 VERTICAL_FOV_DEG = 45.0
 TRANSPORTS = ("tcp", "ipc", "shm", "curve")
 DEFAULT_PROFILE = '{"kind": "prescription", "eye_side": "OS", "sphere_dpt": -2}'
@@ -68,7 +68,7 @@ STDOUT = "-"
 
 @dataclass(frozen=True)
 class Settings:
-    """What is streamed and how."""
+    """Settings of a run: content and transport of the stream."""
 
     width_px: int
     height_px: int
@@ -88,7 +88,7 @@ class Settings:
 
     @property
     def tangents(self) -> list[tuple[float, float, float, float]]:
-        """Return those of each view: a headset's where there are two eyes."""
+        """Return the tangents of each view: a headset's if there are two eyes."""
         if self.right_profile is None:
             usual = tangents_from_fov(VERTICAL_FOV_DEG, self.width_px, self.height_px)
             return [usual] * self.n_views
@@ -99,14 +99,14 @@ class Settings:
 
     @property
     def states(self) -> list[ViewState]:
-        """Return through whose eye each view is seen."""
+        """Return the view states, which select the eye of each view."""
         if self.right_profile is None:
             return [ViewState()] * self.n_views
         return [ViewState(eye) for eye in EYES]
 
     @property
     def case(self) -> str:
-        """Return what is streamed, in words."""
+        """Return a description of the content."""
         views = "" if self.n_views == 1 else f"{self.n_views} x "
         eye = _name_of(self.profile)
         if self.right_profile is not None:
@@ -118,7 +118,7 @@ class Settings:
 
     @property
     def setting(self) -> str:
-        """Return how it is streamed, in words."""
+        """Return a description of schedule and transport."""
         schedule = f"{self.rate_hz:g} Hz for {self.duration_s:g} s"
         how = [self.transport]
         if self.compression != "none":
@@ -133,7 +133,7 @@ def _name_of(profile: Mapping[str, Any]) -> str:
 
 
 def make_frames(settings: Settings) -> list[list[RgbdView]]:
-    """Return a loop of frames: a slanted checkered floor and a near disc that moves."""
+    """Return a loop of frames: a slanted checkered floor and a moving near disc."""
     width_px, height_px = settings.width_px, settings.height_px
     x, y = np.meshgrid(np.arange(width_px), np.arange(height_px))
     cell_px = max(height_px // 24, 2)
@@ -154,7 +154,7 @@ def make_frames(settings: Settings) -> list[list[RgbdView]]:
 
 
 def measure(client: FilterClient, settings: Settings, read_memory_mb) -> LatencyRun:
-    """Prepare the eye, warm up, and send the frames on their schedule."""
+    """Prepare the eye, warm up and send the frames on schedule."""
     frames = make_frames(settings)
     look = {
         "pupil_diameter_mm": settings.pupil_diameter_mm,
@@ -181,7 +181,7 @@ def measure(client: FilterClient, settings: Settings, read_memory_mb) -> Latency
         loop.take_until(time.monotonic() + 0.01)
     loop.take_until(time.monotonic())
     run.drops["unanswered"] += client.n_unanswered
-    run.drops += type(run.drops)()  # drops what was counted zero times
+    run.drops += type(run.drops)()  # removes zero counts
     run.duration_s = time.monotonic() - start_s
     run.due_s = [due_s - start_s for due_s in run.due_s]
     run.memory_end_mb = read_memory_mb()
@@ -203,7 +203,7 @@ def _set_profiles(
 
 
 class _Loop:
-    """Takes in replies between two frames that are due."""
+    """Receives replies between due frames."""
 
     def __init__(self, client: FilterClient, run: LatencyRun, first_colors) -> None:
         self._client = client
@@ -245,7 +245,7 @@ class _Loop:
             raise event.exception()
 
     def _compare(self, event: FilteredFrame, index: int) -> None:
-        """Compare with the first reply to this frame, on every 16th pixel: cheap."""
+        """Compare with the first reply to this frame, on every 16th pixel for speed."""
         for first, now in zip(self._first_colors[index], event.colors, strict=True):
             part = slice(None, None, 4)
             difference = first[part, part].astype(np.float32) - now[part, part]
@@ -256,7 +256,7 @@ class _Loop:
 
 @contextlib.contextmanager
 def connect(endpoint: str | None, settings: Settings) -> Iterator[tuple]:
-    """Yield (client, how to read the service's memory); spawn a service if need be."""
+    """Yield (client, reader of the service's memory); start a service if needed."""
     with contextlib.ExitStack() as stack:
         service, key_file, transport = None, None, settings.transport
         if endpoint is None:
@@ -289,7 +289,7 @@ def connect(endpoint: str | None, settings: Settings) -> Iterator[tuple]:
 
 
 def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    """Return the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m clients.latency", description=__doc__.splitlines()[0]
     )
@@ -355,7 +355,7 @@ def read_settings(arguments: argparse.Namespace) -> Settings:
     Raises
     ------
     ValueError
-        Names the option.
+        If a value is invalid; the message names the option.
     """
     usual = "1832x1920" if arguments.stereo else "1280x720"
     size = "320x180" if arguments.quick else arguments.size or usual
@@ -408,7 +408,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(run: LatencyRun, parsed: argparse.Namespace) -> None:
-    """Write table, JSON and plot to where they were asked for."""
+    """Print or write the table, JSON and plot as requested."""
     console = Console(stderr=parsed.json == STDOUT)
     console.print(as_table(run))
     console.print(summary(run), highlight=False)

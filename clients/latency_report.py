@@ -1,4 +1,4 @@
-"""What a latency run measured, as numbers, table, JSON and picture."""
+"""Results of a latency run, as numbers, table, JSON and plot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 PERCENTILES = (50, 95, 99, 99.9)
 CLIENT_STAGES = ("client_wait_ms", "wire_and_queue_ms")
 SERVICE_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "other_ms")
-"""Those that are not the renderer's."""
+"""Stages of the service outside the renderer."""
 
 SUMS = ("added_ms", "service_total_ms", "round_trip_ms", "age_ms")
 
@@ -27,22 +27,22 @@ class LatencyRun:
     Attributes
     ----------
     case, setting : str
-        What was streamed and how.
+        Descriptions of the content and of schedule and transport.
     stages_ms : dict of lists
-        ``client_wait_ms`` from the schedule to the send; ``wire_and_queue_ms`` what
-        the round trip has beyond the service's own total; the service's stages;
-        ``added_ms`` what the round trip has beyond the renderer's stages;
+        ``client_wait_ms`` from the schedule to the send; ``wire_and_queue_ms``, the
+        round trip minus the service's own total; the service's stages;
+        ``added_ms``, the round trip minus the renderer's stages;
         ``service_total_ms``, ``round_trip_ms``, and ``age_ms`` from the schedule to the
-        reply (a late client does not hide: the schedule never waits).
+        reply (includes delays of a late client: the schedule never waits).
     due_s : list
-        When each filtered frame was scheduled, from the start of the run.
+        Scheduled time of each filtered frame, from the start of the run.
     max_repeat_difference : float
         Largest difference between two replies to the same frame, in units of the
-        output (levels of 255, or linear light): mixed up or torn images would show.
+        output (levels of 255, or linear light); reveals mixed up or torn images.
     n_bytes : (sent, received)
-        Of the messages of the whole run.
+        Total size of the run's messages.
     floor_ms : float
-        What so many bytes take over a bare socket between two processes.
+        Round trip of the same number of bytes over a bare socket between two processes.
     """
 
     case: str
@@ -67,18 +67,18 @@ class LatencyRun:
 
     @property
     def n_filtered(self) -> int:
-        """Return how many frames came back filtered."""
+        """Return the number of filtered frames."""
         return len(self.due_s)
 
     def stage_names(self) -> list[str]:
-        """Return the stages in the order in which a frame passes them, then sums."""
+        """Return the stages in the order that a frame passes them, then the sums."""
         inner = [n for n in self.stages_ms if n not in (*CLIENT_STAGES, *SUMS)]
         ordered = [*CLIENT_STAGES, *inner, *SUMS]
         return [name for name in ordered if name in self.stages_ms]
 
     @property
     def n_bytes_per_frame(self) -> tuple[int, int]:
-        """Return what one frame takes on its way, and its result."""
+        """Return the bytes sent and received per frame."""
         sent, received = self.n_bytes
         n_frames = max(1, self.n_filtered)
         return sent // n_frames, received // n_frames
@@ -90,7 +90,7 @@ class LatencyRun:
 
 
 def as_json(run: LatencyRun) -> dict[str, Any]:
-    """Return the run in the form of every `ocufilter bench`: no time without error."""
+    """Return the run in the format of `ocufilter bench`: each time with an error."""
     rows = []
     for name in run.stage_names():
         p = run.percentiles_ms(name)
@@ -129,7 +129,7 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
 
 
 def as_table(run: LatencyRun) -> Table:
-    """Return the run as a table for a terminal."""
+    """Return the run as a terminal table."""
     table = Table(title=f"{run.case}, {run.setting}", title_justify="left")
     table.add_column("stage")
     for percentile in PERCENTILES:
@@ -157,7 +157,7 @@ def summary(run: LatencyRun) -> str:
 
 
 def save_plot(run: LatencyRun, path: Path) -> None:
-    """Write a picture: age over the run, and the stages."""
+    """Plot the age over the run and the stages to a file."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -186,7 +186,7 @@ def save_plot(run: LatencyRun, path: Path) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Return what the times depend on."""
+    """Return the machine properties that the times depend on."""
     import os
 
     return {

@@ -1,6 +1,6 @@
-"""The client's side of the protocol: hello, what is in flight, what has happened.
+"""The client's side of the protocol: handshake, frames in flight, events.
 
-`filter_client` is the interface to use; this file keeps its state.  There is no
+`filter_client` is the public interface; this module holds its state.  There is no
 thread: everything happens inside `ServiceLink.pump`.
 """
 
@@ -45,7 +45,7 @@ from filter_service.messages import (
 )
 
 MAX_KEPT_PROGRESS = 1000
-RETRY_SEND_S = 0.002  # a new connection takes messages a moment after it is reported
+RETRY_SEND_S = 0.002  # a new connection accepts messages shortly after its event
 
 _Found = TypeVar("_Found")
 
@@ -54,7 +54,7 @@ _Found = TypeVar("_Found")
 class FilteredFrame:
     """A filtered frame.
 
-    ``colors`` holds one image per view; ``header`` what the service says about it.
+    ``colors`` holds one image per view, and ``header`` the service's reply.
     ``age_ms`` counts from `submit`, ``round_trip_ms`` from the send.
     """
 
@@ -75,7 +75,7 @@ Event = FilteredFrame | Dropped | ErrorReply | Ready | Progress | Accepted
 
 @dataclass
 class Outgoing:
-    """A frame that is packed and waits to be sent, or was sent and is not answered."""
+    """A packed frame that waits to be sent or answered."""
 
     frame_id: int
     parts: list[Any]
@@ -86,13 +86,13 @@ class Outgoing:
     sent_s: float = 0.0
 
     def release(self) -> None:
-        """Let the pool have the memory back, once it is sent; only once."""
+        """Return the buffers to the pool after the send."""
         for buffer in self.buffers:
             buffer.is_held = False
         self.parts, self.buffers = [], []
 
     def end(self) -> None:
-        """Let go of everything: the frame is answered, or will never be."""
+        """Release all resources: the frame is answered or lost."""
         self.release()
         for slot in self.slots:
             slot.release()
@@ -100,18 +100,18 @@ class Outgoing:
 
 
 class ServiceLink:
-    """What one client knows of its session.
+    """State of a client's session.
 
     Parameters
     ----------
     endpoint : str
-        Where the service listens.
+        Address that the service listens on.
     max_in_flight : int
-        Frames on their way at once; the service's credit bounds it too.
+        Maximum number of frames in flight; the service's credit is a limit too.
     client_name : str
-        Sent with hello.
+        Name sent with hello.
     shared_memory : bool
-        Take it where it is offered.
+        Whether to use shared memory if offered.
     key : ClientKey, optional
     """
 
@@ -141,17 +141,17 @@ class ServiceLink:
         self._refusal: FilterError | None = None
 
     def close(self) -> None:
-        """Say bye if anybody listens, and close the socket."""
+        """Send bye if connected, and close the socket."""
         if self._connection.is_up:
             self._connection.send(encode(Bye()))
         self._connection.close()
 
     def say(self, parts: list[Any]) -> None:
-        """Send a control message as soon as the connection takes it, in order."""
+        """Send a control message as soon as the connection accepts it, in order."""
         self._outbox.append(parts)
 
     def submit(self, outgoing: Outgoing) -> None:
-        """Make this the frame to be sent next; one that still waits is superseded."""
+        """Queue a frame as the next to send; it supersedes one that still waits."""
         if self.pending is not None:
             self.n_superseded += 1
             self._drop(self.pending, "superseded")
@@ -160,29 +160,29 @@ class ServiceLink:
 
     @property
     def n_bytes(self) -> tuple[int, int]:
-        """Return the bytes of all messages that were sent, and received."""
+        """Return the total bytes of messages sent and received."""
         return self._connection.n_bytes_sent, self._connection.n_bytes_received
 
     def take_events(self) -> list[Event]:
-        """Return and forget all events, oldest first."""
+        """Remove and return all events, oldest first."""
         taken, self._events = self._events, []
         return taken
 
     def take_event(self, is_wanted: Callable[[Event], bool]) -> Event | None:
-        """Return and forget the oldest event that is wanted, if any."""
+        """Remove and return the oldest event that matches, if any."""
         wanted = next((event for event in self._events if is_wanted(event)), None)
         self._events = [event for event in self._events if event is not wanted]
         return wanted
 
     @property
     def has_events(self) -> bool:
-        """Return whether anything has happened that was not taken."""
+        """Return whether there are events left to take."""
         return bool(self._events)
 
     def wait_until(
         self, find: Callable[[], _Found | None], timeout_s: float, what: str
     ) -> _Found:
-        """Pump until something is found; ServiceTimeout says what was awaited."""
+        """Pump until ``find`` returns a true value; ServiceTimeout names ``what``."""
         deadline_s = time.monotonic() + timeout_s
         self.pump(0.0)
         while not (found := find()):
@@ -190,7 +190,7 @@ class ServiceLink:
         return found
 
     def pump_before(self, deadline_s: float, what: str) -> None:
-        """Pump once, or raise where the time is over or the service refused hello."""
+        """Pump once; raise on timeout or if the service refused hello."""
         remaining_s = deadline_s - time.monotonic()
         if remaining_s <= 0:
             raise ServiceTimeout(
@@ -210,7 +210,7 @@ class ServiceLink:
             raise refusal
 
     def pump(self, timeout_s: float) -> None:
-        """Wait for something to happen, once; handle it, send what may be sent."""
+        """Wait once for messages or changes, handle them and send what is queued."""
         is_due = bool(self._outbox) and self._connection.is_up
         self._connection.wait(min(timeout_s, RETRY_SEND_S) if is_due else timeout_s)
         for is_up in self._connection.changes():
@@ -223,10 +223,10 @@ class ServiceLink:
         self._send_waiting()
 
     def greet(self) -> None:
-        """Say hello; the first connection and every later one take the same way.
+        """Send hello, on the first connection and on every later one.
 
-        With its key the client comes back to its session; what `_begin` finds missing
-        there it says again.
+        The session key resumes the client's session; `_begin` sends the profiles that
+        are missing there.
         """
         self.welcome = None
         self._refusal = None
@@ -239,7 +239,7 @@ class ServiceLink:
             self._drop(outgoing, "connection_lost")
         self.in_flight.clear()
         if self.pending is not None and self.pending.frame.memory is not None:
-            self._drop(self.pending, "connection_lost")  # its memory is gone, too
+            self._drop(self.pending, "connection_lost")  # its memory is lost too
             self.pending = None
         self.memory.begin(is_offered=False)
 
@@ -281,7 +281,7 @@ class ServiceLink:
             self._bound_progress()
 
     def _begin(self, welcome: Welcome) -> None:
-        """Begin or go on with a session; send the profiles that it does not have."""
+        """Start or resume a session; send the profiles that it lacks."""
         self.welcome = welcome
         self._session_key = welcome.session_key
         if not self.in_flight:
@@ -294,7 +294,7 @@ class ServiceLink:
                 self.say(encode(profile))
 
     def _bound_progress(self) -> None:
-        """Forget the oldest progress of a program that never polls for it."""
+        """Discard the oldest progress event if a program never polls for it."""
         if len(self._events) > MAX_KEPT_PROGRESS:
             progress = (e for e in self._events if isinstance(e, Progress))
             oldest = next(progress, None)
@@ -304,7 +304,7 @@ class ServiceLink:
     def _finish_frame(self, reply: Result | Dropped) -> None:
         outgoing = self.in_flight.pop(reply.frame_id, None)
         if outgoing is None:
-            return  # reported already, as lost with an earlier connection
+            return  # already reported as lost with an earlier connection
         if isinstance(reply, Dropped):
             outgoing.end()
             self._events.append(reply)
@@ -323,7 +323,7 @@ class ServiceLink:
         )
 
     def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
-        """Return the pictures that the service has put into a slot."""
+        """Return the images that the service has written to a slot."""
         frame, (_, slot) = outgoing.frame, outgoing.slots
         assert frame.memory is not None
         return tuple(
@@ -352,7 +352,7 @@ class ServiceLink:
         self._events.append(reply)
 
     def _restart_session(self, reply: ErrorReply) -> None:
-        """Say hello again: the service ended this session on a live connection."""
+        """Send hello again: the service ended this session on a live connection."""
         frame_id = reply.frame_id
         if frame_id is not None and frame_id in self.in_flight:
             self._drop(self.in_flight.pop(frame_id), "connection_lost")

@@ -1,9 +1,9 @@
-"""An eye that follows what it sees: its pupil the light, its focus what it looks at.
+"""An eye whose pupil follows the light and whose focus follows the viewed distance.
 
     eye = NaturalEye(age_years=35)
     pupil_diameter_mm, focus_dpt = eye.look(luminance_cd_m2, distance_dpt, at_s)
 
-The dynamics are the estimator's (`estimator.dynamics` has their sources).
+The dynamics are those of `estimator.dynamics`, which lists their sources.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from filter_service.messages import Camera
 
 MAX_VERGENCE_DPT = 20.0
 USUAL_WHITE_CD_M2 = 100.0
-"""Of a headset's display that shows white."""
+"""Luminance of white on a headset's display."""
 
 USUAL_AGE_YEARS = 35.0
 PUPIL_RANGE_MM = (0.5, 9.0)
 WINDOW_DEG = 0.5
-"""Half of what the fovea's centre covers: what is looked at lies in it."""
+"""Half the extent of the fovea's center, which contains the fixated object."""
 
 LIMIT_STEP_DPT = 0.01
 _STRIDE = 8
@@ -40,13 +40,13 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of sRGB's primari
 
 @dataclass(frozen=True)
 class EyeState:
-    """What a frame is told of an eye."""
+    """State of an eye that is sent with a frame."""
 
     pupil_diameter_mm: float
     focus_dpt: float
 
     def with_pupil(self, diameter_mm: float) -> EyeState:
-        """Return the same with a pupil that was measured, within what eyes have."""
+        """Return the state with a measured pupil, clipped to the range of eyes."""
         low_mm, high_mm = PUPIL_RANGE_MM
         return EyeState(min(max(diameter_mm, low_mm), high_mm), self.focus_dpt)
 
@@ -57,11 +57,11 @@ class NaturalEye:
     Parameters
     ----------
     age_years : float
-        Of the person: the pupil is smaller with age.
+        Age of the person; the pupil shrinks with age.
     field_area_deg2 : float
-        What the display covers.
+        Area of the display in the visual field, deg2.
     pupil_diameter_mm : float, optional
-        Fixed, instead of following the light.
+        Fixed pupil, instead of one that follows the light.
 
     Raises
     ------
@@ -95,26 +95,26 @@ class NaturalEye:
     def look(
         self, luminance_cd_m2: float, distance_dpt: float, at_s: float
     ) -> EyeState:
-        """See this light and look at this distance from now on; return the eye now.
+        """Set the luminance and distance from now on; return the current state.
 
         Parameters
         ----------
         luminance_cd_m2 : float
-            Mean of what is seen; see the function of this name.
+            Mean luminance of the image; see the function of this name.
         distance_dpt : float
-            One over metres; beyond 0 to `MAX_VERGENCE_DPT` it is taken as the limit.
+            Inverse distance, 1/m, clipped to 0 to `MAX_VERGENCE_DPT`.
         at_s : float
-            By any clock; it runs on only.
+            Time of any monotonic clock.
 
         Raises
         ------
         ValueError
-            No light (``luminance_cd_m2`` below 0), or something not finite.
+            If ``luminance_cd_m2`` is negative or a value is not finite.
         """
         if self._fixed_mm is not None:
             pupil_mm = self._fixed_mm
         else:
-            if self._pupil is None:  # steady in what it sees first
+            if self._pupil is None:  # starts in the steady state
                 self._pupil = PupilReflex(
                     self._age_years, self._field_area_deg2, luminance_cd_m2
                 )
@@ -123,7 +123,7 @@ class NaturalEye:
         focus_dpt = self._focus.follow(wanted_dpt, at_s)
         far_dpt, near_dpt = self._far_dpt, self._near_dpt
         self._focus.hold(far_dpt, near_dpt)
-        # At its limit it tries on: so a limit that has moved is found out.
+        # At its limit the eye keeps requesting more, to detect a limit that has moved.
         if focus_dpt <= far_dpt:
             focus_dpt = min(wanted_dpt, far_dpt)
         elif focus_dpt >= near_dpt:
@@ -131,16 +131,15 @@ class NaturalEye:
         return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
 
     def learn(self, asked_dpt: float, used_dpt: float) -> None:
-        """Take in what a filter made of a focus: where this eye cannot follow.
+        """Learn the far and near point from the focus that a filter used.
 
-        Farther than its far point, or nearer than its near point, the eye does not
-        move; its way back begins there.  Both change with the pupil: an eye at its
-        limit goes on asking for more.
+        The focus does not go beyond the far or near point, and moves back from there.
+        Both points change with the pupil, so an eye at its limit keeps requesting more.
 
         Parameters
         ----------
         asked_dpt, used_dpt : float
-            What a frame was sent with, and what came back with its picture.
+            Focus that a frame was sent with, and focus returned with the result.
         """
         if used_dpt > asked_dpt + LIMIT_STEP_DPT:
             self._far_dpt = used_dpt
@@ -150,25 +149,25 @@ class NaturalEye:
         self._near_dpt = max(self._near_dpt, used_dpt)
 
     def change(self) -> None:
-        """Become another eye, whose far and near point are not known yet."""
+        """Reset the far and near point, after a change of the eye."""
         self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
 
 def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:
-    """Return the mean luminance of a picture on a display.
+    """Return the mean luminance of an image on a display.
 
     Parameters
     ----------
     color : (h, w, 3) uint8 sRGB
     white_cd_m2 : float
-        The display's white.
+        Luminance of the display's white.
     """
     light = _LINEAR_OF_SRGB8[color[::_STRIDE, ::_STRIDE]]
     return white_cd_m2 * float((light @ _LUMINANCE).mean())
 
 
 def field_area_deg2(camera: Camera) -> float:
-    """Return the area of what a camera sees, as the product of its two angles."""
+    """Return the area of a camera's field of view, the product of its two angles."""
     left, right, up, down = (math.degrees(math.atan(t)) for t in camera.tangents)
     return (right - left) * (up - down)
 
@@ -176,7 +175,7 @@ def field_area_deg2(camera: Camera) -> float:
 def distance_at(
     depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
 ) -> float | None:
-    """Return how far what is looked at is, in metres along the ray; None if unknown.
+    """Return the distance along the gaze, in meters; None if unknown.
 
     See `planar_depth_at`.
     """
@@ -196,16 +195,16 @@ def _on_image(gaze_deg: tuple[float, float]) -> tuple[float, float]:
 def planar_depth_at(
     depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
 ) -> float | None:
-    """Return the depth of what is looked at, in metres; None if unknown.
+    """Return the planar depth at the gaze, in meters; None if unknown.
 
-    The median over `WINDOW_DEG` to every side: one thin thing in front, or a pixel
-    without depth, does not change it.
+    The median over `WINDOW_DEG` to every side is robust against a thin object in front
+    and pixels without depth.
 
     Parameters
     ----------
     depth_m : (h, w) float32, planar
     gaze_deg : (h, v)
-        To the right and up from the camera's axis.
+        Angles to the right and up from the camera's axis.
     """
     x, y = _on_image(gaze_deg)
     left, right, up, down = camera.tangents
@@ -221,8 +220,8 @@ def planar_depth_at(
     window = depth_m[
         max(0, i - along) : i + along + 1, max(0, j - across) : j + across + 1
     ]
-    seen = window[window > 0]  # what is missing is not
+    seen = window[window > 0]  # without missing depth
     if seen.size == 0:
         return None
-    # Of the nearer one of two in the middle: a mean would lie between two things.
+    # The lower of the two middle values: their mean would lie between two objects.
     return float(np.partition(seen, (seen.size - 1) // 2)[(seen.size - 1) // 2])

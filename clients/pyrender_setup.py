@@ -1,6 +1,6 @@
-"""Import pyrender 0.1.45 on today's Python, without a display.
+"""Import of pyrender 0.1.45 on current Python versions, without a display.
 
-Import `pyrender` from here and nowhere else: three settings must come before it.
+Import `pyrender` only from here: three settings must precede its import.
 """
 
 import os
@@ -11,13 +11,13 @@ import pyglet
 
 # PyOpenGL reads the platform once, at its first import.
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-# pyrender imports its window viewer; without this pyglet looks for a display.
+# pyrender imports its viewer window, for which pyglet otherwise requires a display.
 pyglet.options["headless"] = True
 # Removed from numpy 2; pyrender's Scene.bounds still reads it.
 np.infty = np.inf  # noqa: NPY201
 
 with warnings.catch_warnings():
-    # Old syntax in a third party's files; nothing that we can mend from here.
+    # Old syntax in third-party files, which we cannot fix here.
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", SyntaxWarning)
     import pyrender
@@ -26,10 +26,10 @@ __all__ = ["delete_renderer", "pyrender", "release_context"]
 
 
 def release_context(renderer: "pyrender.OffscreenRenderer") -> None:
-    """Let go of the thread's EGL context, so that a GLX window may take over.
+    """Release the thread's EGL context, so that a GLX window can be used.
 
     pyrender's own hook for this does nothing, and X11 refuses a GLX context while an
-    EGL one is current.  The next render takes the context back by itself.
+    EGL one is current.  The next rendering makes the EGL context current again.
     """
     from OpenGL import EGL
 
@@ -41,12 +41,12 @@ def release_context(renderer: "pyrender.OffscreenRenderer") -> None:
 
 
 def delete_renderer(renderer: "pyrender.OffscreenRenderer") -> None:
-    """Free an off-screen renderer; afterwards no context is current."""
+    """Delete an off-screen renderer; afterwards no context is current."""
     platform = renderer._platform
     platform.make_current()
     renderer._renderer.delete()
-    # Before the display ends, not after as pyrender has it: NVIDIA's EGL then no longer
-    # knows the display, and Mesa's keeps the context alive.
+    # Release before the display is terminated, not after as in pyrender: otherwise
+    # NVIDIA's EGL no longer knows the display, and Mesa's keeps the context alive.
     release_context(renderer)
     platform.delete_context()
     renderer._renderer = renderer._platform = None

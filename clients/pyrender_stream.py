@@ -1,10 +1,10 @@
-"""Stream a scene through a running filter service, as a game or a viewer would.
+"""Stream a scene through a running filter service, like a game or a viewer.
 
     ocufilter serve &
     python -m clients.pyrender_stream --scene courtyard --profile keratoconus --window
 
-Frames are rendered and sent without waiting for answers; of those that wait, the
-newest wins.
+Frames are rendered and sent without waiting for replies; the newest frame replaces one
+that waits to be sent.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
     moments = [m for name in scene_names for m in path_moments(PATHS[name], 200)]
     pupils_mm = [moment.pupil_diameter_mm for moment in moments]
     foci_dpt = [moment.focus_dpt for moment in moments]
-    # The nearest thing in a scene is at 0.12 m; the margins are for rounding.
+    # The nearest object in a scene is at 0.12 m; the margins allow for rounding.
     return {
         "pupil_range_mm": (min(pupils_mm) - 0.01, max(pupils_mm) + 0.01),
         "focus_range_dpt": (max(min(foci_dpt) - 0.01, 0.0), max(foci_dpt) + 0.01),
@@ -74,7 +74,7 @@ def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
 def _looped_frames(
     scene: Scene, size_px: tuple[int, int], n_frames: int, *, with_hidden: bool
 ) -> Iterator[SceneFrame]:
-    """Follow the scene's path to its end and back, without end."""
+    """Follow the scene's path back and forth, endlessly."""
     moments = path_moments(PATHS[scene.name], n_frames)
     moments = moments + moments[-2:0:-1]
     with SceneRenderer(scene, size_px) as renderer:
@@ -86,7 +86,7 @@ def _looped_frames(
 def looking_around(
     frames: Iterator[SceneFrame], reach_deg: float
 ) -> Iterator[SceneFrame]:
-    """Let the eye's gaze go round the image, twice as far to the sides as up."""
+    """Move the gaze around the image, twice as far to the sides as up and down."""
     for number, frame in enumerate(frames):
         turn = 2 * np.pi * number / FRAMES_PER_ROUND
         h_deg, v_deg = reach_deg * np.sin(turn), 0.5 * reach_deg * np.cos(turn)
@@ -100,7 +100,7 @@ def looking_naturally(
     white_cd_m2: float = USUAL_WHITE_CD_M2,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[SceneFrame]:
-    """Let focus follow what is looked at, and the pupil the light, as they do."""
+    """Let the focus follow the fixated object, and the pupil the light."""
     for frame in frames:
         height_px, width_px = frame.depth_m.shape
         camera = Camera(width_px, height_px, frame.tangents)
@@ -128,8 +128,8 @@ def stream(
 
     Parameters
     ----------
-    show : called with (input, filtered, title) for each answer; false ends the stream.
-    learn : called with the focus that a frame asked for, and the one that was used.
+    show : called with (input, filtered, title) for each reply; false ends the stream.
+    learn : called with the focus that a frame requested and the focus that was used.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def stream(
     Raises
     ------
     FilterError
-        The service refuses a frame or stops answering.
+        If the service rejects a frame or stops answering.
     """
     sent: dict[int, SceneFrame] = {}
     n_sent = 0
@@ -160,7 +160,7 @@ def stream(
 
 
 def _take_answers(client, sent, log, show, learn, *, timeout_s: float) -> bool:
-    """Handle what has come back; return whether to go on."""
+    """Handle the replies; return whether to continue."""
     events = client.poll(timeout_s)
     if not events and timeout_s:
         raise ServiceTimeout(f"no answer to a frame within {timeout_s:g} s")
@@ -174,7 +174,7 @@ def _take_answers(client, sent, log, show, learn, *, timeout_s: float) -> bool:
         elif isinstance(event, FilteredFrame):
             log.add(event)
             frame = sent.pop(event.frame_id)
-            if event.header.is_complete:  # a preview's focus tells nothing of the eye
+            if event.header.is_complete:  # a preview has a focus of its own
                 learn(frame.focus_dpt, event.header.focus_dpt)
             if show is not None:
                 go_on = show(frame.color, event.color, _title(event)) and go_on
@@ -239,7 +239,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Connect, stream, and return what the log says."""
+    """Connect and stream; return the summary of the log."""
     reach_deg = options.look_around
     if not 0.0 <= reach_deg <= MAX_LOOK_AROUND_DEG:
         raise ValueError(

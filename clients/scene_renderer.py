@@ -1,4 +1,4 @@
-"""Render a scene's colour and depth off screen with pyrender, without a display."""
+"""Off-screen rendering of a scene's color and depth with pyrender."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ class SceneFrame:
     tangents : left, right, up, down of the view
     pose : (4, 4), camera to world
     pupil_diameter_mm, focus_dpt : suggested state of the eye
-    gaze_deg : (h, v), where it looks in the image; None is straight on
-    hidden_color, hidden_depth_m : the same of what is behind, where asked for; depth 0
-        where nothing is
+    gaze_deg : (h, v), gaze direction in the image; None is straight ahead
+    hidden_color, hidden_depth_m : color and depth of the hidden layer, if requested;
+        depth 0 where nothing is hidden
     """
 
     color: NDArray[np.uint8]
@@ -43,24 +43,24 @@ class SceneFrame:
 
 
 class SceneRenderer:
-    """An off-screen window onto one scene.
+    """An off-screen renderer of one scene.
 
     Parameters
     ----------
-    scene : what to show
+    scene : scene to render
     size_px : (width, height)
     supersampling : samples per pixel and axis
 
     Raises
     ------
     ValueError
-        A size below 1 px.
+        If a size is below 1 px.
 
     Notes
     -----
-    A pixel's colour is the mean of its samples in linear light.  Its depth is that of
-    one sample, the second nearest of each four, so that it is never a depth at which
-    nothing is: a mean across an edge would be.
+    A pixel's color is the mean of its samples in linear light.  Its depth is that of
+    one sample, the second nearest of each four, so that a surface exists at that depth,
+    unlike at the mean across an edge.
     """
 
     def __init__(self, scene: Scene, size_px: tuple[int, int], *, supersampling=2):
@@ -94,19 +94,19 @@ class SceneRenderer:
         self.close()
 
     def close(self) -> None:
-        """Free the GL context."""
+        """Release the GL context."""
         self._hidden.close()
         delete_renderer(self._renderer)
 
     def render(self, pose: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Return colour (h, w, 3) and planar depth (h, w) seen from a pose (4, 4)."""
+        """Return color (h, w, 3) and planar depth (h, w) seen from a pose (4, 4)."""
         return self._render(pose, with_hidden=False)[0]
 
     def render_layers(self, pose: Array) -> tuple[tuple[NDArray, NDArray], ...]:
-        """Return colour and depth as seen, and those of what is behind.
+        """Return color and depth of the visible surface and of the hidden layer.
 
-        Depth of the second is 0 where nothing is behind.  Its colour is the mean of a
-        pixel's samples that show something.
+        Depth of the hidden layer is 0 where nothing is hidden.  Its color is the mean
+        of the pixel's samples that have a hidden surface.
         """
         return self._render(pose, with_hidden=True)
 
@@ -142,7 +142,7 @@ def scene_frames(
     *,
     with_hidden: bool = False,
 ) -> Iterator[SceneFrame]:
-    """Render a scene along a camera path, the scene's own when `path` is None."""
+    """Render a scene along a camera path; `path` None is the scene's own."""
     moments = path_moments(path or PATHS[scene.name], n_frames)
     with SceneRenderer(scene, size_px) as renderer:
         for moment in moments:
@@ -171,7 +171,7 @@ def frame_at(
 
 
 def _primitive(batch) -> "pyrender.Primitive":
-    """Hand one batch to pyrender as an unlit, two-sided draw call."""
+    """Convert one batch to an unlit, two-sided draw call of pyrender."""
     alpha = np.ones((len(batch.srgb), 1), np.float32)
     return pyrender.Primitive(
         positions=batch.vertices_m,
@@ -204,20 +204,20 @@ _SRGB8_FROM_LINEAR = np.round(
 
 
 def _is_behind(seen_m, hidden_m) -> NDArray[np.bool_]:
-    """Return whether something is behind, far enough to matter."""
+    """Return where the hidden surface is far enough behind to matter."""
     return 1.0 / seen_m - 1.0 / hidden_m >= LEAST_GAP_DPT
 
 
 def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
-    """Return colour and depth of pixels from their samples that show something.
+    """Return color and depth of hidden pixels from the samples that have a surface.
 
-    A pixel holds something where its depth is behind that of what is seen there: what
-    is behind a sliver of a nearer surface, the pixel shows already.
+    Depth is 0 unless it lies behind the pixel's visible depth: a surface behind a
+    sliver of a nearer one is visible in the pixel already.
     """
     light = _blocks(_LINEAR_FROM_SRGB8[color] * shows[..., None], samples).sum(axis=2)
     count = _blocks(shows, samples).sum(axis=2)
     light /= np.maximum(count, 1)[..., None]
-    # Missing samples sort last, and the rank is among those that show something.
+    # Missing samples sort last; the rank counts only the others.
     ordered = np.sort(
         _blocks(np.where(shows, depth_m, np.float32(np.nan)), samples), axis=2
     )
@@ -238,7 +238,7 @@ def _blocks(image, samples: int) -> NDArray:
 
 
 def _mean_color(color, samples: int) -> NDArray[np.uint8]:
-    """Average blocks of sRGB samples in linear light; tables keep it fast."""
+    """Average blocks of sRGB samples in linear light, with tables for speed."""
     linear = _LINEAR_FROM_SRGB8[color]
     # Strided sums are several times faster than mean() over a five-axis view.
     total = sum(

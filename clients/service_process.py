@@ -1,4 +1,4 @@
-"""A filter service started as a process of its own, for demos, benchmarks and tests."""
+"""A filter service in a child process, for demos, benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from typing import Any
 
 SERVE_COMMAND = (sys.executable, "-m", "filter_service", "serve")
 CHECKOUT = Path(__file__).resolve().parents[1]
-# There `-m` finds our packages whatever the folder; installed ones are found anyway.
+# From there, `-m` finds our packages; installed packages are found from any folder.
 SERVICE_FOLDER = CHECKOUT if (CHECKOUT / "pyproject.toml").is_file() else None
 POLL_S = 0.02
 LOG_TAIL_CHARACTERS = 2000
 
 
 class ServiceProcess:
-    """`ocufilter serve` on a free port of this machine, from start to clean end.
+    """`ocufilter serve` on a free local port, from start to clean shutdown.
 
     Parameters
     ----------
     settings : mapping, optional
         Fields of the service's configuration file.
     command : sequence of str
-        What is started; ``--config FILE`` is appended.
+        Command to start; ``--config FILE`` is appended.
     start_timeout_s : float
-        The longest wait for the service to be ready.
+        Timeout for the service to become ready.
     wait : bool
-        Whether to wait for it here; otherwise `await_ready` does, after other work.
+        Whether to wait until it is ready; otherwise call `await_ready` later.
 
     Examples
     --------
@@ -68,23 +68,23 @@ class ServiceProcess:
             self.await_ready(start_timeout_s)
 
     def __enter__(self) -> ServiceProcess:
-        """Return the service, ready if it was waited for."""
+        """Return the service, which is ready if ``wait`` was set."""
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """End the service."""
+        """Stop the service."""
         self.stop()
 
     @property
     def log(self) -> str:
-        """Return what the service has printed."""
+        """Return the output of the service."""
         return self._log_file.read_text(encoding="utf-8", errors="replace")
 
     def pids(self) -> dict[str, int]:
         """Return the processes of the service by name: keeper, door, render (Linux).
 
-        With a second process that filters, the one that stands by is `standby`; those
-        of several devices are `render 0` and so on.
+        If there is a second render process, the spare one is `standby`; the render
+        processes of several devices are `render 0` and so on.
         """
         keeper = self.process.pid
         found = {"keeper": keeper}
@@ -106,7 +106,7 @@ class ServiceProcess:
 
     @property
     def memory_mb(self) -> float:
-        """Return the memory that the service holds now, without its worker (Linux)."""
+        """Return the memory in use by the service, without its worker (Linux)."""
         kilobytes = 0
         for pid in self.pids().values():
             status = Path(f"/proc/{pid}/status").read_text().splitlines()
@@ -115,7 +115,7 @@ class ServiceProcess:
         return kilobytes / 1e3
 
     def stop(self, timeout_s: float = 10.0) -> int:
-        """Ask the service to end; return its exit code."""
+        """Stop the service with SIGTERM; return its exit code."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         try:
@@ -129,18 +129,18 @@ class ServiceProcess:
         return code
 
     def kill(self) -> None:
-        """End the service as a crash would."""
+        """Kill the service, like a crash."""
         self.process.kill()
         self.process.wait()
         self._folder.cleanup()
 
     def await_ready(self, timeout_s: float = 60.0) -> None:
-        """Return when frames may come; a service that fails to start is ended.
+        """Wait until the service accepts frames; kill it if it fails to start.
 
         Raises
         ------
         RuntimeError
-            It has ended or takes too long; says what it has printed.
+            If it has ended or takes too long; the message includes its output.
         """
         try:
             self._await_ready(timeout_s)

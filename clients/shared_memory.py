@@ -1,8 +1,8 @@
 """Images in memory that the service shares with its clients on the same machine.
 
-A client asks for slots as it needs them; until they come, and where they cannot be had,
-its images travel as parts of messages.  What the service puts into a slot is handed out
-as it lies there: the slot is free again when nobody has the array any more.
+A client requests slots as it needs them.  Until they arrive, or if they are not
+available, its images are sent as parts of messages.  Results in a slot are returned
+without a copy: the slot is free again when the array is no longer referenced.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ log = logging.getLogger("ocufilter")
 
 @dataclass(eq=False)
 class ClientSlot:
-    """A slot, and how many users it has: frames on their way, arrays handed out."""
+    """A slot and its number of users: frames in flight and returned arrays."""
 
     slot: Slot
     n_users: int = 0
 
     def release(self) -> None:
-        """Note that it has one user less."""
+        """Decrement the number of users."""
         self.n_users -= 1
 
 
 class SharedMemory:
-    """The slots of one session.
+    """The shared memory slots of one session.
 
     Parameters
     ----------
     say : callable
-        Sends a message to the service.
+        Function that sends a message to the service.
     """
 
     def __init__(self, say: Callable[[Share | Unshare], None]) -> None:
@@ -55,14 +55,14 @@ class SharedMemory:
         self.is_offered = False
 
     def begin(self, *, is_offered: bool) -> None:
-        """Forget the slots of an earlier connection; arrays in them stay valid."""
+        """Discard the slots of an earlier connection; arrays in them stay valid."""
         for held in self._slots:
             held.slot.close()
         self._slots, self._n_asked = [], 0
         self.is_offered = is_offered
 
     def take_in(self, reply: Shared) -> None:
-        """Map a slot that the service gives."""
+        """Map a slot that the service provides."""
         self._n_asked -= 1
         if reply.slot is None or reply.size_bytes is None:
             log.info("no shared memory: %s", reply.reason)
@@ -78,7 +78,7 @@ class SharedMemory:
         self._slots.append(ClientSlot(slot))
 
     def take(self, size_bytes: int) -> ClientSlot | None:
-        """Return a free slot with so much room; ask for one where there is none."""
+        """Return a free slot of at least this size; if there is none, request one."""
         if not self.is_offered:
             return None
         most = KEPT_RATIO * max(size_bytes, PAGE_BYTES)
@@ -99,7 +99,7 @@ class SharedMemory:
         return None
 
     def holding(self, images: Sequence[NDArray[Any]]) -> ClientSlot | None:
-        """Return the slot in which images lie where `places` would put them."""
+        """Return the slot that already holds the images at the expected offsets."""
         starts, _ = starts_of([image.nbytes for image in images])
         for held in self._slots:
             base = held.slot.array(0, (1,), np.dtype(np.uint8)).ctypes.data
@@ -113,15 +113,15 @@ class SharedMemory:
     def array(
         self, held: ClientSlot, start: int, shape: tuple[int, ...], dtype: Any
     ) -> NDArray[Any]:
-        """Return an array in a slot, which is a user as long as somebody has it."""
+        """Return an array in a slot; it counts as a user while it is referenced."""
         array = held.slot.array(start, shape, np.dtype(dtype))
         held.n_users += 1
-        # What views of the array hold on to is its base.
+        # Views of the array keep a reference to its base.
         weakref.finalize(array.base, held.release)
         return array
 
     def _drop_one(self) -> None:
-        """Give the largest free slot back: images have another size now."""
+        """Return the largest free slot to the service: the image size has changed."""
         free = [held for held in self._slots if not held.n_users]
         if free:
             largest = max(free, key=lambda held: held.slot.size_bytes)

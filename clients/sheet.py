@@ -1,4 +1,4 @@
-"""Lay out pictures with captions: frames of the demo's video and its contact sheet."""
+"""Layout of images with captions: frames of the demo's video and its contact sheet."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ MAX_CELL_WIDTH_PX = 480
 
 @dataclass(frozen=True)
 class Cell:
-    """One picture and its caption.
+    """One image and its caption.
 
     Attributes
     ----------
     image : (h, w, 3) uint8, sRGB
     title : one line
     lines : smaller lines below the title
-    detail : a magnified part, drawn below the picture; optional
+    detail : a magnified part, drawn below the image; optional
     """
 
     image: NDArray[np.uint8]
@@ -41,18 +41,18 @@ class Cell:
 
 @dataclass(frozen=True)
 class EyeState:
-    """What is shown of the eye at one moment."""
+    """State of the eye at one moment, for captions."""
 
     scene: str
     pupil_diameter_mm: float
     focus_dpt: float
 
     def text(self) -> str:
-        """Return it as one line for a caption."""
+        """Return the state as one line for a caption."""
         return f"pupil {self.pupil_diameter_mm:.1f} mm, focus {self.distance()}"
 
     def distance(self) -> str:
-        """Return the distance focused on, as people say it."""
+        """Return the focus distance as text."""
         if self.focus_dpt < 0.02:
             return "far away"
         distance_m = 1 / self.focus_dpt
@@ -62,14 +62,14 @@ class EyeState:
 
 
 def cell_size_px(image_size_px: tuple[int, int]) -> tuple[int, int]:
-    """Return the size at which an image (width, height) is shown, even both ways."""
+    """Return the display size of an image (width, height), both even."""
     width, height = image_size_px
     shown = min(max(width, MIN_CELL_WIDTH_PX), MAX_CELL_WIDTH_PX) // 2 * 2
     return shown, max(2, round(shown * height / width / 2) * 2)
 
 
 def fitted(image: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize an image (h, w, 3) to (width, height); its own size stays as it is."""
+    """Resize an image (h, w, 3) to (width, height), unless it has that size."""
     if image.shape[1::-1] == size_px:
         return image
     picture = Image.fromarray(image)
@@ -83,7 +83,7 @@ def magnified(
 
     Parameters
     ----------
-    corner : upper left corner as parts of the image's width and height
+    corner : upper left corner in parts of the image's width and height
     size_px : (width, height) of a cell; the strip has its width and half its height.
     """
     height, width = image.shape[:2]
@@ -95,9 +95,9 @@ def magnified(
 def video_frame(
     cells: Sequence[Cell], state: EyeState, depth_m: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """Return one frame of the video: every picture, and a panel with the eye's state.
+    """Return one video frame: every image, and a panel with the state of the eye.
 
-    Width and height are even, as video encoders need them.
+    Width and height are even, as video encoders require.
     """
     size_px = cells[0].image.shape[1::-1]
     panel = Cell(state_panel(size_px, state, depth_m), "Pupil, focus, depth")
@@ -108,7 +108,7 @@ def video_frame(
 def contact_sheet(
     blocks: Sequence[tuple[str, Sequence[Cell]]], heading: str
 ) -> Image.Image:
-    """Return a page of titled blocks of pictures, one below the other."""
+    """Return a page of titled blocks of images, one below the other."""
     pages = [_grid(cells, title=title, line_px=22) for title, cells in blocks]
     width = max(page.width for page in pages)
     top = 58
@@ -122,7 +122,7 @@ def contact_sheet(
 
 
 def _grid(cells: Sequence[Cell], *, title: str, line_px: int) -> Image.Image:
-    """Return cells in two rows (one when they are few) below a title."""
+    """Return cells in two rows (one if there are few) below a title."""
     columns = len(cells) if len(cells) <= 3 else (len(cells) + 1) // 2
     rows = -(-len(cells) // columns)
     height_px, width_px = cells[0].image.shape[:2]
@@ -153,7 +153,7 @@ def _grid(cells: Sequence[Cell], *, title: str, line_px: int) -> Image.Image:
 
 
 def _caption(draw, cell: Cell, corner, size, line_px: int) -> None:
-    """Write a cell's title and lines into the bar below its picture."""
+    """Draw a cell's title and lines into the bar below its image."""
     left, top = corner
     draw.rectangle((left, top, left + size[0] - 1, top + size[1] - 1), fill=_BAR)
     draw.text((left + 10, top + 16), cell.title, fill=_INK, font=_font(20), anchor="lm")
@@ -164,7 +164,7 @@ def _caption(draw, cell: Cell, corner, size, line_px: int) -> None:
 
 
 def state_panel(size_px, state: EyeState, depth_m) -> NDArray[np.uint8]:
-    """Draw the pupil at the size of the moment, the focus on a scale, the depth map."""
+    """Draw the pupil at its current size, the focus on a scale, and the depth map."""
     width, height = size_px
     panel = Image.new("RGB", size_px, "#0d1013")
     draw = ImageDraw.Draw(panel)
@@ -196,7 +196,7 @@ def _disc(draw, x: float, y: float, radius: float, color: str) -> None:
 
 
 def _focus_scale(draw, size_px, state: EyeState, small: int) -> None:
-    """Draw a scale of dioptres with a mark at the focus asked for."""
+    """Draw a scale of diopters with a mark at the requested focus."""
     width, height = size_px
     left, right, y = 0.08 * width, 0.92 * width, 0.82 * height
     top_dpt = 4.5
@@ -221,7 +221,7 @@ def _focus_scale(draw, size_px, state: EyeState, small: int) -> None:
 
 
 def _depth_picture(depth_m, size_px) -> Image.Image:
-    """Return depth as brightness, evenly in the logarithm from 0.15 to 30 m."""
+    """Return depth as brightness, on a logarithmic scale from 0.15 to 30 m."""
     log = np.log(np.clip(depth_m, 0.15, 30.0) / 30.0) / np.log(0.15 / 30.0)
     return Image.fromarray(np.round(255 * log).astype(np.uint8)).resize(size_px)
 

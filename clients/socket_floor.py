@@ -1,4 +1,4 @@
-"""How long a frame's bytes take over a bare socket: no protocol goes below that."""
+"""Round trip of a frame's bytes over a bare socket: a lower bound for any protocol."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 N_EXCHANGES = 40
 PAUSE_S = 0.03
-"""Between two exchanges: about that of a stream, in which processes fall asleep."""
+"""Pause between exchanges, about that of a stream, during which processes sleep."""
 
 ANSWER_WITH = """
 import socket, sys
@@ -35,14 +35,14 @@ while True:
 
 
 def socket_floor_ms(transport: str, n_up: int, n_down: int) -> float:
-    """Return the median time of sending so many bytes and getting others back.
+    """Return the median round trip of a request and a reply of given sizes.
 
     Parameters
     ----------
     transport : "tcp" or another
-        Another stands for a Unix socket.
+        "tcp"; any other value stands for a Unix socket.
     n_up, n_down : int
-        Bytes that go to another process, and that come back.
+        Bytes sent to another process, and bytes returned.
     """
     with (
         tempfile.TemporaryDirectory() as folder,

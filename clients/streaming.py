@@ -1,6 +1,6 @@
-"""Send rendered frames through a service: in order, while an eye changes, with a log.
+"""Streaming of rendered frames through a service: in order, and while an eye changes.
 
-Between the scenes' frames and the client library; `pyrender_stream` and `demo` use it.
+`pyrender_stream` and `demo` use it to pass rendered frames to the client library.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from clients.scene_renderer import SceneFrame
 from filter_service.errors import ConnectionLost, ServiceTimeout
 from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Ready
 
-# Frames a second while an eye is being prepared: enough to see that the stream goes
-# on, few enough to leave the processor to the preparation.
+# Frames per second while an eye is being prepared: enough to show that the stream
+# continues, few enough to leave the processor to the preparation.
 _PREVIEW_HZ = 4.0
 _BUILD_LIMIT_S = 180.0
 _LOST = "the connection to the service broke off"
 
 
 def view_of(frame: SceneFrame) -> RgbdView:
-    """Return a rendered frame as the client library takes it."""
+    """Convert a rendered frame to the view type of the client library."""
     return RgbdView(
         frame.color,
         frame.depth_m,
@@ -37,14 +37,14 @@ def view_of(frame: SceneFrame) -> RgbdView:
 def filter_in_order(
     client: FilterClient, frames: Iterable[SceneFrame], log: FrameLog
 ) -> Iterator[tuple[SceneFrame, FilteredFrame]]:
-    """Send one frame after the other and yield each with its filtered image.
+    """Send frames one by one and yield each with its filtered image.
 
     A frame that the service drops is counted and sent again.
 
     Raises
     ------
     FilterError
-        The service refuses a frame, does not answer in time or is gone.
+        If the service rejects a frame, does not answer in time or disconnects.
     """
     for frame in frames:
         while True:
@@ -59,7 +59,7 @@ def filter_in_order(
 
 
 def _check_connection(event) -> None:
-    """Raise where a frame was dropped because the service went away."""
+    """Raise if a frame was dropped because the service disconnected."""
     if isinstance(event, Dropped) and event.reason == "connection_lost":
         raise ConnectionLost(_LOST)
 
@@ -74,7 +74,7 @@ def _submit(client: FilterClient, frame: SceneFrame) -> int:
 
 
 def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
-    """Wait for the one frame that is on its way."""
+    """Wait for the reply to the one frame in flight."""
     deadline_s = time.monotonic() + client.timeout_s
     while time.monotonic() < deadline_s:
         for event in client.poll(0.2):
@@ -82,7 +82,7 @@ def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
                 raise event.exception()
             if isinstance(event, FilteredFrame | Dropped):
                 return event
-        # A frame that was not on its way yet waits for the next connection.
+        # A frame that was not sent yet would wait for the next connection.
         if client.welcome is None:
             raise ConnectionLost(_LOST)
     raise ServiceTimeout(f"no answer to a frame within {client.timeout_s:g} s")
@@ -90,13 +90,13 @@ def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
 
 @dataclass(frozen=True)
 class EyeChange:
-    """How one eye took over from another while frames went on.
+    """Record of a change of the eye during a stream.
 
     Attributes
     ----------
-    generation, previous_generation : as the service counts eyes; None before any eye
-    frames_through_previous : frames answered with the old eye during preparation
-    ready : what the service says of the new eye
+    generation, previous_generation : the service's eye counter; None before any eye
+    frames_through_previous : frames filtered with the old eye during preparation
+    ready : the service's Ready message of the new eye
     """
 
     generation: int
@@ -126,20 +126,20 @@ def change_eye(
     has_eye: bool,
     on_progress: Callable[[float, str], None] = lambda fraction, stage: None,
 ) -> EyeChange:
-    """Ask for another eye and keep the stream going until it is ready.
+    """Request another eye and continue the stream until it is ready.
 
     Parameters
     ----------
-    body : profile, as ``{"kind": "preset", "name": "myopia"}``
+    body : profile, such as ``{"kind": "preset", "name": "myopia"}``
     settings : fields of `FilterSettings`
-    frames : sent round and round meanwhile; the first one's camera is prepared for
-    has_eye : whether an earlier eye serves them
+    frames : sent in a loop meanwhile; the eye is prepared for the first one's camera
+    has_eye : whether an earlier eye can filter them
     on_progress : called with (fraction 0..1, stage)
 
     Raises
     ------
     FilterError
-        The profile is refused, its preparation fails or takes too long.
+        If the profile is rejected, or its preparation fails or takes too long.
     """
     accepted = client.set_profile(
         body,
@@ -170,7 +170,7 @@ def change_eye(
 
 
 class _ChangeWatch:
-    """Sorts what happens while an eye is prepared."""
+    """Collects events while an eye is prepared."""
 
     def __init__(self, accepted: Accepted, on_progress) -> None:
         self._accepted, self._on_progress = accepted, on_progress
@@ -179,7 +179,7 @@ class _ChangeWatch:
         self.n_through_old = 0
 
     def take(self, event) -> None:
-        """Count a frame, pass progress on, keep Ready; raise what went wrong."""
+        """Count frames, report progress and keep Ready; raise on errors."""
         if isinstance(event, ErrorReply):
             raise event.exception()
         _check_connection(event)

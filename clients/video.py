@@ -1,4 +1,4 @@
-"""Write a video: H.264 in MP4 where the encoder works, an animated GIF elsewhere."""
+"""Video output: H.264 in MP4 if the encoder works, otherwise an animated GIF."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def write_video(
     Parameters
     ----------
     stem : path without its suffix
-    frames : gives the frames (h, w, 3) uint8 from the first, each time it is called;
-        width and height even.
+    frames : function that returns the frames (h, w, 3) uint8 from the start at each
+        call; width and height must be even.
 
     Returns
     -------
-    The path that was written.
+    Path of the written file.
     """
     target = stem.with_suffix(".mp4")
     try:
         _write_mp4(target, frames(), frames_per_second)
     except (OSError, RuntimeError):
-        # No ffmpeg for this machine, or it died: its pipe breaks.
+        # No ffmpeg on this machine, or it crashed and broke the pipe.
         target.unlink(missing_ok=True)
         return _write_gif(stem.with_suffix(".gif"), frames(), frames_per_second)
     return target

@@ -1,4 +1,4 @@
-"""A live window: the scene on the left, what the eye sees on the right."""
+"""A live window: the scene on the left, the filtered image on the right."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ void main() { color = vec4(texture(image, uv).rgb, 1.0); }
 
 
 class NoDisplay(Exception):
-    """There is no screen to open a window on."""
+    """No display is available for a window."""
 
 
 class LiveWindow:
-    """A window with two pictures side by side.
+    """A window with two images side by side.
 
     Parameters
     ----------
-    size_px : (width, height) of one picture
+    size_px : (width, height) of one image
     title : text of the title bar
 
     Raises
     ------
     NoDisplay
-        No display, or none that offers OpenGL 4.3.
+        If there is no display with OpenGL 4.3.
 
     Notes
     -----
     pyrender draws through EGL and this window, on X11, through GLX.  One thread cannot
-    hold a context of each, so the window takes its context for `show` and lets it go.
+    hold a context of each, so the window's context is current only during `show`.
     """
 
     def __init__(self, size_px: tuple[int, int], title: str) -> None:
@@ -85,7 +85,7 @@ class LiveWindow:
 
     @property
     def is_open(self) -> bool:
-        """Return whether the person has not closed it (Esc, or the close button)."""
+        """Return whether the window is open (Esc or the close button closes it)."""
         return self._window is not None and not glfw.window_should_close(self._window)
 
     def show(
@@ -94,12 +94,12 @@ class LiveWindow:
         right: NDArray[np.uint8],
         title: str | None = None,
     ) -> bool:
-        """Draw two pictures (h, w, 3) of the window's size; return `is_open`.
+        """Draw two images (h, w, 3) of the window's size; return `is_open`.
 
         Raises
         ------
         ValueError
-            A picture of another size.
+            If an image has another size.
         """
         glfw.make_context_current(self._window)
         try:
@@ -111,7 +111,7 @@ class LiveWindow:
                         f"picture of shape {image.shape}; the window shows "
                         f"{(texture.height, texture.width, 3)}"
                     )
-                # Rows of three bytes a pixel are not always a multiple of four.
+                # Rows of three bytes per pixel are not always a multiple of four.
                 texture.write(np.ascontiguousarray(image), alignment=1)
                 texture.use()
                 self._context.viewport = (i * width // 2, 0, width // 2, height)
@@ -125,7 +125,7 @@ class LiveWindow:
         return self.is_open
 
     def shown(self) -> NDArray[np.uint8]:
-        """Read back what the window last drew, (h, 2w, 3), top row first."""
+        """Read back the window's last image, (h, 2w, 3), top row first."""
         glfw.make_context_current(self._window)
         try:
             width, height = glfw.get_framebuffer_size(self._window)

@@ -1,22 +1,22 @@
-"""Figures of an eye, for reports and pages: matplotlib without pyplot, safe in threads.
+"""Figures of an eye, for reports and web pages: matplotlib without pyplot, thread-safe.
 
     study = EyeStudy.of("keratoconus")
     mtf_figure(study).savefig("mtf.svg")
 
-`NAME_figure` gives a figure of its own, `draw_NAME` draws into axes, or into a figure
-or part of one where it needs several axes.
+`NAME_figure` returns a new figure.  `draw_NAME` draws into axes, or into a figure or
+subfigure if it needs several axes.
 
 study           `EyeStudy`: one eye, estimated and traced once
-pupil_wavefront  one wavefront, and what its optics pass on
-style           sizes, colours, type
+pupil_wavefront  one wavefront in the pupil, and its transfer function
+style           sizes, colors, fonts
 wavefront       maps of a wavefront
 orders          RMS by radial order, coefficients
-psfs            what becomes of a point of light
+psfs            images of point-spread functions
 transfer_curves  contrast by spatial frequency
 field_maps      refraction and blur over the visual field
-acuity          what can be read at each distance
-acuity_curves   and as curves
-section         the eye, cut, with rays
+acuity          visual acuity by distance
+acuity_curves   curves of visual acuity
+section         cross-section of the eye, with rays
 """
 
 import lazy_loader

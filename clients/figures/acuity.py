@@ -1,4 +1,4 @@
-"""What an eye may read at each distance, as its optics let it."""
+"""Visual acuity of an eye by distance, as limited by its optics."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from clients.figures.pupil_wavefront import PupilWavefront
 from estimator import EyeOptics, log_mar_of
 
 STEP_COUNT, WITHIN_COUNT = 11, 3
-"""Distances of a curve, and of its part within the eye's reach."""
+"""Number of distances of a curve, and of its part within the accommodation range."""
 
 FINE_STEP_DPT = 0.25
-"""Of the curve of a lens with several foci: they lie 1 dpt apart."""
+"""Step of the curve of a lens with several foci, which lie 1 dpt apart."""
 
 PAST_LAST_FOCUS_DPT = 1.0
 
@@ -23,15 +23,15 @@ NEAREST_DPT = 5.0
 PAST_FAR_POINT_DPT = 2.0
 HIGHEST_DPT = 20.0
 LEAST_REACH_DPT = 1e-6
-"""An eye with less does not accommodate."""
+"""Smallest accommodation range; an eye with less does not accommodate."""
 
 
 class Seeing(Protocol):
-    """What is asked of an eye: an `EyeStudy`."""
+    """The interface required of an eye, which `EyeStudy` implements."""
 
     @property
     def optics(self) -> EyeOptics:
-        """On the axis, in all its states of focus."""
+        """Return the optics on the axis, in all states of focus."""
 
     def wavefront(
         self,
@@ -40,19 +40,19 @@ class Seeing(Protocol):
         object_dpt: float = 0.0,
         focus_dpt: float = 0.0,
     ) -> PupilWavefront:
-        """Return what a point makes in the pupil."""
+        """Return the wavefront of a point in the pupil."""
 
 
 @dataclass(frozen=True)
 class AcuityByDistance:
-    """Acuity through one pupil, logMAR; infinite where the blur is too wide to tell.
+    """Acuity through one pupil, logMAR; infinite where the blur is too wide.
 
     Attributes
     ----------
     object_dpt : (n,)
         Distances, far to near.
     far_log_mar, near_log_mar : (n,)
-        Of the eye that goes on looking far, and that accommodates for each distance.
+        Acuity of the eye focused far, and accommodating for each distance.
     """
 
     object_dpt: NDArray[np.float64]
@@ -69,9 +69,9 @@ def acuity_by_distance(study: Seeing, pupil_diameter_mm: float) -> AcuityByDista
 
 
 def acuity_log_mar(wavefront: PupilWavefront) -> float:
-    """Return the acuity of a wavefront; infinite where it is too steep to be told.
+    """Return the acuity of a wavefront; infinite if it is too steep to be resolved.
 
-    NaN through lenslets: nobody has found how people read through them.
+    NaN through lenslets: how people read through them is not known.
     """
     if not wavefront.is_readable:
         return np.nan
@@ -102,7 +102,7 @@ def distances_dpt(study: Seeing, pupil_diameter_mm: float) -> NDArray[np.float64
 def through_focus_log_mar(
     study: Seeing, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the acuity (n,) of an eye that looks far, logMAR, at distances (n,)."""
+    """Return the acuity (n,) of an eye focused far, logMAR, at distances (n,)."""
     return np.array(
         [
             acuity_log_mar(study.wavefront(pupil_diameter_mm, object_dpt=distance_dpt))
@@ -119,13 +119,13 @@ def accommodated_log_mar(
 ) -> NDArray[np.float64]:
     """Return the acuity (n,) of an eye that accommodates for each distance, logMAR.
 
-    Within the eye's reach it changes slowly: it is told at three distances and drawn
-    through them.
+    Within the accommodation range acuity changes slowly: it is computed at three
+    distances and interpolated.
 
     Parameters
     ----------
     far_log_mar : (n,)
-        Of the same eye that looks far: beyond its far point it is no better.
+        Acuity of the same eye focused far, which applies beyond its far point.
     """
     pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
     far_dpt, near_dpt = study.optics.focus_limits_dpt(pupil_mm)

@@ -1,4 +1,4 @@
-"""What an eye may read at each distance, as its optics let it."""
+"""Curves of visual acuity by distance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 def draw_through_focus_acuity(
     axes: Axes, study: EyeStudy, *, pupils_mm: Sequence[float] = PUPILS_MM
 ) -> None:
-    """Draw acuity by distance through pupils: looking far, and accommodating."""
+    """Draw acuity by distance through several pupils: focused far and accommodating."""
     colors = dict(zip(pupils_mm, PUPIL_COLORS, strict=False))
     for pupil_mm, color in colors.items():
         found = study.acuity(pupil_mm)
@@ -50,7 +50,7 @@ def draw_through_focus_acuity(
 def draw_acuity_of_several(
     axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str], pupil_mm: float
 ) -> None:
-    """Draw the acuity of several eyes that accommodate, through one pupil."""
+    """Draw the acuity of several accommodating eyes through one pupil."""
     colors = dict(zip(labels, (BLUE, GREEN), strict=False))
     nearest_dpt, is_known = 0.0, True
     for study, color in zip(studies, colors.values(), strict=True):

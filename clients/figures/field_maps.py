@@ -24,13 +24,13 @@ LEVEL_COUNT = 14
 
 
 def blur_arcmin(study: EyeStudy) -> NDArray[np.float64]:
-    """Return the blur (n,) of each direction while the eye looks far away, arcmin.
+    """Return the blur (n,) of each direction for an eye focused far, arcmin.
 
-    The root mean square radius of what the second order makes of a far point.
+    It is the RMS radius of a far point's blur by the second order.
     """
     m_dpt, j0_dpt, j45_dpt = study.field.power_dpt.T
     m_dpt = m_dpt - study.far_accommodation_dpt
-    # A point at r mm is sent aside by r times the power, in mrad; mean r² is R² / 2.
+    # A ray at r mm is deflected by r times the power, in mrad; mean r² is R² / 2.
     power_dpt = np.sqrt(m_dpt**2 + j0_dpt**2 + j45_dpt**2)
     return ARCMIN_PER_MRAD * power_dpt * study.field.zernike_radius_mm / np.sqrt(2.0)
 
@@ -38,12 +38,12 @@ def blur_arcmin(study: EyeStudy) -> NDArray[np.float64]:
 def draw_field_map(
     axes: Axes, values: NDArray[np.float64], *, title: str, label: str, middle=None
 ) -> None:
-    """Draw values (n,) of the field's directions.
+    """Draw a map of values (n,) of the field's directions.
 
     Parameters
     ----------
     middle : float, optional
-        What the diverging colours are white at; one colour that rises where None.
+        Value at which the diverging colors are white; sequential colors if None.
     """
     grid = values.reshape(FIELD_V_DEG.size, FIELD_H_DEG.size)
     levels, colors = LEVEL_COUNT, SEQUENTIAL
@@ -61,7 +61,7 @@ def draw_field_map(
 
 
 def draw_field_maps(panel: FigureBase, study: EyeStudy) -> None:
-    """Draw M, J0, J45 and blur over 60 x 40 deg, as the person sees the world."""
+    """Draw M, J0, J45 and blur over 60 x 40 deg, from the person's view."""
     m_dpt, j0_dpt, j45_dpt = study.field.power_dpt.T
     maps = {
         "M": (m_dpt, "dpt", float(m_dpt[m_dpt.size // 2])),

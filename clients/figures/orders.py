@@ -1,4 +1,4 @@
-"""How much of a wavefront belongs to each radial order, and to each term."""
+"""Charts of a wavefront's RMS by radial order, and of its coefficients."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from estimator import nm_from_index, rescale_pupil
 
 ORDERS = (2, 3, 4, 5, 6)
 LEAST_TOP_UM = 0.1
-"""Of an axis: less is no aberration to speak of."""
+"""Smallest upper limit of an axis; smaller aberrations are negligible."""
 
 FIRST_SEEN, FIRST_HIGHER = 2, 3
-"""Lowest order that blurs, and that spectacles leave."""
+"""Lowest order that blurs, and lowest order that spectacles do not correct."""
 
 
 def order_range(order: int) -> slice:
-    """Return where the terms of a radial order stand."""
+    """Return the slice of the terms of a radial order."""
     first = order * (order + 1) // 2
     return slice(first, first + order + 1)
 
 
 def rms_by_order_um(zernike_um: NDArray[np.float64]) -> dict[int, float]:
-    """Return the root mean square of each order, 2 to 6, µm.
+    """Return the RMS of each order, 2 to 6, µm.
 
-    That of all together is the root of the sum of their squares.
+    The total RMS is the root of the sum of their squares.
     """
     return {n: float(np.linalg.norm(zernike_um[order_range(n)])) for n in ORDERS}
 
 
 def rms_um(zernike_um: NDArray[np.float64], *, from_order: int = FIRST_HIGHER) -> float:
-    """Return the root mean square of an order and all above it, µm."""
+    """Return the RMS of an order and all above it, µm."""
     return float(np.linalg.norm(zernike_um[order_range(from_order).start :]))
 
 
@@ -59,9 +59,9 @@ def on_circle_um(study: EyeStudy, radius_mm: float) -> NDArray[np.float64]:
 def draw_rms_by_order(
     axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str] = ()
 ) -> None:
-    """Draw the higher orders of one eye or several, on the smallest of their circles.
+    """Draw the higher orders of one or more eyes, on the smallest of their circles.
 
-    The second order, which is much larger, is written.
+    The second order, which is much larger, is given as text.
     """
     radius_mm = min(study.found.zernike_radius_mm for study in studies)
     names = [*(str(n) for n in ORDERS[1:]), "3-6"]
@@ -84,7 +84,7 @@ def draw_rms_by_order(
         )
         seconds.append(f"{by_order[2]:.2f}")
     axes.set_xticks(places, names)
-    axes.margins(y=0.5 if labels else 0.18)  # above the bars there are words
+    axes.margins(y=0.5 if labels else 0.18)  # labels are above the bars
     axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
     note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)} µm"
     dress(axes, title="RMS by radial order", x=f"radial order\n{note}", y="RMS, µm")
@@ -101,7 +101,7 @@ def rms_by_order_figure(studies: Sequence[EyeStudy], **options) -> Figure:
 
 
 def draw_terms(axes: Axes, study: EyeStudy) -> None:
-    """Draw each coefficient of the higher orders: as measured, and of the eye found."""
+    """Draw each higher-order coefficient: measured, and of the estimated eye."""
     index = np.arange(order_range(FIRST_HIGHER).start, study.measured_um.size)
     measured, eye = study.measured_um[index], study.found.zernike_um[index]
     axes.bar(index - 0.2, measured, 0.4, color=SOFT, label="measured or assumed")

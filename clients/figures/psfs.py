@@ -1,4 +1,4 @@
-"""What an eye makes of a point of light, as pictures."""
+"""Images of an eye's point-spread functions."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from estimator import compute_psfs
 SIDE_PX = 161
 LEAST_SIDE_ARCMIN = 20.0
 ROOM_RATIO = 1.25
-"""Side of the picture over the diameter of the blur."""
+"""Ratio of the image's side to the diameter of the blur."""
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 SLOPE_COUNT = 81
-"""Places across a pupil at which its light's directions are looked at."""
+"""Number of points across a pupil at which ray directions are computed."""
 
 DECADES = 2.0
-"""Of light, from white to black."""
+"""Decades of light from white to black."""
 
 NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
 def ray_directions_mrad(wavefront: PupilWavefront) -> NDArray[np.float64]:
-    """Return where the pupil sends its light (n, 2), x and y, by ray optics."""
+    """Return the ray directions of a pupil (n, 2), x and y."""
     radius_mm = wavefront.circle_diameter_mm / 2.0
     values_um = wavefront_values_um(wavefront.zernike_um, from_order=1, n=SLOPE_COUNT)
     step_mm = 2.0 * radius_mm / (SLOPE_COUNT - 1)
@@ -43,7 +43,7 @@ def ray_directions_mrad(wavefront: PupilWavefront) -> NDArray[np.float64]:
 
 
 def centred(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
-    """Return it with its blur about the middle, and the blur's radius, arcmin."""
+    """Return the wavefront with its blur centered, and the blur's radius, arcmin."""
     slopes = ray_directions_mrad(wavefront)
     middle = (slopes.min(axis=0) + slopes.max(axis=0)) / 2.0
     zernike_um = wavefront.zernike_um.copy()
@@ -55,7 +55,7 @@ def centred(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
 
 
 def main_reach_mrad(wavefront: PupilWavefront) -> float:
-    """Return how far rings send light aside to their foci, or lenslets all of it."""
+    """Return the deflection of light to the foci of rings, or by lenslets, mrad."""
     rings, radius_mm = wavefront.rings, wavefront.circle_diameter_mm / 2.0
     if rings is None:
         return 0.0
@@ -67,7 +67,7 @@ def main_reach_mrad(wavefront: PupilWavefront) -> float:
 def psf_picture(
     wavefront: PupilWavefront, *, side_arcmin: float
 ) -> NDArray[np.float64]:
-    """Return the light of a point (161, 161), top row first; its sum is 1."""
+    """Return the PSF (161, 161), top row first, with unit sum."""
     state: dict[str, Any] = {
         "pupil_diameter_mm": wavefront.circle_diameter_mm,
         "pupil_ellipse": wavefront.pupil_ellipse,
@@ -76,14 +76,14 @@ def psf_picture(
         "radius_px": SIDE_PX // 2,
         "accuracy": "fine",
     }
-    try:  # a mix with rays shows its seams on a logarithmic scale
+    try:  # a mix with ray optics shows seams on a logarithmic scale
         found = compute_psfs(
             wavefront.zernike_um[None],
             method="fourier",
             pupil_screen=wavefront.rings,
             **state,
         )
-    except ValueError:  # too steep for that: by far wider than what rings add
+    except ValueError:  # too steep: blur is far wider than the rings' effect
         found = compute_psfs(wavefront.zernike_um[None], **state)
     return found[0].kernel
 
@@ -91,7 +91,7 @@ def psf_picture(
 def draw_psf(
     axes: Axes, wavefront: PupilWavefront, *, side_arcmin: float, title: str = ""
 ) -> None:
-    """Draw one point, two decades of light, with a scale."""
+    """Draw one PSF over two decades of light, with a scale bar."""
     kernel = psf_picture(wavefront, side_arcmin=side_arcmin)
     light = np.log10(np.maximum(kernel / kernel.max(), 10.0**-DECADES))
     half = side_arcmin / 2.0
@@ -114,7 +114,7 @@ def _draw_scale(axes: Axes, side_arcmin: float) -> None:
 
 
 def draw_psfs(panel: FigureBase, study: EyeStudy) -> None:
-    """Draw a far point through 3 and 5 mm: as the eye sees it, and best corrected."""
+    """Draw PSFs of a far point through 3 and 5 mm: as it is, and best corrected."""
     states = [study.wavefront(pupil_mm) for pupil_mm in PUPILS_MM]
     rows = {
         "as it is": states,

@@ -1,4 +1,4 @@
-"""One wavefront in the pupil, and what its optics pass on."""
+"""One wavefront in the pupil, and its optical transfer function."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ TILTS = slice(1, 3)
 
 @dataclass(frozen=True)
 class PupilWavefront:
-    """What a point looks like from within: a wavefront and its pupil.
+    """The wavefront of a point and its pupil.
 
     Attributes
     ----------
     zernike_um : (28,)
-        On the circle of ``circle_diameter_mm``, in the plane of the entrance pupil.
+        Coefficients on the circle of ``circle_diameter_mm``, in the plane of the
+        entrance pupil.
     pupil_ellipse : (5,)
-        Pupil within the circle: centre x, y and semi-axes, mm, and angle, rad.
+        Pupil within the circle: center x, y and semi-axes, mm, and angle, rad.
     rings : Rings or None
-        What makes several foci of it, or lenslets before it.
+        Rings that produce several foci, or lenslets in front of the pupil.
     """
 
     zernike_um: NDArray[np.float64]
@@ -35,25 +36,25 @@ class PupilWavefront:
 
     @property
     def is_readable(self) -> bool:
-        """Return whether acuity and contrast are known: not through lenslets."""
+        """Return whether acuity and contrast are known; not through lenslets."""
         return self.rings is None or self.rings.lattice_mm is None
 
     def best_corrected(self) -> PupilWavefront:
-        """Return it with a lens for the sphere and cylinder of this pupil."""
+        """Return the wavefront with sphere and cylinder of this pupil corrected."""
         zernike_um = self.zernike_um.copy()
         zernike_um[SECOND_ORDER] = 0.0
         return replace(self, zernike_um=zernike_um)
 
     def transfer(self) -> Transfer:
-        """Return its optical transfer function.
+        """Return the optical transfer function.
 
         Raises
         ------
         ValueError
-            A wavefront too steep to be resolved, or lenslets.
+            If the wavefront is too steep to be resolved, or through lenslets.
         """
         zernike_um = self.zernike_um.copy()
-        zernike_um[TILTS] = 0.0  # where the picture lies does not matter
+        zernike_um[TILTS] = 0.0  # the image's position is irrelevant
         return optical_transfer(
             zernike_um,
             zernike_radius_mm=self.circle_diameter_mm / 2.0,

@@ -1,4 +1,4 @@
-"""The eye that was found, cut vertically, with rays."""
+"""A vertical cross-section of the estimated eye, with rays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from estimator import draw_section
 
 
 def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
-    """Draw an eye that looks far away, with rays from there, without its correction."""
+    """Draw an eye focused far, with rays from infinity, without its correction."""
     focused = study.found.focused(0.0)
     draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM)
     length_mm = focused.parameters.eye_length_mm

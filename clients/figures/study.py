@@ -1,4 +1,4 @@
-"""One eye made ready for its figures: estimated once, traced once, asked often."""
+"""One eye prepared for its figures: estimated and traced once, evaluated often."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from estimator import (
 )
 
 PUPILS_MM = (3.0, 5.0)
-"""In daylight, and at dusk."""
+"""Pupils in daylight and at dusk."""
 
 WAVELENGTH_NM = 555.0
 FOCUS_RANGE_DPT = (-80.0, 20.0)
-"""Relaxed, also of the most far-sighted, to as near as any eye can accommodate for."""
+"""From the relaxed state of the most hyperopic eye to the nearest possible focus."""
 
 FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)
 FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
@@ -43,12 +43,12 @@ Report = Callable[[float, str], None]
 
 
 def profile_of(profile: Profile) -> EyeProfile:
-    """Return a profile of any form: parsed, a map, a preset's name or a file.
+    """Return a profile from any form: parsed, a mapping, a preset's name or a file.
 
     Raises
     ------
     ValueError
-        Names the field, the bad value and what is allowed.
+        If the profile is invalid; the message names field, value and allowed range.
     """
     if isinstance(profile, EyeProfile):
         return profile
@@ -59,17 +59,17 @@ def profile_of(profile: Profile) -> EyeProfile:
 
 @dataclass(frozen=True)
 class EyeStudy:
-    """One eye: what was said of it, the eye that was found, and its light on the axis.
+    """One eye: its profile, the estimated eye model, and its optics on the axis.
 
     Attributes
     ----------
     profile : EyeProfile
-        As it came.
+        Profile as given.
     found : EstimatedEye
     optics : EyeOptics
-        On the axis, at 555 nm, in all its states of focus.
+        Optics on the axis, at 555 nm, in all states of focus.
     notes : tuple of str
-        What was measured and what is assumed, in sentences.
+        Sentences on what was measured and what is assumed.
     """
 
     profile: EyeProfile
@@ -89,7 +89,7 @@ class EyeStudy:
         Raises
         ------
         ValueError
-            A profile that is wrong, or an eye that light does not pass.
+            If the profile is invalid, or light does not pass the eye.
         """
         parsed = profile_of(profile)
         optics, notes = prepare_eye(
@@ -108,10 +108,10 @@ class EyeStudy:
 
     @cached_property
     def measured_um(self) -> NDArray[np.float64]:
-        """Return what the eye was estimated from (28,), at the cornea, no correction.
+        """Return the measured wavefront (28,), at the cornea, without correction.
 
-        On the circle of ``found.zernike_radius_mm``; of a prescription with the typical
-        aberrations that were added; of an eye that is given, its own.
+        It is given on the circle of ``found.zernike_radius_mm``.  For a prescription it
+        includes the added typical aberrations; for a given eye it is the eye's own.
         """
         return self.found.zernike_um - self.found.residual_um
 
@@ -122,14 +122,14 @@ class EyeStudy:
         object_dpt: float = 0.0,
         focus_dpt: float = 0.0,
     ) -> PupilWavefront:
-        """Return what a point makes in the pupil, through the worn correction.
+        """Return the wavefront of a point in the pupil, through the correction.
 
         Parameters
         ----------
         object_dpt : float
             Distance of the point, dpt.
         focus_dpt : float
-            Where the eye looks: it accommodates for that as well as it can.
+            Distance that the eye accommodates for, as well as it can.
         """
         pupil_mm = self.optics.usable_pupil_mm(pupil_diameter_mm)
         used_dpt = self.optics.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
@@ -152,7 +152,7 @@ class EyeStudy:
         )
 
     def _rings(self, circle_diameter_mm: float) -> Rings | None:
-        """Return the worn lens's rings before a pupil; None where it sees none."""
+        """Return the lens's rings in front of a pupil; None if there are none."""
         if self.optics.rings is None:
             return None
         rings = self.optics.rings.seen_from(0.0, 0.0)
@@ -163,7 +163,7 @@ class EyeStudy:
         return None if reach_mm <= clear_mm else rings
 
     def acuity(self, pupil_diameter_mm: float) -> AcuityByDistance:
-        """Return what is read at each distance through a pupil; kept, as it is slow."""
+        """Return the acuity by distance through a pupil, cached because it is slow."""
         if pupil_diameter_mm not in self._acuity:
             found = acuity_by_distance(self, pupil_diameter_mm)
             self._acuity[pupil_diameter_mm] = found
@@ -175,7 +175,7 @@ class EyeStudy:
 
     @cached_property
     def field(self) -> FieldTable:
-        """Return the relaxed eye over 60 x 40 deg, through the worn correction."""
+        """Return the relaxed eye over 60 x 40 deg, through the correction."""
         across, up = np.meshgrid(FIELD_H_DEG, FIELD_V_DEG)
         return field_table(
             self.profile,
@@ -187,7 +187,7 @@ class EyeStudy:
 
     @cached_property
     def far_accommodation_dpt(self) -> float:
-        """Return by how much M changes through 4 mm when the eye looks far away."""
+        """Return the change of M through 4 mm from relaxed to far focus, dpt."""
         pupil_mm = self.optics.usable_pupil_mm(FIELD_PUPIL_MM)
         used_dpt = self.optics.accommodation_dpt(0.0, pupil_diameter_mm=pupil_mm)
         relaxed_dpt, seen_dpt = self.optics.total_defocus_dpt(

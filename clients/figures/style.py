@@ -1,6 +1,6 @@
-"""How all figures look: sizes, colours, one type; never matplotlib's global settings.
+"""Style of all figures: sizes, colors, fonts, without matplotlib's global settings.
 
-Figures are made without pyplot, which is not safe in threads.
+Figures are made without pyplot, which is not thread-safe.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from matplotlib.transforms import ScaledTranslation
 INK, SOFT, GRID = "#1b2430", "#5b6775", "#d9dee4"
 BLUE, ORANGE, GREEN, RED = "#1f5fa8", "#d9731a", "#2c8a57", "#b3262e"
 PUPIL_COLORS = (BLUE, ORANGE)
-"""Of the small and the large pupil."""
+"""Colors of the small and the large pupil."""
 
 TEXT_PT, SMALL_PT, TITLE_PT = 8.0, 7.0, 9.0
 LINE_PT = 1.5
 LEGEND_DOWN_PT = 27.0
-"""From an axis to what explains its lines: its numbers and its words are between."""
+"""Distance from an axis to the legend below it; tick and axis labels are between."""
 MM_PER_INCH = 25.4
 DIVERGING, SEQUENTIAL = "RdBu_r", "cividis"
 
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
-    """Return an empty figure of a size on paper."""
+    """Return an empty figure of a given size on paper."""
     size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
     return Figure(figsize=size, layout="constrained", facecolor="white")
 
 
 def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
-    """Give axes their words and the looks of all figures."""
+    """Set title and labels of axes, and apply the common style."""
     if title:
         axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left")
     axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
@@ -47,18 +47,18 @@ def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def with_grid(axes: Axes) -> None:
-    """Draw faint lines to read values by."""
+    """Draw a faint grid."""
     axes.set_axisbelow(True)
     axes.grid(color=GRID, linewidth=0.5)
 
 
 def legend(axes: Axes, **options) -> None:
-    """Explain lines."""
+    """Draw a legend inside the axes."""
     axes.legend(fontsize=SMALL_PT, labelcolor=INK, frameon=False, **options)
 
 
 def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
-    """Explain lines under the axes, where no curve can run: words to their looks."""
+    """Draw a legend below the axes, clear of the curves; maps labels to line styles."""
     lines = [
         Line2D([], [], **({"linewidth": LINE_PT} | looks)) for looks in entries.values()
     ]
@@ -73,7 +73,7 @@ def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def say_unknown(axes: Axes) -> None:
-    """Say in the middle of axes why there are no curves."""
+    """Write in the middle of axes why there are no curves."""
     axes.text(
         0.5, 0.5, "not known through lenslets", fontsize=SMALL_PT, color=SOFT,
         ha="center", transform=axes.transAxes,
@@ -81,7 +81,7 @@ def say_unknown(axes: Axes) -> None:
 
 
 def bare(axes: Axes, *, title: str = "") -> None:
-    """Leave a picture's axes without ticks and spines."""
+    """Remove ticks and spines from an image's axes."""
     dress(axes, title=title)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -90,7 +90,7 @@ def bare(axes: Axes, *, title: str = "") -> None:
 
 
 def color_bar(axes: Axes, drawn, *, label: str) -> None:
-    """Explain colours beside axes."""
+    """Draw a color bar beside axes."""
     bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.02, aspect=18)
     bar.set_label(label, fontsize=SMALL_PT, color=INK)
     bar.ax.tick_params(labelsize=SMALL_PT, colors=SOFT, width=0.6, length=2.5)

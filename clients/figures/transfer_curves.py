@@ -1,4 +1,4 @@
-"""Contrast that an eye's optics pass on, by spatial frequency."""
+"""Modulation transfer of an eye's optics by spatial frequency."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def modulation(
 ) -> NDArray[np.float64]:
     """Return the modulation transfer (n,) of a far object, mean over all directions.
 
-    NaN where the wavefront is too steep to tell: there, hardly any is left.  And
-    through lenslets.
+    NaN if the wavefront is too steep to be resolved, where hardly any contrast is left,
+    and through lenslets.
 
     Parameters
     ----------
     is_corrected : bool
-        With a lens for the sphere and cylinder of this pupil.
+        Whether sphere and cylinder of this pupil are corrected.
     at_cpd : (n,)
     """
     wavefront = study.wavefront(pupil_diameter_mm)

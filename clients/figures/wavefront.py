@@ -1,4 +1,4 @@
-"""A wavefront as a map over the pupil, as the examiner sees the eye."""
+"""Maps of a wavefront over the pupil, as the examiner sees the eye."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from estimator import zernike_values
 SIDE_COUNT = 161
 LEVEL_COUNT = 13
 FLAT_UM = 0.05
-"""Least half range of the colours: less than a tenth of a wave is no shape."""
+"""Smallest half range of the colors; below a tenth of a wave there is no shape."""
 
 
 def wavefront_values_um(
@@ -30,7 +30,7 @@ def wavefront_values_um(
     Parameters
     ----------
     from_order : int
-        Lowest radial order that is drawn.
+        Lowest radial order to draw.
     """
     along = np.linspace(-1.0, 1.0, n)
     x, y = np.meshgrid(along, -along)
@@ -39,7 +39,7 @@ def wavefront_values_um(
 
 
 def in_circle(n: int) -> NDArray[np.bool_]:
-    """Return which of those values (n, n) lie in the pupil."""
+    """Return a mask (n, n) of the values inside the pupil."""
     along = np.linspace(-1.0, 1.0, n)
     return np.hypot(along, along[:, None]) <= 1.0
 
@@ -58,7 +58,7 @@ def draw_wavefront_map(
     Parameters
     ----------
     zernike_um : (28,)
-        In the eye's frame, x to the person's right.
+        Coefficients in the eye's frame, x to the person's right.
     """
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]
     top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), FLAT_UM)
@@ -97,7 +97,7 @@ def draw_wavefront_map(
 
 
 def draw_wavefront_maps(panel: FigureBase, study: EyeStudy) -> None:
-    """Draw what was measured: all of it, and its higher orders."""
+    """Draw the measured wavefront: all orders, and the higher orders."""
     for axes, from_order, title in zip(
         panel.subplots(1, 2),
         (FIRST_SEEN, FIRST_HIGHER),

@@ -1,20 +1,20 @@
-"""Reports of eyes, for those who judge a simulation: `ocufilter report`, `report_html`.
+"""Reports of simulated eyes: `ocufilter report` and `report_html`.
 
 program     the command
-make        from profiles to a report
-facts       what is told of one eye, computed
-numbers     its numbers
-worn_words  what is worn
-charts      the letter chart near and far
-provenance  what was measured, what is assumed
-sources     papers
-blocks      what a report is made of
-tables      of a report
+make        reports from profiles
+facts       computed content of a report on one eye
+numbers     numbers of a report
+worn_words  descriptions of corrections
+charts      filtered letter charts, near and far
+provenance  measured, entered and assumed data
+sources     literature references
+blocks      building blocks of a report
+tables      tables of a report
 content     the report of one eye
-comparison  of two
-html_page   written as one HTML file
-pdf_pages   written as a PDF
-pdf_text    its lines of text
+comparison  the report of two eyes
+html_page   HTML output
+pdf_pages   PDF output
+pdf_text    text layout of the PDF
 """
 
 import lazy_loader

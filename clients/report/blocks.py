@@ -1,4 +1,4 @@
-"""What a report is made of, whatever it is written as: rows of blocks under titles."""
+"""Building blocks of a report, independent of its format: titled rows of blocks."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ PAGE_WIDTH_MM, PAGE_HEIGHT_MM = 210.0, 297.0
 MARGIN_MM = 12.0
 CONTENT_WIDTH_MM = PAGE_WIDTH_MM - 2.0 * MARGIN_MM
 GAP_MM = 5.0
-"""Between the blocks of a row."""
+"""Gap between the blocks of a row."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text; the first column is what a row is about."""
+    """Cells of text; the first column labels the rows."""
 
     title: str
     rows: tuple[tuple[str, ...], ...]
@@ -28,7 +28,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure, drawn where it is needed; ``alt`` says in words what it shows."""
+    """A figure, drawn on demand; ``alt`` describes it in words."""
 
     draw: Callable[[FigureBase], None]
     height_mm: float
@@ -37,7 +37,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image (height, width, 3) of sRGB, and what it is."""
+    """An sRGB image (height, width, 3) with a caption."""
 
     image: NDArray[np.uint8]
     caption: str
@@ -45,7 +45,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Words:
-    """Paragraphs, or the points of a list."""
+    """Paragraphs, or the items of a list."""
 
     paragraphs: tuple[str, ...]
     title: str = ""
@@ -57,7 +57,7 @@ Block = Table | Plot | Picture | Words
 
 @dataclass(frozen=True)
 class Row:
-    """Blocks beside each other, and how they share the width."""
+    """Blocks side by side, and their shares of the width."""
 
     blocks: tuple[Block, ...]
     width_ratio: tuple[float, ...] = ()
@@ -81,7 +81,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A report: its title, what stands beside it, its sections, its last line."""
+    """A report: title, subtitle, sections and footer."""
 
     title: str
     subtitle: str

@@ -1,4 +1,4 @@
-"""The letter chart as an eye sees it near and far, through an `EyeFilter`."""
+"""The letter chart as an eye sees it near and far, filtered by an `EyeFilter`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIELD_DEG = 8.2
 LOG_MAR = tuple(round(1.0 - 0.1 * k, 1) for k in range(13))
 SIDE_PX, LEAST_SIDE_PX = 860, 180
 LARGEST_BLUR_PX = 190.0
-"""Radius of a blur that PSFs are made for, with room for its edge."""
+"""Largest blur radius that PSFs are computed for, with a margin for the edge."""
 
 Chart = tuple[float, float]
 """Pupil, mm, and distance, m."""
@@ -32,14 +32,14 @@ def charts_of(
     distances_m: Sequence[float] = DISTANCES_M,
     progress: Callable[[float], None] | None = None,
 ) -> dict[Chart, NDArray[np.uint8]]:
-    """Return the chart at each pupil and distance, the eye trying to focus on it.
+    """Return the chart for each pupil and distance, with the eye focusing on it.
 
     The filters of a process share one worker: call from one thread at a time.
 
     Raises
     ------
     FilterError
-        No engine works here, or the eye's blur is wider than any PSF may be.
+        If no engine works here, or the eye's blur is wider than the largest PSF.
     """
     side_px = picture_side_px(study, max(pupils_mm), distances_m)
     camera = Camera.from_fov(FIELD_DEG, width_px=side_px, height_px=side_px)
@@ -75,7 +75,7 @@ def _settings(pupil_mm: float, distances_m: Sequence[float]) -> FilterSettings:
 def picture_side_px(
     study: EyeStudy, pupil_mm: float, distances_m: Sequence[float]
 ) -> int:
-    """Return as many pixels as the widest blur leaves: what is blurred needs few."""
+    """Return the image size that the widest blur allows: blurred images need few px."""
     reach_mrad = 0.0
     for distance_m in distances_m:
         at_dpt = 1.0 / distance_m

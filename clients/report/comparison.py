@@ -1,4 +1,4 @@
-"""The report of two eyes, or of one before and after: surgery, lenses, years."""
+"""The report of two eyes, or of one eye before and after surgery, lenses or years."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ from clients.report.worn_words import limits_words
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
 MAP_MM, PSF_MM = 46.0, 58.0
-"""Heights at which the first page holds all that belongs on it."""
+"""Heights at which all content of the first page fits on it."""
 
 CURVES_MM = 64.0
 """Height of curves of both eyes."""
 
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
-    """Return the report of two eyes: what differs first, then each of them."""
+    """Return the report of two eyes: first the differences, then each eye."""
     cite = Citations()
     cite("csoba", "osa", "vectors")
     of_each = [
@@ -100,7 +100,7 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
 
 
 def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
-    """Return what lenses make true only in part, each once."""
+    """Return the limitations that lenses impose on the report, each once."""
     of_all = [limits_words(f.study.profile.correction) for f in (before, after)]
     return tuple(dict.fromkeys(limits for limits in of_all if limits))
 
@@ -178,7 +178,7 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
 
 
 def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
-    """Return near and far charts of both through one pupil."""
+    """Return near and far charts of both eyes through one pupil."""
     pictures: list[Block] = []
     for facts in (before, after):
         if not facts.charts:

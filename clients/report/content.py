@@ -1,4 +1,4 @@
-"""The report of one eye: a page to read first, then the details."""
+"""The report of one eye: a summary page, then the details."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from clients.report.worn_words import limits_words, subtitle_words
 DAY_MM, DUSK_MM = PUPILS_MM
 
 MAP_MM, PSF_MM = 47.0, 57.0
-"""Heights at which the first page holds all that belongs on it."""
+"""Heights at which all content of the first page fits on it."""
 
 FIELD_MM, CURVE_MM, TERMS_MM = 84.0, 68.0, 42.0
 SIDES = {"OD": "right eye (OD)", "OS": "left eye (OS)"}
@@ -67,7 +67,7 @@ def eye_document(facts: EyeFacts) -> Document:
 
 
 def subtitle(study: EyeStudy) -> str:
-    """Return whose eye it is, in a line."""
+    """Return one line on the eye: side, age and source."""
     profile = study.profile
     age = "age not given"
     if profile.age_years is not None:
@@ -85,7 +85,7 @@ KIND_WORDS = {
 
 
 def summary(facts: EyeFacts) -> Section:
-    """Return what one reads first."""
+    """Return the summary section."""
     study = facts.study
     maps = Plot(
         lambda panel: draw_wavefront_maps(panel, study),
@@ -141,7 +141,7 @@ def on_axes(draw: Callable[[Any], None], height_mm: float, alt: str) -> Plot:
 
 
 def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
-    """Return the chart at all distances through one pupil."""
+    """Return the charts at all distances through one pupil."""
     if not facts.charts:
         return Row((Words((f"No letter charts: {facts.chart_problem}.",)),))
     pictures: list[Block] = []
@@ -158,7 +158,7 @@ def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
 
 
 def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Section, ...]:
-    """Return what lies behind the summary."""
+    """Return the sections that follow the summary."""
     of_whom = f" ({name})" if name else ""
     return _field_section(facts, of_whom), _known_section(facts, cite, of_whom)
 
@@ -211,5 +211,5 @@ def _known_section(facts: EyeFacts, cite: Citations, of_whom: str) -> Section:
 
 
 def sources(cite: Citations) -> Section:
-    """Return the papers that were named."""
+    """Return the section of cited papers."""
     return Section("Sources", (Row((Words(cite.listed()),)),))

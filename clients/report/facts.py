@@ -1,4 +1,4 @@
-"""All that a report tells of one eye, computed before anything is written."""
+"""The content of a report on one eye, computed before it is written."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from clients.report.numbers import chart_numbers, eye_numbers
 from filter_service import FilterError
 
 NUMBERS_AT, CHARTS_AT = 0.1, 0.5
-"""Progress at which they begin."""
+"""Progress at which numbers and charts begin."""
 
 
 @dataclass(frozen=True)
 class EyeFacts:
-    """One eye's study, numbers and pictures.
+    """One eye's study, numbers and images.
 
     Attributes
     ----------
     label : str
-        What the eye is called in this report.
+        Name of the eye in this report.
     charts : dict
-        Pictures (height, width, 3) by pupil, mm, and distance, m; empty where they
-        could not be made, which ``chart_problem`` then explains.
+        Images (height, width, 3) by pupil, mm, and distance, m; if they could not be
+        made, empty, and ``chart_problem`` gives the reason.
     """
 
     study: EyeStudy
@@ -40,7 +40,7 @@ class EyeFacts:
 
     @property
     def chart_numbers(self) -> dict[Chart, dict[str, Any]]:
-        """Return what is predicted for each chart."""
+        """Return the predicted numbers of each chart."""
         return {
             (asked_mm, entry["distance_m"]): entry
             for asked_mm, entry in zip(
@@ -58,21 +58,21 @@ def facts_of(
     has_charts: bool = True,
     progress: Report | None = None,
 ) -> EyeFacts:
-    """Compute all that a report tells of an eye.
+    """Compute the content of a report on an eye.
 
     Parameters
     ----------
     label : str
-        Instead of the profile's name.
+        Name to use instead of the profile's.
     has_charts : bool
-        Whether letter charts are filtered, which takes a quarter of the time.
+        Whether to filter letter charts, which takes a quarter of the time.
     progress : callable, optional
         Called with a fraction and a stage.
 
     Raises
     ------
     ValueError
-        A profile that is wrong, or an eye that light does not pass.
+        If the profile is invalid, or light does not pass the eye.
     """
 
     def say(done: float, stage: str) -> None:
@@ -104,5 +104,5 @@ def _charts(
 
     try:
         return charts_of(study, progress=along), ""
-    except FilterError as error:  # the rest of the report stands without them
+    except FilterError as error:  # the report is useful without them
         return {}, str(error)

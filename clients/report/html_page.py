@@ -1,4 +1,4 @@
-"""A report as one HTML file: nothing outside of it is needed, and it prints on A4."""
+"""HTML output of a report: one self-contained file that prints on A4."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _plot(plot: Plot, width_mm: float) -> str:
 
 
 def _svg(figure: Figure) -> str:
-    """Return a figure as text within text: its ids meet no other figure's."""
+    """Return a figure as an SVG data URI, so that ids of figures do not clash."""
     written = io.BytesIO()
     figure.savefig(written, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(written.getvalue()).decode()

@@ -1,4 +1,4 @@
-"""From profiles to a report: as text of an HTML file, as a file, as numbers."""
+"""Reports from profiles: as HTML text, as a file, or as numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clients.report.pdf_pages import write_pdf
 
 SUFFIXES = (".html", ".pdf")
 WRITING_AT = 0.85
-"""Progress at which eyes are done and writing begins."""
+"""Progress at which the eyes are computed and writing begins."""
 
 
 def report_html(
@@ -27,26 +27,26 @@ def report_html(
     has_charts: bool = True,
     progress: Report | None = None,
 ) -> str:
-    """Return the report of an eye, or of two, as the text of one HTML file.
+    """Return the report of one or two eyes as the text of one HTML file.
 
-    Letter charts go through the process's `EyeFilter`s: call it in the thread that uses
+    Letter charts use the process's `EyeFilter`s: call this in the thread that uses
     them, or without charts.
 
     Parameters
     ----------
     profile, after : EyeProfile, mapping, preset's name or file
-        With ``after``, what differs comes first.
+        With ``after``, the report starts with the differences.
     label, after_label : str
-        What the eyes are called, instead of their profiles' names.
+        Names of the eyes, instead of their profiles' names.
     has_charts : bool
-        Whether letter charts are filtered, which takes a quarter of the time.
+        Whether to filter letter charts, which takes a quarter of the time.
     progress : callable, optional
         Called with a fraction and a stage.
 
     Raises
     ------
     ValueError
-        A profile that is wrong, or an eye that light does not pass.
+        If a profile is invalid, or light does not pass an eye.
     """
     eyes = eyes_of(
         [profile] if after is None else [profile, after],
@@ -67,7 +67,7 @@ def eyes_of(
     has_charts: bool = True,
     progress: Report | None = None,
 ) -> list[EyeFacts]:
-    """Return all that a report tells of one eye or two."""
+    """Compute the content of a report on one or two eyes."""
     share = WRITING_AT / len(profiles)
 
     def along(k: int) -> Report | None:
@@ -85,7 +85,7 @@ def eyes_of(
 
 
 def document_of(eyes: list[EyeFacts]) -> Document:
-    """Return the document of one eye, or of two that are compared."""
+    """Return the document of one eye, or of the comparison of two."""
     return eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
 
 
@@ -95,7 +95,7 @@ def write_report(eyes: list[EyeFacts], path: Path) -> None:
     Raises
     ------
     OSError
-        The file cannot be written.
+        If the file cannot be written.
     """
     document = document_of(eyes)
     if path.suffix.lower() == ".pdf":

@@ -1,4 +1,4 @@
-"""The numbers of a report, by name and with their units: what `--json` prints."""
+"""The numbers of a report by name, with units, as `--json` prints them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from estimator import (
 )
 
 PRESCRIBED_PUPIL_MM = 4.0
-"""Pupil through which a refraction is told, where one as wide was measured."""
+"""Pupil of reported refractions, if the measured pupil is as wide."""
 
 SPECTACLE_VERTEX_MM = 12.0
-"""Usual distance from the cornea."""
+"""Usual distance of spectacles from the cornea."""
 
 TOLD_CPD = (10.0, 20.0, 30.0)
 FIELD_TOLD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
@@ -45,15 +45,15 @@ class Refraction:
 
     @property
     def prescription(self) -> Prescription:
-        """Return it with a minus cylinder and the axis as the examiner writes it."""
+        """Return the prescription in minus cylinder, axis as the examiner writes it."""
         return prescription_from_power_vector(self.m_dpt, self.j0_dpt, self.j45_dpt)
 
     def written(self) -> str:
-        """Return it as people write it."""
+        """Return the prescription in the usual notation."""
         return written(self.prescription)
 
     def as_mapping(self) -> dict[str, float]:
-        """Return all of its numbers."""
+        """Return all numbers as a mapping."""
         lens = self.prescription
         return {
             "sphere_dpt": lens.sphere_dpt,
@@ -66,7 +66,7 @@ class Refraction:
 
 
 def written(lens: Prescription) -> str:
-    """Return a lens as people write it: sphere, cylinder, axis."""
+    """Return a lens in the usual notation: sphere, cylinder, axis."""
     text = f"{_signed(lens.sphere_dpt)} dpt sph"
     if abs(lens.cylinder_dpt) >= 0.005:
         text += f" {_signed(lens.cylinder_dpt)} cyl x {lens.axis_deg:.0f}°"
@@ -93,7 +93,7 @@ def _signed(value: float) -> str:
 
 
 def refraction_pupil_mm(study: EyeStudy) -> float:
-    """Return the pupil that refractions are told through."""
+    """Return the pupil of reported refractions."""
     return min(PRESCRIBED_PUPIL_MM, 2.0 * study.found.zernike_radius_mm)
 
 
@@ -111,7 +111,7 @@ def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> Refractio
 
 
 def worn_refraction_dpt(study: EyeStudy) -> float:
-    """Return M of the relaxed eye through what it wears, at its entrance pupil."""
+    """Return M of the relaxed eye through its correction, at its entrance pupil."""
     return float(
         study.optics.total_defocus_dpt(
             pupil_diameter_mm=refraction_pupil_mm(study),
@@ -122,14 +122,14 @@ def worn_refraction_dpt(study: EyeStudy) -> float:
 
 
 def worn_lens(profile: EyeProfile) -> Refraction | None:
-    """Return what a worn correction does at the cornea; None where none is worn."""
+    """Return the correction's power at the cornea; None without a correction."""
     if profile.correction is None:
         return None
     return Refraction(*power_vector(profile.correction))
 
 
 def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
-    """Return what a wavefront lets through and lets be read."""
+    """Return the modulation transfer and acuity of a wavefront."""
     zernike_um = seen.zernike_um.copy()
     zernike_um[TILTS] = 0.0
     try:
@@ -160,7 +160,7 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
 
 
 def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
-    """Return what one pupil makes of a far object, as it is and best corrected."""
+    """Return the numbers of a far object through a pupil, as is and best corrected."""
     seen = study.wavefront(pupil_diameter_mm)
     higher_um = rms_um(seen.zernike_um)
     far_dpt, near_dpt = study.optics.focus_limits_dpt(seen.circle_diameter_mm)
@@ -176,14 +176,14 @@ def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
 
 
 def is_beyond_measured(study: EyeStudy, pupil_diameter_mm: float) -> bool:
-    """Return whether a pupil is wider than what was measured."""
+    """Return whether a pupil is wider than the measured one."""
     return pupil_diameter_mm > study.profile.max_pupil_diameter_mm + 1e-6
 
 
 def chart_numbers(
     study: EyeStudy, pupil_diameter_mm: float, distance_m: float
 ) -> dict[str, Any]:
-    """Return what is read of a chart by an eye that accommodates for it."""
+    """Return the predicted acuity on a chart of an eye that accommodates for it."""
     at_dpt = 1.0 / distance_m
     seen = study.wavefront(pupil_diameter_mm, object_dpt=at_dpt, focus_dpt=at_dpt)
     usable_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
@@ -229,7 +229,7 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
 
 
 def measured_numbers(study: EyeStudy) -> dict[str, Any]:
-    """Return what the eye was estimated from, typical aberrations included."""
+    """Return the data that the eye was estimated from, with typical aberrations."""
     by_order = rms_by_order_um(study.measured_um)
     return {
         "refraction": refraction_of(study, study.measured_um).as_mapping(),

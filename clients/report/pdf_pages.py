@@ -1,7 +1,7 @@
-"""A report as a PDF of A4 pages: figures and type as vectors, by matplotlib alone.
+"""PDF output of a report on A4 pages: vector figures and text, by matplotlib alone.
 
-Matplotlib draws the figures anyway, and draws them here into the page itself; another
-library would want them as bitmaps, or a browser.
+Matplotlib draws the figures anyway, here directly into the page; another library would
+need them as bitmaps, or require a browser.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ BOTTOM_MM = PAGE_HEIGHT_MM - MARGIN_MM - 5.0
 
 
 def write_pdf(document: Document, path: Path) -> int:
-    """Write a document; return the number of its pages.
+    """Write a document as a PDF; return the number of pages.
 
     Raises
     ------
     OSError
-        The file cannot be written.
+        If the file cannot be written.
     """
     pages = _Pages(document)
     pages.fill()
@@ -57,7 +57,7 @@ def write_pdf(document: Document, path: Path) -> int:
 
 
 class _Pages:
-    """Pages that rows flow onto, one below the other; millimetres from the top left."""
+    """Pages filled with rows from top to bottom; positions in mm from the top left."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -72,7 +72,7 @@ class _Pages:
             self._section(section, is_first=k == 0)
 
     def finish(self, page: Figure, number: int) -> None:
-        """Write a page's last line."""
+        """Draw the footer of a page."""
         y_mm = PAGE_HEIGHT_MM - MARGIN_MM
         self._rule(page, MARGIN_MM, CONTENT_WIDTH_MM, y_mm - 3.5, SOFT)
         self._text(page, MARGIN_MM, y_mm, self._document.footer, NOTE_PT, color=SOFT)
@@ -82,7 +82,7 @@ class _Pages:
 
     def _new_page(self) -> None:
         page = new_figure(PAGE_WIDTH_MM, PAGE_HEIGHT_MM)
-        page.set_layout_engine("none")  # until there is a figure to be laid out
+        page.set_layout_engine("none")  # until a figure needs a layout
         self.made.append(page)
         self._y_mm = MARGIN_MM
 
@@ -211,7 +211,7 @@ class _Pages:
 
 
 def _panel(page: Figure, left_mm, top_mm, width_mm, height_mm):
-    """Return a part of a page, in which a figure is laid out for itself."""
+    """Return a subfigure of a page with its own layout."""
     page.set_layout_engine("constrained")
     grid = GridSpec(
         3,
@@ -247,7 +247,7 @@ def _cells_mm(cells: list[list[str]]) -> float:
 
 
 def row_height_mm(row: Row) -> float:
-    """Return how high a row is: as its highest block."""
+    """Return the height of a row, that of its highest block."""
     return max(
         _height_mm(block, width_mm)
         for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)
@@ -278,7 +278,7 @@ def _line_count(text: str, width_mm: float) -> int:
 
 
 def _fitting(row: Row) -> list[Row]:
-    """Return a row, or its paragraphs one by one, which may go to other pages."""
+    """Return a row, or its paragraphs one by one, so that they can break over pages."""
     if len(row.blocks) > 1 or not isinstance(row.blocks[0], Words):
         return [row]
     words = row.blocks[0]

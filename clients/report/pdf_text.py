@@ -1,4 +1,4 @@
-"""Text on paper: how wide it is, and where its lines end."""
+"""Text layout on paper: widths and line breaks."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from clients.figures.style import MM_PER_INCH
 
 POINTS_PER_INCH = 72.0
 LINE_RATIO = 1.32
-"""From line to line, over the size of the type."""
+"""Ratio of line spacing to font size."""
 
 
 def mm_of_points(points: float) -> float:
-    """Return a length on paper."""
+    """Convert points to mm."""
     return points * MM_PER_INCH / POINTS_PER_INCH
 
 
 def line_mm(size_pt: float) -> float:
-    """Return from line to line."""
+    """Return the line spacing."""
     return mm_of_points(size_pt * LINE_RATIO)
 
 
 @lru_cache(maxsize=20_000)
 def width_mm(text: str, size_pt: float, weight: str = "normal") -> float:
-    """Return how wide a line is."""
+    """Return the width of a line of text."""
     font = FontProperties(size=size_pt, weight=weight)
     points, _, _ = text_to_path.get_text_width_height_descent(text, font, ismath=False)
     return mm_of_points(points)
 
 
 def lines_of(text: str, available_mm: float, size_pt: float) -> list[str]:
-    """Return a text's lines; a word that is too long has one for itself."""
+    """Break a text into lines; a word that is too long gets its own line."""
     lines, line = [], ""
     for word in text.split():
         longer = f"{line} {word}" if line else word
@@ -50,7 +50,7 @@ def column_widths_mm(
     size_pt: float,
     gap_mm: float,
 ) -> list[float]:
-    """Return widths of a table's columns: what they need, the widest one the rest."""
+    """Return a table's column widths; if too wide, the widest column shrinks."""
     needed = [
         max(width_mm(row[k], size_pt) for row in rows if k < len(row)) + gap_mm
         for k in range(max(len(row) for row in rows))

@@ -1,4 +1,4 @@
-"""Write a report of one eye, or of an eye before and after, to judge and to file.
+"""Write a report of one eye, or of an eye before and after.
 
     ocufilter report keratoconus -o eye.html
     ocufilter report eye.json -o eye.pdf
@@ -6,9 +6,9 @@
 
 A profile is a preset's name, or a .json, .abp or .csv file.  The first page is the
 summary: refraction, acuity, wavefront, point images, contrast, a letter chart near and
-far.  Behind it: the visual field, acuity by distance, the eye found, what of all this
-was measured and what is assumed, and the papers it stands on.  The HTML file needs
-nothing beside it and prints on A4.
+far.  The following pages show the visual field, acuity by distance, the estimated eye,
+which data were measured or assumed, and the literature references.  The HTML file is
+self-contained and prints on A4.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from filter_service.progress import Progress
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with a command line in one line, as other errors."""
+    """Argument parser that reports errors in one line, like other errors."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; --help says more")
 
 
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the command line."""
+    """Parse the command line."""
     parser = _Parser(
         prog="ocufilter report",
         description=__doc__,
@@ -60,16 +60,16 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def run(options: argparse.Namespace) -> str:
-    """Write what is asked for; return what there is to print.
+    """Write the requested report; return the text to print.
 
     Raises
     ------
     ValueError
-        A profile or file name that cannot be used.
+        If a profile or file name cannot be used.
     """
     _check_out(options)
     sources = [options.profile] + ([options.after] if options.after else [])
-    profiles = [profile_of(source) for source in sources]  # all faults before any work
+    profiles = [profile_of(source) for source in sources]  # fail before any work
     labels = tuple(
         name or _called(source)
         for name, source in zip(
@@ -109,7 +109,7 @@ def _check_out(options: argparse.Namespace) -> None:
 
 
 def _called(source: str) -> str:
-    """Return a file's name without its ending; a preset's as it is."""
+    """Return a file's name without its suffix, or a preset's name."""
     return Path(source).stem if Path(source).suffix else source
 
 

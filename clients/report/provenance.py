@@ -1,4 +1,4 @@
-"""What of a report was measured or entered, what is typical of people, and of whom."""
+"""Provenance of a report's data: measured, entered, or typical, and of which people."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from clients.report.worn_words import worn_words
 from estimator import Prescription, WornLens
 
 WELL_DETERMINED = 0.5
-"""Share of the prior's variance that a measurement must take away."""
+"""Fraction of the prior's variance that a measurement must remove."""
 
 MEASURED, TYPICAL, STATED = "measured", "assumed", "entered"
 
 
 def provenance_table(study: EyeStudy, cite: Citations) -> Table:
-    """Return what each part of the eye comes from."""
+    """Return the source of each part of the eye."""
     rows = (
         _refraction(study),
         _higher_orders(study, cite),

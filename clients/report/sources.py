@@ -1,4 +1,4 @@
-"""The papers that a report's figures stand on."""
+"""Literature references of a report's figures."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SOURCES = {
 
 
 class Citations:
-    """Numbers the sources in the order in which they are named."""
+    """Numbers the sources in the order of citation."""
 
     def __init__(self) -> None:
         self._names: list[str] = []
 
     def __call__(self, *names: str) -> str:
-        """Return marks such as ``[1, 4]`` for sources."""
+        """Return citation marks such as ``[1, 4]`` for sources."""
         for name in names:
             if name not in self._names:
                 self._names.append(name)
@@ -47,7 +47,7 @@ class Citations:
         return f"[{', '.join(numbers)}]"
 
     def listed(self) -> tuple[str, ...]:
-        """Return what was named, numbered."""
+        """Return the cited sources, numbered."""
         return tuple(
             f"[{k + 1}] {SOURCES[name]}." for k, name in enumerate(self._names)
         )

@@ -11,7 +11,7 @@ from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 from clients.report.worn_words import worn_words
 
 THROUGH_LENSLETS = "not known"
-"""Instead of an acuity: the summary says why."""
+"""Text in place of an acuity; the summary gives the reason."""
 
 REFRACTION_ROWS = {
     "sphere, dpt": "sphere_dpt",
@@ -24,7 +24,7 @@ REFRACTION_ROWS = {
 
 
 def refraction_words(refraction: dict, name: str) -> str:
-    """Return one number of a refraction as it is written."""
+    """Return one number of a refraction as text."""
     if name != "axis_deg":
         return signed(refraction[name])
     has_axis = abs(refraction["cylinder_dpt"]) >= 0.005
@@ -32,7 +32,7 @@ def refraction_words(refraction: dict, name: str) -> str:
 
 
 def refraction_table(facts: EyeFacts) -> Table:
-    """Return the refraction that came in, and that of the eye found."""
+    """Return the entered or measured refraction, and that of the estimated eye."""
     numbers = facts.numbers
     is_entered = facts.study.profile.kind in ("prescription", "eye")
     pairs = numbers["measured"]["refraction"], numbers["eye"]["refraction"]
@@ -74,14 +74,14 @@ def _refraction_note(facts: EyeFacts) -> str:
 
 
 def signed(value: float) -> str:
-    """Return a number with its sign, to a hundredth."""
+    """Return a number with its sign, rounded to a hundredth."""
     if abs(value) < 0.005:
         return "0.00"
     return f"{value:+.2f}".replace("-", "−")
 
 
 def vision_table(facts: EyeFacts) -> Table:
-    """Return what is seen through both pupils, as it is and best corrected."""
+    """Return the vision through both pupils, as it is and best corrected."""
     pupils = facts.numbers["pupils"]
     note = "Acuity in logMAR, and as a decimal."
     if any(p["is_beyond_measured"] for p in pupils):
@@ -95,7 +95,7 @@ def vision_table(facts: EyeFacts) -> Table:
 
 
 def distance_words(distance_dpt: float) -> str:
-    """Return a far or near point in dpt, and as people say it."""
+    """Return a far or near point in dpt, and as a distance."""
     if abs(distance_dpt) < 0.02:
         return "infinity"
     if distance_dpt < 0.0:
@@ -122,7 +122,7 @@ VISION_ROWS: dict[str, Callable[[dict], str]] = {
 
 
 def pupil_word(pupil: dict) -> str:
-    """Return a pupil, with a star where it is wider than what was measured."""
+    """Return a pupil, with a star if it is wider than the measured one."""
     star = "*" if pupil["is_beyond_measured"] else ""
     return f"{pupil['pupil_diameter_mm']:.3g} mm{star}"
 
@@ -138,7 +138,7 @@ def _modulations(values: dict | None) -> str:
 
 
 def told_acuity(state: dict) -> str:
-    """Return the acuity of a state, or that nobody knows it."""
+    """Return the acuity of a state, or that it is not known."""
     return acuity_words(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
 
 

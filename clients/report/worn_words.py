@@ -1,4 +1,4 @@
-"""What a person wears, in plain words."""
+"""Descriptions of a person's correction, in plain words."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STRAIGHT_DEG = 0.5
 
 
 def short_words(lens: Prescription) -> str:
-    """Return what is worn in two or three words."""
+    """Return the type of a correction, in two or three words."""
     if isinstance(lens, ProgressiveLens):
         return "progressive spectacles"
     if not isinstance(lens, WornLens):
@@ -41,7 +41,7 @@ def short_words(lens: Prescription) -> str:
 
 
 def worn_words(lens: Prescription) -> str:
-    """Return what is worn, its powers, and where on it the eye looks through."""
+    """Return the type of a correction, its powers and its alignment to the eye."""
     if isinstance(lens, ProgressiveLens):
         own, more = lens.distance, _progressive(lens)
     elif isinstance(lens, WornLens):
@@ -54,7 +54,7 @@ def worn_words(lens: Prescription) -> str:
 
 
 def _own_power(lens: WornLens) -> tuple[str, ...]:
-    """Return what an intraocular lens has beside what the eye needs."""
+    """Return an intraocular lens's power beyond the eye's need."""
     own = Prescription(
         lens.at_lens_dpt(lens.sphere_dpt),
         lens.at_lens_dpt(lens.cylinder_dpt),
@@ -90,11 +90,11 @@ def _seated(lens: WornLens) -> tuple[str, ...]:
 
 
 def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
-    """Return the additions that a lens is made for, dpt in the pupil, ascending."""
+    """Return the design additions of a lens, dpt in the pupil, ascending."""
     lowest, highest = rings.orders
     orders = np.arange(lowest + 1, highest + 1)
     middle = orders[:-1]
-    if middle.size > 1:  # of orders between, the one that has the light
+    if middle.size > 1:  # the intermediate order with the most light
         light = np.abs(rings.kinoform.amplitudes(middle))
         middle = middle[[int(light.argmax())]]
     return [float(k - lowest) * rings.spacing_dpt for k in (*middle, highest)]
@@ -110,7 +110,7 @@ def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
 
 
 def gaze_words(gaze_deg: tuple[float, float]) -> str:
-    """Return where an eye looks."""
+    """Return the gaze direction of an eye as text."""
     parts = [
         f"{abs(angle):.0f}° {names[angle < 0.0]}"
         for angle, names in zip(
@@ -122,7 +122,7 @@ def gaze_words(gaze_deg: tuple[float, float]) -> str:
 
 
 def _power(power_dpt: float) -> str:
-    """Return an addition: one digit, two where they matter."""
+    """Return an addition with one decimal, or two if needed."""
     text = f"{power_dpt:+.2f}".replace("-", "\N{MINUS SIGN}")
     return text[:-1] if text.endswith("0") else text
 
@@ -134,7 +134,7 @@ def subtitle_words(profile: EyeProfile) -> str:
 
 
 def limits_words(lens: Prescription | None) -> tuple[str, ...]:
-    """Return what of a report a lens makes true only in part."""
+    """Return the limitations that a lens imposes on a report."""
     if isinstance(lens, ProgressiveLens):
         return (
             f"Progressive lens: all of this report is for {_of_gaze(lens.gaze_deg)}; "

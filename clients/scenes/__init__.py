@@ -1,1 +1,1 @@
-"""Two test scenes and a letter chart, built in code: no files, no downloads."""
+"""Two test scenes and a letter chart, built in code without files or downloads."""

@@ -1,4 +1,4 @@
-"""Walls, arches, columns, roofs, a fountain and the view behind."""
+"""Walls, arches, columns, roofs, windows, awnings, a fountain and a lattice."""
 
 from itertools import pairwise
 
@@ -36,14 +36,14 @@ def column(height_m: float, *, radius_m=0.16, color="#d9c7a5") -> Mesh:
 def arch_wall(
     *, bay_m, bays, springing_m, height_m, opening_ratio=0.78, depth_m=0.45, **look
 ) -> Mesh:
-    """Return a wall of round arches along x from 0, its front towards +z at z = 0.
+    """Return a wall of round arches along x from 0, its front facing +z at z = 0.
 
     Parameters
     ----------
-    bay_m, height_m, depth_m : width of one bay, height and thickness, metres
-    springing_m : height at which the arches start, metres
-    opening_ratio : width of an opening over `bay_m`
-    look : texture and color for `new_mesh`; uv repeats once every two metres.
+    bay_m, height_m, depth_m : width of one bay, height and thickness, meters
+    springing_m : height at which the arches start, meters
+    opening_ratio : ratio of the width of an opening to `bay_m`
+    look : texture and color for `new_mesh`; uv repeats once every two meters.
     """
     radius = opening_ratio * bay_m / 2
     parts = []
@@ -87,7 +87,7 @@ def _face_over_arch(edge, start_m, bay_m, height_m, look) -> list[Mesh]:
     above = np.linspace(start_m, start_m + bay_m, len(curve))
     crown = np.column_stack([above, np.full(len(curve), height_m), 0 * above])
     sheet = (1 - top) * curve[None] + top * crown[None]
-    # The sheet's sides run from the springing to the corners: fill what they leave.
+    # The sheet's sides run from the springing to the corners: fill the gaps they leave.
     corner_l = _corner_fill(sheet[:, 0], start_m)
     corner_r = _corner_fill(sheet[:, -1], start_m + bay_m)
     front = np.array([0, 0, 1e3])
@@ -105,7 +105,7 @@ def _corner_fill(side, x):
 
 
 def _sheet(points, *, inward, **look) -> Mesh:
-    """Return a grid of points (a, b, 3) as a sheet that faces towards `inward`."""
+    """Return a grid of points (a, b, 3) as a sheet that faces `inward`."""
     a, b = points.shape[:2]
     i, j = np.meshgrid(np.arange(a - 1), np.arange(b - 1), indexing="ij")
     first = (i * b + j).ravel()
@@ -125,7 +125,7 @@ def _sheet(points, *, inward, **look) -> Mesh:
 
 
 def wall(origin_m, along_m, height_m, *, cell_m=0.25, texture="", color="#ffffff"):
-    """Return a plain upright wall, its front where along × up points."""
+    """Return a plain upright wall whose front faces along × up."""
     length_m = float(np.linalg.norm(along_m))
     cells = (max(1, round(length_m / cell_m)), max(1, round(height_m / cell_m)))
     return patch(
@@ -140,7 +140,7 @@ def wall(origin_m, along_m, height_m, *, cell_m=0.25, texture="", color="#ffffff
 
 
 def tiled_roof(width_m, slope_m, *, pitch_deg=24.0, rows=5) -> Mesh:
-    """Return rows of clay tiles that fall towards +z; the ridge lies on the x axis."""
+    """Return rows of clay tiles that slope toward +z; the ridge is on the x axis."""
     rng = np.random.default_rng(12)
     tiles = []
     step = slope_m / rows
@@ -185,7 +185,7 @@ def window(*, width_m=0.9, height_m=1.4, shutter="#2f6f73") -> list[Mesh]:
 
 
 def awning(width_m, reach_m, drop_m, *, texture: str) -> list[Mesh]:
-    """Return a striped awning that hangs from (0..width, 0, 0) towards +z."""
+    """Return a striped awning that hangs from (0..width, 0, 0) toward +z."""
     cloth = patch(
         (0, -drop_m, reach_m),
         (width_m, 0, 0),

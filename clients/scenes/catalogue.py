@@ -1,4 +1,4 @@
-"""The scenes by name."""
+"""Lookup of scenes by name."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ SCENE_BUILDERS: dict[str, Callable[[], Scene]] = {
     "primitives": primitives.build,
     "courtyard": courtyard.build,
 }
-"""A scene is built when its function is called."""
+"""Builder function of each scene."""
 
 
 def build_scene(name: str) -> Scene:
@@ -18,7 +18,7 @@ def build_scene(name: str) -> Scene:
     Raises
     ------
     ValueError
-        No scene has that name.
+        If no scene has that name.
     """
     if name not in SCENE_BUILDERS:
         raise ValueError(

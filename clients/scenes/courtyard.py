@@ -1,7 +1,7 @@
 """Courtyard: a café garden in the evening sun, 0.3 to 30 m deep.
 
-It stands where the literature uses San Miguel: thin occluders, foliage close by,
-furniture, text of several sizes, repeated arches, small lamps.
+It replaces San Miguel, the usual scene of the literature: thin occluders, nearby
+foliage, furniture, text of several sizes, repeated arches, small lamps.
 """
 
 from dataclasses import replace
@@ -110,7 +110,7 @@ def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list
         bay_m=2.4, bays=5, springing_m=3.0 - 0.02, height_m=4.3, opening_ratio=0.86,
         depth_m=0.3, texture=texture,
     )  # fmt: skip
-    # Only the part above the columns is wanted: lift the feet of the piers.
+    # Keep only the part above the columns: lift the feet of the piers.
     lifted = arcade.vertices_m.copy()
     lifted[:, 1] = np.maximum(lifted[:, 1], 2.98)
     arcade = replace(arcade, vertices_m=lifted)
@@ -125,7 +125,7 @@ def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list
 
 
 def _furniture(rng) -> list[Mesh]:
-    """Return tables, chairs, boards, railing and what stands on the near table."""
+    """Return tables, chairs, boards, railing and the objects on the near table."""
     parts = []
     spots = ((-1.75, -3.4, 20), (1.9, -4.9, -35), (-2.9, -6.6, 60), (2.7, -8.6, 10))
     frames = ("#1f6f78", "#2b2f33", "#a23b2a", "#1f6f78")
@@ -155,7 +155,7 @@ def _table_group(x, z, turn, frame, rng) -> list[Mesh]:
 
 
 def _near_table(rng) -> list[Mesh]:
-    """Return the viewer's own table; what stands on it is 0.6 to 1.1 m away."""
+    """Return the viewer's own table, with objects at 0.6 to 1.1 m."""
     things = list(furniture.bistro_table(radius_m=0.46, top="table"))
     top = 0.74
     cup = furniture.cup()
@@ -207,7 +207,7 @@ def _plants(rng) -> list[Mesh]:
 
 
 def _lamps() -> tuple[list[Mesh], np.ndarray]:
-    """Return the string lights and where their bulbs are (n, 3)."""
+    """Return the string lights and the positions of their bulbs (n, 3)."""
     parts, positions = [], []
     lines = (
         ((-5.2, 3.3, -1.4), (4.0, 3.5, -5.2), 0.45, 13),
@@ -235,7 +235,7 @@ def _floor_batch(bake: Baker) -> Batch:
     image = bake.light_map(
         (left, 0, far), (width, 0, 0), (0, 0, length), size=(columns, rows)
     )
-    tile_px = round(4.0 / texel_m)  # one repeat of the pattern is four metres
+    tile_px = round(4.0 / texel_m)  # one repeat of the pattern is four meters
     tiles = _resized(stone_tiles(), tile_px, tile_px)
     repeat = np.tile(tiles, (rows // tile_px + 1, columns // tile_px + 1, 1))
     texture = uint8_srgb(image * repeat[:rows, :columns])
@@ -258,7 +258,7 @@ def _resized(image, width: int, height: int):
 
 
 def _backdrop() -> list[Mesh]:
-    """Return what lies behind the arches, and the sky; no shadow falls there."""
+    """Return the view behind the arches and the sky, without shadows."""
     rng = np.random.default_rng(31)
     lawn = patch((-30, -0.01, -14.4), (60, 0, 0), (0, 0, -15.6), color="#77853d")
     view = patch(
@@ -271,7 +271,7 @@ def _backdrop() -> list[Mesh]:
         (6.2, -18.5, 5.2), (-7.6, -24, 7.0),
     ):  # fmt: skip
         trees.append(placed(foliage.cypress(rng=rng, height_m=height), (x, 0, z)))
-    # Leaves turned to the sun are brighter: the light of a plain cosine.
+    # Leaves that face the sun are brighter: plain cosine shading.
     shaded = []
     for tree in trees:
         facing = np.maximum(tree.normals @ _SUN / np.linalg.norm(_SUN), 0)
@@ -281,7 +281,7 @@ def _backdrop() -> list[Mesh]:
 
 
 def _sky() -> Mesh:
-    """Return a dome 100 m away; the renderer calls it infinitely far."""
+    """Return a dome 100 m away, which the renderer treats as infinitely far."""
     t = np.linspace(-0.05, np.pi / 2, 12)
     a = np.linspace(0, 2 * np.pi, 25)
     tt, aa = np.meshgrid(t, a, indexing="ij")
@@ -301,7 +301,7 @@ def _sky() -> Mesh:
 
 
 def _textures() -> dict:
-    """Draw every texture of the scene; the rest is vertex colour."""
+    """Draw all textures of the scene; other meshes have vertex colors."""
     linear = {
         "plaster_warm": plaster("#c99a5e", "#ecd09a"),
         "plaster_rose": plaster("#b87862", "#dca58c", seed=6),

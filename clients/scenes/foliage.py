@@ -1,4 +1,4 @@
-"""Leaves, flowers, branches and plants: many small triangles at every distance."""
+"""Leaves, flowers, branches and plants: many small triangles at all distances."""
 
 from dataclasses import replace
 
@@ -23,16 +23,16 @@ BLOSSOMS = ("#d63a7e", "#e85d9a", "#c22a6a", "#f08ab8")
 def leaves(
     base_m, along, facing, *, length_m, width_m, colors, rng, segments=0
 ) -> Mesh:
-    """Return folded leaves; light comes through them.
+    """Return folded, translucent leaves.
 
     Parameters
     ----------
     base_m, along, facing : (n, 3)
         Foot, direction and upper side of each leaf (the last two need no unit length).
-    length_m, width_m : mean size, metres
-    colors : sRGB codes to draw from
+    length_m, width_m : mean size, meters
+    colors : sRGB codes to choose from
     rng : numpy Generator
-    segments : rows of a leaf's triangles; 0 leaves out the midrib: two triangles.
+    segments : rows of a leaf's triangles; 0 omits the midrib: two triangles.
     """
     n = len(base_m)
     along = _unit(along)
@@ -58,7 +58,7 @@ def leaves(
     mesh = new_mesh(vertices, all_faces, normals=np.repeat(up, per_leaf, axis=0))
     palette = np.array([linear_from_hex(color) for color in colors])
     tint = palette[rng.integers(len(palette), size=n)] * rng.uniform(0.75, 1.2, (n, 1))
-    # A pale midrib and a darker foot make a single leaf readable close by.
+    # A pale midrib and a darker foot make a single leaf recognizable at close range.
     shade = np.ones((len(s), 3, 1)) * np.array([1.0, 1.25, 1.0])[None, :, None]
     shade = shade * (0.75 + 0.35 * s)[:, None, None]
     albedo = np.clip(tint[:, None, None] * shade, 0, 1).reshape(-1, 3)
@@ -88,7 +88,7 @@ def _unit(vectors) -> Array:
 def branch(
     path_m, *, radius_m=0.006, leaf_m=0.07, n_leaves=40, rng, colors=GREENS
 ) -> Mesh:
-    """Return a twig with leaves of two sides, fine enough for 0.3 m away."""
+    """Return a twig with leaves on two sides, detailed enough for 0.3 m distance."""
     path_m = np.asarray(path_m, float)
     taper = np.linspace(radius_m, 0.3 * radius_m, len(path_m))
     bark = tube(path_m, taper, sides=6, color="#5b4632")
@@ -116,7 +116,7 @@ def branch(
 def cloud(
     center_m, size_m, *, n_leaves, leaf_m, rng, colors=GREENS, width_ratio=0.55
 ) -> Mesh:
-    """Return leaves on the shell of a rough ball: a bush, a tree's crown."""
+    """Return leaves on the shell of a rough ball, as a bush or the crown of a tree."""
     direction = _unit(rng.normal(0, 1, (n_leaves, 3)))
     depth = rng.uniform(0.55, 1.0, (n_leaves, 1)) ** 0.5
     lumps = 1 + 0.18 * np.sin(direction @ rng.normal(0, 4, (3, 1)) + 1)

@@ -1,4 +1,4 @@
-"""Things that stand, hang and lie about: tables, chairs, cups, lanterns, railings."""
+"""Furniture and small objects: tables, chairs, cups, lanterns, railings, boards."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def bistro_table(*, radius_m=0.36, height_m=0.74, top="") -> list[Mesh]:
 
 
 def _disc(radius_m, height_m, *, rings=8, sides=36, texture="", color="#ffffff"):
-    """Return a level disc, finely divided so that small shadows fall on it."""
+    """Return a horizontal disc, finely divided to show small shadows."""
     r = np.linspace(0, radius_m, rings + 1)
     mesh = lathe(np.stack([r, np.full_like(r, height_m)], axis=1)[::-1], sides=sides)
     uv = mesh.vertices_m[:, [0, 2]] / (2 * radius_m) * [1, -1] + 0.5
@@ -110,13 +110,13 @@ def cup(*, color="#f4efe6", coffee="#5a3218", sides=28) -> list[Mesh]:
 
 
 def _upward(mesh: Mesh) -> Mesh:
-    """Return a level sheet whose normals all point up."""
+    """Return a horizontal sheet with all normals pointing up."""
     normals = np.tile([0.0, 1.0, 0.0], (len(mesh.vertices_m), 1))
     return replace(mesh, normals=normals)
 
 
 def lantern(*, glow=1.6) -> list[Mesh]:
-    """Return a candle lantern 0.24 m high: a cage of thin bars about a flame."""
+    """Return a candle lantern 0.24 m high: a cage of thin bars around a flame."""
     parts = [placed(box((0.10, 0.012, 0.10), color=_IRON), (0, 0.006, 0))]
     parts.append(placed(box((0.10, 0.010, 0.10), color=_IRON), (0, 0.170, 0)))
     roof = lathe([(0.068, 0.175), (0.02, 0.215), (0.008, 0.222)], sides=4, color=_IRON)
@@ -137,7 +137,7 @@ def lantern(*, glow=1.6) -> list[Mesh]:
 
 
 def railing(start_m, end_m, *, height_m=1.0, spacing_m=0.11) -> list[Mesh]:
-    """Return an iron railing of thin bars with a ring between every two."""
+    """Return an iron railing of thin bars with a ring between neighbors."""
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
     length_m = np.linalg.norm(end_m - start_m)
     count = max(2, round(length_m / spacing_m))
@@ -162,7 +162,7 @@ def railing(start_m, end_m, *, height_m=1.0, spacing_m=0.11) -> list[Mesh]:
 def string_lights(
     start_m, end_m, *, sag_m, count, bulb_m=0.035
 ) -> tuple[list[Mesh], Array]:
-    """Return a hanging cable with glowing bulbs, and where the bulbs are (n, 3)."""
+    """Return a hanging cable with glowing bulbs, and the bulbs' positions (n, 3)."""
     t = np.linspace(0, 1, 25)[:, None]
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
 
@@ -184,7 +184,7 @@ def string_lights(
 
 
 def standing_board(size_m, *, texture: str, lean_deg=12.0) -> list[Mesh]:
-    """Return a board on two legs that leans back, its front towards +z."""
+    """Return a board on two legs that leans back, its front facing +z."""
     width, height = size_m
     front = patch(
         (-width / 2, 0.08, 0.0),
@@ -210,7 +210,7 @@ def standing_board(size_m, *, texture: str, lean_deg=12.0) -> list[Mesh]:
 
 
 def table_card(size_m, *, texture: str) -> list[Mesh]:
-    """Return a folded menu card that stands on a table, its front towards +z."""
+    """Return a folded menu card that stands on a table, its front facing +z."""
     width, height = size_m
     tilt = rotation("x", -14)
     front = patch(

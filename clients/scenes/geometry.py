@@ -1,6 +1,6 @@
-"""Triangle meshes as plain arrays, and the few shapes that the scenes are built from.
+"""Triangle meshes as plain arrays, and the basic shapes of the scenes.
 
-Frame of every scene: metres, x right, y up, z towards the viewer (OpenGL).
+Frame of every scene: meters, x right, y up, z toward the viewer (OpenGL).
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ class Mesh:
 
     Attributes
     ----------
-    vertices_m : (n, 3), metres
+    vertices_m : (n, 3), meters
     normals : (n, 3), unit vectors
     faces : (m, 3), int
     albedo : (n, 3), linear reflectance 0..1; multiplies the texture
-    emission : (n, 3), linear light added whatever the lighting
-    translucency : (n,), part of the light that comes through from behind (leaves)
+    emission : (n, 3), linear light added regardless of the lighting
+    translucency : (n,), fraction of light transmitted from behind (leaves)
     uv : (n, 2), texture position, v up
     texture : name of the texture; empty for none
     """
@@ -39,7 +39,7 @@ class Mesh:
 
 
 def linear_from_hex(code: str) -> Array:
-    """Return the linear RGB (3,) of an sRGB colour written as "#rrggbb"."""
+    """Return the linear RGB (3,) of an sRGB color written as "#rrggbb"."""
     srgb = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
@@ -55,7 +55,7 @@ def srgb_from_linear(linear: Array) -> Array:
 def new_mesh(
     vertices_m, faces, *, normals=None, uv=None, color="#ffffff", texture=""
 ) -> Mesh:
-    """Fill in a mesh: normals from the faces when none are given, one colour."""
+    """Return a mesh of one color, with normals from the faces if none are given."""
     vertices_m = np.asarray(vertices_m, float).reshape(-1, 3)
     faces = np.asarray(faces, int).reshape(-1, 3)
     n = len(vertices_m)
@@ -85,13 +85,13 @@ def vertex_normals(vertices_m: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
-    """Return the mesh in one colour; `emission` times that colour glows."""
+    """Return the mesh in one color, with an emission of `emission` times that color."""
     rgb = np.tile(linear_from_hex(color), (len(mesh.vertices_m), 1))
     return replace(mesh, albedo=rgb, emission=rgb * emission)
 
 
 def transformed(mesh: Mesh, matrix: Array) -> Mesh:
-    """Apply a (4, 4) matrix to a mesh; non-uniform scales keep normals right."""
+    """Apply a (4, 4) matrix to a mesh; normals stay correct at non-uniform scales."""
     linear = matrix[:3, :3]
     normals = mesh.normals @ np.linalg.inv(linear)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -101,7 +101,7 @@ def transformed(mesh: Mesh, matrix: Array) -> Mesh:
 
 
 def placed(mesh: Mesh, position_m=(0, 0, 0), *, turn_deg=0.0, scale=1.0) -> Mesh:
-    """Scale, turn about the vertical axis and move a mesh."""
+    """Scale a mesh, rotate it about the vertical axis and move it."""
     matrix = rotation("y", turn_deg)
     matrix[:3, :3] *= scale
     matrix[:3, 3] = position_m
@@ -139,13 +139,13 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def by_texture(meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Merge meshes into one per texture, so that a frame takes few draw calls."""
+    """Merge meshes into one per texture, so that a frame needs few draw calls."""
     names = sorted({mesh.texture for mesh in meshes})
     return [merged([m for m in meshes if m.texture == name]) for name in names]
 
 
 def patch(origin_m, side_u_m, side_v_m, *, cells=(1, 1), uv_scale=(1, 1), **look):
-    """Return a flat parallelogram, its front where side_u × side_v points."""
+    """Return a flat parallelogram whose front faces side_u × side_v."""
     nu, nv = cells
     u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
     u, v = u.ravel(), v.ravel()
@@ -168,7 +168,7 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def box(size_m, *, cells=1, **look) -> Mesh:
-    """Return a box centred on the origin, its faces split into cells × cells."""
+    """Return a box centered on the origin, its faces split into cells × cells."""
     sides = []
     half = np.asarray(size_m, float) / 2
     for axis in range(3):
@@ -184,7 +184,7 @@ def box(size_m, *, cells=1, **look) -> Mesh:
 
 
 def lathe(profile_m, *, sides=20, **look) -> Mesh:
-    """Turn a profile of (radius, height) points, bottom first, about the y axis."""
+    """Revolve a profile of (radius, height) points, bottom first, about the y axis."""
     profile_m = np.asarray(profile_m, float)
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
@@ -212,7 +212,7 @@ def tube(path_m, radius_m, *, sides=6, **look) -> Mesh:
     radius_m = np.broadcast_to(np.asarray(radius_m, float), len(path_m))
     along = np.gradient(path_m, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # One helper direction for the whole bar keeps its rings from twisting.
+    # A single helper direction for the whole bar keeps its rings from twisting.
     helper = np.eye(3)[np.argmin(np.abs(along).mean(axis=0))]
     across = np.cross(along, helper)
     across /= np.linalg.norm(across, axis=1, keepdims=True)

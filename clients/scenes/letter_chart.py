@@ -1,9 +1,9 @@
-"""A letter chart as charts for the acuity are: five Sloan letters a row, in logMAR.
+"""A letter chart for visual acuity: five Sloan letters per row, in logMAR.
 
 A letter of logMAR L is 5 · 10^L minutes of arc high, its strokes a fifth of that.
-Letters stand one letter apart, a row stands above the next by the height of the next
-(Ferris et al., Am. J. Ophthalmol. 94:91, 1982).  The chart is a white plane that faces
-the camera, black ink on it, at one distance: by angle it looks the same at each.
+Letters are one letter apart, and rows are apart by the height of the lower one (Ferris
+et al., Am. J. Ophthalmol. 94:91, 1982).  The chart is a white plane with black ink that
+faces the camera at one distance; its angular size is the same at every distance.
 """
 
 import math
@@ -18,7 +18,7 @@ from clients.scenes.sloan_letters import SLOAN_LETTERS, UNITS
 from filter_service import Camera, RgbdView
 
 LOG_MAR_ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(14))
-"""Of usual charts, 1.0 to -0.3."""
+"""Rows of usual charts, 1.0 to -0.3."""
 
 ROWS_OF_LETTERS = (
     *("NCKZO", "RHSDK", "DOVHR", "CZRHS", "ONHRC", "DKSNV", "ZSOKN"),
@@ -28,17 +28,17 @@ ARCMIN_PER_DEG = 60.0
 LOG_MAR_LIMITS = (-1.0, 2.5)
 
 SAMPLES = 6
-"""Per pixel and axis, of a letter's edge."""
+"""Samples of a letter per pixel and axis."""
 
 
 @dataclass(frozen=True)
 class ChartRow:
-    """One row of letters in the picture.
+    """One row of letters in the image.
 
     Attributes
     ----------
     y_px : float
-        Of the row's middle, from the picture's top.
+        Distance of the row's middle from the image's top.
     """
 
     letters: str
@@ -49,7 +49,7 @@ class ChartRow:
 
 @dataclass(frozen=True)
 class LetterChart:
-    """A chart as a camera sees it, and where its rows are."""
+    """A chart as seen by a camera, and its rows."""
 
     view: RgbdView
     rows: tuple[ChartRow, ...]
@@ -68,22 +68,22 @@ def letter_chart(
     log_mar: Sequence[float] = LOG_MAR_ROWS,
     letters: Sequence[str] = ROWS_OF_LETTERS,
 ) -> LetterChart:
-    """Draw a chart in the middle of a camera's picture.
+    """Draw a chart in the middle of a camera's image.
 
     Parameters
     ----------
     distance_m : float
-        From the eye to the chart's plane; inf is allowed.
+        Distance from the eye to the chart's plane; inf is allowed.
     log_mar : sequence of float
-        Of each row, from above.
+        Size of each row, from the top.
     letters : sequence of str
-        Of each row, Sloan letters; begun anew where there are more rows.
+        Sloan letters of each row; repeated if there are more rows.
 
     Raises
     ------
     ValueError
-        A distance that is not positive, an unknown letter, a size out of range, or rows
-        that the camera does not see whole.
+        If the distance is not positive, a letter is unknown, a size is out of range, or
+        the camera does not see all rows completely.
     """
     _check(distance_m, log_mar, letters)
     texts = [letters[k % len(letters)] for k in range(len(log_mar))]
@@ -118,7 +118,7 @@ def _check(distance_m, log_mar, letters) -> None:
 
 
 def _middles(sizes: Sequence[float]) -> list[float]:
-    """Return the height of each row's middle, the chart's middle being 0."""
+    """Return the height of each row's middle above the chart's middle."""
     gaps = [*sizes[1:], 0.0]
     whole = sum(sizes) + sum(gaps)
     tops = np.concatenate([[0.0], np.cumsum(np.add(sizes, gaps))[:-1]])
@@ -146,7 +146,7 @@ def _row(camera: Camera, text, log_mar, size, middle) -> ChartRow:
 
 
 def _draw(ink: NDArray, camera: Camera, letter: str, size, left, bottom) -> None:
-    """Add the share of ink to the pixels that a letter covers; tangents, y up."""
+    """Add a letter's ink coverage to the pixels; positions are tangents, y up."""
     pitch_x, pitch_y = (pitch / 1000.0 for pitch in camera.pixel_pitch_mrad)
     edge_left, _, edge_up, _ = camera.tangents
     columns = _pixels(left - edge_left, size, pitch_x, camera.width_px)

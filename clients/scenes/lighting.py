@@ -1,4 +1,4 @@
-"""Bake sun, sky and lamps into a still scene, so that a frame needs no lights at all.
+"""Baking of sun, sky and lamps into a static scene, so that frames need no lights.
 
 Shadows come from depth maps that pyrender renders along parallel rays: one fine map
 for the sun, many coarse ones for the sky (ambient occlusion).
@@ -19,14 +19,14 @@ _DEPTH_FLAGS = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SKIP_CULL_
 
 @dataclass(frozen=True)
 class Lights:
-    """The lights of a scene; colours are linear, 1 makes a white sheet white.
+    """The lights of a scene; colors are linear, and 1 renders a white sheet white.
 
     Attributes
     ----------
-    sun_direction : (3,), towards the sun
+    sun_direction : (3,), toward the sun
     sun, sky_zenith, sky_horizon, bounce : (3,), linear RGB
     lamps_m : (n, 3), positions of small lamps
-    lamp : (3,), light of one lamp on a sheet one metre away
+    lamp : (3,), light of one lamp on a sheet one meter away
     """
 
     sun_direction: Array
@@ -59,11 +59,11 @@ class DepthMaps:
         self._renderer = pyrender.OffscreenRenderer(64, 64)
 
     def close(self) -> None:
-        """Free the GL context."""
+        """Release the GL context."""
         delete_renderer(self._renderer)
 
     def toward(self, direction: Array, size_px: int) -> "ParallelMap":
-        """Render what a far source in `direction` sees."""
+        """Render the depth map of a distant source in `direction`."""
         axes = _axes_along(direction)
         pose = np.eye(4)
         pose[:3, :3] = axes.T
@@ -73,14 +73,14 @@ class DepthMaps:
         read = self._renderer.render(self._scene, _DEPTH_FLAGS)
         near_m, far_m = _NEAR_M, _NEAR_M + 2 * self._radius_m
         with np.errstate(divide="ignore"):
-            # pyrender undoes a perspective even for this camera; put it back.
+            # pyrender inverts a perspective even for this camera; undo that.
             depth_m = np.where(read > 0, near_m + far_m - near_m * far_m / read, np.inf)
         return ParallelMap(depth_m, pose[:3, 3], axes, self._radius_m)
 
 
 @dataclass(frozen=True)
 class ParallelMap:
-    """One depth map along parallel rays, and how to look points up in it."""
+    """One depth map along parallel rays, with visibility lookup of points."""
 
     depth_m: Array
     origin_m: Array
@@ -88,7 +88,7 @@ class ParallelMap:
     radius_m: float
 
     def seen(self, points_m: Array, *, bias_m: float, soft: bool = False) -> Array:
-        """Return which points (n, 3) the source sees, 0..1 per point."""
+        """Return the visibility of points (n, 3) from the source, 0..1 per point."""
         local = (points_m - self.origin_m) @ self.axes.T
         size = len(self.depth_m)
         column = (local[:, 0] / self.radius_m + 1) * size / 2
@@ -103,7 +103,7 @@ class ParallelMap:
 
 
 def _axes_along(direction: Array) -> Array:
-    """Return rows right, up, back of a camera that looks against `direction`."""
+    """Return axes right, up, back (rows) of a camera that looks against `direction`."""
     back = np.asarray(direction, float) / np.linalg.norm(direction)
     helper = np.eye(3)[2 if abs(back[1]) > 0.9 else 1]
     right = np.cross(helper, back)
@@ -121,7 +121,7 @@ def hemisphere(count: int) -> Array:
 
 
 class Baker:
-    """Works out the light that arrives at points of a scene."""
+    """Computes the light that arrives at points of a scene."""
 
     def __init__(self, lights: Lights, maps: DepthMaps, *, sky_directions: int = 40):
         self._lights = lights
@@ -141,7 +141,8 @@ class Baker:
     def light_map(self, origin_m, side_u_m, side_v_m, *, size) -> Array:
         """Return the light (h, w, 3) over a parallelogram that faces up.
 
-        Sun at every texel; sky and lamps, which change slowly, at every eighth.
+        The sun is computed at every texel; sky and lamps, which change slowly, at every
+        eighth.
         """
         width, height = size
         coarse = (max(2, width // 8), max(2, height // 8))
@@ -183,13 +184,13 @@ class Baker:
             away = lamp_m - points_m
             square = np.einsum("ij,ij->i", away, away)
             cosine = np.einsum("ij,ij->i", away, normals) / np.sqrt(square + 1e-9)
-            # The constant stands for the lamp's own size and keeps it finite.
+            # The constant models the lamp's own size and keeps the result finite.
             total += _facing(cosine, through) / (square + 0.03)
         return total[:, None] * self._lights.lamp
 
 
 def _grid_points(origin_m, side_u_m, side_v_m, size) -> Array:
-    """Return the texel centres (h·w, 3) of a parallelogram, row by row."""
+    """Return the texel centers (h·w, 3) of a parallelogram, row by row."""
     width, height = size
     u, v = np.meshgrid(
         (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
@@ -210,13 +211,13 @@ def _enlarged(image: Array, size) -> Array:
 
 
 def _facing(cosine: Array, through: Array) -> Array:
-    """Return the cosine law, with light from behind where a surface lets it pass."""
+    """Return the cosine law, with transmitted light from behind."""
     return np.maximum(cosine, 0.0) + through * np.maximum(-cosine, 0.0)
 
 
 @contextmanager
 def baker(lights: Lights, occluders: list[Mesh], *, center_m, radius_m: float):
-    """Open a Baker for a scene; its GL context lives only inside the block."""
+    """Open a Baker for a scene; its GL context exists only inside the block."""
     maps = DepthMaps(occluders, center_m=center_m, radius_m=radius_m)
     try:
         yield Baker(lights, maps)

@@ -1,4 +1,4 @@
-"""Camera paths: where the eye stands, looks and focuses, and how wide its pupil is."""
+"""Camera paths: position, target, focus and pupil of the eye over time."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,12 @@ from clients.scenes.geometry import Array
 
 @dataclass(frozen=True)
 class Key:
-    """One moment of a path.
+    """One key frame of a path.
 
     Attributes
     ----------
-    position_m, target_m : (3,), where the eye is and what it looks at
-    focus_m : distance focused on, metres; inf for far away
+    position_m, target_m : (3,), position of the eye and of the fixated point
+    focus_m : focus distance, meters; inf for far
     """
 
     position_m: tuple[float, float, float]
@@ -51,7 +51,7 @@ PATHS = {
 
 
 def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
-    """Follow a path smoothly from its first key to its last.
+    """Interpolate a path smoothly from its first key to its last.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
     Raises
     ------
     ValueError
-        Too few keys or frames.
+        If there are too few keys or frames.
 
     Notes
     -----
-    Catmull-Rom through the keys; focus runs in dioptres, in which an eye's effort is
-    even.
+    Catmull-Rom through the keys; focus is interpolated in diopters, in which an eye's
+    effort is uniform.
     """
     if len(path) < 2 or n_frames < 1:
         raise ValueError(f"{len(path)} keys, {n_frames} frames; need 2 and 1 or more")

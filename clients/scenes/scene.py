@@ -1,4 +1,4 @@
-"""A finished scene: triangles with their light baked in, ready for a flat render."""
+"""A finished scene: triangles with baked light, ready for flat rendering."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ class Batch:
 
     Attributes
     ----------
-    vertices_m : (n, 3) float32, metres
-    faces : (m, 3) uint32, anticlockwise as seen from where their normals point
+    vertices_m : (n, 3) float32, meters
+    faces : (m, 3) uint32, counterclockwise as seen from the side of their normals
     uv : (n, 2) float32
     srgb : (n, 3) float32, sRGB-encoded light that leaves the vertex; with a texture,
         the factor on its sRGB values
@@ -31,7 +31,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Scene:
-    """Named batches, the colour behind them and the camera's depth limits.
+    """Named batches, the background color and the camera's depth limits.
 
     Attributes
     ----------
@@ -48,14 +48,14 @@ class Scene:
 
     @property
     def n_triangles(self) -> int:
-        """Number of triangles in all batches."""
+        """Return the number of triangles in all batches."""
         return sum(len(batch.faces) for batch in self.batches)
 
 
 def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -> Batch:
-    """Turn a mesh and the light (n, 3) on its vertices into a draw call."""
+    """Convert a mesh and the light (n, 3) on its vertices to a draw call."""
     if mesh.texture:
-        # A power law splits a product exactly; sRGB itself does not.
+        # A power law factors a product exactly; sRGB itself does not.
         srgb = np.maximum(mesh.albedo * light + mesh.emission, 0.0) ** (1 / 2.2)
     else:
         srgb = srgb_from_linear(mesh.albedo * light + mesh.emission)
@@ -69,7 +69,7 @@ def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -
 
 
 def _wound(mesh: Mesh) -> NDArray[np.int64]:
-    """Return faces (m, 3), those of mirrored parts turned to face their normals."""
+    """Return faces (m, 3), reversing those of mirrored parts to match their normals."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     normals = mesh.normals[mesh.faces].sum(axis=1)
     against = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0.0

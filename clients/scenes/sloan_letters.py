@@ -1,7 +1,8 @@
 """The ten Sloan letters as shapes: five units high and wide, strokes one unit wide.
 
-A shape is a function of places x, y (arrays, 0 to 5 units, y up) that says where ink
-is.  Straight strokes are as wide as on charts, slanted ones to a tenth of a unit.
+A shape is a function of positions x, y (arrays, 0 to 5 units, y up) that returns a mask
+of the ink.  The width of straight strokes is that of charts; slanted ones match it to a
+tenth of a unit.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ def _ring(x: Places, y: Places, centre, outer: float) -> Ink:
 
 
 def _polygon(x: Places, y: Places, corners: Sequence[tuple[float, float]]) -> Ink:
-    """Inside of a convex polygon with its corners anticlockwise."""
+    """Return the inside of a convex polygon with counterclockwise corners."""
     inside = np.ones(np.broadcast_shapes(x.shape, y.shape), dtype=bool)
     for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
         inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0.0

@@ -1,4 +1,4 @@
-"""Textures drawn with numpy and Pillow: linear float images (h, w, 3) in 0..1."""
+"""Textures drawn with NumPy and Pillow: linear float images (h, w, 3) in 0..1."""
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -14,7 +14,7 @@ def noise(height: int, width: int, *, cells: int, seed: int, octaves: int = 4) -
         n = cells * 2**octave
         grid = np.pad(rng.uniform(-1, 1, (n, n)), 2, mode="wrap")
         image = Image.fromarray(grid.astype(np.float32))
-        # The padding makes the cubic filter wrap; crop it away after.
+        # The padding makes the cubic filter wrap around; it is cropped afterwards.
         step_x, step_y = width / n, height / n
         size = (round(width + 4 * step_x), round(height + 4 * step_y))
         big = np.asarray(image.resize(size, Image.Resampling.BICUBIC))
@@ -24,7 +24,7 @@ def noise(height: int, width: int, *, cells: int, seed: int, octaves: int = 4) -
 
 
 def tinted(value: Array, dark: str, light: str) -> Array:
-    """Blend two colours by value (h, w), -1 dark to 1 light."""
+    """Blend two colors by value (h, w), from -1 (dark) to 1 (light)."""
     t = np.clip(value / 2 + 0.5, 0, 1)[..., None]
     return (1 - t) * linear_from_hex(dark) + t * linear_from_hex(light)
 
@@ -50,7 +50,7 @@ def wood(dark: str, light: str, *, size: int = 512, planks: int = 5) -> Array:
 
 
 def stone_tiles(*, size: int = 1024, tiles: int = 8) -> Array:
-    """Return a floor of squares laid in two colours with small dark corner stones."""
+    """Return a floor of squares in two colors with small dark corner stones."""
     y, x = np.mgrid[0:size, 0:size] / size * tiles
     column, row = x.astype(int), y.astype(int)
     tone = np.random.default_rng(2).uniform(-0.35, 0.35, (tiles, tiles))[row, column]
@@ -65,7 +65,7 @@ def stone_tiles(*, size: int = 1024, tiles: int = 8) -> Array:
 
 
 def stripes(first: str, second: str, *, count: int, size: int = 256) -> Array:
-    """Return vertical stripes in two colours (size, size, 3)."""
+    """Return vertical stripes in two colors (size, size, 3)."""
     x = np.arange(size) / size * 2 * count
     edge = np.clip((np.abs((x + 0.5) % 2 - 1) - 0.5) * size / count, -1, 1)
     cloth = noise(size, size, cells=32, seed=9, octaves=2)
@@ -76,13 +76,13 @@ def stripes(first: str, second: str, *, count: int, size: int = 256) -> Array:
 
 
 def board(size_px, lines, *, paper: str, ink: str, grain: float = 0.1) -> Array:
-    """Draw centred lines of text on a board.
+    """Draw centered lines of text on a board.
 
     Parameters
     ----------
     size_px : (width, height)
-    lines : iterable of (text, centre height 0..1 from the top, font size px, colour)
-        An empty colour means `ink`.
+    lines : iterable of (text, center height 0..1 from the top, font size px, color)
+        An empty color means `ink`.
     paper, ink : "#rrggbb"
     grain : strength of the paper's texture
     """
@@ -103,7 +103,7 @@ def board(size_px, lines, *, paper: str, ink: str, grain: float = 0.1) -> Array:
 
 
 def framed(image: Array, *, color: str, border_px: int, inset_px: int = 0) -> Array:
-    """Draw a line of `color` round an image, inset from its edge."""
+    """Draw a frame of `color` around an image, inset from its edge."""
     result = image.copy()
     h, w = image.shape[:2]
     a, b = inset_px, inset_px + border_px
@@ -115,7 +115,7 @@ def framed(image: Array, *, color: str, border_px: int, inset_px: int = 0) -> Ar
 
 
 def optotype_e(*, size: int = 640) -> Array:
-    """Return a Snellen E on white: five units high, each bar one unit, 1.5 around."""
+    """Return a Snellen E on white: five units high, bars of one unit, margin of 1.5."""
     unit = size // 8
     image = np.full((size, size, 3), 0.9)
     low, high = round(1.5 * unit), round(6.5 * unit)
@@ -127,7 +127,7 @@ def optotype_e(*, size: int = 640) -> Array:
 
 
 def squares(*, size: int = 256) -> Array:
-    """Return white with a grey frame and a grey square, to be tinted by the vertex."""
+    """Return white with a gray frame and a gray square, to be tinted by the vertex."""
     y, x = np.abs(np.mgrid[0:size, 0:size] / (size - 1) * 2 - 1)
     ring = np.maximum(x, y)
     value = np.where((ring > 0.9) | (ring < 0.4), 0.35, 1.0)
@@ -135,23 +135,23 @@ def squares(*, size: int = 256) -> Array:
 
 
 def checks(first: str, second: str, *, columns: int, rows: int, size: int = 512):
-    """Return a board of two colours (size, size, 3)."""
+    """Return a checkerboard of two colors (size, size, 3)."""
     y, x = np.mgrid[0:size, 0:size] / size
     odd = ((x * columns).astype(int) + (y * rows).astype(int)) % 2 == 0
     return np.where(odd[..., None], linear_from_hex(first), linear_from_hex(second))
 
 
 def evening_sky(sine: Array) -> Array:
-    """Return the sky's linear colour (..., 3) at the sine of an elevation (...)."""
+    """Return the sky's linear color (..., 3) at the sine of an elevation (...)."""
     t = np.clip(sine / 0.5, 0, 1)[..., None] ** 0.75
     return (1 - t) * linear_from_hex("#fbe3bf") + t * linear_from_hex("#74aee6")
 
 
 def hills(bottom_m, height_m, distance_m, *, width=1024, height=512) -> Array:
-    """Return an evening view: sky, lines of hills and fields.
+    """Return an evening view: sky, ridges of hills and fields.
 
-    The lengths say where the picture hangs (foot above the eye, height, distance), so
-    that its sky goes over into `evening_sky` behind it.
+    The lengths give the position of the image (foot above the eye, height, distance),
+    so that its sky blends into `evening_sky` behind it.
     """
     x = np.linspace(0, 1, width)
     y = np.linspace(1, 0, height)[:, None]
